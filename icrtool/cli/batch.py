@@ -113,7 +113,7 @@ def write_exports(
     rows: Sequence[Row], missing: Sequence[str], page: Path | None, *, junit: Path | None, markdown: Path | None
 ) -> None:
     """Write the page of the fleet, and what machines that watch pull requests read, where they are asked for."""
-    from icrtool.output.files.atomic_file import write_file
+    from icrtool.output.files.atomic_file import is_page, write_file
 
     if junit is not None:
         from icrtool.fleet.acceptance import suites_of
@@ -129,7 +129,7 @@ def write_exports(
         from icrtool.output.page.fleet_page import fleet_page
         from icrtool.output.run_directory import PAGE_FILE
 
-        write_file(page / PAGE_FILE, fleet_page(fleet_document(rows), page))
+        write_file(page / PAGE_FILE, fleet_page(fleet_document(rows), page), page, is_page)
 
 
 def print_results(

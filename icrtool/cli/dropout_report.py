@@ -11,7 +11,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.drive_options import numbers
-from icrtool.cli.fit import RUNS, check_run_config, fit_log, logs_of, run_directories
+from icrtool.cli.fit import RUNS, RunPlace, check_run_config, fit_log, logs_of, run_directories
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
 from icrtool.cli.terminal import show
@@ -138,7 +138,7 @@ def report_json(source: str, outcome: Outcome) -> dict[str, Any]:
 
 def plan_sources(
     sources: tuple[Path, ...], output: Path | None, into: Path | None, config: Config, *, quiet: bool
-) -> tuple[tuple[Path, ...], dict[Path, Path]]:
+) -> tuple[tuple[Path, ...], dict[Path, RunPlace]]:
     """Return the sources, the newest run where none is named, and the run directory of each that is a log.
 
     Everything that can be refused without reading a log is refused here: a finished run keeps its configuration and
@@ -158,7 +158,9 @@ def plan_sources(
     return sources, {}
 
 
-def report_all(sources: tuple[Path, ...], places: dict[Path, Path], request: Request) -> Iterator[tuple[Path, Outcome]]:
+def report_all(
+    sources: tuple[Path, ...], places: dict[Path, RunPlace], request: Request
+) -> Iterator[tuple[Path, Outcome]]:
     """Report on each source in turn; one that cannot be used does not stop the others."""
     from icrtool.errors import IcrToolError
 
@@ -187,31 +189,29 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
     options.leave(failed, len(outcomes), "runs and logs", gate_failed=not all(one.passed for one in verdicts))
 
 
-def _report_one(source: Path, place: Path | None, request: Request) -> DropoutReport:
+def _report_one(source: Path, place: RunPlace | None, request: Request) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
     from icrtool.output.run_directory import PAGE_FILE
 
-    if place is None:
-        run = _read(source)
-    else:
-        run = fit_log(
-            source, place, request.config, plots=request.asked.plots, smooth=request.further["reference"] == "smoothed",
-            overwrite=request.overwrite, quiet=request.quiet, verbose=request.verbose,
-        )  # fmt: skip
-    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
-    from icrtool.fleet.fit_and_report import report_and_write
+    reports: list[DropoutReport] = []
 
-    directory = source if place is None else place
-    if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
-        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-    baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
-    with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
-        report = report_and_write(
-            run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
-            further=request.further,
+    def report_into(run: Run, directory: Path) -> None:
+        reports.append(_analyse(run, directory, request))
+
+    if place is None:
+        directory, run = source, _read(source)
+        report_into(run, directory)
+    else:
+        directory = place.directory
+        # One result: where the report fails, an old run in this place stays, with its report.
+        run = fit_log(
+            source, directory, request.config, plots=request.asked.plots, inside=place.inside,
+            smooth=request.further["reference"] == "smoothed", overwrite=request.overwrite, then=report_into,
+            quiet=request.quiet, verbose=request.verbose,
         )  # fmt: skip
-    if baseline is not None:
-        options.warn([f"{run.name}: {change}" for change in baseline.changes(run.summary)], quiet=request.quiet)
+    report = reports[0]
+    if report.baseline is not None:
+        options.warn([f"{run.name}: {change}" for change in report.baseline.changes(run.summary)], quiet=request.quiet)
     if request.prints:
         from icrtool.output.tables.dropout import format_dropout
 
@@ -223,6 +223,21 @@ def _report_one(source: Path, place: Path | None, request: Request) -> DropoutRe
             if not verdict.passed:
                 click.echo(verdict.line(), err=True)
     return report
+
+
+def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
+    """Analyse a run, and write its report into its directory."""
+    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
+    from icrtool.fleet.fit_and_report import report_and_write
+
+    if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
+        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
+    baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
+    with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
+        return report_and_write(
+            run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
+            further=request.further,
+        )  # fmt: skip
 
 
 def _read(directory: Path) -> Run:

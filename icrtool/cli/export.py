@@ -93,9 +93,11 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
     from icrtool.output.exports.trajectories import SUFFIXES, format_trajectory
 
     directory.mkdir(parents=True, exist_ok=True)
+    from icrtool.output.files.atomic_file import write_file
+
     for path in paths_of(run):
         file = directory / f"{path.name}{SUFFIXES[target]}"
-        options.write_or_print(format_trajectory(path, target), file)
+        write_file(file, format_trajectory(path, target), directory)
         click.echo(f"written to {file}")
 
 
@@ -107,10 +109,10 @@ def _write_foxglove(run: Run, output: Path) -> None:
     from icrtool.output.files.json_file import json_bytes
 
     layout = output.with_name(f"{output.stem}.layout.json")
-    check_place(layout)
+    check_place(layout, layout.parent)
     with atomic_file(output) as partial:
         write_foxglove(run, partial)
-    write_file(layout, json_bytes(foxglove_layout(run)))
+    write_file(layout, json_bytes(foxglove_layout(run)), layout.parent)
     click.echo(f"written to {output}; layout for Foxglove: {layout}")
 
 

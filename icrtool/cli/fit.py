@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
 
@@ -62,11 +62,11 @@ def command(
     directories = run_directories(logs, output, into)
     documents: list[dict[str, Any]] = []
     failed: list[Path] = []
-    for log, directory in zip(logs, directories, strict=True):
+    for log, (directory, inside) in zip(logs, directories, strict=True):
         try:
             run = fit_log(
-                log, directory, config, quiet=quiet, verbose=verbose, overwrite=overwrite, plots=plots, states=states,
-                span=(start, end), warm_start=warm_start, changes_s=changes, smooth=smooth,
+                log, directory, config, inside=inside, quiet=quiet, verbose=verbose, overwrite=overwrite, plots=plots,
+                states=states, span=(start, end), warm_start=warm_start, changes_s=changes, smooth=smooth,
             )  # fmt: skip
         except IcrToolError as err:
             failed.append(log)
@@ -109,7 +109,14 @@ def check_run_config(config: Config, *, free: str = "") -> None:
         raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
 
 
-def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | None) -> list[Path]:
+class RunPlace(NamedTuple):
+    """Where the run of a log goes; `inside` is the folder of the runs, below which no link is followed."""
+
+    directory: Path
+    inside: Path | None
+
+
+def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | None) -> list[RunPlace]:
     """Return where each log's run goes: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` for several or `into`.
 
     Logs of one name are distinguished by what their paths differ in.
@@ -121,13 +128,14 @@ def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | No
     if output is not None and into is not None:
         raise click.UsageError("-o and --into both state where the runs go: give one of them")
     if output is not None and len(logs) == 1:
-        return [output]
+        return [RunPlace(output, None)]
     parent = output or into
     if parent is not None and (parent / RUN_FILE).is_file():
         raise OutputError(
             parent, "is a run itself", "fitting that run again would remove the runs in it: name another place"
         )
-    return [(parent or RUNS) / name for name in distinct_names(logs)]
+    folder = parent or RUNS
+    return [RunPlace(folder / name, folder) for name in distinct_names(logs)]
 
 
 def _other_robot(source: Path | None, start: WarmStart | None, config: Config) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
       icrtool report results/
     """  # noqa: D301 - click reads the escape
     from icrtool.errors import ConfigError
-    from icrtool.output.files.atomic_file import check_place
+    from icrtool.output.files.atomic_file import check_place, is_page, write_file
     from icrtool.output.run_directory import PAGE_FILE
     from icrtool.output.stored_run import newest_run
 
@@ -41,36 +41,38 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
         raise ConfigError("-o", "names one file for several pages", "leave it out: each page goes to its own directory")
     for source in sources:
         place = output or (source / PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
-        check_place(place)
-        _write(source, place, coordinates=not no_coordinates)
+        # A page in its usual place is beside what a stranger may have put there.
+        inside = place.parent if output is None else None
+        ours = is_page if output is None else None
+        check_place(place, inside, ours)
+        page = _page_of(source, coordinates=not no_coordinates)
+        write_file(place, page, inside, ours)
         if not quiet:
             click.echo(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
 
 
-def _write(source: Path, place: Path, *, coordinates: bool) -> None:
-    """Write the page of a run, a fleet or a comparison."""
+def _page_of(source: Path, *, coordinates: bool) -> str:
+    """Return the page of a run, a fleet or a comparison."""
     import json
 
     from icrtool.errors import RunError
-    from icrtool.output.files.atomic_file import write_file
     from icrtool.output.files.json_file import FLEET_FILE, schema_of
     from icrtool.output.page.comparison_page import comparison_in, comparison_page
     from icrtool.output.page.fleet_page import FLEET_FAMILY, fleet_page
     from icrtool.output.run_directory import is_run_directory
+    from icrtool.records.regular_file import read_regular
 
     if is_run_directory(source):
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
-            page = _page_of_run(source, coordinates=coordinates)
-    elif schema_of(source / FLEET_FILE).startswith(FLEET_FAMILY):
+            return _page_of_run(source, coordinates=coordinates)
+    if schema_of(source / FLEET_FILE, source).startswith(FLEET_FAMILY):
         with _as_written(source / FLEET_FILE, "run icrtool batch again"):
-            page = fleet_page(json.loads((source / FLEET_FILE).read_bytes()), source)
-    elif (file := comparison_in(source)) is not None:
+            return fleet_page(json.loads(read_regular(source / FLEET_FILE, source)), source)
+    if (file := comparison_in(source)) is not None:
         with _as_written(file, "run icrtool compare again"):
-            page = comparison_page(json.loads(file.read_bytes()), file.stem)
-    else:
-        what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
-        raise RunError(source, what, "icrtool fit, batch and compare make one")
-    write_file(place, page)
+            return comparison_page(json.loads(read_regular(file, source if source.is_dir() else None)), file.stem)
+    what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
+    raise RunError(source, what, "icrtool fit, batch and compare make one")
 
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> str:

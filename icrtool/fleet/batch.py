@@ -22,6 +22,7 @@ from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
 from icrtool.fleet.row import File, Row, as_text
 from icrtool.fleet.worker import close_all, process_apart
 from icrtool.logs.containers.split_files import files_of_log
+from icrtool.records.regular_file import read_regular
 
 RUNS, ROWS = "runs", ".rows"
 
@@ -103,8 +104,8 @@ def finished(request: Request) -> Row | None:
     from icrtool.output.run_directory import PAGE_FILE
 
     try:
-        row = msgspec.json.decode(path_of(request.row_file).read_bytes(), type=Row)
-    except (OSError, msgspec.MsgspecError, ValueError):
+        row = msgspec.json.decode(read_regular(path_of(request.row_file), path_of(request.folder)), type=Row)
+    except (OSError, ValueError):
         return None
     if row.key != request.row.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
         return None
@@ -195,7 +196,8 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
     # Workers of a cluster may have another working directory.
     folder = output.absolute()
     return Request(
-        path=os.fsencode(one.path.absolute()), row=row, directory=os.fsencode(folder / RUNS / one.name),
+        path=os.fsencode(one.path.absolute()), row=row, folder=os.fsencode(folder),
+        directory=os.fsencode(folder / RUNS / one.name),
         row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, report=report,
         overwrite=options.overwrite,
         baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",

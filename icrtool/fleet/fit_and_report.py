@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -53,20 +54,23 @@ def fit_and_write(
     smooth: bool = False,
     share: Callable[[float], None] | None = None,
     note: Callable[[str], None] | None = None,
+    inside: Path | None = None,
+    then: Callable[[Run, Path], None] | None = None,
 ) -> Run:
     """Fit a log and write its run directory.
 
     Parameters
     ----------
     overwrite : the run of another recording may be replaced
-    plots, states, note : as in `icrtool.output.run_directory.write_run`
+    plots, states, note, inside : as in `icrtool.output.run_directory.write_run`
     span : from when to when the log is read, as in `icrtool.read_log`
     warm_start, changes_s, smooth : as in `icrtool.fit`
     share : called with the share of the log that was read
+    then : called with the run and its new directory before that is put in place: writes what belongs to the result
     """
     from icrtool.output.run_directory import check_target, replaced_log, write_run
 
-    check_target(directory, log, overwrite=overwrite)
+    check_target(directory, log, overwrite=overwrite, inside=inside)
     begin("reading")
     from icrtool.logs.read_log import read_log
 
@@ -78,7 +82,8 @@ def fit_and_write(
     if note is not None and (before := replaced_log(directory, run)) is not None:
         note(f"{directory}: replaced the run of another recording ({before})")
     begin("writing, pictures" if plots else "writing")
-    write_run(run, directory, states=states, plots=plots, note=note)
+    more = partial(then, run) if then is not None else None
+    write_run(run, directory, states=states, plots=plots, note=note, inside=inside, then=more)
     return run
 
 
@@ -114,10 +119,11 @@ def report_and_write(
         return report
 
     stamps = run.table.stamp_ns if trials else None
-    report = write_report(analysed, directory / DROPOUT_DIRECTORY, plots=options.plots, stamp_ns=stamps)
+    report = write_report(analysed, directory / DROPOUT_DIRECTORY, plots=options.plots, stamp_ns=stamps,
+                          inside=directory)  # fmt: skip
     if options.page:
         from icrtool.output.page.run_page import write_page
 
         begin("page")
-        write_page(run, report, directory / PAGE_FILE, plots=directory)
+        write_page(run, report, directory / PAGE_FILE, plots=directory, inside=directory)
     return report

@@ -13,9 +13,11 @@ import msgspec
 from icrtool import __version__
 from icrtool.fleet.roll_up import MOST_POOLED_S, PooledCalibration
 from icrtool.fleet.row import SHOWN_ERROR, Row, as_text, columns_of
-from icrtool.output.files.atomic_file import atomic_file, write_file
+from icrtool.output.files import disk
+from icrtool.output.files.atomic_file import atomic_file, make_folders, write_file
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes
+from icrtool.output.run_directory import PLOT_FORMATS
 from icrtool.records.dropout import Verdict
 from icrtool.records.text import LogText, counted, escaped
 
@@ -65,17 +67,23 @@ def write_fleet(
     """
     columns = columns_of(rows)
     cells = [row.columns() for row in rows]
-    write_file(directory / "fleet.csv", csv_bytes(columns, [[row.get(name) for name in columns] for row in cells]))
+    write_file(
+        directory / "fleet.csv", csv_bytes(columns, [[row.get(name) for name in columns] for row in cells]), directory
+    )
     failures = [msgspec.to_builtins(row) for row in rows if row.status == "failed"]
-    write_file(directory / "failures.csv", csv_bytes(FAILURES, [[row[name] for name in FAILURES] for row in failures]))
-    with atomic_file(directory / "fleet.parquet") as file:
+    write_file(
+        directory / "failures.csv",
+        csv_bytes(FAILURES, [[row[name] for name in FAILURES] for row in failures]),
+        directory,
+    )
+    with atomic_file(directory / "fleet.parquet", directory) as file:
         _write_parquet(columns, cells, file)
     if calibrations:
-        write_file(directory / "calibrations.txt", calibrations_text(calibrations))
+        write_file(directory / "calibrations.txt", calibrations_text(calibrations), directory)
     if plots:
-        write_figures(rows, directory / PLOTS, tuple(plots))
+        write_figures(rows, directory, tuple(plots))
     # Last: where it is, the others are of the same batch.
-    write_file(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)))
+    write_file(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)), directory)
 
 
 def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool = True) -> str:
@@ -98,8 +106,13 @@ def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool
     return ("\n\n" if tables else "\n").join(parts) + "\n"
 
 
-def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]) -> None:
-    """Draw the ICRs by robot and date, the error by group and the failures by reason; older pictures are removed."""
+def write_figures(rows: Sequence[Row], folder: Path, formats: tuple[str, ...]) -> None:
+    """Draw the ICRs by robot and date, the error by group and the failures by reason; older pictures are removed.
+
+    Parameters
+    ----------
+    folder : of the batch
+    """
     from icrtool.output.figure_catalogue import FIGURES, figures_of
     from icrtool.output.figures.fleet import FleetNumbers
     from icrtool.output.files.picture_file import save_picture
@@ -116,14 +129,15 @@ def write_figures(rows: Sequence[Row], directory: Path, formats: tuple[str, ...]
             errors.setdefault(name, []).append(error)
         if row.status == "failed":
             reasons[reason_of(row)] += 1
-    directory.mkdir(exist_ok=True)
+    directory = folder / PLOTS
+    make_folders(directory, folder)
     numbers = FleetNumbers(f"{len(rows)} logs", points, errors, dict(reasons.most_common()))
     drawn = {directory / f"{name}.{form}": figure for name, figure in figures_of("fleet", numbers) for form in formats}
     for file, figure in drawn.items():
-        save_picture(figure, file)
+        save_picture(figure, file, folder)
     for name in (name for name, entry in FIGURES.items() if entry.of == "fleet"):
-        for old in set(directory.glob(f"{name}.*")) - set(drawn):
-            old.unlink()
+        for old in {directory / f"{name}.{form}" for form in PLOT_FORMATS} - set(drawn):
+            disk.remove(old)
 
 
 def reason_of(row: Row) -> str:

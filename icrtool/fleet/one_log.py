@@ -23,6 +23,7 @@ from icrtool.records.run import ICR_COLUMNS
 
 if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
+    from icrtool.records.run import Run
     from icrtool.records.run_document import RunDocument
 
 
@@ -34,13 +35,15 @@ class Request:
     ----------
     path : of the log
     row : what is known of it before: names, robot, group, tags, key
-    directory : of the run
+    folder : of the batch
+    directory : of the run, below it
     baseline : place of an earlier report or batch to compare with; empty: none
-    row_file : where the row is written, for a batch that continues this one
+    row_file : below `folder`, where the row is written, for a batch that continues this one
     """
 
     path: bytes
     row: Row
+    folder: bytes
     directory: bytes
     row_file: bytes
     config: Config
@@ -74,7 +77,7 @@ def process(request: Request, stage: Stage) -> Row:
     ----------
     stage : called with what is done next
     """
-    from icrtool.output.files.atomic_file import write_file
+    from icrtool.output.files.atomic_file import make_folders, write_file
 
     begun = time.monotonic()
     try:
@@ -85,9 +88,9 @@ def process(request: Request, stage: Stage) -> Row:
         reason = err.beside(str(path), str(directory), log_name(path))
         row = failed(request, reason, repeatable=not isinstance(err, OutputError))
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
-    row_file = path_of(request.row_file)
-    row_file.parent.mkdir(parents=True, exist_ok=True)
-    write_file(row_file, msgspec.json.encode(row))
+    row_file, folder = path_of(request.row_file), path_of(request.folder)
+    make_folders(row_file.parent, folder)
+    write_file(row_file, msgspec.json.encode(row), folder)
     return row
 
 
@@ -117,13 +120,17 @@ def _results(request: Request, stage: Stage) -> Row:
     from icrtool.output.files.baseline_file import open_baseline
 
     directory, place = path_of(request.directory), path_of(request.baseline) if request.baseline else None
+    reports: list[DropoutReport] = []
+
+    def report(run: Run, partial: Path) -> None:
+        baseline = open_baseline(place).find(request.row.log, run.summary["inputs"]) if place is not None else None
+        reports.append(report_and_write(run, partial, request.report, stage, baseline=baseline))
+
     run = fit_and_write(
         path_of(request.path), directory, request.config, stage, overwrite=request.overwrite,
-        plots=request.report.plots,
+        plots=request.report.plots, inside=path_of(request.folder), then=report,
     )  # fmt: skip
-    baseline = open_baseline(place).find(request.row.log, run.summary["inputs"]) if place is not None else None
-    report = report_and_write(run, directory, request.report, stage, baseline=baseline)
-    return _row(request, run.summary, int(run.table.stamp_ns[0]), report)
+    return _row(request, run.summary, int(run.table.stamp_ns[0]), reports[0])
 
 
 def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> Row:

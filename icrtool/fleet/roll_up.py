@@ -17,8 +17,10 @@ from icrtool import __version__
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import unique_name
 from icrtool.fleet.row import File, Row
-from icrtool.output.files.atomic_file import write_file
-from icrtool.output.files.json_file import FLEET_FILE, InputFile, json_bytes, logs_of_fleet
+from icrtool.output.files.atomic_file import make_folders
+from icrtool.output.files.calibration_file import write_calibration
+from icrtool.output.files.json_file import FLEET_FILE, InputFile, logs_of_fleet
+from icrtool.records.regular_file import is_regular, read_regular
 from icrtool.records.run import Run
 
 CALIBRATIONS = "calibrations"
@@ -69,7 +71,7 @@ def pooled_calibrations(rows: Sequence[Row], directory: Path) -> Iterator[Pooled
         ).hexdigest()
         name = _file_name(robot, group, names)
         known = before.get(key)
-        if known is not None and (not known.file or (directory / known.file).is_file()):
+        if known is not None and (not known.file or is_regular(directory / known.file, directory)):
             yield known
         else:
             logs = tuple(row.log for row in members)
@@ -106,7 +108,7 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
 
 def is_fleet(directory: Path) -> bool:
     """Return whether a folder is that of a batch."""
-    return (directory / FLEET_FILE).is_file()
+    return is_regular(directory / FLEET_FILE, directory)
 
 
 def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, name: str) -> PooledCalibration:
@@ -122,6 +124,7 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     count = math.ceil(len(ordered) * min(1.0, MOST_POOLED_S / max(total_s, 1.0)))
     spaced = {ordered[i].log for i in np.linspace(0, len(ordered) - 1, count).round().astype(int)}
     used: list[str] = []
+    file = f"{CALIBRATIONS}/{name}.json"
 
     def usable() -> Iterator[Run]:
         for row in members:
@@ -131,12 +134,11 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
 
     try:
         result = calibrate_runs(usable())
+        make_folders(directory / CALIBRATIONS, directory)
+        write_calibration(result.calibration.summary(), directory / file, directory)
     except IcrToolError as err:
         left_out = tuple(log for log in one.logs if log not in used)
         return replace(one, left_out=left_out, reason=str(err))
-    (directory / CALIBRATIONS).mkdir(exist_ok=True)
-    file = f"{CALIBRATIONS}/{name}.json"
-    write_file(directory / file, json_bytes(result.calibration.summary()))
     numbers = result.calibration.controller_numbers()
     table = str(Text(held_out_blocks(result.table)))
     return replace(
@@ -154,7 +156,7 @@ def _content(inputs: Sequence[File | InputFile]) -> tuple[str, ...]:
 def _stored(directory: Path) -> list[PooledCalibration]:
     """Return the calibrations of an earlier batch in the same folder."""
     try:
-        document: Mapping[str, Any] = json.loads((directory / FLEET_FILE).read_bytes())
+        document: Mapping[str, Any] = json.loads(read_regular(directory / FLEET_FILE, directory))
         return [msgspec.convert(one, PooledCalibration) for one in document.get("calibrations", [])]
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, msgspec.ValidationError):
         return []

@@ -50,6 +50,7 @@ def write_report(
     *,
     plots: tuple[str, ...] = ("png",),
     stamp_ns: Ints | None = None,
+    inside: Path | None = None,
 ) -> DropoutReport:
     """Write a report, whole or not at all; an old one in its place is replaced.
 
@@ -58,13 +59,14 @@ def write_report(
     analyse : gives the report; it is called with what takes every single trial, None where they are not written
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: they are not written
+    inside : as in `icrtool.output.files.atomic_directory.check_directory`
 
     Raises
     ------
     OutputError
         Something that is not a dropout report stands in its place, or the disk does not take it.
     """
-    with atomic_directory(directory, is_dropout_directory, kind="dropout report") as partial:
+    with atomic_directory(directory, is_dropout_directory, kind="dropout report", inside=inside) as partial:
         with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
             report = analyse(sink)
         if plots:
@@ -77,7 +79,7 @@ def write_report(
 
 def is_dropout_directory(directory: Path) -> bool:
     """Return whether a directory is a dropout report of ours, of whatever version."""
-    return schema_of(directory / REPORT_FILE).startswith(SCHEMA_FAMILY)
+    return schema_of(directory / REPORT_FILE, directory).startswith(SCHEMA_FAMILY)
 
 
 def write_tables(report: DropoutReport, directory: Path) -> None:

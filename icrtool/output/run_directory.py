@@ -17,6 +17,7 @@ from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.files.own_files import made_from
 from icrtool.output.files.states_file import StatesFormat, file_b2sum, write_states
+from icrtool.records.regular_file import read_regular
 from icrtool.records.run import Run
 from icrtool.records.run_document import EVENT_COLUMNS
 
@@ -24,7 +25,7 @@ RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
 PAGE_FILE = "report.html"
 CHECKSUM_FILE = "B2SUMS"
-"""Sums of all files except the pictures, as ``b2sum -c`` reads them: an edited run is recognised."""
+"""Sums of all files, as ``b2sum -c`` reads them: an edited run is recognised."""
 
 STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": "parquet"}
 
@@ -38,20 +39,23 @@ PLOT_FORMATS = ("png", "svg", "pdf")
 SCHEMA_FAMILY = "icrtool/run/"
 
 
-def check_target(directory: Path, log: Path | None = None, *, overwrite: bool = False) -> None:
+def check_target(
+    directory: Path, log: Path | None = None, *, overwrite: bool = False, inside: Path | None = None
+) -> None:  # fmt: skip
     """Refuse a place where a run directory cannot be put, before any work is done for it.
 
     Parameters
     ----------
     log : the run will be made from it; a run of another recording is refused
     overwrite : a run of another recording may be replaced
+    inside : as in `check_directory`
 
     Raises
     ------
     OutputError
         A file, a directory that is not a run of ours, or the run of another recording is there.
     """
-    check_directory(directory, is_run_directory, kind="run directory")
+    check_directory(directory, is_run_directory, kind="run directory", inside=inside)
     if log is not None and not overwrite and is_run_directory(directory) and not _is_made_from(directory, log):
         other = next((one.get("path") for one in _inputs_of(directory)), "data frames")
         advice = "name another place, or replace it with --overwrite"
@@ -77,6 +81,8 @@ def write_run(
     states: StatesFormat | None = None,
     plots: tuple[str, ...] = ("png",),
     note: Callable[[str], None] | None = None,
+    inside: Path | None = None,
+    then: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a run directory, whole or not at all.
 
@@ -87,6 +93,9 @@ def write_run(
     states : format of the states; default: ``csv``, of more than `MOST_CSV_STATES` ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
+    inside : as in `check_directory`
+    then : called with the new directory before it is put in place: what it writes there belongs to the run, and where
+        it fails the old run stays
 
     Raises
     ------
@@ -102,7 +111,13 @@ def write_run(
     sources = [os.path.realpath(file["path"]) for file in run.summary["inputs"]]
     with (
         atomic_directory(
-            directory, is_run_directory, kind="run directory", names=(PAGE_FILE,), made_from=sources, note=note
+            directory,
+            is_run_directory,
+            kind="run directory",
+            inside=inside,
+            names=(PAGE_FILE,),
+            made_from=sources,
+            note=note,
         ) as partial,
         ThreadPoolExecutor(1) as pool,
     ):
@@ -118,9 +133,12 @@ def write_run(
         write_measurements(run, partial / MEASUREMENTS_FILE)
         (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
         (partial / EVENTS_FILE).write_bytes(events_csv(run.summary["events"]))
-        sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE)}
+        pictures = [f"plots/{file.name}" for file in sorted((partial / "plots").glob("*"))]
+        sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE, *pictures)}
         sums[states_name] = states_sum.result()
         (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
+        if then is not None:
+            then(partial)
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:
@@ -133,7 +151,7 @@ def replaced_log(directory: Path, run: Run) -> str | None:
 def _inputs_of(directory: Path) -> list[dict[str, Any]]:
     """Return the inputs in a run.json that nobody checked yet."""
     try:
-        inputs = json.loads((directory / RUN_FILE).read_bytes())["inputs"]
+        inputs = json.loads(read_regular(directory / RUN_FILE, directory))["inputs"]
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return []
     return [one for one in inputs if isinstance(one, dict)] if isinstance(inputs, list) else []
@@ -141,7 +159,7 @@ def _inputs_of(directory: Path) -> list[dict[str, Any]]:
 
 def is_run_directory(directory: Path) -> bool:
     """Return whether a directory is a run of ours, of whatever version."""
-    return schema_of(directory / RUN_FILE).startswith(SCHEMA_FAMILY)
+    return schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
 
 
 def events_csv(events: Sequence[Mapping[str, Any]]) -> bytes:

@@ -25,6 +25,7 @@ from icrtool.output.run_directory import (
     is_run_directory,
 )
 from icrtool.records.memory import give_back_freed
+from icrtool.records.regular_file import read_regular
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.tables import States
@@ -59,7 +60,7 @@ def open_run(path: str | Path) -> Run:
     """
     directory = Path(path)
     document = _read_document(directory)
-    sums = _read_sums(directory)
+    sums = read_sums(directory)
     _check_sum(directory, RUN_FILE, sums)
     if MEASUREMENTS_FILE not in sums:
         raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
@@ -74,7 +75,7 @@ def open_run(path: str | Path) -> Run:
         if table.fault:
             raise ValueError(table.fault)
         _check_sum(directory, MEASUREMENTS_FILE, sums)
-        table, sensors, gnss, heading = read_measurements(directory / MEASUREMENTS_FILE, table, run_document)
+        table, sensors, gnss, heading = read_measurements(directory, table, run_document)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
@@ -164,7 +165,7 @@ def check_run_document(document: dict[str, Any]) -> RunDocument:
 
 def _read_document(directory: Path) -> dict[str, Any]:
     try:
-        raw = (directory / RUN_FILE).read_bytes()
+        raw = read_regular(directory / RUN_FILE, directory)
     except (OSError, ValueError) as err:
         why = "not a run directory" if directory.is_dir() else "no such run directory"
         raise RunError(directory, why, f"it holds no readable {RUN_FILE}; icrtool fit makes one") from err
@@ -202,14 +203,21 @@ def _read_states(directory: Path, names: Mapping[str, StatesFormat], sums: Mappi
         # Both read the file from end to end; hashing leaves the interpreter to the other.
         checked = pool.submit(_check_sum, directory, name, sums)
         try:
-            return read_states(directory / name, names[name])
+            return read_states(directory / name, names[name], directory)
         finally:
             checked.result()
 
 
-def _read_sums(directory: Path) -> dict[str, str]:
+def read_sums(directory: Path) -> dict[str, str]:
+    """Return the BLAKE2b sums (hex) of the files of a run, by their path below it.
+
+    Raises
+    ------
+    RunError
+        Its list of them cannot be read.
+    """
     try:
-        lines = (directory / CHECKSUM_FILE).read_text(encoding="utf-8").splitlines()
+        lines = read_regular(directory / CHECKSUM_FILE, directory).decode().splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise RunError(directory, f"no readable {CHECKSUM_FILE}", FIT_AGAIN) from err
     return {name: sum_ for sum_, _, name in (line.partition("  ") for line in lines)}
@@ -217,8 +225,8 @@ def _read_sums(directory: Path) -> dict[str, str]:
 
 def _check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
     try:
-        found = file_b2sum(directory / name)
+        found = file_b2sum(directory / name, directory)
     except OSError as err:
-        raise RunError(directory, f"{name} is missing or unreadable", FIT_AGAIN) from err
+        raise RunError(directory, f"{name} is missing or unreadable ({err.strerror})", FIT_AGAIN) from err
     if found != sums.get(name):
         raise RunError(directory, f"{name} was edited or cut short since the run", FIT_AGAIN)

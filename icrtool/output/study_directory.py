@@ -57,7 +57,7 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
 
 def is_study_directory(directory: Path) -> bool:
     """Return whether a directory is a study of ours, of whatever version."""
-    return schema_of(directory / STUDY_FILE).startswith(SCHEMA_FAMILY)
+    return schema_of(directory / STUDY_FILE, directory).startswith(SCHEMA_FAMILY)
 
 
 def study_document(result: StudyResult) -> dict[str, Any]:

@@ -26,14 +26,21 @@ def write_mcap(
     compression: Compression,
     definitions: bool,
     metadata: Mapping[str, str] | None = None,
+    library: str = "icrtool",
 ) -> None:
-    """Write one MCAP file of ROS 2 messages (CDR); `metadata` becomes its metadata record ``icrtool``."""
+    """Write one MCAP file of ROS 2 messages (CDR).
+
+    Parameters
+    ----------
+    metadata : becomes its metadata record ``icrtool``
+    library : name in its header
+    """
     from mcap.writer import CompressionType, Writer
 
     kind = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}[compression]
     with path.open("wb") as stream:
         writer: Any = Writer(stream, compression=kind)
-        writer.start(profile="ros2", library="icrtool")
+        writer.start(profile="ros2", library=library)
         channels = []
         for topic in topics:
             text = store.generate_msgdef(topic.message_type, ros_version=2)[0] if definitions else ""

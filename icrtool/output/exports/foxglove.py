@@ -38,6 +38,7 @@ from icrtool.output.exports.paths import (
     paths_of,
     rows_apart,
 )
+from icrtool.output.files.atomic_file import EXPORTED_MCAP
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.samples import FIXED_FIX
 
@@ -48,6 +49,8 @@ INTERVAL_S = 0.05
 """States are written 20 times a second at most."""
 
 WORLD = "map"
+LIBRARY = EXPORTED_MCAP.decode()
+
 BODIES: dict[PathName, str] = {
     "filter": "base_link", "smoothed": "smoothed", "icr": "icr_odometry", "no_slip": "no_slip_odometry",
 }  # fmt: skip
@@ -116,7 +119,7 @@ def write_foxglove(run: Run, path: Path) -> None:
         "unusable_because": run.summary["unusable_because"] or "",
         "datum": "" if globe is None else " ".join(f"{value!r}" for value in globe),
     }  # fmt: skip
-    write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about)
+    write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about, library=LIBRARY)
 
 
 @cache

@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 from icrtool.errors import OutputError
 from icrtool.output.files import disk
 from icrtool.output.files.own_files import OWN_FILES, carry, files_by_owner, files_in, kind_of, write_own_files
+from icrtool.records.regular_file import check_folders
 from icrtool.records.text import escaped, listed
 from icrtool.records.unfinished import end, unfinished
 
@@ -22,7 +23,7 @@ IsOurs = Callable[[Path], bool]
 """Whether a directory is one that we wrote and may replace."""
 
 
-def check_directory(directory: Path, ours: IsOurs, *, kind: str) -> None:
+def check_directory(directory: Path, ours: IsOurs, *, kind: str, inside: Path | None = None) -> None:
     """Refuse a place where a directory of ours cannot be put; restore what a killed process renamed aside.
 
     Parameters
@@ -30,6 +31,7 @@ def check_directory(directory: Path, ours: IsOurs, *, kind: str) -> None:
     directory : where it shall appear; nothing, an empty directory and one of ours may be there
     ours : whether a directory may be replaced
     kind : what is being written, for the message ("run directory")
+    inside : a directory above it; below that no link is followed. None: the user named `directory`, and links are
 
     Raises
     ------
@@ -38,6 +40,8 @@ def check_directory(directory: Path, ours: IsOurs, *, kind: str) -> None:
         point; or nothing can be known about the place.
     """
     try:
+        if inside is not None:
+            check_folders(directory, inside)
         place = _resolved(directory)
         outer = next((parent for parent in place.parents if ours(parent)), None)
         if outer is not None:
@@ -65,6 +69,7 @@ def atomic_directory(
     ours: IsOurs,
     *,
     kind: str,
+    inside: Path | None = None,
     names: Collection[str] = (),
     made_from: Sequence[str] = (),
     note: Callable[[str], None] | None = None,
@@ -75,7 +80,7 @@ def atomic_directory(
 
     Parameters
     ----------
-    directory, ours, kind : as in `check_directory`
+    directory, ours, kind, inside : as in `check_directory`
     names : names at the top of the directory that are icrtool's though they are written later (``report.html``)
     made_from : absolute paths of the files that the content is made from
     note : called with one line where the replacement removed files that it did not write again, or kept foreign ones
@@ -90,7 +95,7 @@ def atomic_directory(
     OutputError
         As `check_directory`, and for every OSError of the block (disk full, no permission).
     """
-    check_directory(directory, ours, kind=kind)
+    check_directory(directory, ours, kind=kind, inside=inside)
     made: list[Path] = []
     try:
         place = _resolved(directory)
@@ -98,7 +103,7 @@ def atomic_directory(
         _make_parents(place, made)
         with hidden_directory(place, names) as partial:
             yield partial
-            check_directory(place, ours, kind=kind)
+            check_directory(directory, ours, kind=kind, inside=inside)
             done = _put(partial, place, kind, names, made_from)
         made = []
         if note is not None and done:

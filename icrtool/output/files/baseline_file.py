@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -19,6 +18,7 @@ from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
 from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet
 from icrtool.records.dropout import METRICS
+from icrtool.records.regular_file import is_regular, read_regular
 from icrtool.records.text import escaped
 
 LARGEST = 1e12
@@ -45,9 +45,14 @@ class Baseline:
     sources: tuple[Path, ...]
 
     @property
+    def folder(self) -> Path | None:
+        """The directory that was named; None where it was one report."""
+        return None if self.path.is_file() else self.path
+
+    @property
     def digest(self) -> str:
         """A text that changes with the content."""
-        return sha256(b"".join(file.read_bytes() for file in self.sources)).hexdigest()
+        return sha256(b"".join(read_regular(file, self.folder) for file in self.sources)).hexdigest()
 
     def missing(self, logs: Iterable[str]) -> list[str]:
         """Return the logs of the baseline that are not among some others, by name."""
@@ -68,7 +73,7 @@ class Baseline:
         if found is None and self.path.is_file():
             found = next(iter(self.reports))
         found = found if found is not None else name if name in self.reports else None
-        return read_report(self.reports[found], found) if found is not None else None
+        return read_report(self.reports[found], found, self.folder) if found is not None else None
 
 
 def open_baseline(path: Path) -> Baseline:
@@ -86,7 +91,7 @@ def open_baseline(path: Path) -> Baseline:
     reports: dict[str, Path] = {}
     files: dict[str, tuple[str, ...]] = {}
     for file in [path] if path.is_file() else _report_files(path):
-        one = read_report(file)
+        one = read_report(file, inside=None if file == path else path)
         if one.log in reports:
             why = f"two reports of logs named {one.log}"
             raise ConfigError(f"--baseline {path}", why, f"{reports[one.log]} and {file}")
@@ -96,12 +101,13 @@ def open_baseline(path: Path) -> Baseline:
     return Baseline(path, reports, files, tuple(reports.values()))
 
 
-def read_report(path: Path, log: str = "") -> BaselineReport:
+def read_report(path: Path, log: str = "", inside: Path | None = None) -> BaselineReport:
     """Read a report.json as a baseline.
 
     Parameters
     ----------
     log : its name in a batch; default: that in the report
+    inside : as in `open_regular`
 
     Raises
     ------
@@ -109,7 +115,7 @@ def read_report(path: Path, log: str = "") -> BaselineReport:
         It is not a dropout report.
     """
     try:
-        document = json.loads(path.read_bytes())
+        document = json.loads(read_regular(path, inside))
         run = document["run"]
         if not document["schema"].startswith(SCHEMA_FAMILY):
             raise ValueError(document["schema"])
@@ -153,7 +159,7 @@ def _number(value: float | None) -> float:
 def _fleet_baseline(path: Path) -> Baseline:
     """Return the baseline of a batch: its fleet.json names logs, content and runs."""
     logs = {one.log: (path / one.run / DROPOUT_DIRECTORY / REPORT_FILE, one) for one in logs_of_fleet(path)}
-    present = {log: found for log, found in logs.items() if os.path.isfile(found[0])}  # noqa: PTH113 - any text may be a path here
+    present = {log: found for log, found in logs.items() if is_regular(found[0], path)}
     if not present:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
     files = {log: tuple(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}

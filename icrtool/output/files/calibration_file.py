@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.atomic_file import write_file
 from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.records.regular_file import read_regular
 from icrtool.records.run import CALIBRATION_SCHEMA
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def open_calibration(file: Path | str) -> Calibration:
 
     path = Path(file)
     try:
-        return replace(calibration_of(json.loads(path.read_bytes())), name=path.stem)
+        return replace(calibration_of(json.loads(read_regular(path))), name=path.stem)
     except OSError as err:
         raise RunError(path, "cannot be read", err.strerror or str(err)) from err
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as err:
@@ -43,8 +44,12 @@ def open_calibration(file: Path | str) -> Calibration:
         raise RunError(path, why, "make one with icrtool calibrate -o") from err
 
 
-def write_calibration(document: Mapping[str, Any], place: Path) -> Path:
+def write_calibration(document: Mapping[str, Any], place: Path, inside: Path | None = None) -> Path:
     """Write plain data of a calibration: into `place` where that is a folder, else as `place`.
+
+    Parameters
+    ----------
+    inside : as in `icrtool.output.files.atomic_file.atomic_file`
 
     Returns
     -------
@@ -56,13 +61,17 @@ def write_calibration(document: Mapping[str, Any], place: Path) -> Path:
     OutputError
         Something that is not a calibration is there, or it cannot be written.
     """
-    file = calibration_file(place)
-    write_file(file, json_bytes(document))
+    file = calibration_file(place, inside)
+    write_file(file, json_bytes(document), place if file != place else inside)
     return file
 
 
-def calibration_file(place: Path) -> Path:
+def calibration_file(place: Path, inside: Path | None = None) -> Path:
     """Return where a calibration asked for at `place` goes.
+
+    Parameters
+    ----------
+    inside : as in `write_calibration`
 
     Raises
     ------
@@ -72,6 +81,7 @@ def calibration_file(place: Path) -> Path:
     file = place / FILE_NAME if place.is_dir() else place
     if not file.parent.is_dir():
         raise OutputError(file, f"there is no folder {file.parent}", "make it, or name another place")
-    if file.exists() and schema_of(file) != CALIBRATION_SCHEMA:
+    replaced = file.is_symlink() and (file != place or inside is not None)
+    if file.exists() and not replaced and schema_of(file) != CALIBRATION_SCHEMA:
         raise OutputError(file, "a file that is not a calibration is there", "it is left alone; name another place")
     return file

@@ -43,6 +43,9 @@ SYNC_THREADS = 8
 """A journal commits what is asked for together: eight threads sync 16 files in a fifth of the time of one."""
 
 
+_LOOK = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+
+
 def hidden_name(place: Path, end: str) -> Path:
     """Return a new hidden name beside a place, for what shall get its name."""
     return place.with_name(f"{_hidden_begin(place)}{secrets.token_hex(TOKEN_BYTES)}{end}")
@@ -57,7 +60,8 @@ def hidden(place: Path, *ends: str) -> list[Path]:
         beside = list(place.parent.iterdir())
     except (FileNotFoundError, NotADirectoryError):
         return []
-    return [path for path in beside if any(one.fullmatch(path.name) for one in sought)]
+    # A link is not ours: it would lead the cleaning elsewhere.
+    return [path for path in beside if any(one.fullmatch(path.name) for one in sought) and not path.is_symlink()]
 
 
 def _hidden_begin(place: Path) -> str:
@@ -158,7 +162,7 @@ def locked(path: Path) -> Iterator[None]:
     handle = None
     if sys.platform != "win32":
         with suppress(OSError):
-            handle = os.open(path, os.O_RDONLY)
+            handle = os.open(path, _LOOK)
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     try:
         yield
@@ -171,7 +175,7 @@ def is_abandoned(path: Path) -> bool:
     """Return whether no living process writes what `locked` locked."""
     try:
         if sys.platform != "win32":
-            handle = os.open(path, os.O_RDONLY)
+            handle = os.open(path, _LOOK)
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             finally:

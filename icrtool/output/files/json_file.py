@@ -11,6 +11,7 @@ import msgspec
 
 from icrtool.errors import RunError
 from icrtool.records.plain_data import plain
+from icrtool.records.regular_file import check_folders, read_regular
 from icrtool.records.text import LogText
 
 FLEET_FILE = "fleet.json"
@@ -54,16 +55,24 @@ def logs_of_fleet(directory: Path) -> list[FleetLog]:
         The folder does not hold the result of a batch.
     """
     try:
-        found = msgspec.json.decode((directory / FLEET_FILE).read_bytes(), type=_Fleet).logs
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as err:
+        found = msgspec.json.decode(read_regular(directory / FLEET_FILE, directory), type=_Fleet).logs
+        found = [one for one in found if one.status != "failed"]
+        for one in found:
+            check_folders(directory / one.run, directory)
+    except (OSError, ValueError, RecursionError) as err:
         raise RunError(directory, f"its {FLEET_FILE} cannot be read ({err})", "name the folder of a batch") from err
-    return [one for one in found if one.status != "failed"]
+    return found
 
 
-def schema_of(file: Path) -> str:
-    """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty where it states none."""
+def schema_of(file: Path, inside: Path | None = None) -> str:
+    """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty where it states none.
+
+    Parameters
+    ----------
+    inside : as in `open_regular`
+    """
     try:
-        schema = json.loads(file.read_bytes())["schema"]
+        schema = json.loads(read_regular(file, inside))["schema"]
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return ""
     return schema if isinstance(schema, str) else ""

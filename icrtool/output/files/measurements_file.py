@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from icrtool.kernels.arrays import Ints
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, IcrStart, SensorData
+from icrtool.records.regular_file import open_regular
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, thin
@@ -66,7 +67,7 @@ def write_measurements(run: Run, path: Path) -> None:
 
 
 def read_measurements(
-    path: Path, table: States, document: RunDocument
+    directory: Path, table: States, document: RunDocument
 ) -> tuple[States, SensorData, MeasurementOutcome, MeasurementOutcome]:
     """Read what `write_measurements` wrote: the sensors, and the outcome of fixes and headings.
 
@@ -74,6 +75,7 @@ def read_measurements(
 
     Parameters
     ----------
+    directory : of the run
     table : the states of the run; `document`: its run.json, which holds what is no column
 
     Raises
@@ -86,7 +88,7 @@ def read_measurements(
     facts, events = document["filter"], cast("list[dict[str, Any]]", document["events"])
     start = facts["icr_start"]
     try:
-        with ZipFile(path) as stored:
+        with open_regular(directory / MEASUREMENTS_FILE, directory) as file, ZipFile(file) as stored:
             if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
                 raise ValueError(f"{MEASUREMENTS_FILE} is compressed")  # its size would have no bound
             columns = {member.filename.removesuffix(".npy"): _array(stored, member) for member in stored.infolist()}

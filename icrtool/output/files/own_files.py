@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from icrtool.output.files import disk
+from icrtool.records.regular_file import read_regular
 
 OWN_FILES = ".icrtool-files"
 """List of the files that were written with a directory: JSON with `schema`, `kind`, `files` and `made_from`."""
@@ -103,7 +104,7 @@ def _write(file: Path, kind: str, files: list[str], made_from: Sequence[str] = (
 
 def _read(directory: Path) -> tuple[str, frozenset[str], frozenset[str]] | None:
     try:
-        document = json.loads((directory / OWN_FILES).read_bytes())
+        document = json.loads(read_regular(directory / OWN_FILES, directory))
         if document["schema"] == SCHEMA:
             files, sources = (frozenset(map(str, document.get(key, ()))) for key in ("files", "made_from"))
             return str(document["kind"]), files, sources

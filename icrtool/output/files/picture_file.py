@@ -26,8 +26,12 @@ def check_picture(file: Path) -> None:
     check_place(file)
 
 
-def save_picture(figure: Figure, file: Path) -> None:
+def save_picture(figure: Figure, file: Path, inside: Path | None = None) -> None:
     """Write a figure; the suffix gives the format.
+
+    Parameters
+    ----------
+    inside : as in `icrtool.output.files.atomic_file.atomic_file`
 
     Raises
     ------
@@ -37,4 +41,4 @@ def save_picture(figure: Figure, file: Path) -> None:
     form = file.suffix.removeprefix(".").lower()
     from icrtool.output.figures.style import picture_bytes
 
-    write_file(file, picture_bytes(figure, form))
+    write_file(file, picture_bytes(figure, form), inside)

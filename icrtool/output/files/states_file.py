@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.decompress import LARGEST_RATIO
+from icrtool.records.regular_file import open_regular
 from icrtool.records.tables import States
 
 if TYPE_CHECKING:
@@ -39,6 +42,9 @@ PARQUET_ROWS = 1 << 17
 
 FREE_BYTES = 1 << 29
 """States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
+
+LARGEST_RUN_FILE_BYTES = 1 << 33
+"""Of a file of a run: 70 h at 100 Hz. A file may be far larger than what is on the disk, and take hours to read."""
 
 PIECES_AHEAD = 4
 """Pieces of text that wait to be written at most."""
@@ -97,8 +103,12 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
     return digest.hexdigest()
 
 
-def read_states(path: Path, states: StatesFormat) -> States:
+def read_states(path: Path, states: StatesFormat, inside: Path | None = None) -> States:
     """Read what `write_states` wrote.
+
+    Parameters
+    ----------
+    inside : as in `open_regular`
 
     Raises
     ------
@@ -114,9 +124,9 @@ def read_states(path: Path, states: StatesFormat) -> States:
         if states == "parquet":
             import pyarrow.parquet as pq
 
-            with pq.ParquetFile(path) as file:
+            with open_regular(path, inside) as source, pq.ParquetFile(source) as file:
                 numbers = file.metadata.num_rows * len(COLUMNS)
-                if 8 * numbers > FREE_BYTES + LARGEST_RATIO * path.stat().st_size:
+                if 8 * numbers > FREE_BYTES + LARGEST_RATIO * os.fstat(source.fileno()).st_size:
                     raise StatesFileError(f"it claims {numbers} numbers, too many for its size")
                 _check_columns(file.schema_arrow, types)
                 # One at a time: each one's memory is used again for the next.
@@ -125,7 +135,8 @@ def read_states(path: Path, states: StatesFormat) -> States:
         import pyarrow.csv as pc
 
         options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])
-        stored = pc.read_csv(path, convert_options=options)
+        with open_regular(path, inside) as source:
+            stored = pc.read_csv(source, convert_options=options)
         _check_columns(stored.schema, types)
         columns = dict(zip(stored.schema.names, stored.columns, strict=True))
         del stored
@@ -147,9 +158,21 @@ def _array(column: pa.ChunkedArray) -> NDArray[Any]:
     return np.concatenate([np.from_dlpack(chunk) for chunk in column.chunks])
 
 
-def file_b2sum(path: Path) -> str:
-    """Return the BLAKE2b sum (hex) of a file: as safe as SHA-256, at twice its speed on most machines."""
-    with path.open("rb") as file:
+def file_b2sum(path: Path, inside: Path | None = None) -> str:
+    """Return the BLAKE2b sum (hex) of a file: as safe as SHA-256, at twice its speed on most machines.
+
+    Parameters
+    ----------
+    inside : as in `open_regular`
+
+    Raises
+    ------
+    OSError
+        The file cannot be read, or is larger than `LARGEST_RUN_FILE_BYTES`.
+    """
+    with open_regular(path, inside) as file:
+        if os.fstat(file.fileno()).st_size > LARGEST_RUN_FILE_BYTES:
+            raise OSError(errno.EFBIG, f"larger than {LARGEST_RUN_FILE_BYTES} bytes", str(path))
         return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
 
 

@@ -55,5 +55,6 @@ def _errors(cells: Sequence[Mapping[str, Any]], names: Sequence[str], tested_on:
 
 def comparison_in(place: Path) -> Path | None:
     """Return the file of a comparison: `place` itself, or the one in that folder; None where there is none."""
-    files = sorted(place.glob("*.json")) if place.is_dir() else [place]
-    return next((file for file in files if schema_of(file).startswith(COMPARISON_FAMILY)), None)
+    inside = place if place.is_dir() else None
+    files = [place] if inside is None else sorted(place.glob("*.json"))
+    return next((file for file in files if schema_of(file, inside).startswith(COMPARISON_FAMILY)), None)

@@ -11,6 +11,7 @@ from icrtool.output.page.pictures import pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text
+from icrtool.records.regular_file import is_regular
 
 PLOTS = "plots"
 
@@ -61,7 +62,7 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
         counts=document["counts"], gates_failed=document["gates_failed"], made_with=document["tool_version"],
         choices={key: sorted({log[key] for log in logs} - {""}) for key in ("status", "robot", "group")},
         horizon_m=HORIZON_M,
-        pictures=list(pictures_in(folder / PLOTS).values()),
+        pictures=list(pictures_in(folder / PLOTS, folder).values()),
     )  # fmt: skip
 
 
@@ -111,6 +112,6 @@ def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
 def _link(run: str, folder: Path) -> str:
     """Return the relative address of a log's page; empty where it is not there, or would lead out of the folder."""
     path = PurePosixPath(run)
-    if path.is_absolute() or ".." in path.parts or not (folder / path / PAGE_FILE).is_file():
+    if path.is_absolute() or not is_regular(folder / path / PAGE_FILE, folder):
         return ""
     return f"./{quote(str(path / PAGE_FILE))}"

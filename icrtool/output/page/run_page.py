@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,16 +15,19 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
-from icrtool.output.files.atomic_file import write_file
+from icrtool.output.files.atomic_file import is_page, write_file
 from icrtool.output.files.json_file import schema_of
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
+from icrtool.output.run_directory import CHECKSUM_FILE
+from icrtool.output.stored_run import read_sums
 from icrtool.output.tables.dropout import shown_horizons
 from icrtool.output.text_format import duration_text, error_text, position_word, role_word
 from icrtool.records.plain_data import plain
+from icrtool.records.regular_file import read_regular
 from icrtool.records.run import ICR_WORDS, Run
 
 SCRIPTS = (
@@ -41,8 +45,9 @@ TWINS = ("trajectory", "icr_estimates", "gnss_difference", "summary")
 
 
 def write_page(
-    run: Run, report: DropoutReport, path: str | Path, *, plots: Path | None = None, coordinates: bool = True
-) -> None:
+    run: Run, report: DropoutReport, path: str | Path, *, plots: Path | None = None, coordinates: bool = True,
+    inside: Path | None = None,
+) -> None:  # fmt: skip
     """Write a run and its dropout report as one HTML file.
 
     Parameters
@@ -52,6 +57,7 @@ def write_page(
     path : the file
     plots : directory of the run, whose PNG pictures the page shows where no script draws; default: that of `run`
     coordinates : False leaves out where on the globe the robot was
+    inside : as in `icrtool.output.files.atomic_file.atomic_file`
 
     Raises
     ------
@@ -59,7 +65,8 @@ def write_page(
         The file cannot be written.
     """
     pictures = pictures_of_run(plots if plots is not None else run.directory)
-    write_file(Path(path), run_page(run, report_document(report), pictures, coordinates=coordinates))
+    page = run_page(run, report_document(report), pictures, coordinates=coordinates)
+    write_file(Path(path), page, inside, ours=is_page if inside is not None else None)
 
 
 def run_page(
@@ -100,18 +107,20 @@ def read_report(directory: Path) -> dict[str, Any] | None:
         It is not a report of this version.
     """
     file = directory / DROPOUT_DIRECTORY / REPORT_FILE
-    if not file.exists():
+    if not os.path.lexists(file):
         return None
-    if schema_of(file) != DROPOUT_SCHEMA:
+    if schema_of(file, directory) != DROPOUT_SCHEMA:
         raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
-    return dict(json.loads(file.read_bytes()))
+    return dict(json.loads(read_regular(file, directory)))
 
 
 def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
     """Return the pictures in a run's directory and in that of its dropout report."""
     if directory is None:
         return {}
-    return pictures_in(directory / "plots") | pictures_in(directory / DROPOUT_DIRECTORY / "plots")
+    sums = read_sums(directory) if os.path.lexists(directory / CHECKSUM_FILE) else {}
+    found = pictures_in(directory / "plots", directory, sums)
+    return found | pictures_in(directory / DROPOUT_DIRECTORY / "plots", directory)
 
 
 def draw_pictures(run: Run) -> dict[str, Picture]:

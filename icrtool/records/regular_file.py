@@ -1,0 +1,128 @@
+"""Files that somebody else may have put there: opened as regular files, and below a directory without any link.
+
+The path that a user names is followed, wherever links lead. What lies below it may come from a stranger: a link there
+could lead to any file of the user, and a pipe or a device would never end.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import sys
+from io import BufferedReader
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path  # its import would be a tenth of ``icrtool --help``
+
+LARGEST_DOCUMENT_BYTES = 1 << 28
+"""Of a file that is read into memory whole: the run.json of a long drive has some MB."""
+
+# Windows has neither; there links are looked for before, and pipes are no files.
+_FILE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
+
+NOT_REGULAR = "not a regular file"
+
+
+class NotRegularFileError(OSError):
+    """A link, pipe, device or directory where a regular file is expected."""
+
+    def __init__(self, path: Path, why: str = NOT_REGULAR) -> None:
+        super().__init__(errno.EINVAL, why, str(path))
+
+
+def open_regular(path: Path, inside: Path | None = None) -> BufferedReader:
+    """Open a regular file for reading; never wait for a pipe or a device.
+
+    Parameters
+    ----------
+    inside : a directory above the file; below it no link is followed. None: the user named this file, links are
+
+    Raises
+    ------
+    NotRegularFileError
+        It is a link, a pipe, a device or a directory, or a directory above it is a link.
+    OSError
+        It cannot be opened.
+    """
+    handle = os.open(path, _FILE) if inside is None else _open_inside(path, inside)
+    try:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise NotRegularFileError(path)
+        return os.fdopen(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGEST_DOCUMENT_BYTES) -> bytes:
+    """Return the content of a file that `open_regular` opens.
+
+    Raises
+    ------
+    OSError
+        As `open_regular`; the file is larger than `most_bytes`.
+    """
+    with open_regular(path, inside) as file:
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
+    return content
+
+
+def is_regular(path: Path, inside: Path) -> bool:
+    """Return whether there is a file that `open_regular` opens."""
+    try:
+        open_regular(path, inside).close()
+    except (OSError, ValueError):  # ValueError: what a stranger wrote is no path
+        return False
+    return True
+
+
+def check_folders(path: Path, inside: Path) -> None:
+    """Refuse a path below a directory that leads over a link to a directory, or that is one itself.
+
+    Raises
+    ------
+    NotRegularFileError
+        It does.
+    """
+    place = inside
+    for name in _parts(path, inside):
+        place = place / name
+        if place.is_symlink() and (place != path or place.is_dir()):
+            raise NotRegularFileError(place, f"{name} is a link, which is not followed")
+
+
+def _open_inside(path: Path, inside: Path) -> int:
+    *folders, name = _parts(path, inside)
+    if sys.platform == "win32":
+        check_folders(path, inside)
+        if path.is_symlink():
+            raise NotRegularFileError(path, "a link, which is not followed")
+        return os.open(path, _FILE)
+    folder = os.open(inside, _FOLDER)
+    try:
+        for each in folders:
+            inner = os.open(each, _FOLDER | _NO_LINK, dir_fd=folder)
+            os.close(folder)
+            folder = inner
+        return os.open(name, _FILE | _NO_LINK, dir_fd=folder)
+    except OSError as err:
+        # Linux: ELOOP for a link, ENOTDIR for one where a directory is expected.
+        if err.errno in (errno.ELOOP, errno.EMLINK, errno.ENXIO):
+            raise NotRegularFileError(path, "a link, which is not followed") from err
+        raise
+    finally:
+        os.close(folder)
+
+
+def _parts(path: Path, inside: Path) -> tuple[str, ...]:
+    """Return the names that lead from a directory to a path below it."""
+    parts = path.relative_to(inside).parts
+    if not parts or ".." in parts:
+        raise NotRegularFileError(path, f"does not lie in {inside}")
+    return parts

@@ -1,0 +1,60 @@
+"""Regular files, opened below a directory without following links."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from icrtool.records.regular_file import NotRegularFileError, check_folders, is_regular, read_regular
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    (tmp_path / "place" / "inner").mkdir(parents=True)
+    (tmp_path / "outside").mkdir()
+    for file in ("place/file", "place/inner/file", "outside/file"):
+        (tmp_path / file).write_bytes(file.encode())
+    (tmp_path / "place" / "link").symlink_to("file")
+    (tmp_path / "place" / "out").symlink_to(tmp_path / "outside")
+    os.mkfifo(tmp_path / "place" / "pipe")
+    return tmp_path / "place"
+
+
+@pytest.mark.parametrize("name", ["file", "inner/file"])
+def test_a_regular_file_below_a_directory_is_read(place: Path, name: str) -> None:
+    assert read_regular(place / name, place) == f"place/{name}".encode()
+
+
+@pytest.mark.parametrize("name", ["link", "out", "out/file", "pipe", "inner", "inner/../file", "../outside/file"])
+def test_no_link_pipe_or_folder_is_read_below_a_directory(place: Path, name: str) -> None:
+    with pytest.raises(OSError, match=r"link|regular|[Dd]irectory|does not lie"):
+        read_regular(place / name, place)
+    assert not is_regular(place / name, place)
+
+
+def test_a_file_that_the_user_names_may_be_a_link_and_no_pipe(place: Path) -> None:
+    assert read_regular(place / "link") == b"place/file"
+    assert read_regular(place / "out" / "file") == b"outside/file"
+    for device in (place / "pipe", Path("/dev/zero")):
+        with pytest.raises(NotRegularFileError):
+            read_regular(device)
+
+
+def test_a_directory_that_is_named_may_be_a_link(place: Path) -> None:
+    assert read_regular(place / "out" / "file", place / "out") == b"outside/file"
+
+
+def test_a_file_that_is_too_large_is_not_read(place: Path) -> None:
+    assert read_regular(place / "file", place, most_bytes=10) == b"place/file"
+    with pytest.raises(OSError, match="larger than 9 bytes"):
+        read_regular(place / "file", place, most_bytes=9)
+
+
+def test_a_path_over_a_link_to_a_folder_is_refused_and_a_link_to_a_file_is_left_to_the_writer(place: Path) -> None:
+    check_folders(place / "inner" / "new", place)
+    check_folders(place / "link", place)
+    for name in ("out", "out/new", "../outside"):
+        with pytest.raises(NotRegularFileError):
+            check_folders(place / name, place)
