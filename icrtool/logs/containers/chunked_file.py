@@ -23,21 +23,15 @@ from icrtool.logs.containers.decompress import (
     Space,
     decompress,
 )
+from icrtool.logs.containers.record_table import Records
 
 Item = TypeVar("Item")
-
-MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_MESSAGE_INDEX = 3, 4, 5, 7
-BAG_MESSAGE, BAG_CONNECTION = 2, 7
-"""Operation codes of records."""
 
 THREADS, BLOCKS_AHEAD = 2, 3
 """Threads that make blocks of chunks, and blocks that they make while one is used."""
 
 JOINED_BYTES = 1 << 22
 """Of the wanted records of chunks that are made one block: each block has a cost of its own."""
-
-MOST_ROWS, _LEAST_RECORD_BYTES = 1 << 18, 16
-"""Messages that a scan finds at a time; a record has more bytes than this."""
 
 
 class Chunk(NamedTuple):
@@ -51,6 +45,7 @@ class Chunk(NamedTuple):
     index_length : of the message index records that follow it
     size : of its records, decompressed; -1 where there is no chunk in its place
     compression : as the log calls it
+    messages : where its messages begin in the records that are read, by the index; None without one
     ranges : begin and end (2, n) of its wanted records, where only those are read
     """
 
@@ -62,6 +57,7 @@ class Chunk(NamedTuple):
     index_length: int = 0
     size: int = 0
     compression: str = ""
+    messages: Ints | None = None
     ranges: Ints | None = None
 
     @property
@@ -75,12 +71,11 @@ class _PartError(DecompressionError):
 
 
 class Spaces(NamedTuple):
-    """Memory for a chunk as it is in the file, for its records, and for those of several chunks and their table."""
+    """Memory for a chunk as it is in the file, for its records, and for those of several chunks."""
 
     packed: Space
     records: Space
     joined: Space
-    rows: Space
 
 
 class ChunkedFile(ABC):
@@ -127,12 +122,12 @@ class ChunkedFile(ABC):
         """
 
     @abstractmethod
-    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
-        """Find records as `icrtool.logs.containers.record_table` does; what only opens a file does not load it."""
+    def _scan(self, data: Bytes, begin: int, hint: Ints | None = None) -> Records:
+        """Find records as `icrtool.logs.containers.record_table` does."""
 
     @abstractmethod
-    def _learn(self, row: Ints, data: Bytes) -> None:
-        """Remember a record that is no message; `row` is its column in `others` of the scan of `data`."""
+    def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
+        """Remember a record that is no message, of `others` of the scan of `data`."""
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
         """Yield the messages of the wanted channels, in the order of their chunks; the next are made meanwhile."""
@@ -188,17 +183,17 @@ class ChunkedFile(ABC):
             raise DecompressionError(f"it claims {size} bytes")
         inflation = Inflation(0)
         joined = spaces.joined.of(size + 1)
-        most = _most_rows(size)
-        messages, others = spaces.rows.of(32 * most).view(np.int64).reshape(4, most), np.empty((4, 0), np.int64)
-        data, count, stop = joined[:0], 0, 0
+        messages: list[Ints] = []
+        data, stop = joined[:0], 0
         for chunk in group:
             begin = stop
             data = joined[: begin + self._unpack(chunk, spaces, joined[begin:], inflation)]
-            data.flags.writeable = False
-            count, _, stop = self._scan(data, begin, messages, others, count)
+            hint = None if chunk.messages is None else chunk.messages + begin
+            found, _, stop = self._scan(data, begin, hint)
             if stop < len(data):
                 raise DecompressionError if chunk.ranges is None else _PartError
-        return Block(data, *messages[:, :count]), inflation
+            messages.append(found)
+        return Block(data, *np.concatenate(messages, axis=1)), inflation
 
     def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
         """Decompress the wanted records of a chunk, and return how many bytes they have.
@@ -229,7 +224,7 @@ class ChunkedFile(ABC):
 
     def _free(self) -> None:
         """Give back the memory of chunks: a directory holds many files open."""
-        self._spaces = deque(Spaces(Space(), Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
+        self._spaces = deque(Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
 
     def _next_spaces(self) -> Spaces:
         """Return the memory of the block that was used first."""
@@ -292,17 +287,10 @@ class ChunkedFile(ABC):
 
     def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
-        most = _most_rows(len(data) - begin)
-        messages, others = np.empty((4, most), np.int64), np.empty((4, most if learn else 0), np.int64)
-        count, other, stop = self._scan(data, begin, messages, others, 0)
-        for row in others[:, :other].T:
-            self._learn(row, data)
-        return with_possible_times(Block(data, *messages[:, :count]), self.problems), stop
-
-
-def _most_rows(size: int) -> int:
-    """Return how many messages a scan of so many bytes finds at most."""
-    return min(size // _LEAST_RECORD_BYTES + 1, MOST_ROWS)
+        messages, others, stop = self._scan(data, begin)
+        for record in others if learn else ():
+            self._learn(data, record)
+        return with_possible_times(Block(data, *messages), self.problems), stop
 
 
 def _groups(chunks: Iterable[Chunk]) -> Iterator[list[Chunk]]:

@@ -106,7 +106,6 @@ def decompress(packed: Packed, space: Bytes) -> Bytes:
         raise DecompressionError(f"{len(out)} bytes instead of {size}")
     if checksum and zlib.crc32(out.data) != checksum:
         raise DecompressionError("its checksum is wrong")
-    out.flags.writeable = False  # as that of a database: the kernels are compiled once
     return out
 
 

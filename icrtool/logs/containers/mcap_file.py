@@ -13,7 +13,7 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name
-from icrtool.logs.containers.chunked_file import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, ChunkedFile, Spaces
+from icrtool.logs.containers.chunked_file import Chunk, ChunkedFile, Spaces
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
     STORED,
@@ -24,6 +24,7 @@ from icrtool.logs.containers.decompress import (
     decompress,
     unpack_messages,
 )
+from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Records, scan_mcap
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ MAGIC = b"\x89MCAP0\r\n"
 PIECE_BYTES = 1 << 22
 _FOOTER, _CHUNK, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 8, 11, 15
 _HEAD_BYTES, _FOOTER_BYTES = 9, 20
+_MESSAGE_INDEX, _INDEX_HEAD = 7, struct.Struct("<BQHI")
 _CHECKSUM_BYTES = 4
 _ENCODINGS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
 
@@ -95,8 +97,6 @@ class McapFile(ChunkedFile):
         """
         if chunk.ranges is None:
             return super()._unpack(chunk, spaces, target, inflation)
-        from icrtool.logs.containers.record_table import copy_ranges
-
         first, needed = int(chunk.ranges[0, 0]), int(chunk.ranges[1, -1])
         if chunk.compression in STORED and chunk.size <= chunk.length:
             at = chunk.at + chunk.length - chunk.size + first
@@ -109,28 +109,34 @@ class McapFile(ChunkedFile):
         data = decompress(packed, spaces.records.of(packed.claimed + 1))
         if len(data) < needed - first:
             raise DecompressionError("smaller than the index states")
-        copy_ranges(data, first, chunk.ranges, target)
-        return chunk.wanted_bytes
+        at = 0
+        for begin, end in (chunk.ranges - first).T.tolist():
+            target[at : at + end - begin] = data[begin:end]
+            at += end - begin
+        return at
 
     def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:
-        """Return a chunk with the ranges of its wanted records by its message index.
+        """Return a chunk with its messages by the message index behind it; of a small part also the wanted ranges.
 
-        It has none where most of the chunk is wanted, or the index cannot be right.
+        It has neither where the index cannot be right.
         """
-        from icrtool.logs.containers.record_table import read_message_index, wanted_ranges
-
-        is_whole = chunk.channels is None or chunk.channels <= wanted
-        if is_whole or max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
+        if max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
             return chunk
-        flags = np.zeros(1 << 16, np.bool_)
-        flags[list(wanted)] = True
-        index = np.frombuffer(self._bytes(chunk.at + chunk.length, chunk.index_length), np.uint8)
-        places = np.empty(len(index) // 16, np.int64)
-        count, wanted_count = read_message_index(index, flags, places)
-        places[:count].sort()
-        ranges = np.empty((2, wanted_count), np.int64)
-        count, size = wanted_ranges(places[:count], chunk.size, ranges)
-        return chunk._replace(ranges=ranges[:, :count].copy()) if 0 < size < SMALL_PART * chunk.size else chunk
+        places, channels = _message_index(self._bytes(chunk.at + chunk.length, chunk.index_length))
+        order = np.argsort(places, kind="stable")
+        begins = places[order]
+        ends = np.append(begins[1:], chunk.size)
+        if not len(begins) or (ends <= begins).any():
+            return chunk
+        if chunk.channels is not None and not chunk.channels <= wanted:
+            is_wanted = np.isin(channels, list(wanted))[order]
+            sizes = (ends - begins)[is_wanted]
+            if 0 < sizes.sum() < SMALL_PART * chunk.size:
+                first, last = begins[is_wanted], ends[is_wanted]
+                apart = first[1:] != last[:-1]
+                ranges = np.stack([first[np.append(True, apart)], last[np.append(apart, True)]])
+                return chunk._replace(messages=np.cumsum(sizes) - sizes, ranges=ranges)
+        return chunk._replace(messages=begins)
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -305,26 +311,39 @@ class McapFile(ChunkedFile):
             raise DecompressionError("its header is damaged")
         return Packed(data, compression, size, checksum=checksum)
 
-    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
-        from icrtool.logs.containers.record_table import scan_mcap
+    def _scan(self, data: Bytes, begin: int, hint: Ints | None = None) -> Records:
+        return scan_mcap(data, begin, hint)
 
-        return scan_mcap(data, begin, messages, others, filled)
-
-    def _learn(self, row: Ints, data: Bytes) -> None:
+    def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         from mcap.records import Channel as McapChannel
         from mcap.records import Schema
 
-        record = _parse(int(row[0]), bytes(data[row[2] : row[3]]))
-        if isinstance(record, Schema):
-            known = self._schemas.setdefault(record.id, record) == record
-        elif isinstance(record, McapChannel):
-            known = self._channels.setdefault(record.id, record) == record
+        code, _, start, end = record
+        described = _parse(code, bytes(data[start:end]))
+        if isinstance(described, Schema):
+            known = self._schemas.setdefault(described.id, described) == described
+        elif isinstance(described, McapChannel):
+            known = self._channels.setdefault(described.id, described) == described
         else:
             self.problems.add("a schema or channel that cannot be read was left out")
             return
         if not known:
-            what = f"{type(record).__name__.lower()} {record.id}"
+            what = f"{type(described).__name__.lower()} {described.id}"
             self.problems.add(f"{what} is described twice, differently; the first description was used")
+
+
+def _message_index(index: bytes) -> tuple[Ints, Ints]:
+    """Return where in its records the messages of a chunk begin (n,), and their channels (n,); none where damaged."""
+    places, channels, at = [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
+    while at + _INDEX_HEAD.size <= len(index):
+        code, length, channel, _ = _INDEX_HEAD.unpack_from(index, at)
+        if code != _MESSAGE_INDEX or not 6 <= length <= len(index) - at - _HEAD_BYTES or len(places) > 1 << 16:
+            return places[0], channels[0]
+        entries = np.frombuffer(index, "<u8", (length - 6) // 16 * 2, at + _INDEX_HEAD.size)
+        places.append(entries[1::2].astype(np.int64))
+        channels.append(np.full(len(entries) // 2, channel))
+        at += _HEAD_BYTES + length
+    return np.concatenate(places), np.concatenate(channels)
 
 
 def _chunk_of_index(content: bytes) -> Chunk | None:

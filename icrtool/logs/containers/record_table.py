@@ -1,183 +1,218 @@
-"""Compiled scans over the records of a decompressed chunk: where each message is, without one Python object each."""
+"""Where the records of a decompressed chunk are: by the file's own index of messages, else one after the other.
+
+The index is only a hint. Each record begins where the one before it ends, which is checked for all of them at once;
+records that it lacks are found by following their lengths, and so are all records where it is wrong.
+"""
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Callable
+from struct import Struct
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from icrtool.kernels.arrays import Bools, Bytes, Ints
-from icrtool.kernels.compiled import njit
-from icrtool.kernels.words import read_word
-from icrtool.logs.containers.chunked_file import (
-    BAG_CONNECTION,
-    BAG_MESSAGE,
-    MCAP_MESSAGE,
-    MCAP_MESSAGE_INDEX,
-    MCAP_SCHEMA,
+from icrtool.kernels.arrays import Bytes, Ints
+
+MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE = 3, 4, 5
+BAG_MESSAGE, BAG_CONNECTION = 2, 7
+"""Operation codes of records."""
+
+MOST_ROWS = 1 << 18
+"""Records that are followed at a time."""
+
+_MOST_GAPS = 1 << 8
+"""Between messages of an index, that are followed; where there are more, all records are."""
+
+_MOST_HEADERS = 1 << 4
+"""Kinds of bag headers that all records are compared with; further ones are read one by one."""
+
+_BAG_VALUES = {b"op=": 1, b"conn=": 4, b"time=": 8}
+"""Bytes of the values in a bag's headers."""
+
+_MCAP_HEAD, _LENGTH = Struct("<BQ"), Struct("<I")
+_MCAP_HEADS = np.dtype(
+    [("code", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("time", "<i8"), ("published", "<u8")]
 )
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES
-
-_ZERO, _TWO, _FOUR, _EIGHT = (cast(int, np.int64(value)) for value in (0, 2, 4, 8))
-"""Typed: numba compiles another copy of a function for every plain number that it is called with."""
+_LEAST_MESSAGE_BYTES = _MCAP_HEADS.itemsize - _MCAP_HEAD.size
 
 
-@njit
-def little_endian(data: Bytes, at: int, size: int) -> int:
-    """Return the unsigned little-endian integer of `size` bytes; a value above 2^63 comes out negative."""
-    return int(np.int64(read_word(data, at, size, _ZERO)))
+class Records(NamedTuple):
+    """Records that follow one another.
+
+    Attributes
+    ----------
+    messages : (4, n) channel, log time [ns], begin and end of the content
+    others : operation code, begin, and begin and end of the content of the other ones
+    stop : the first byte behind: an incomplete record, another kind of record, or the end
+    """
+
+    messages: Ints
+    others: list[tuple[int, int, int, int]]
+    stop: int
 
 
-@njit
-def scan_mcap(data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
-    """Find schema, channel and message records.
+def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
+    """Find the schema, channel and message records from `begin` on.
 
     Parameters
     ----------
-    data : chunk or piece of a file; scanning starts at `begin`
-    messages : (4, capacity), filled with channel id, log time [ns], start and end of content, from column `filled` on
-    others : (4, capacity), filled for other records with opcode, an unused number, start and end of content; where it
-        has no columns they are passed over
-
-    Returns
-    -------
-    messages, others : columns filled
-    stop : the first byte not consumed: an incomplete record, another kind of record, or the end; or one of the tables
-        is full
+    hint : (n,) where messages are by the index, ascending; None without one
     """
-    at, count, other, size = begin, filled, 0, len(data)
-    while at + 9 <= size and count < messages.shape[1]:
-        opcode, length, content = data[at], little_endian(data, at + 1, _EIGHT), at + 9
-        if length < 0 or length > size - content or opcode < MCAP_SCHEMA or opcode > MCAP_MESSAGE:
+    starts, stop = _starts(data, begin, hint, _follow_mcap, _mcap_ends)
+    codes = data[starts]
+    is_message = codes == MCAP_MESSAGE
+    at = starts if is_message.all() else starts[is_message]
+    heads = _mcap_heads(data, at)
+    messages = np.empty((4, len(at)), np.int64)
+    messages[0], messages[1] = heads["channel"], heads["time"]
+    messages[2], messages[3] = at + _MCAP_HEADS.itemsize, at + (9 + heads["length"].astype(np.int64))
+    others = []
+    for place in starts[~is_message].tolist():
+        code, length = _MCAP_HEAD.unpack_from(data.data, place)
+        others.append((code, place, place + 9, place + 9 + length))
+    return Records(messages, others, stop)
+
+
+def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
+    """Find the message and connection records of a ROS 1 bag from `begin` on; as `scan_mcap`."""
+    starts, stop = _starts(data, begin, hint, _follow_bag, _bag_ends)
+    sizes = _unaligned(data, "<u4")[starts] + np.int64(8)
+    table = np.empty((5, len(starts)), np.int64)
+    left, rounds = np.arange(len(starts)), 0
+    while len(left):
+        # Most have headers of the same fields.
+        size = int(sizes[left[0]])
+        fits = sizes[left] == size if rounds < _MOST_HEADERS else np.arange(len(left)) == 0
+        heads = _unaligned(data, f"V{size}")[starts[left if fits.all() else left[fits]]]
+        fields = _fields(heads[0].tobytes()[:-4])
+        same, end = np.ones(len(heads), np.bool_), 0
+        for at, length in [*sorted(fields.values()), (size - 4, 0)]:
+            if at > end:
+                parts = _strided(heads, end, f"V{at - end}")
+                same &= parts == parts[0]
+            end = at + length
+        if not same.all():
+            fits[fits] = same
+            heads = heads[same]
+        rows = slice(None) if len(heads) == len(starts) else left[fits]
+        table[0, rows] = _strided(heads, fields[b"op="][0], "u1") if b"op=" in fields else 0
+        table[1, rows] = _strided(heads, fields[b"conn="][0], "<u4") if b"conn=" in fields else -1
+        table[2, rows] = 0
+        if b"time=" in fields:
+            seconds, nanoseconds = (_strided(heads, fields[b"time="][0] + part, "<u4") for part in (0, 4))
+            table[2, rows] = seconds * np.int64(1_000_000_000) + nanoseconds
+        table[3, rows] = starts[rows] + size
+        table[4, rows] = table[3, rows] + _strided(heads, size - 4, "<u4")
+        left, rounds = left[~fits], rounds + 1
+    codes, messages = table[0], table[1:]
+    is_message = codes == BAG_MESSAGE
+    others = [
+        (BAG_CONNECTION, int(starts[row]), *messages[2:, row].tolist())
+        for row in np.flatnonzero(codes == BAG_CONNECTION)
+    ]
+    return Records(messages if is_message.all() else messages[:, is_message], others, stop)
+
+
+def _starts(
+    data: Bytes,
+    begin: int,
+    hint: Ints | None,
+    follow: Callable[[memoryview, int, int], tuple[list[int], int]],
+    ends: Callable[[Bytes, Ints], Ints],
+) -> tuple[Ints, int]:
+    """Return where records begin (n,), and the first byte behind them."""
+    view = data.data
+    if hint is not None and 0 < len(hint) <= MOST_ROWS and hint[0] >= begin:
+        first, last = np.append(begin, ends(data, hint)), np.append(hint, len(data))
+        gaps = np.flatnonzero(first != last)
+        if (first <= last).all() and (last[:-1] < first[1:]).all() and len(gaps) <= _MOST_GAPS:
+            found = [follow(view, *gap) for gap in zip(first[gaps].tolist(), last[gaps].tolist(), strict=True)]
+            if all(stop == last[gap] for gap, (_, stop) in zip(gaps, found, strict=True)):
+                others = np.array([at for some, _ in found for at in some], np.int64)
+                return (np.sort(np.append(hint, others)) if len(others) else hint), len(data)
+    starts, stop = follow(view, begin, len(data))
+    return np.array(starts, np.int64), stop
+
+
+def _follow_mcap(data: memoryview, begin: int, end: int) -> tuple[list[int], int]:
+    """Return where the records [begin, end) begin, one after the other, and where they stop."""
+    starts: list[int] = []
+    at, unpack = begin, _MCAP_HEAD.unpack_from
+    while at + 9 <= end and len(starts) < MOST_ROWS:
+        code, length = unpack(data, at)
+        behind = at + 9 + length
+        if behind > end or not MCAP_SCHEMA <= code <= MCAP_MESSAGE:
             break
-        if opcode == MCAP_MESSAGE:
-            if length < 22:
-                break
-            messages[0, count] = little_endian(data, content, _TWO)
-            messages[1, count] = little_endian(data, content + 6, _EIGHT)
-            messages[2, count], messages[3, count] = content + 22, content + length
-            count += 1
-        elif others.shape[1]:
-            if other == others.shape[1]:
-                break
-            others[0, other], others[2, other], others[3, other] = opcode, content, content + length
-            other += 1
-        at = content + length
-    return count, other, at
-
-
-@njit
-def scan_bag(data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
-    """Find message and connection records of a ROS 1 bag chunk.
-
-    Parameters and returns as `scan_mcap`; for a connection the range is that of its data (the header its publisher
-    sent), its number is the connection, and in place of the opcode is the position of the record's own header.
-    """
-    at, count, other, size = begin, filled, 0, len(data)
-    while at + 4 <= size and count < messages.shape[1]:
-        header_length = little_endian(data, at, _FOUR)
-        header = at + 4
-        if header_length > size - header - 4:
+        if code == MCAP_MESSAGE and length < _LEAST_MESSAGE_BYTES:
             break
-        opcode, connection, stamp = 0, -1, 0
-        field = header
-        while field + 4 <= header + header_length:
-            length = little_endian(data, field, _FOUR)
-            name = field + 4
-            field = name + length
-            if field > header + header_length:
-                break
-            if length == 4 and data[name] == 111 and data[name + 1] == 112 and data[name + 2] == 61:  # op=
-                opcode = data[name + 3]
-            elif length == 9 and data[name] == 99 and data[name + 4] == 61:  # conn=
-                connection = little_endian(data, name + 5, _FOUR)
-            elif length == 13 and data[name] == 116 and data[name + 4] == 61:  # time=
-                seconds, nanoseconds = little_endian(data, name + 5, _FOUR), little_endian(data, name + 9, _FOUR)
-                stamp = seconds * 1_000_000_000 + nanoseconds
-        content = header + header_length + 4
-        length = little_endian(data, content - 4, _FOUR)
-        if length > size - content:
+        starts.append(at)
+        at = behind
+    return starts, at
+
+
+def _mcap_ends(data: Bytes, at: Ints) -> Ints:
+    """Return where messages (n,) end; their begin where there is none."""
+    if at[-1] > len(data) - _MCAP_HEADS.itemsize:
+        return at
+    heads = _mcap_heads(data, at)
+    length = heads["length"]
+    good = (heads["code"] == MCAP_MESSAGE) & (length >= _LEAST_MESSAGE_BYTES) & (length <= len(data))
+    return np.where(good, at + (length.astype(np.int64) + 9), at)
+
+
+def _mcap_heads(data: Bytes, at: Ints) -> NDArray[Any]:
+    """Return the heads (n,) of messages."""
+    together: NDArray[Any] = _unaligned(data, f"V{_MCAP_HEADS.itemsize}")[at].view(_MCAP_HEADS)
+    return together
+
+
+def _follow_bag(data: memoryview, begin: int, end: int) -> tuple[list[int], int]:
+    """Return where the records [begin, end) of a bag begin, one after the other, and where they stop."""
+    starts: list[int] = []
+    at, unpack = begin, _LENGTH.unpack_from
+    while at + 8 <= end and len(starts) < MOST_ROWS:
+        content = at + 8 + unpack(data, at)[0]
+        if content > end:
             break
-        if opcode == BAG_MESSAGE:
-            messages[0, count], messages[1, count] = connection, stamp
-            messages[2, count], messages[3, count] = content, content + length
-            count += 1
-        elif opcode == BAG_CONNECTION and others.shape[1]:
-            if other == others.shape[1]:
-                break
-            others[0, other], others[1, other] = header, connection
-            others[2, other], others[3, other] = content, content + length
-            other += 1
-        at = content + length
-    return count, other, at
+        behind = content + unpack(data, content - 4)[0]
+        if behind > end:
+            break
+        starts.append(at)
+        at = behind
+    return starts, at
 
 
-@njit
-def read_message_index(index: Bytes, wanted: Bools, places: Ints) -> tuple[int, int]:
-    """Read the message index records behind a chunk.
-
-    Parameters
-    ----------
-    wanted : (65536,) whether a channel is wanted
-    places : filled with twice the place of each message in the chunk's records, and one more where it is not wanted
-
-    Returns
-    -------
-    Number of messages and number of wanted ones; no messages where a record is damaged, or is of another kind.
-    """
-    at, count, wanted_count, size = 0, 0, 0, len(index)
-    while at + 15 <= size:
-        length = little_endian(index, at + 1, _EIGHT)
-        if index[at] != MCAP_MESSAGE_INDEX or length < 6 or length > size - at - 9:
-            return 0, 0
-        is_wanted = wanted[little_endian(index, at + 9, _TWO)]
-        for entry in range((length - 6) // 16):
-            place = little_endian(index, at + 15 + 16 * entry + 8, _EIGHT)
-            if place < 0 or place >= LARGEST_CHUNK_BYTES or count == len(places):
-                return 0, 0
-            places[count] = 2 * place + (not is_wanted)
-            count += 1
-            wanted_count += is_wanted
-        at += 9 + length
-    return count, wanted_count
+def _bag_ends(data: Bytes, at: Ints) -> Ints:
+    """Return where records (n,) of a bag end that have headers as long as the first; the begin of others."""
+    lengths, last = _unaligned(data, "<u4"), len(data) - 4
+    size = 8 + int(lengths[at[0]]) if at[-1] <= last else len(data)
+    if at[-1] + size > len(data):
+        return at
+    return np.where(lengths[at] == size - 8, at + (size + lengths[at + (size - 4)].astype(np.int64)), at)
 
 
-@njit
-def wanted_ranges(places: Ints, size: int, ranges: Ints) -> tuple[int, int]:
-    """Find the ranges of a chunk's records that hold wanted messages.
-
-    Parameters
-    ----------
-    places : of `read_message_index`, in order
-    size : of the records
-    ranges : (2, capacity) filled with begin and end of each range
-
-    Returns
-    -------
-    Number of ranges and of bytes in them; no ranges where two messages are at the same place, or one is outside.
-    """
-    count, held = 0, 0
-    for k in range(len(places)):
-        begin = places[k] // 2
-        end = places[k + 1] // 2 if k + 1 < len(places) else size
-        if end <= begin:
-            return 0, 0
-        if places[k] % 2 == 0:
-            if count and ranges[1, count - 1] == begin:
-                ranges[1, count - 1] = end
-            else:
-                ranges[0, count], ranges[1, count] = begin, end
-                count += 1
-            held += end - begin
-    return count, held
+def _fields(header: bytes) -> dict[bytes, tuple[int, int]]:
+    """Return offset and length of the values in a header, the four bytes of its length included, by name."""
+    fields: dict[bytes, tuple[int, int]] = {}
+    at = 4
+    while at + 4 <= len(header):
+        begin = at + 4
+        at = begin + _LENGTH.unpack_from(header, at)[0]
+        if at > len(header):
+            break
+        for name, length in _BAG_VALUES.items():
+            if at - begin == len(name) + length and header.startswith(name, begin):
+                fields[name] = at - length, length
+    return fields
 
 
-@njit
-def copy_ranges(source: Bytes, first: int, ranges: Ints, target: Bytes) -> None:
-    """Copy ranges to the target, one behind the other; `first` is the place of the source's begin."""
-    at = np.uint64(0)
-    for k in range(ranges.shape[1]):
-        begin, size = np.uint64(ranges[0, k] - first), np.uint64(ranges[1, k] - ranges[0, k])
-        for i in range(size):  # an assignment of slices takes seconds to compile
-            target[at + np.uint64(i)] = source[begin + np.uint64(i)]
-        at += size
+def _strided(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
+    """Return the value at an offset in each of some rows of bytes (n,)."""
+    return np.ndarray(len(rows), kind, rows, offset, rows.strides)
+
+
+def _unaligned(data: Bytes, kind: str) -> NDArray[Any]:
+    """Return the value that begins at each byte."""
+    return np.ndarray(max(len(data) - np.dtype(kind).itemsize + 1, 0), kind, data, strides=(1,))

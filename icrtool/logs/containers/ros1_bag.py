@@ -12,12 +12,13 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import Block, Channel, ros_type_name
-from icrtool.logs.containers.chunked_file import BAG_CONNECTION, Chunk, ChunkedFile, Spaces
-from icrtool.logs.containers.decompress import DecompressionError, Packed, Space
+from icrtool.logs.containers.chunked_file import Chunk, ChunkedFile, Spaces
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Packed, Space
+from icrtool.logs.containers.record_table import BAG_CONNECTION, Records, scan_bag
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
-_BAG_HEADER, _CHUNK, _CHUNK_INFO = 3, 5, 6
+_BAG_HEADER, _INDEX_DATA, _CHUNK, _CHUNK_INFO = 3, 4, 5, 6
 _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
 _MOST_FIELDS = 100
 """Of a header; real ones have ten at most."""
@@ -71,7 +72,11 @@ class Ros1Bag(ChunkedFile):
 
     def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:  # noqa: ARG002 - all its records are read
         record = self._record(chunk.at)
-        return _chunk_of(record) if record is not None and record.op == _CHUNK else chunk._replace(size=-1)
+        if record is None or record.op != _CHUNK:
+            return chunk._replace(size=-1)
+        end = record.at + record.length
+        index = self._bytes(end, min(max(chunk.at + chunk.index_length - end, 0), LARGEST_CHUNK_BYTES))
+        return _chunk_of(record)._replace(messages=_message_index(index))
 
     def _check_start(self) -> None:
         start = self._stream.read(len(MAGIC))
@@ -125,7 +130,9 @@ class Ros1Bag(ChunkedFile):
         if (len(chunks), len(self._connections)) != (first.number(b"chunk_count"), first.number(b"conn_count")):
             return None
         self._connections = {n: replace(c, count=counts.get(n, 0)) for n, c in self._connections.items()}
-        return sorted(chunks.values(), key=lambda chunk: chunk.at)
+        ordered = sorted(chunks.values(), key=lambda chunk: chunk.at)
+        ends = [*(chunk.at for chunk in ordered), first.number(b"index_pos", 8)][1:]
+        return [chunk._replace(index_length=end - chunk.at) for chunk, end in zip(ordered, ends, strict=False)]
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
         at = len(MAGIC)
@@ -156,15 +163,13 @@ class Ros1Bag(ChunkedFile):
             raise DecompressionError("no chunk")
         return Packed(self._content(chunk.at, chunk.length, space), chunk.compression, chunk.size, partial=cut)
 
-    def _scan(self, data: Bytes, begin: int, messages: Ints, others: Ints, filled: int) -> tuple[int, int, int]:
-        from icrtool.logs.containers.record_table import scan_bag
+    def _scan(self, data: Bytes, begin: int, hint: Ints | None = None) -> Records:
+        return scan_bag(data, begin, hint)
 
-        return scan_bag(data, begin, messages, others, filled)
-
-    def _learn(self, row: Ints, data: Bytes) -> None:
-        header, number, start, end = row.tolist()
-        topic = _header_fields(bytes(data[header : start - 4])).get(b"topic", b"").decode("utf-8", "replace")
-        self._connect(number, topic, bytes(data[start:end]))
+    def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
+        _, at, start, end = record
+        described = _Record(_header_fields(bytes(data[at + 4 : start - 4])), start, end - start)
+        self._connect(described.number(b"conn"), described.text(b"topic"), bytes(data[start:end]))
 
     def _connect(self, number: int, topic: str, content: bytes) -> None:
         """Remember a connection record; `content` is the header that the publisher sent."""
@@ -182,6 +187,20 @@ class Ros1Bag(ChunkedFile):
 
 def _chunk_of(record: _Record) -> Chunk:
     return Chunk(record.at, record.length, size=record.number(b"size"), compression=record.text(b"compression"))
+
+
+def _message_index(index: bytes) -> Ints | None:
+    """Return where in its records the messages of a chunk begin (n,), ascending; None where that is not known."""
+    places, at = [], 0
+    while at + 8 <= len(index):
+        content = at + 8 + int.from_bytes(index[at : at + 4], "little")
+        length = int.from_bytes(index[content - 4 : content], "little")
+        entries = index[content : content + length]
+        if len(entries) < length or _header_fields(index[at + 4 : content - 4]).get(b"op") != bytes([_INDEX_DATA]):
+            return None
+        places.append(np.frombuffer(entries[: length // 12 * 12], "<u4")[2::3])
+        at = content + length
+    return np.sort(np.concatenate(places), kind="stable").astype(np.int64) if places else None
 
 
 def _header_fields(header: bytes) -> dict[bytes, bytes]:

@@ -2,13 +2,13 @@
 
 The message has one InterfaceValue per joint, and each of these has lists of its own. A sequence is stored as its
 length, then its elements. With the number of joints known, it reads like a number followed by that many plain fields.
-So the messages are grouped by their number of joints, and each group is decoded by the compiled loop.
+So the messages are grouped by their number of joints, and each group is decoded like any topic.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.decoder import decode_messages
+from icrtool.logs.messages.decoder import Decoder
 from icrtool.logs.messages.definitions import definitions_of, full_name
 from icrtool.logs.messages.schema import BASE, NAME, SEQUENCE, Definitions, compile_layout
 from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable, merge_tables, time_order
@@ -50,19 +50,17 @@ class DynamicJointCollector:
         texts = (_NAMES, "joint 0.interface_names[*]")
         if "joint 0.values[*]" not in kinds or any(kinds.get(path) != "string" for path in texts):
             raise DefinitionError(channel.message_type, "its definition in the log lacks names or values of the joints")
-        self._counter = compile_layout(
-            self._unrolled(0), channel.message_type, (_JOINTS,), "cdr" if layout.cdr else "ros1"
-        )
+        encoding: Literal["cdr", "ros1"] = "cdr" if layout.cdr else "ros1"
+        self._counter = Decoder(compile_layout(self._unrolled(0), channel.message_type, (_JOINTS,), encoding))
 
     def feed(self, block: Block, number: int) -> None:
         """Add the messages of a block whose channel is `number`."""
-        places = np.flatnonzero(block.channel == number)
-        self._times.append(block.log_time_ns[places])
-        decoded, readable = decode_messages(self._counter, block.data, block.start[places], block.end[places])
         joints = np.full(len(block.channel), -1)
-        joints[places[readable]] = decoded.numbers(_JOINTS)
-        joints[joints > MOST_JOINTS] = -1
-        self._unreadable += int(np.count_nonzero(joints[places] < 0))
+        for rows, decoded in self._counter.decode(block, number):
+            self._times.append(block.log_time_ns[rows])
+            joints[rows[decoded.readable]] = decoded.numbers(_JOINTS)
+            joints[joints > MOST_JOINTS] = -1
+            self._unreadable += int(np.count_nonzero(joints[rows] < 0))
         for count, messages in zip(*np.unique(joints[joints >= 0], return_counts=True), strict=True):
             if int(count) not in self._collectors and len(self._collectors) > MOST_LAYOUTS:
                 self._unreadable += int(messages)

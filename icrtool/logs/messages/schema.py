@@ -1,24 +1,19 @@
-"""Where the wanted fields of a message type are: its definition compiled to a small program for `decode`.
+"""Where the wanted fields of a message type are: its definition compiled to a small program.
 
 A serialized message has no index: the offset of a field depends on the strings and sequences before it. The program
-lists what to skip and what to copy. One compiled loop (`icrtool.logs.messages.decoder`) then reads a topic without a
-Python object per message, also where the lengths of strings change from message to message.
+lists what to pass over and what to take; `icrtool.logs.messages.decoder` runs it over one message of each shape.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Ints
 
-SKIP, TAKE, SKIP_STRING, TAKE_STRING, SKIP_SEQUENCE, TAKE_SEQUENCE, BEGIN_LOOP, END_LOOP = range(8)
-"""Operations. A row of the program is (operation, element size, count, column, capacity, stride, jump)."""
+NUMBERS, TEXT, LOOP = range(3)
+"""Kinds of operations."""
 
 Definitions = Mapping[str, tuple[Any, Any]]
 """``package/msg/Name`` to (constants, fields), as rosbags parses it."""
@@ -32,207 +27,178 @@ SIZES = {
     "bool": 1, "byte": 1, "char": 1, "octet": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
     "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
 }  # fmt: skip
-_STRING_COLUMNS = 3
-_STRIDE_LATER = -1
-"""Of a slot in a loop whose end, and with it the columns of an element, is not reached yet."""
 LONGEST_UNROLLED = 4096
-"""Longest fixed array of which elements are copied: a covariance has 36."""
+"""Longest fixed array of which elements are taken: a covariance has 36."""
 
-DEEPEST, MOST_FIELDS, LONGEST_FIXED, MOST_COLUMNS = 32, 20_000, 1 << 31, 1 << 16
-"""Bounds of a definition: messages within one another, fields in all, elements of a fixed array, columns taken.
+DEEPEST, MOST_FIELDS, LONGEST_FIXED, MOST_NUMBERS = 32, 20_000, 1 << 31, 1 << 16
+"""Bounds of a definition: messages within one another, fields in all, elements of a fixed array, numbers taken.
 
 Real definitions reach a depth of 6 and some hundred fields; a definition that refers to itself has no end.
 """
+MOST_ELEMENTS = 256
+"""Taken of a sequence."""
+
+COUNTED = -1
+"""In place of a number of elements: the message states it before them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Slot:
-    """Where a wanted field is in the table that `decode` fills.
+class Operation(NamedTuple):
+    """A step of a program.
 
     Attributes
     ----------
-    kind : primitive type name, or ``string`` (columns: offset, length, hash)
-    column : first column; one more before it holds the count when `counted`
-    repeat : elements taken per message (1 for a plain field)
-    stride : columns from one element to the next
-    count_column : column with the number of elements in the message, -1 where it is fixed
+    kind : `NUMBERS`, `TEXT` or `LOOP`
+    size, number : bytes of a number; how many numbers or elements, or `COUNTED`
+    slot : number of the slot that takes it, -1 where it is passed over
+    body : what each element of a loop is made of
+    is_constant : nothing in the loop is counted or taken: from the second element on, all have the same size
     """
 
+    kind: int
+    size: int
+    number: int
+    slot: int
+    body: tuple[Operation, ...] = ()
+    is_constant: bool = False
+
+    @property
+    def takes(self) -> bool:
+        """Whether anything in it is taken."""
+        return self.slot >= 0 or any(operation.takes for operation in self.body)
+
+
+class Slot(NamedTuple):
+    """A wanted field: its primitive type (or ``string``), and its number."""
+
     kind: str
-    column: int
-    repeat: int
-    stride: int
-    count_column: int
+    number: int
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A compiled message layout: `program` int64 (operations, 7), number of columns, slots by path."""
+    """A compiled message layout.
 
-    program: Ints
-    columns: int
+    Attributes
+    ----------
+    slots : by path
+    taken : how many slots the program knows; of a field that a definition has twice, the last one counts
+    most : elements taken of a sequence
+    """
+
+    program: tuple[Operation, ...]
     slots: dict[str, Slot]
+    taken: int
     cdr: bool
-
-    def counts(self, shapes: NDArray[np.uint64], path: str) -> Ints:
-        """Return how many elements of an array messages of some shapes (columns, k) hold (k,)."""
-        slot = self.slots[path]
-        if slot.count_column < 0:
-            return np.full(shapes.shape[1], slot.repeat, np.int64)
-        counts: Ints = shapes[slot.count_column].astype(np.int64)
-        return counts
+    most: int = MOST_ELEMENTS
 
 
 class _Compiler:
     """Reads a definition once and writes the program."""
 
-    def __init__(self, definitions: Definitions, wanted: Sequence[str], *, cdr: bool, capacity: int) -> None:
+    def __init__(self, definitions: Definitions, wanted: Sequence[str], *, cdr: bool, most: int) -> None:
         self._definitions = definitions
         self._wanted = frozenset(wanted)
         self._cdr = cdr
-        self._capacity = capacity
-        self.rows: list[list[int]] = []
-        self.fields = 0
-        self._depth = 0
-        self.columns = 0
+        self._most = most
+        self.program: list[Operation] = []
         self.slots: dict[str, Slot] = {}
-        self._last_take = 0
+        self._fields = self._depth = self._loops = self._taken = self._numbers_taken = 0
 
-    def message(self, name: str, prefix: str, loop: tuple[int, int, int]) -> None:
-        """Write the fields of message type `name`; `loop` is (repeat, stride, count column) of the loop around it."""
+    def message(self, name: str, prefix: str) -> None:
+        """Write the fields of message type `name`."""
         if name not in self._definitions:
             raise DefinitionError(name, "its definition is not in the log and not bundled")
         if self._depth >= DEEPEST:
             raise DefinitionError(name, f"its definition nests more than {DEEPEST} messages", "this type is not read")
         self._depth += 1
         for field, (node, detail) in self._definitions[name][1]:
-            self.fields += 1
-            if self.fields > MOST_FIELDS:
+            self._fields += 1
+            if self._fields > MOST_FIELDS:
                 raise DefinitionError(name, f"its definition has more than {MOST_FIELDS} fields", "it is not read")
-            self.field(f"{prefix}{field}", int(node), detail, loop)
+            self._field(f"{prefix}{field}", int(node), detail)
         self._depth -= 1
 
-    def field(self, path: str, node: int, detail: FieldDetail, loop: tuple[int, int, int]) -> None:
-        """Write one field."""
+    def _field(self, path: str, node: int, detail: FieldDetail) -> None:
         if node == NAME:
-            self.message(detail, f"{path}.", loop)
+            self.message(detail, f"{path}.")
         elif node == BASE:
-            self._base(path, detail[0], loop)
+            self._base(path, detail[0])
         else:
             (element, inner), count = detail
-            fixed = count if node == ARRAY else None
-            if fixed is not None and fixed > LONGEST_FIXED:
+            count = count if node == ARRAY else COUNTED
+            if count > LONGEST_FIXED:
                 raise DefinitionError(path, "its definition has an array longer than a message can be")
             if int(element) == BASE and inner[0] in SIZES:
-                self._numbers(path, inner[0], fixed, loop)
+                self._array(path, inner[0], count)
             else:
-                self._loop(f"{path}[*]", int(element), inner, fixed, loop)
+                self._loop(f"{path}[*]", int(element), inner, count)
 
-    def _base(self, path: str, kind: str, loop: tuple[int, int, int]) -> None:
+    def _base(self, path: str, kind: str) -> None:
         if kind == "string":
-            if path in self._wanted:
-                self._place(path, kind, loop, _STRING_COLUMNS, TAKE_STRING)
-            else:
-                self._emit(SKIP_STRING)
-        elif kind in SIZES:
-            if path in self._wanted:
-                self._place(path, kind, loop, 1, TAKE, size=SIZES[kind])
-            else:
-                self._skip(SIZES[kind], 1)
-        else:
+            self.program.append(Operation(TEXT, 0, COUNTED, self._slot(path, kind) if path in self._wanted else -1))
+        elif kind not in SIZES:
             raise DefinitionError(path, f"field type {kind} is not read", "only its message type is affected")
-
-    def _place(
-        self, path: str, kind: str, loop: tuple[int, int, int], width: int, operation: int, size: int = 0
-    ) -> None:
-        repeat, stride, count_column = loop
-        column = self._reserve(width)
-        self._emit(operation, size, 1, column)
-        self.slots[path] = Slot(kind, column, repeat, stride or 1, count_column)
-        self._last_take = len(self.rows)
-
-    def _numbers(self, path: str, kind: str, fixed: int | None, loop: tuple[int, int, int]) -> None:
-        """Write an array (fixed length) or sequence of numbers."""
-        size, starred = SIZES[kind], f"{path}[*]"
-        elements = any(name.startswith(f"{path}[") for name in self._wanted)
-        if fixed is not None and not elements:
-            self._skip(size, fixed)
-        elif fixed is not None and fixed > LONGEST_UNROLLED:
-            raise DefinitionError(path, f"an array of {fixed} numbers is not read")
-        elif fixed is not None and starred not in self._wanted:
-            for i in range(fixed):
-                element = f"{path}[{i}]"
-                if element in self._wanted:
-                    self._place(element, kind, loop, 1, TAKE, size=size)
-                else:
-                    self._skip(size, 1)
-        elif fixed is not None:
-            column = self._reserve(fixed)
-            self._emit(TAKE, size, fixed, column)
-            self.slots[starred] = Slot(kind, column, fixed, 1, -1)
-            self._last_take = len(self.rows)
-        elif starred in self._wanted:
-            if loop[1]:
-                raise DefinitionError(path, "a sequence in each element of a sequence is not read")
-            count_column = self._reserve(1)
-            column = self._reserve(self._capacity)
-            self._emit(TAKE_SEQUENCE, size, 0, count_column, self._capacity)
-            self.slots[starred] = Slot(kind, column, self._capacity, 1, count_column)
-            self._last_take = len(self.rows)
+        elif path in self._wanted:
+            self.program.append(Operation(NUMBERS, SIZES[kind], 1, self._slot(path, kind)))
         else:
-            self._emit(SKIP_SEQUENCE, size)
+            self._skip(SIZES[kind], 1)
 
-    def _loop(
-        self, path: str, element: int, inner: FieldDetail, fixed: int | None, outer: tuple[int, int, int]
-    ) -> None:
+    def _slot(self, path: str, kind: str, count: int = 1) -> int:
+        """Return the number of a new slot for a field of up to `count` numbers or texts."""
+        if path.count("[*]") > 1:
+            raise DefinitionError(path, "a sequence in each element of a sequence is not read")
+        self._numbers_taken += count * (self._most if self._loops else 1)
+        if self._numbers_taken > MOST_NUMBERS:
+            raise DefinitionError("message", f"more than {MOST_NUMBERS} numbers of each message would be taken")
+        self.slots[path] = Slot(kind, self._taken)
+        self._taken += 1
+        return self._taken - 1
+
+    def _array(self, path: str, kind: str, count: int) -> None:
+        """Write an array (of fixed length) or sequence of numbers."""
+        size, all_of_it = SIZES[kind], f"{path}[*]"
+        is_wanted = any(name.startswith(f"{path}[") for name in self._wanted)
+        if count > LONGEST_UNROLLED and is_wanted:
+            raise DefinitionError(path, f"an array of {count} numbers is not read")
+        if all_of_it in self._wanted:
+            slot = self._slot(all_of_it, kind, self._most if count == COUNTED else count)
+            self.program.append(Operation(NUMBERS, size, count, slot))
+        elif count == COUNTED:
+            self.program.append(Operation(NUMBERS, size, COUNTED, -1))
+        elif is_wanted:
+            for i in range(count):
+                self._base(f"{path}[{i}]", kind)
+        else:
+            self._skip(size, count)
+
+    def _loop(self, path: str, element: int, inner: FieldDetail, count: int) -> None:
         """Write a loop over the elements of an array or sequence of strings or messages."""
-        takes = not outer[1] and any(name == path or name.startswith(f"{path}.") for name in self._wanted)
-        repeat = min(fixed, self._capacity) if fixed is not None else self._capacity
-        count_column = self._reserve(1) if takes and fixed is None else -1
-        begin = len(self.rows)
-        self._emit(BEGIN_LOOP, 0, -1 if fixed is None else fixed, count_column, repeat if takes else 0)
-        first, loop = self.columns, (repeat, _STRIDE_LATER if takes else 0, count_column)
+        before, self.program = self.program, []
+        self._loops += 1
         if element == BASE:
-            self._base(path, inner[0], loop)
+            self._base(path, inner[0])
         else:
-            self.message(inner, f"{path}.", loop)
-        self._emit(END_LOOP)
-        self.rows[begin][6] = len(self.rows)
-        if takes:
-            stride = self.rows[begin][5] = max(self.columns - first, 1)
-            self.slots |= {
-                name: replace(slot, stride=stride) for name, slot in self.slots.items() if slot.stride == _STRIDE_LATER
-            }
-            self.columns = first + stride * repeat
-            self._check_columns()
-            self._last_take = len(self.rows)
-
-    def _reserve(self, columns: int) -> int:
-        first = self.columns
-        self.columns += columns
-        self._check_columns()
-        return first
-
-    def _check_columns(self) -> None:
-        if self.columns > MOST_COLUMNS:
-            raise DefinitionError("message", f"more than {MOST_COLUMNS} numbers of each message would be taken")
+            self.message(inner, f"{path}.")
+        self._loops -= 1
+        body, self.program = tuple(self.program), before
+        is_constant = all(step.number != COUNTED and step.slot < 0 for step in body)
+        is_constant = is_constant and all(step.is_constant for step in body if step.kind == LOOP)
+        self.program.append(Operation(LOOP, 0, count, -1, body, is_constant))
 
     def _skip(self, size: int, count: int) -> None:
         if not self._cdr:
             size, count = 1, size * count
-        last = self.rows[-1] if self.rows else None
-        if last is not None and last[0] == SKIP and last[1] == size:
-            last[2] += count
+        last = self.program[-1] if self.program else None
+        if last is not None and last[:2] == (NUMBERS, size) and last.number != COUNTED and last.slot < 0:
+            self.program[-1] = last._replace(number=last.number + count)
         else:
-            self._emit(SKIP, size, count)
-
-    def _emit(self, operation: int, size: int = 0, count: int = 0, column: int = -1, capacity: int = 0) -> None:
-        self.rows.append([operation, size, count, column, capacity, 0, 0])
+            self.program.append(Operation(NUMBERS, size, count, -1))
 
     def layout(self) -> Layout:
         """Return what was written, without the steps after the last taken field."""
-        program = np.array(self.rows[: self._last_take] or np.empty((0, 7)), np.int64).reshape(-1, 7)
-        return Layout(program, self.columns, self.slots, self._cdr)
+        while self.program and not self.program[-1].takes:
+            self.program.pop()
+        return Layout(tuple(self.program), self.slots, self._taken, self._cdr, self._most)
 
 
 def compile_layout(
@@ -240,7 +206,7 @@ def compile_layout(
     message_type: str,
     wanted: Sequence[str],
     encoding: Literal["cdr", "ros1"],
-    capacity: int = 8,
+    most: int = MOST_ELEMENTS,
 ) -> Layout:
     """Compile the layout of a message type.
 
@@ -250,7 +216,7 @@ def compile_layout(
     message_type : ``package/Name``
     wanted : paths such as ``header.stamp.sec``, ``orientation_covariance[0]``, ``position[*]``,
         ``drivers[*].measured_travel``; those the type does not have are left out of the layout's slots
-    capacity : elements copied of a sequence; `Layout.counts` shows where a message holds more
+    most : elements taken of a sequence
 
     Raises
     ------
@@ -258,6 +224,6 @@ def compile_layout(
         The definition of a type in it is missing, or a field has a type that cannot be skipped.
     """
     package, _, name = message_type.partition("/")
-    compiler = _Compiler(definitions, wanted, cdr=encoding == "cdr", capacity=capacity)
-    compiler.message(f"{package}/msg/{name}", "", (1, 0, -1))
+    compiler = _Compiler(definitions, wanted, cdr=encoding == "cdr", most=most)
+    compiler.message(f"{package}/msg/{name}", "")
     return compiler.layout()

@@ -9,31 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.decoder import ANY_LENGTH, Decoded
+from icrtool.logs.messages.decoder import Decoded, Decoder
 from icrtool.logs.messages.definitions import definitions_of
-from icrtool.logs.messages.growing_column import GrowingColumn
-from icrtool.logs.messages.schema import Definitions, Layout, compile_layout
+from icrtool.logs.messages.schema import MOST_ELEMENTS, Definitions, Layout, compile_layout
 from icrtool.records.text import LogText
 
 READ_ENCODINGS = ("cdr", "ros1")
 """Serializations of messages that are read: of ROS 2 and of ROS 1."""
 
-_FIRST_CAPACITY = 8
-_LARGEST_CAPACITY = 256
-
-_ROWS_AT_ONCE = 16_384 + 8
-"""Not a power of two: with columns that far apart, all would use the same few lines of the processor's cache."""
-
-_FIRST_ROWS, _FIRST_NUMBERS = 32, 2048
-"""Of a topic's first table, at most; the next ones have eight times as many: a log may hold thousands of topics."""
-
 MOST_TEXTS = 1 << 16
 """Different texts of a field, as names of joints: with one for each message, memory would grow tenfold."""
-
-_LARGEST_TABLE = 1 << 22
-"""Numbers in it."""
 
 
 class SetBack(NamedTuple):
@@ -144,41 +131,29 @@ class TopicCollector:
     Attributes
     ----------
     definitions : in place of the channel's own, None where those are used
-    largest_capacity : elements taken of a sequence at most
+    most : elements taken of a sequence at most
     """
 
     channel: Channel
     wanted: tuple[str, ...]
     definitions: Definitions | None = None
-    largest_capacity: int = _LARGEST_CAPACITY
-    _capacity: int = _FIRST_CAPACITY
-    _rows: Decoded = field(init=False)
-    _learned: int = 0
-    _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
-    _columns: dict[str, GrowingColumn] = field(default_factory=dict)
-    _texts: dict[str, dict[int, LogText]] = field(default_factory=dict)
+    most: int = MOST_ELEMENTS
+    layout: Layout = field(init=False)
+    _decoder: Decoder = field(init=False)
+    _times: list[Ints] = field(default_factory=list)
+    _columns: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    _texts: dict[str, dict[bytes, int]] = field(default_factory=dict)
     _unreadable: int = 0
 
     def __post_init__(self) -> None:
-        self._compile()
-
-    def _compile(self) -> None:
         definitions = self.definitions if self.definitions is not None else definitions_of(self.channel)
         encoding = self.channel.encoding
         if encoding not in READ_ENCODINGS:
             raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
-        layout = compile_layout(
-            definitions, self.channel.message_type, self.wanted, cast(Literal["cdr", "ros1"], encoding), self._capacity
+        self.layout = compile_layout(
+            definitions, self.channel.message_type, self.wanted, cast(Literal["cdr", "ros1"], encoding), self.most
         )
-        self._new_rows(layout, min(_FIRST_ROWS, _FIRST_NUMBERS // max(layout.columns, 1)))
-
-    def _new_rows(self, layout: Layout, rows: int) -> None:
-        self._rows, self._learned = Decoded(layout, max(min(rows, _most_rows(layout)), 1)), 0
-
-    @property
-    def layout(self) -> Layout:
-        """The compiled layout."""
-        return self._rows.layout
+        self._decoder = Decoder(self.layout)
 
     def feed(self, block: Block, number: int) -> None:
         """Add the messages of a block whose channel is `number`.
@@ -186,83 +161,39 @@ class TopicCollector:
         Raises
         ------
         DefinitionError
-            They take too many columns, or have too many different texts.
+            They have too many different texts.
         """
-        first = 0
-        while first < len(block.channel):
-            if self._rows.filled == self._rows.rows:
-                self._settle()
-                if self._rows.rows < _most_rows(self.layout):
-                    self._new_rows(self.layout, 8 * self._rows.rows)
-            more = self._capacity < self.largest_capacity
-            first = self._rows.decode(block, number, first, self._capacity if more else ANY_LENGTH)
-            if self._rows.known_shapes > self._learned:
-                self._learn_texts(block.data)
-            if self._rows.longest:
-                self._capacity = min(self._rows.longest, self.largest_capacity)
-                self._settle()
-                self._compile()
+        for rows, decoded in self._decoder.decode(block, number):
+            readable = rows[decoded.readable]
+            self._unreadable += len(rows) - len(readable)
+            if len(readable):
+                self._add(decoded, block.log_time_ns[readable])
 
-    def _learn_texts(self, data: Bytes) -> None:
-        """Learn the texts of new shapes, which are in `data`."""
-        new = self._rows.shapes[:, self._learned : self._rows.known_shapes]
-        self._learned = self._rows.known_shapes
+    def _add(self, decoded: Decoded, times: Ints) -> None:
+        self._times.append(times)
         for path, slot in self.layout.slots.items():
             if slot.kind != "string":
-                continue
-            texts, counts = self._texts.setdefault(path, {}), self.layout.counts(new, path)
-            repeat = min(slot.repeat, int(counts.max(initial=0)))
-            held = np.arange(repeat)[:, None] < counts
-            fields = new[slot.column : slot.column + (repeat - 1) * slot.stride + 3]
-            places, lengths, codes = (fields[part :: slot.stride][:repeat][held] for part in range(3))
-            _, first = np.unique(codes, return_index=True)
-            first.sort()
-            for i, code in zip(first.tolist(), codes[first].tolist(), strict=True):
-                if code not in texts:
-                    raw = data[int(places[i]) : int(places[i] + lengths[i])].tobytes()
-                    texts[code] = LogText(raw.decode("utf-8", "replace"))
-            if len(texts) > MOST_TEXTS:
-                why = f"its {path} has over {MOST_TEXTS} different texts"
-                raise DefinitionError(self.channel.topic, why, "not read")
-
-    def _settle(self) -> None:
-        """Turn the filled rows into columns, and free the rows."""
-        rows = self._rows
-        if rows.filled:
-            expected = self.channel.count or 0
-            self._times.add(rows.times_ns[: rows.filled], expected)
-            for path, slot in self.layout.slots.items():
-                is_text = slot.kind == "string"
-                values = self._text_numbers(path) if is_text else rows.numbers(path)
-                self._columns.setdefault(path, GrowingColumn(-1 if is_text else 0)).add(values, expected)
-        self._unreadable += rows.clear()
-        self._learned = rows.known_shapes
-
-    def _text_numbers(self, path: str) -> Ints:
-        """Return the numbers of a text field's texts (n,) or (n, k), in the order they were learned; -1 for none."""
-        shapes, shape_of = self._rows.used_shapes()
-        slot, counts = self.layout.slots[path], self.layout.counts(shapes, path)
-        repeat = min(slot.repeat, int(counts.max(initial=0))) if "[*]" in path else 1
-        codes = shapes[slot.column + 2 :][: repeat * slot.stride : slot.stride].T
-        known = np.fromiter(self._texts[path], np.uint64)
-        order = np.append(np.argsort(known), -1)
-        numbers = order[np.searchsorted(known, codes, sorter=order[:-1])]
-        numbers[np.arange(repeat) >= counts[:, None]] = -1
-        numbers = numbers[shape_of] if len(numbers) > 1 else np.broadcast_to(numbers, (len(shape_of), repeat))
-        return numbers if "[*]" in path else numbers[:, 0]
+                values = decoded.numbers(path)
+            else:
+                known = self._texts.setdefault(path, {})
+                values = decoded.text_numbers(path, known)
+                if len(known) > MOST_TEXTS:
+                    why = f"its {path} has over {MOST_TEXTS} different texts"
+                    raise DefinitionError(self.channel.topic, why, "not read")
+            self._columns.setdefault(path, []).append(_compact(values))
 
     def table(self) -> TopicTable:
         """Return what was gathered since the last call, sorted by log time."""
-        self._settle()
-        times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
-        self._times, self._columns, self._unreadable = GrowingColumn(0), {}, 0
+        times = np.concatenate(self._times) if self._times else np.empty(0, np.int64)
+        gathered, unreadable = self._columns, self._unreadable
+        self._times, self._columns, self._unreadable = [], {}, 0
         back, order = time_order(times)
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
         for path in [*gathered]:
-            values = gathered.pop(path).taken()
             if path in self._texts:
-                texts[path] = list(self._texts[path].values())
+                texts[path] = [LogText(text.decode("utf-8", "replace")) for text in self._texts[path]]
+            values = _joined(gathered.pop(path), -1 if path in texts else 0)
             columns[path] = values if order is None else values[order]
         return TopicTable(
             self.channel.topic,
@@ -273,10 +204,6 @@ class TopicCollector:
             unreadable,
             back,
         )
-
-
-def _most_rows(layout: Layout) -> int:
-    return min(_ROWS_AT_ONCE, _LARGEST_TABLE // max(layout.columns, 1))
 
 
 def time_order(times: Ints) -> tuple[SetBack, Ints | None]:
@@ -329,9 +256,12 @@ def _merged(group: list[TopicTable]) -> TopicTable:
 
 def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
     """Concatenate parts; those with fewer columns are padded with NaN, or with `lacking` where they hold integers."""
-    if parts[0].ndim == 2:
+    first = parts[0]
+    if all(_is_one_row(part) and part[:1].tobytes() == first[:1].tobytes() for part in parts):
+        return np.broadcast_to(first[:1], (sum(map(len, parts)), *first.shape[1:]))
+    if first.ndim == 2:
         width = max(part.shape[1] for part in parts)
-        lacking = np.nan if parts[0].dtype.kind == "f" else lacking
+        lacking = np.nan if first.dtype.kind == "f" else lacking
         parts = [
             np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=lacking)
             if part.shape[1] < width
@@ -339,3 +269,15 @@ def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
             for part in parts
         ]
     return np.concatenate(parts)
+
+
+def _compact(rows: NDArray[Any]) -> NDArray[Any]:
+    """Return rows (n,) or (n, k) that are equal bit by bit in the memory of one; they cannot be written to then."""
+    bits = rows.view(np.int64)
+    if (bits[-1] != bits[0]).any() or (bits != bits[0]).any():
+        return np.ascontiguousarray(rows)
+    return np.broadcast_to(rows[:1].copy(), rows.shape)
+
+
+def _is_one_row(rows: NDArray[Any]) -> bool:
+    return len(rows) > 0 and rows.strides[0] == 0
