@@ -114,7 +114,7 @@ Ladder = plain("Ladder", {
 }, total=False)  # fmt: skip
 GateDocument = record(
     Gate, value_m=Number, value_bound_m=Number, baseline_m=Number, margin_m=Number, margin_low_m=Number,
-    margin_high_m=Number, not_checked=str | None, passed=bool, verdict=str,
+    margin_high_m=Number, not_checked=str | None, unusable=str | None, passed=bool, verdict=str,
 )  # fmt: skip
 BaselineDocument = plain("BaselineDocument", {
     "path": str, "log": str, "tool_version": str, "same_recording": bool, "changes": list[str],

@@ -6,48 +6,75 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings
+from icrtool.calibration.pooled import CalibrationResult, LeftOut, calibrate_recordings
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import turning_recording_of
-from icrtool.errors import ConfigError
+from icrtool.errors import ConfigError, DataError
+from icrtool.motion.recording import Recording, cut_windows
 from icrtool.records.run import Run
 
 
-def calibrate(runs: Run | Sequence[Run]) -> Calibration:
+def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Calibration:
     """Calibrate the motion model of a robot from one run or many, tested on what it was not fitted to.
 
     Parameters
     ----------
-    runs : of `icrtool.fit` or `icrtool.open_run`, of one robot
+    runs : of `icrtool.fit` or `icrtool.open_run`, of one robot; of many, those are left out that are not usable, too
+        short, or copies of another
+    allow_unusable : take runs that are not usable, too
 
     Raises
     ------
     ConfigError
-        Runs of different robots or wheel radii, one run twice, or a track width that is not known.
+        Runs of different robots or wheel radii, or a track width that is not known.
     DataError
-        Too short a drive.
+        No run is left, or too short a drive.
     """
-    return calibrate_runs([runs] if isinstance(runs, Run) else runs).calibration
+    return calibrate_runs([runs] if isinstance(runs, Run) else runs, allow_unusable=allow_unusable).calibration
 
 
-def calibrate_runs(runs: Iterable[Run]) -> CalibrationResult:
-    """Calibrate as `calibrate` does, with the tables by which the model was chosen; one run at a time is held."""
-    recordings, robots = [], []
+def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> CalibrationResult:
+    """Calibrate as `calibrate` does, with the table of the test; one run at a time is held."""
+    recordings: list[Recording] = []
+    robots, left_out = [], []
     alone: tuple[str, ...] = ()
     warnings: list[str] = []
     for run in runs:
-        recordings.append(turning_recording_of(run))
+        recording = turning_recording_of(run)
+        if why := _why_left_out(run, recording, recordings, allow_unusable=allow_unusable):
+            left_out.append(LeftOut(run.name, why))
+            continue
+        recordings.append(recording)
         robots.append(robot_of(run))
         alone = use_warnings(run)
         warnings += use_warnings(run, alone=False)
     if not recordings:
-        raise ConfigError("runs", "no usable one is given", "name at least one run or log")
+        if not left_out:
+            raise ConfigError("runs", "no usable one is given", "name at least one run or log")
+        if len(left_out) == 1:
+            raise DataError(*left_out[0], "--allow-unusable takes a run that is not usable")
+        raise DataError("runs", f"none of {len(left_out)} can be used", "; ".join(map(str, left_out)))
     if len(found := {robot["wheel_radius_m"] for robot in robots}) > 1:
         why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
     result = calibrate_recordings(recordings, robots[0])
     known = alone if len(recordings) == 1 else tuple(dict.fromkeys(warnings))
-    return result._replace(calibration=replace(result.calibration, warnings=known))
+    calibration = replace(result.calibration, warnings=known)
+    return result._replace(calibration=calibration, left_out=tuple(left_out))
+
+
+def _why_left_out(run: Run, recording: Recording, before: Sequence[Recording], *, allow_unusable: bool) -> str:
+    """Return why a run is not calibrated with those before it; empty where it is."""
+    if not (run.usable or allow_unusable):
+        return f"not usable: {run.summary['unusable_because']}"
+    same = next((one.name for one in before if recording.sha256 and one.sha256 == recording.sha256), None)
+    if same is not None:
+        return f"a copy of {same}"
+    try:
+        cut_windows(recording)
+    except DataError as err:
+        return f"too short: {err.why}"
+    return ""
 
 
 def robot_of(run: Run) -> dict[str, Any]:

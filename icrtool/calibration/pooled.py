@@ -21,12 +21,23 @@ from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import ErrorsOf
 
 
+class LeftOut(NamedTuple):
+    """A log that a calibration leaves out, and why."""
+
+    name: str
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: left out: {self.why}"
+
+
 class CalibrationResult(NamedTuple):
     """A calibration with the table that it was tested by."""
 
     calibration: Calibration
     table: HeldOut
     notes: tuple[str, ...]
+    left_out: tuple[LeftOut, ...] = ()
 
 
 def calibrate_recordings(recordings: Sequence[Recording], robot: Mapping[str, Any] | None = None) -> CalibrationResult:

@@ -19,7 +19,6 @@ from icrtool.calibration.error_differences import ErrorEstimate, blocks_of, comp
 from icrtool.calibration.from_runs import calibrate_runs
 from icrtool.calibration.pooled import CalibrationResult, predictor
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
@@ -125,9 +124,10 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> Transfer:
     """
     if len(groups) < 2:
         raise ConfigError("groups", "only one is given", "name two or more to compare")
-    recordings = {name: [turning_recording_of(run) for run in runs] for name, runs in groups.items()}
+    results = {name: calibrate_runs(runs) for name, runs in groups.items()}
+    recordings = {name: one.table.recordings for name, one in results.items()}
     _check_apart(recordings)
-    return compare_calibrations({name: calibrate_runs(runs) for name, runs in groups.items()}, recordings)
+    return compare_calibrations(results, recordings)
 
 
 def compare_calibrations(

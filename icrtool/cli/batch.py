@@ -74,7 +74,7 @@ def command(
     output.mkdir(parents=True, exist_ok=True)
     view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
     rows = run_all(requests, jobs, scheduler, batch, view)
-    calibrations = list(pooled_calibrations(rows, output)) if asked.ladder else []
+    calibrations = list(pooled_calibrations(rows, output, allow_unusable=asked.allow_unusable)) if asked.ladder else []
     drawn = (output / PLOTS).is_dir() and not any(row.status == "done" for row in rows)
     write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
     missing = compared.missing(row.log for row in rows) if compared is not None else []

@@ -26,18 +26,21 @@ if TYPE_CHECKING:
               help="Forward position of the ICRs, where known: it gives that of the antenna. One log.")  # fmt: skip
 @click.option("--plot", metavar="FILE", type=options.NEW_PICTURE,
               help="Draw the residuals before and after the calibration: png, svg, pdf. One log.")  # fmt: skip
+@options.allow_unusable
 @json_option
 @options.configuration
 @options.verbosity
 def command(
-    sources: tuple[Path, ...], output: Path | None, x_icr: float | None, plot: Path | None, as_json: bool,
+    sources: tuple[Path, ...], output: Path | None, x_icr: float | None, plot: Path | None, allow_unusable: bool,
+    as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.
 
-    Several logs are fitted together; to test the models and to choose one, each log is left out in turn. With one log,
-    each trial is predicted by a fit to the rest of the drive; position of the antenna, heading offset, delays and wheel
-    scales are estimated as well. A RUN keeps the configuration that it was fitted with.
+    Several logs are fitted together, and each is left out in turn to test the model. With one log, each trial is
+    predicted by a fit to the rest of the drive; position of the antenna, heading offset, delays and wheel scales are
+    estimated as well. A RUN keeps the configuration that it was fitted with. Logs that are not usable, too short, or
+    copies of another are left out.
 
     \b
     Example:
@@ -61,9 +64,10 @@ def command(
     sensors = _sensors(runs[0], x_icr, quiet=quiet, verbose=verbose) if len(runs) == 1 else None
     result = None
     try:
-        result = calibrate_runs(runs)
+        result = calibrate_runs(runs, allow_unusable=allow_unusable)
+        options.warn([str(one) for one in result.left_out], quiet=quiet)
     except IcrToolError as err:
-        if sensors is None:
+        if sensors is None or not (runs[0].usable or allow_unusable):
             raise
         options.warn([f"no motion model: {err}"], quiet=quiet)
     texts: list[str] = [format_result(result)] if result is not None else []

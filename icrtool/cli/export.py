@@ -156,4 +156,4 @@ def _read_calibration(source: Path | None, *, force: bool) -> tuple[str, Calibra
     if not (run.usable or force):
         why = f"its ICRs are not usable: {run.summary['unusable_because']}"
         raise DataError(run.name, why, f"drive again, with turns to both sides; {ALL_THE_SAME}")
-    return run.name, calibrate(run)
+    return run.name, calibrate(run, allow_unusable=force)

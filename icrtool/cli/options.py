@@ -144,11 +144,11 @@ def report(command: Command) -> Command:
     @wraps(command)
     def with_options(
         *, plots: tuple[str, ...], gates: tuple[str, ...], budgets: tuple[float, ...], ladder: bool, strict: bool,
-        page: bool, junit: Path | None, markdown: Path | None, **others: object,
+        page: bool, allow_unusable: bool, junit: Path | None, markdown: Path | None, **others: object,
     ) -> object:  # fmt: skip
         from icrtool.fleet.fit_and_report import ReportOptions
 
-        asked = ReportOptions(plots, gates, budgets, ladder, strict, page)
+        asked = ReportOptions(plots, gates, budgets, ladder, strict, page, allow_unusable)
         return command(asked=asked, junit=junit, markdown=markdown, **others)
 
     return add_options(
@@ -163,13 +163,21 @@ def report(command: Command) -> Command:
                      help="Compare limits relative to the baseline by their number alone, without the "
                      "confidence interval of the difference."),
         click.option("--ladder/--no-ladder", default=True, show_default=True,
-                     help="Compare all models, with a gyro too, on distance that they were not fitted to."),
+                     help="Also test the motion model and the controller numbers, with a gyro too, on distance "
+                     "that they were not fitted to."),
         click.option("--junit", metavar="FILE", type=NEW_FILE, help="Write the verdicts on the limits as JUnit XML."),
         click.option("--markdown", metavar="FILE", type=NEW_FILE, help="Write a summary for a pull request."),
+        allow_unusable,
         plots,
         click.option("--page/--no-page", default=True, show_default=True,
                      help="Also write report.html: pictures, tables and an interactive map in one file."),
     )  # fmt: skip
+
+
+def allow_unusable(command: Command) -> Command:
+    """Add --allow-unusable."""
+    return click.option("--allow-unusable", is_flag=True,
+                        help="Give distances and numbers of runs that are not usable, too.")(command)  # fmt: skip
 
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:

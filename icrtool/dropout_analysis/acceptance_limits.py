@@ -13,13 +13,14 @@ from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_wi
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.motion.models import FAMILY
 from icrtool.records.dropout import METRICS, BudgetDistance, Gate, ModelResult, Verdict
 from icrtool.records.plain_data import plain
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(
-    r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max)@(?P<horizon>\d+(?:\.\d+)?)\s*m?\s*"
+    r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max|within)@(?P<at>\d+(?:\.\d+)?)\s*m?\s*"
     rf"(?P<relation><=|>=|<|>)\s*(?:(?P<bound>[+-]?{_NUMBER})\s*m?|"
     rf"(?:(?P<factor>{_NUMBER})\s*\*\s*)?(?P<baseline>baseline)(?:\s*(?P<offset>[+-]\s*{_NUMBER})\s*m?)?)\s*$"
 )
@@ -66,14 +67,18 @@ def parse_gate(text: str) -> Gate:
     """
     match = _FORM.match(text)
     if match is None:
-        form = "model.p50|p95|expected|max@HORIZONm <= metres, or <= [FACTOR *] baseline [+ METRES m]"
-        raise ConfigError(f"gate {text!r}", f"not of the form {form}", 'for example "icr.p95@10m <= 3.8"')
-    horizon_m = float(match["horizon"])
-    if not horizon_m > 0:
-        raise ConfigError(f"gate {text!r}", "a horizon of 0 m is no drive", "name a distance, for example @10m")
+        form = "model.p50|p95|expected|max@HORIZONm <= metres, model.within@ERRORm >= metres, or [FACTOR *] baseline"
+        example = 'for example "recommended.p95@10m <= 1.2" or "recommended.within@0.5m >= 10"'
+        raise ConfigError(f"gate {text!r}", f"not of the form {form}", example)
+    at_m, within = float(match["at"]), match["metric"] == "within"
+    if not at_m > 0:
+        raise ConfigError(f"gate {text!r}", "0 m is no length", "name one above zero, for example @10m")
     factor = float(match["factor"] or 1.0) if match["baseline"] else 0.0
     bound_m = float((match["bound"] or match["offset"] or "0").replace(" ", ""))
-    return Gate(" ".join(text.split()), match["model"], match["metric"], horizon_m, match["relation"], bound_m, factor)
+    return Gate(
+        " ".join(text.split()), match["model"], match["metric"], None if within else at_m, match["relation"], bound_m,
+        factor, at_m if within else None,
+    )  # fmt: skip
 
 
 def check_gate(
@@ -92,23 +97,20 @@ def check_gate(
         A model or horizon that the report, or the baseline, does not have.
     """
     result = _result(gate, report)
-    places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m))
-    if not len(places):
-        known = ", ".join(f"{horizon:g}" for horizon in report.horizons_m)
-        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", f"use {known}")
-    h = int(places[0])
-    field, _ = METRICS[gate.metric]
-    value = float(getattr(result.summary, field)[h])
+    if gate.budget_m is not None:
+        reached = within_budget(report.horizons_m, result.summary.p95, gate.budget_m)
+        value, sums = (math.nan if reached is None else reached[0]), None
+    else:
+        h = _place(gate, report)
+        value, sums = float(getattr(result.summary, METRICS[gate.metric][0])[h]), result.block_sums[h]
     if gate.baseline_factor and baseline is None:
         return Verdict(gate, True, plain(value), log=report.name, not_checked="this log is not in the baseline")
     half_width, before = math.nan, math.nan
     if gate.baseline_factor and baseline is not None:
-        row = baseline.row(gate)
-        before = row.values_m[gate.metric]
+        before, old = _before(gate, baseline)
         half_width = difference_half_width(
-            result.block_sums[h], row.sums, gate.metric, gate.baseline_factor,
-            same_recording=baseline.is_of(report.run_summary),
-        )  # fmt: skip
+            sums, old, gate.metric, gate.baseline_factor, same_recording=baseline.is_of(report.run_summary)
+        )
     bound = gate.bound_m + (gate.baseline_factor * before if gate.baseline_factor else 0.0)
     margin = bound - value if gate.relation.startswith("<") else value - bound
     passed = _RELATIONS[gate.relation](value, bound)
@@ -116,6 +118,25 @@ def check_gate(
         passed = True
     low, high = margin - half_width, margin + half_width
     return Verdict(gate, passed, *plain((value, margin, low, high, bound, before, report.name)))
+
+
+def _place(gate: Gate, report: DropoutReport) -> int:
+    """Return the place of a gate's horizon among those of the report."""
+    places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m or math.nan))
+    if not len(places):
+        known = ", ".join(f"{horizon:g}" for horizon in report.horizons_m)
+        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", f"use {known}")
+    return int(places[0])
+
+
+def _before(gate: Gate, baseline: BaselineReport) -> tuple[float, BlockSums | None]:
+    """Return the baseline's number, and its block sums."""
+    if gate.budget_m is None:
+        row = baseline.row(gate)
+        return row.values_m[gate.metric], row.sums
+    horizons_m, p95_m = baseline.p95_of(gate)
+    reached = within_budget(horizons_m, p95_m, gate.budget_m)
+    return (math.nan if reached is None else reached[0]), None
 
 
 def _result(gate: Gate, report: DropoutReport) -> ModelResult:
@@ -131,17 +152,23 @@ def _result(gate: Gate, report: DropoutReport) -> ModelResult:
 
 
 def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool, tuple[float, float]] | None:
-    """Return how far an error (h,) [m] that grows with the distance (h,) [m], from 0 m at 0 m, stays within a budget.
+    """Return how far an error (h,) [m] stays within a budget, over the distance (h,) [m] and from 0 m at 0 m on.
 
     Returns
     -------
     The interpolated distance, whether the error is within the budget at the last one, and the distances interpolated
     between; None without errors.
+
+    Notes
+    -----
+    Errors at few trials may fall with the distance; here they are those that never fall and are nearest to the given
+    ones (isotonic regression, Barlow et al. 1972: the largest over beginnings of the smallest mean over ends).
     """
     known = np.isfinite(p95_m)
     if not known.any():
         return None
-    distance, p95 = np.concatenate([[0.0], horizons_m[known]]), np.concatenate([[0.0], p95_m[known]])
+    distance = np.concatenate([[0.0], horizons_m[known]])
+    p95 = np.concatenate([[0.0], never_falling(p95_m[known])])
     over = np.flatnonzero(p95 > budget_m)
     if not len(over):
         return float(distance[-1]), True, (float(distance[-1]), float(distance[-1]))
@@ -149,3 +176,16 @@ def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[f
     share = (budget_m - p95[i - 1]) / (p95[i] - p95[i - 1])
     low, high = float(distance[i - 1]), float(distance[i])
     return low + float(share) * (high - low), False, (low, high)
+
+
+def never_falling(values: Floats) -> Floats:
+    """Return the values (n,) that never fall and are nearest to given ones by least squares."""
+    sums, n = np.concatenate([[0.0], np.cumsum(values)]), len(values)
+    first, last = np.arange(n)[:, None], np.arange(n)
+    length = last - first + 1
+    means = np.where(length > 0, (sums[1:] - sums[:-1, None]) / np.maximum(length, 1), np.inf)
+    # the smallest mean of a stretch from each first value to each last one or further
+    least = np.minimum.accumulate(means[:, ::-1], axis=1)[:, ::-1]
+    least[length <= 0] = -np.inf
+    found: Floats = least.max(axis=0)
+    return found

@@ -7,8 +7,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from icrtool import __version__
 from icrtool.errors import ConfigError
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.block_sums import LEVEL, BlockSums, variance_of_sum
 from icrtool.records.dropout import Gate
 from icrtool.records.run_document import RunDocument
@@ -50,10 +53,24 @@ class BaselineReport:
             The report has no such model or horizon.
         """
         for (model, horizon_m), row in self.rows.items():
-            if model == gate.model and math.isclose(horizon_m, gate.horizon_m, rel_tol=1e-6):
+            if model == gate.model and math.isclose(horizon_m, gate.horizon_m or math.nan, rel_tol=1e-6):
                 return row
         what = f"no {gate.model} over {gate.horizon_m:g} m"
         raise ConfigError(f"gate {gate.text!r}", f"{what} in the baseline {self.path}", "make the baseline again")
+
+    def p95_of(self, gate: Gate) -> tuple[Floats, Floats]:
+        """Return distances (h,) and p95 (h,) [m] of the model that a gate names.
+
+        Raises
+        ------
+        ConfigError
+            The report has no such model.
+        """
+        found = sorted((at, row.values_m["p95"]) for (model, at), row in self.rows.items() if model == gate.model)
+        if not found:
+            raise ConfigError(f"gate {gate.text!r}", f"no {gate.model} in the baseline {self.path}", "make it again")
+        horizons_m, p95_m = np.array(found).T
+        return horizons_m, p95_m
 
     def changes(self, run_summary: RunDocument) -> tuple[str, ...]:
         """Return what differs beside the numbers: log, configuration, version; a sentence each."""
@@ -86,7 +103,7 @@ def difference_half_width(
     Student's distribution. Of one recording: of the differences of the blocks' influences. Of two: both variances add
     up, degrees of freedom of Welch (1947).
     """
-    if now is None or before is None or metric == "max":
+    if now is None or before is None or metric in {"max", "within"}:
         return math.nan
     new, old = now.influence(metric), factor * before.influence(metric)
     if same_recording and len(new) == len(old):

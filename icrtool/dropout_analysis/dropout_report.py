@@ -24,7 +24,7 @@ from icrtool.dropout_analysis.straight_and_turning import split_by_turning
 from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
-from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration
+from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration, Verdict
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run
 
@@ -44,6 +44,7 @@ def dropout_report(
     reference: Literal["filter", "smoothed"] = "filter",
     baseline: BaselineReport | None = None,
     strict: bool = False,
+    allow_unusable: bool = False,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
 ) -> DropoutReport:
@@ -65,6 +66,8 @@ def dropout_report(
     reference : what trials are compared with: the filter's states or the smoother's
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
     strict : compare such limits by the number alone, without the confidence interval of the difference
+    allow_unusable : report on a run that is not usable as on any other; else it has the rows of the filter and of no
+        slip alone, no distance, and every limit fails
     seed : of the bootstrap
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
@@ -82,8 +85,9 @@ def dropout_report(
     limits = [gate if isinstance(gate, Gate) else parse_gate(gate) for gate in gates]
     forced = _force(run, outage_s, outage_at_s)
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
-    used, further = _calibration_rows(compared, calibrations)
-    found, why = _compare(compared, run) if comparison else (None, "")
+    unusable = "" if run.usable or allow_unusable else str(run.summary["unusable_because"])
+    used, further = _calibration_rows(compared, () if unusable else calibrations)
+    found, why = _compare(compared, run) if comparison and not unusable else (None, unusable)
     give_back_freed()
     rows = found.rows if found is not None else ()
     further = [*(ConstantModel(row.name, row.label, row.errors_of) for row in rows), *further]
@@ -102,8 +106,14 @@ def dropout_report(
         examples=example_trials(compared),
         worst=worst_trials(compared, found, starts=starts),
         outages=(*forced, *real_outages(compared)),
-        budgets=tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
-        verdicts=tuple(check_gate(gate, report, baseline, strict=strict) for gate in limits),
+        budgets=() if unusable else tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
+        verdicts=tuple(
+            Verdict(gate, False, None, log=run.name, unusable=unusable)
+            if unusable
+            else check_gate(gate, report, baseline, strict=strict)
+            for gate in limits
+        ),
+        usable=not unusable,
         baseline=baseline,
         by_turning=split_by_turning(compared, starts),
         no_comparison=why,
@@ -127,8 +137,9 @@ def _horizons(horizons_m: Sequence[float], gates: Sequence[Gate]) -> list[float]
     """Return the horizons asked for, and those that acceptance limits name."""
     horizons = list(horizons_m)
     for gate in gates:
-        if not any(math.isclose(gate.horizon_m, horizon, rel_tol=1e-9) for horizon in horizons):
-            horizons.append(gate.horizon_m)
+        at = gate.horizon_m
+        if at is not None and not any(math.isclose(at, horizon, rel_tol=1e-9) for horizon in horizons):
+            horizons.append(at)
     return horizons
 
 

@@ -67,6 +67,7 @@ class DropoutReport:
     outages : forced ones, then real ones
     by_turning : straight and turning trials apart
     comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
+    usable : distances and numbers may be used, or were asked for all the same
     calibrations : those with a row of their own
     baseline : an earlier report that this one is compared with
     event_cost : how much slip events change the errors, where trials that cross one are left out; None where they count
@@ -95,6 +96,7 @@ class DropoutReport:
     by_turning: tuple[TurningSplit, ...] = ()
     comparison: ModelComparison | None = None
     no_comparison: str = ""
+    usable: bool = True
     calibrations: tuple[UsedCalibration, ...] = ()
     baseline: BaselineReport | None = None
     event_cost: EventCost | None = None

@@ -186,7 +186,7 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
     report = options.report
     document = {"config": config.effective(), "version": __version__, "plots": report.plots, "gates": report.gates,
                 "budgets": report.budgets_m, "ladder": report.ladder, "robot": known.robot,
-                "baseline": baseline, "strict": report.strict}  # fmt: skip
+                "baseline": baseline, "strict": report.strict, "allow_unusable": report.allow_unusable}  # fmt: skip
     key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
     row = Row(
         one.log, f"{RUNS}/{one.name}", "failed", usable=False, robot=known.robot, group=known.group, tags=known.tags,

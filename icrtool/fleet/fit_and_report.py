@@ -29,6 +29,7 @@ class ReportOptions:
     ladder : compare all models on distance that they were not fitted to
     strict : as in `icrtool.dropout_report`
     page : write report.html
+    allow_unusable : as in `icrtool.dropout_report`
     """
 
     plots: tuple[str, ...] = ("png",)
@@ -37,6 +38,7 @@ class ReportOptions:
     ladder: bool = True
     strict: bool = False
     page: bool = True
+    allow_unusable: bool = False
 
 
 def fit_and_write(
@@ -113,7 +115,7 @@ def report_and_write(
         begin("dropout analysis")
         report = dropout_report(
             run, budgets_m=options.budgets_m, gates=options.gates, comparison=options.ladder, baseline=baseline,
-            strict=options.strict, sink=sink, **(further or {}),
+            strict=options.strict, allow_unusable=options.allow_unusable, sink=sink, **(further or {}),
         )  # fmt: skip
         begin("dropout report, pictures" if options.plots else "dropout report")
         return report

@@ -136,6 +136,8 @@ def _results(request: Request, stage: Stage) -> Row:
 def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> Row:
     geometry: Mapping[str, Any] = summary.get("geometry") or {}
     controller: Mapping[str, Any] = summary.get("controller") or {}
+    if not controller and report.calibration is not None:
+        controller = report.calibration.controller_numbers()._asdict()
     return replace(
         request.row,
         status="done",

@@ -56,18 +56,21 @@ class PooledCalibration:
     key: str = ""
 
 
-def pooled_calibrations(rows: Sequence[Row], directory: Path) -> Iterator[PooledCalibration]:
+def pooled_calibrations(
+    rows: Sequence[Row], directory: Path, *, allow_unusable: bool = False
+) -> Iterator[PooledCalibration]:
     """Yield the calibration of each robot in each group; one of the same logs as before is not fitted again.
 
     Parameters
     ----------
     directory : of the batch, where the runs are; calibration files are written below it
+    allow_unusable : also from runs that are not usable
     """
     before = {one.key: one for one in _stored(directory)}
     names: set[str] = set()
     for (robot, group), members in groups_of(rows).items():
         key = sha256(
-            msgspec.json.encode([__version__, [(row.log, row.key, row.inputs) for row in members]])
+            msgspec.json.encode([__version__, allow_unusable, [(row.log, row.key, row.inputs) for row in members]])
         ).hexdigest()
         name = _file_name(robot, group, names)
         known = before.get(key)
@@ -75,7 +78,8 @@ def pooled_calibrations(rows: Sequence[Row], directory: Path) -> Iterator[Pooled
             yield known
         else:
             logs = tuple(row.log for row in members)
-            yield _pooled(PooledCalibration(robot, group, logs, key=key), members, directory, name)
+            empty = PooledCalibration(robot, group, logs, key=key)
+            yield _pooled(empty, members, directory, name, allow_unusable=allow_unusable)
 
 
 def groups_of(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
@@ -111,7 +115,9 @@ def is_fleet(directory: Path) -> bool:
     return is_regular(directory / FLEET_FILE, directory)
 
 
-def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, name: str) -> PooledCalibration:
+def _pooled(
+    one: PooledCalibration, members: Sequence[Row], directory: Path, name: str, *, allow_unusable: bool
+) -> PooledCalibration:
     from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.output.stored_run import open_run
     from icrtool.output.tables.held_out import held_out_blocks
@@ -125,15 +131,18 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
     spaced = {ordered[i].log for i in np.linspace(0, len(ordered) - 1, count).round().astype(int)}
     used: list[str] = []
     file = f"{CALIBRATIONS}/{name}.json"
+    opened: list[str] = []
 
     def usable() -> Iterator[Run]:
         for row in members:
-            if row.log in spaced and row.usable:
+            if row.log in spaced and (row.usable or allow_unusable):
+                run = open_run(directory / row.run)
                 used.append(row.log)
-                yield open_run(directory / row.run)
+                opened.append(run.name)
+                yield run
 
     try:
-        result = calibrate_runs(usable())
+        result = calibrate_runs(usable(), allow_unusable=allow_unusable)
         make_folders(directory / CALIBRATIONS, directory)
         write_calibration(result.calibration.summary(), directory / file, directory)
     except IcrToolError as err:
@@ -141,6 +150,8 @@ def _pooled(one: PooledCalibration, members: Sequence[Row], directory: Path, nam
         return replace(one, left_out=left_out, reason=str(err))
     numbers = result.calibration.controller_numbers()
     table = str(Text(held_out_blocks(result.table)))
+    short = {name for name, _ in result.left_out}
+    used = [log for log, logged in zip(used, opened, strict=True) if logged not in short]
     return replace(
         one, logs=tuple(used), left_out=tuple(log for log in one.logs if log not in used), file=file,
         recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),

@@ -137,7 +137,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "ladder": comparison_document(report),
         "gates": [
             {**asdict(one.gate), **{key: getattr(one, key) for key in VERDICT_KEYS}, "value_bound_m": one.bound_m,
-             "not_checked": one.not_checked or None, "verdict": one.line()}
+             "not_checked": one.not_checked or None, "unusable": one.unusable or None, "verdict": one.line()}
             for one in report.verdicts
         ],
         "passed": report.passed,

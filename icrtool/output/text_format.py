@@ -35,7 +35,7 @@ def run_title(summary: RunDocument) -> str:
 
 def unusable_lines(summary: RunDocument) -> list[Line]:
     """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
-    return [] if summary["usable"] else [Line(f"NOT USABLE: {summary['unusable_because']}", "bad")]
+    return [] if summary["usable"] else [Line(f"Do not use: {summary['unusable_because']}", "bad")]
 
 
 def position_word(summary: RunDocument) -> str:

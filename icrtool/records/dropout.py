@@ -188,7 +188,7 @@ class BudgetDistance(NamedTuple):
     Attributes
     ----------
     distance_m : interpolated between horizons, from 0 m at 0 m
-    beyond : the error is within the budget at `distance_m`, the last horizon with trials
+    beyond : `distance_m` is a lower bound: the error is within the budget at the last horizon with trials
     between_m : horizons interpolated between
     low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; NaN where
         they stay within it, and where there is no interval
@@ -223,10 +223,12 @@ class BudgetDistance(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One acceptance limit: ``icr.p95@10m <= 3.8``, or ``icr.p95@10m <= 1.1 * baseline + 0.1 m``.
+    """One acceptance limit: ``icr.p95@10m <= 3.8``, ``icr.p95@10m <= 1.1 * baseline + 0.1 m``, or on a distance.
 
     Attributes
     ----------
+    horizon_m : distance at which an error is bounded; None of a limit on the distance itself
+    budget_m : of ``recommended.within@0.5m >= 10``, the error within which the distance counts; else None
     bound_m : [m] the bound, beside the share of the baseline
     baseline_factor : what the baseline's number is multiplied with; 0 where the limit does not name the baseline
     """
@@ -234,10 +236,11 @@ class Gate:
     text: str
     model: str
     metric: str
-    horizon_m: float
+    horizon_m: float | None
     relation: str
     bound_m: float
     baseline_factor: float = 0.0
+    budget_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,6 +256,7 @@ class Verdict:
     bound_m : that of the gate, with the baseline's share; baseline_m : the baseline's number
     log : name of the log
     not_checked : why the limit was not checked; empty where it was
+    unusable : why the run must not be used, which fails every limit; empty where it can be
     """
 
     gate: Gate
@@ -265,6 +269,7 @@ class Verdict:
     baseline_m: float | None = None
     log: str = ""
     not_checked: str = ""
+    unusable: str = ""
 
     def line(self) -> str:
         """Return the verdict in one line, which names the log."""
@@ -272,8 +277,11 @@ class Verdict:
         log = f" (log {self.log})" if self.log else ""
         if self.not_checked:
             return f"none  {self.gate.text}: not checked: {self.not_checked}{log}"
+        if self.unusable:
+            return f"{word}  {self.gate.text}: do not use this run: {self.unusable}{log}"
         if self.value_m is None:
-            return f"{word}  {self.gate.text}: no trial of {self.gate.horizon_m:g} m in this log{log}"
+            length = f" of {self.gate.horizon_m:g} m" if self.gate.horizon_m is not None else ""
+            return f"{word}  {self.gate.text}: no trial{length} in this log{log}"
         return f"{word}  {self.gate.text}: {self.value_m:.4g} m{self._bound_text()}{log}"
 
     def _bound_text(self) -> str:

@@ -46,7 +46,7 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str
         "verdict": verdict,
         "checks": _checks(summary, report),
         "reaches": _reaches(report),
-        "numbers": _numbers(summary["icr"], calibration),
+        "numbers": _numbers(calibration),
         "with_numbers": controller_error_text(calibration.controller) if calibration is not None else "",
         "export": _export(calibration),
         "model": calibration.fitted.model.label if calibration is not None else "",
@@ -72,12 +72,8 @@ def _reaches(report: Mapping[str, Any]) -> list[list[BudgetDistance]]:
     return list(found.values())
 
 
-def _numbers(icr: Mapping[str, Any], calibration: Calibration | None) -> list[tuple[str, str]]:
-    rows = []
-    if calibration is not None:
-        rows = controller_rows(calibration.controller_numbers())
-    elif icr["separation_multiplier"] is not None and icr["separation_multiplier_std"] is not None:
-        rows = [("wheel_separation_multiplier", icr["separation_multiplier"], icr["separation_multiplier_std"])]
+def _numbers(calibration: Calibration | None) -> list[tuple[str, str]]:
+    rows = controller_rows(calibration.controller_numbers()) if calibration is not None else []
     return [(name, _with_std(value, std)) for name, value, std in rows]
 
 

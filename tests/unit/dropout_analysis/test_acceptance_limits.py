@@ -7,8 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import isotonic_regression
 
-from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
+from icrtool.dropout_analysis.acceptance_limits import (
+    budget_distances,
+    check_gate,
+    never_falling,
+    parse_gate,
+    within_budget,
+)
+from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import ConfigError
@@ -121,7 +129,7 @@ def with_p95(report: DropoutReport, *p95: float) -> DropoutReport:
         (1.2, (0.1, 0.4, 2.0), 6.25, False),
         (2.0, (0.1, 0.4, 2.0), 10.0, True),
         (9.0, (0.1, 0.4, 2.0), 10.0, True),
-        (0.3, (0.1, 0.5, 0.2), 1.75, False),
+        (0.3, (0.1, 0.5, 0.2), 2.2, False),
         (0.3, (0.1, 0.2, math.nan), 2.5, True),
         (0.3, (math.nan, 0.6, 1.0), 1.25, False),
     ],
@@ -157,3 +165,42 @@ def test_an_interval_of_a_budget_ends_where_its_knowledge_ends(
     (found,) = budget_distances(replace(one, results=(one.results[0]._replace(intervals=intervals),)), 0.3)
     assert found.distance_m == pytest.approx(1.0 + 1.5 * 0.2 / 0.3)
     assert found.interval_text == text
+
+
+def test_errors_that_never_fall_are_those_of_isotonic_regression() -> None:
+    """Witness: scipy's pool-adjacent-violators."""
+    rng = np.random.default_rng(3)
+    for n in (1, 2, 5, 20):
+        for _ in range(20):
+            values = rng.exponential(1.0, n) * np.arange(1, n + 1) ** rng.uniform(-1.0, 1.0)
+            np.testing.assert_allclose(never_falling(values), isotonic_regression(values).x, rtol=1e-12)
+
+
+def test_a_short_distance_that_is_worse_than_a_longer_one_does_not_end_the_reach() -> None:
+    horizons, p95 = np.array([1.0, 2.0, 5.0, 10.0]), np.array([0.55, 0.3, 0.4, 0.9])
+    reached = within_budget(horizons, p95, 0.5)
+    assert reached is not None
+    assert 5.0 < reached[0] < 10.0
+    assert not reached[1]
+
+
+def test_a_limit_on_the_distance_within_a_budget(report: DropoutReport) -> None:
+    reached = next(one for one in budget_distances(report, 0.2) if one.model == "icr")
+    for bound, passed in ((reached.distance_m - 0.01, True), (reached.distance_m + 0.01, False)):
+        verdict = check_gate(parse_gate(f"icr.within@0.2m >= {bound}"), report)
+        assert (verdict.passed, verdict.value_m) == (passed, pytest.approx(reached.distance_m))
+    wide = check_gate(parse_gate("icr.within@99 >= 1"), report)
+    assert wide.value_m == report.horizons_m[np.isfinite(report.results[0].summary.p95)][-1]
+
+
+def test_every_limit_fails_on_a_run_that_is_not_usable(run: Run) -> None:
+    bad = replace(run, summary={**run.summary, "usable": False, "unusable_because": "the robot did not move"})
+    gates = ["icr.p95@5m <= 100", "recommended.within@0.5m >= 0.1"]
+    report = dropout_report(bad, horizons_m=[5.0], gates=gates)
+    assert [result.name for result in report.results] == ["icr", "no_slip", "icr_final"]
+    assert (report.budgets, report.calibration) == ((), None)
+    assert [verdict.passed for verdict in report.verdicts] == [False, False]
+    assert all("the robot did not move" in verdict.line() for verdict in report.verdicts)
+    allowed = dropout_report(bad, horizons_m=[5.0], gates=gates, allow_unusable=True)
+    assert allowed.result("recommended") is not None
+    assert allowed.verdicts[0].passed

@@ -47,10 +47,10 @@ def test_a_run_that_rejected_a_third_of_a_stream_is_not_usable(stream: str) -> N
     assert rejected_share(outcome) > 0.3
     assert not run.usable
     assert f"% of the {stream} rejected" in run.summary["unusable_because"]
-    assert format_run(run).startswith("NOT USABLE: ")
+    assert format_run(run).startswith("Do not use: ")
     assert any(f"of the {stream} were rejected" in warning for warning in run.warnings)
     report = dropout(run, [5.0])
-    assert format_dropout(report).startswith("NOT USABLE: ")
+    assert format_dropout(report).startswith("Do not use: ")
     document = report_document(report)
     assert document["usable"] is False
     assert document["unusable_because"] == run.summary["unusable_because"]
@@ -61,7 +61,7 @@ def test_a_run_that_rejected_a_tenth_is_usable(stream: str) -> None:
     run = with_wrong(0.12, stream)
     assert run.usable
     assert run.summary["unusable_because"] is None
-    assert "NOT USABLE" not in format_run(run) + format_dropout(dropout(run, [5.0]))
+    assert "Do not use" not in format_run(run) + format_dropout(dropout(run, [5.0]))
 
 
 @pytest.mark.parametrize(
