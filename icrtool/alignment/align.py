@@ -82,6 +82,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
             heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
             heading_is_estimated=heading.is_estimated,
             heading_is_measured=math.isfinite(noise[1]),
+            turn_wander_rad=math.inf if found.fit is None else found.fit.turn_wander_rad,
             attitude=None if found.derived is None else found.derived.attitude,
             losses_ns=quality.losses_ns,
             icr_start=start_icrs(found.geometry, sensors.antenna_m, config),

@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool.alignment.position.gnss_steps import bend_std_m, unbroken
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.records.measurements import Fixes
+from icrtool.records.measurements import TURNING_MPS, Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 
@@ -27,8 +27,8 @@ STARTS_A_WINDOW = 8
 LONGEST_WINDOW_S = 30.0
 """A window that takes longer holds an outage or a stop."""
 
-TURN_WINDOW_S, TURN_STEP_S = 1.0, 0.5
-"""Heading changes are compared over this time; windows start at every step."""
+TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS, TURN_STEP_S = 1.0, 2.0, 0.5
+"""Heading changes are compared over this time, and at least so many intervals; windows start at every step."""
 
 UNSTATED_STD_M, NOISIER = 0.01, 1.5
 """Noise of fixes that state none; and what their second differences must exceed it by to be used instead."""
@@ -36,6 +36,9 @@ UNSTATED_STD_M, NOISIER = 0.01, 1.5
 
 CHORD_S, LEAST_CHORD_M = 2.0, 0.3
 """Without a heading, distances are compared over this time, and where the chord is so long [m]."""
+
+STANDS_S = 5.0
+"""A heading further than this from a turn of the wheels is one of a robot that stands."""
 
 MOST_WHEEL_SAMPLES = 100_000
 """The samples of a longer drive are joined to about so many: 1 h at 28 Hz, where windows last seconds."""
@@ -157,8 +160,12 @@ def join_streams(
     dt = np.append(unbroken(np.diff(wheel_t)), 0.0)
     for span in slipping_ns:
         dt[slice(*np.searchsorted(wheels.stamp_ns, span))] = 0.0
-    wheel_t, dt, left, right = _joined(wheel_t, dt, wheels.v_left_mps, wheels.v_right_mps)
-    heading_t, angle = _averaged(heading_t, np.unwrap(heading.heading_rad))
+    left, right = wheels.v_left_mps, wheels.v_right_mps
+    turns = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
+    so_far = np.concatenate([[0], np.cumsum(turns)])
+    near = [np.searchsorted(wheel_t, heading_t + shift) for shift in (-STANDS_S, STANDS_S)]
+    heading_t, angle = _averaged(heading_t, np.unwrap(heading.heading_rad), so_far[near[1]] > so_far[near[0]])
+    wheel_t, dt, left, right = _joined(wheel_t, dt, left, right, turns)
     step = dt * (np.abs(left) + np.abs(right)) / 2
     return DriveArrays(
         wheel_t, dt, left, right, heading_t, angle,
@@ -167,16 +174,15 @@ def join_streams(
     )  # fmt: skip
 
 
-def _joined(t: Floats, dt: Floats, left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def _joined(t: Floats, dt: Floats, left: Floats, right: Floats, turns: Bools) -> tuple[Floats, Floats, Floats, Floats]:
     """Return times, intervals and speeds with neighbouring samples of a long drive joined; distances are the same.
 
-    Gaps (`dt` 0) stay samples of their own.
+    Gaps (`dt` 0) stay samples of their own; `turns` (n,) marks where the wheels do.
     """
-    every = -(-len(t) // MOST_WHEEL_SAMPLES)
-    if every < 2:
+    if len(t) <= MOST_WHEEL_SAMPLES:
         return t, dt, left, right
     gaps = np.flatnonzero(dt[:-1] == 0.0)
-    first = np.unique(np.concatenate([np.arange(0, len(t), every), gaps, gaps + 1, [len(t) - 1]]))
+    first = np.unique(np.concatenate([_thinned(turns), gaps, gaps + 1, [len(t) - 1]]))
     joined = np.add.reduceat(dt, first)
     speeds = []
     for speed in (left, right):
@@ -185,12 +191,22 @@ def _joined(t: Floats, dt: Floats, left: Floats, right: Floats) -> tuple[Floats,
     return t[first], joined, speeds[0], speeds[1]
 
 
-def _averaged(t: Floats, angle: Floats) -> tuple[Floats, Floats]:
+def _thinned(busy: Bools) -> Ints:
+    """Return rows at which to join the samples of a long drive (n,): evenly, or only where it stands if that is enough.
+
+    A robot that is parked for days leaves the samples of its drives as they are.
+    """
+    every = -(-len(busy) // MOST_WHEEL_SAMPLES)
+    moving = np.flatnonzero(busy | np.append(False, busy[:-1]))
+    even = np.arange(0, len(busy), every)
+    return np.union1d(moving, even) if len(moving) <= MOST_WHEEL_SAMPLES else even
+
+
+def _averaged(t: Floats, angle: Floats, moves: Bools) -> tuple[Floats, Floats]:
     """Return times and unwrapped headings of a long drive, neighbours averaged: a delay then moves no single noise."""
-    every = -(-len(t) // MOST_WHEEL_SAMPLES)
-    if every < 2:
+    if len(t) <= MOST_WHEEL_SAMPLES:
         return t, angle
-    first = np.arange(0, len(t), every)
+    first = _thinned(moves)
     count = np.diff(first, append=len(t))
     return np.add.reduceat(t, first) / count, np.add.reduceat(angle, first) / count
 
@@ -284,8 +300,11 @@ def _turn_windows(drive: DriveArrays, first: float, last: float) -> tuple[Floats
     if not len(t):
         return np.empty(0), np.empty(0)
     begin = t[0] + TURN_STEP_S * np.unique(np.floor((t - t[0]) / TURN_STEP_S))
-    begin = begin[(begin >= first) & (begin + TURN_WINDOW_S <= last)]
-    end = begin + TURN_WINDOW_S
+    length = (
+        max(TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS * float(np.median(np.diff(t)))) if len(t) > 1 else TURN_WINDOW_S
+    )
+    begin = begin[(begin >= first) & (begin + length <= last)]
+    end = begin + length
     sampled = np.searchsorted(t, end) > np.searchsorted(t, begin) + 1
     moved = np.interp(end, drive.wheel_t, drive.travel) > np.interp(begin, drive.wheel_t, drive.travel)
     kept = sampled & moved & _clear(drive, begin, end)

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import TURN_WINDOW_S, DriveArrays, DriveWindows
+from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.records.measurements import RESPONSE_S
@@ -167,6 +167,13 @@ class AlignmentFit(NamedTuple):
 
     def _beyond_noise(self, scatter_m: float) -> float:
         return math.sqrt(max(scatter_m**2 - 2.0 * self.drive.fix_std_m**2, 0.0)) / self.windows.length_m
+
+    @property
+    def turn_wander_rad(self) -> float:
+        """How far the heading wanders from the wheels' turn in a second [rad] (rms of short windows)."""
+        u = len(self.windows.turn_begin)
+        length = self.windows.turn_end - self.windows.turn_begin
+        return float(np.sqrt(np.mean(self.fit.residuals[-u:] ** 2 / length)))
 
     @property
     def turn_slip(self) -> float:
@@ -389,7 +396,7 @@ class _Model:
             return np.asarray(np.interp(end + shift, t, values) - np.interp(begin + shift, t, values))
 
         jacobian = np.zeros((len(begin), len(x)))
-        jacobian[:, K], jacobian[:, Q], jacobian[:, G] = over(self.turn_w), over(self.turn_v) / self.b, TURN_WINDOW_S
+        jacobian[:, K], jacobian[:, Q], jacobian[:, G] = over(self.turn_w), over(self.turn_v) / self.b, end - begin
         jacobian[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
-        predicted = x[K] * jacobian[:, K] + x[Q] * jacobian[:, Q] + x[G] * TURN_WINDOW_S
+        predicted = x[K] * jacobian[:, K] + x[Q] * jacobian[:, Q] + x[G] * jacobian[:, G]
         return predicted - self.turned, jacobian

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
-from icrtool.kernels.arrays import Floats
-from icrtool.kernels.filter.ekf import run_ekf
+from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.filter.ekf import REFERENCE_STEP_S, run_ekf
 from icrtool.kernels.filter.filter_records import FilterOutput
 from icrtool.kernels.filter.measurement_codes import UNSEEN
 from icrtool.records.measurements import SensorData
@@ -29,6 +30,9 @@ FLAT = 0.1
 """Costs that differ by less than this a measurement are alike: it is what 5 % of error in both deviations costs."""
 
 MOST_ROUNDS = 3
+
+Moving = tuple[Bools, Bools]
+"""Which fixes (m,) and which headings (h,) were measured while the wheels turned."""
 
 MOST_SAMPLES = 60_000
 """Wheel samples the search looks at: ten minutes at 100 Hz."""
@@ -51,15 +55,18 @@ def run_adaptively(
 
     noise, settings = configured_noise(config), config.filter
     setup, output = run(sensors, noise)
-    if settings.preset != "field" or max(_capped_nis(setup, output)) <= TOLERATED_NIS:
+    if settings.preset != "field" or max(_capped_nis(setup, output, _moving(sensors))) <= TOLERATED_NIS:
         return setup, output, noise
     del setup, output  # of a long log, as large as all that the next run makes
+    largest = min(LARGEST_HEADING_DEGPS, STEP * math.degrees(sensors.turn_wander_rad) / math.sqrt(REFERENCE_STEP_S))
     part = _busiest_part(sensors)
+    moving = _moving(part)
     best = find_noise(
-        lambda tried: innovation_cost(run(part, tried)[1]),
+        lambda tried: innovation_cost(run(part, tried)[1], moving),
         noise,
         positions=settings.process_position_mps == "auto",
         headings=settings.process_heading_degps is None,
+        largest_degps=largest,
     )
     return *run(sensors, best), best
 
@@ -75,7 +82,12 @@ def _busiest_part(sensors: SensorData) -> SensorData:
 
 
 def find_noise(
-    cost: Callable[[ProcessNoise], float], start: ProcessNoise, *, positions: bool, headings: bool
+    cost: Callable[[ProcessNoise], float],
+    start: ProcessNoise,
+    *,
+    positions: bool,
+    headings: bool,
+    largest_degps: float = LARGEST_HEADING_DEGPS,
 ) -> ProcessNoise:
     """Return the smallest process noise, from `start` up by doubling, whose cost is that of the best one.
 
@@ -83,6 +95,7 @@ def find_noise(
     ----------
     cost : by noise, see `innovation_cost`
     positions, headings : whether the noise of the position, and of the heading, is searched for
+    largest_degps : of the heading: what the turns of the wheels miss of its own turns
 
     Notes
     -----
@@ -106,15 +119,23 @@ def find_noise(
             steps = _doublings(start.position_mps, LARGEST_POSITION_MPS)
             best = best_of(best._replace(position_mps=value) for value in steps)
         if headings:
-            steps = _doublings(start.heading_degps, LARGEST_HEADING_DEGPS)
+            steps = _doublings(start.heading_degps, largest_degps)
             best = best_of(best._replace(heading_degps=value) for value in steps)
         if best == before:
             break
     return best
 
 
-def innovation_cost(output: FilterOutput) -> float:
+def _moving(sensors: SensorData) -> Moving:
+    return sensors.moving(sensors.fixes.stamp_ns), sensors.moving(sensors.headings.stamp_ns)
+
+
+def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float:
     """Return what the innovations of a run cost: the mean over the fixes, and that over the headings, added.
+
+    Parameters
+    ----------
+    moving : which fixes (m,) and headings (h,) count; None: all
 
     Notes
     -----
@@ -125,6 +146,8 @@ def innovation_cost(output: FilterOutput) -> float:
     """
     fixes = output.gnss_code > UNSEEN
     headings = (output.heading_code > UNSEEN) & (output.heading_nis > 0.0)
+    if moving is not None:
+        fixes, headings = fixes & moving[0], headings & moving[1]
     variance = output.heading_innovation[headings] ** 2 / output.heading_nis[headings]
     return _student_cost(output.gnss_nis[fixes], output.gnss_det[fixes], 2) + _student_cost(
         output.heading_nis[headings], variance, 1
@@ -145,9 +168,12 @@ def _doublings(start: float, largest: float) -> list[float]:
     return steps
 
 
-def _capped_nis(setup: FilterSetup, output: FilterOutput) -> tuple[float, float]:
+def _capped_nis(setup: FilterSetup, output: FilterOutput, moving: Moving) -> tuple[float, float]:
     """Return mean NIS of fixes and of headings per degree of freedom, each counted up to its gate; 0 for none."""
-    nis = output.gnss_nis[output.gnss_code > UNSEEN], output.heading_nis[output.heading_code > UNSEEN]
+    nis = (
+        output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]],
+        output.heading_nis[(output.heading_code > UNSEEN) & moving[1]],
+    )
     gates = setup.parameters.gnss_gate, setup.parameters.heading_gate
     fixes, headings = (
         float(np.minimum(one, gate).mean()) if len(one) else 0.0 for one, gate in zip(nis, gates, strict=True)

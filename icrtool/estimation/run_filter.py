@@ -98,9 +98,16 @@ def run_filter(
     fixes_ns, headings_ns = sensors.fixes.stamp_ns, sensors.headings.stamp_ns
     fixes_s, headings_s = ((one - table.stamp_ns[0]) / 1e9 for one in (fixes_ns, headings_ns))
     residual_m = np.hypot(*output.gnss_residual.T)
-    gnss = MeasurementOutcome(fixes_ns, fixes_s, output.gnss_nis, output.gnss_code, residual_m)
+    gnss = MeasurementOutcome(
+        fixes_ns, fixes_s, output.gnss_nis, output.gnss_code, residual_m, sensors.moving(fixes_ns)
+    )
     heading = MeasurementOutcome(
-        headings_ns, headings_s, output.heading_nis, output.heading_code, output.heading_innovation
+        headings_ns,
+        headings_s,
+        output.heading_nis,
+        output.heading_code,
+        output.heading_innovation,
+        sensors.moving(headings_ns),
     )
     in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
     start_std_m, least_icr_m = np.sqrt(np.diag(setup.P0)[3:]), setup.parameters.least_icr

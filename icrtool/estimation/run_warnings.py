@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -38,6 +39,9 @@ WORTH_WARNING_SHARE = 0.1
 USELESS_HEADING_DEGPS = 50.0
 """The heading by wheels with more noise than this errs by 5 deg after a second."""
 
+CONTRADICTION_SIGMAS, CONTRADICTION_SHARE = 3.0, 0.1
+"""Estimates of a y ICR that differ by more than both, the second in parts of the separation, contradict each other."""
+
 UNUSABLE_SHARE = 0.3
 """With more than this share of the fixes, or of the headings, rejected, the filter did not follow them."""
 
@@ -49,11 +53,13 @@ def unusable_reasons(
     noise: ProcessNoise,
     wheel_scale: Finding | None = None,
     twist_separation: float | None = None,
+    contradiction: str = "",
 ) -> list[str]:
     """Return why the ICRs of a run must not be used; empty where they can be.
 
     Parameters
     ----------
+    contradiction : of `contradicts_windows`
     twist_separation : (y_r - y_l) / b by a body twist that was converted with b, None for other wheels
     """
     hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
@@ -66,6 +72,8 @@ def unusable_reasons(
         reasons.append("the wheels explain almost none of the motion")
     elif noise.heading_degps > USELESS_HEADING_DEGPS:
         reasons.append("the wheels explain almost none of the turns: do they slip, as on ice?")
+    if contradiction and not hidden:
+        reasons.append(contradiction)
     if wheel_scale is not None and wheel_scale.value is not None and wheel_scale.std is not None:
         left = wheel_scale.value / wheel_scale.applied
         if wheel_scale.std < LARGEST_SCALE_STD and abs(left - 1.0) > LARGEST_SCALE_CORRECTION:
@@ -78,10 +86,40 @@ def unusable_reasons(
     return reasons
 
 
+def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str, Finding]) -> str:
+    """Return in what the final y ICRs contradict those of windows of the drive; empty where they agree.
+
+    Parameters
+    ----------
+    covariance : (3, 3) of the final ICRs [m^2]
+    findings : of the alignment; without ICRs nothing is compared
+
+    Notes
+    -----
+    The filter weighs each sample, the windows (`icrtool.alignment.estimator`) compare motion over metres and know
+    delays. On recorded and simulated drives whose streams agree they differ by up to 0.04 of the separation.
+    """
+    right, left = findings.get("y_icr_right_m"), findings.get("y_icr_left_m")
+    apart = []
+    for row, (word, found) in enumerate((("right", right), ("left", left))):
+        if found is None or found.value is None or found.std is None:
+            return ""
+        final = float(table.icrs_at(-1)[row])
+        sigma = math.hypot(found.std, math.sqrt(max(float(covariance[row, row]), 0.0)))
+        separation = abs(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
+        if abs(final - found.value) > max(CONTRADICTION_SIGMAS * sigma, CONTRADICTION_SHARE * separation):
+            apart.append(
+                f"y {word} is {final:+.2f} m by the filter and {found.value:+.2f} ± {found.std:.2f} m by windows"
+            )
+    return f"wheels and reference contradict each other ({'; '.join(apart)}): check their clocks" if apart else ""
+
+
 def rejected_share(outcome: MeasurementOutcome) -> float:
-    """Return the share of the measurements within the run that the innovation gate rejected; 0 for none."""
-    seen = int(np.count_nonzero(outcome.code > UNSEEN))
-    return int(np.count_nonzero(outcome.rejected)) / seen if seen else 0.0
+    """Return the share of the measurements of a moving robot that the innovation gate rejected; 0 for none."""
+    seen = outcome.code > UNSEEN
+    if outcome.moving is not None:
+        seen &= outcome.moving
+    return float(outcome.rejected[seen].mean()) if seen.any() else 0.0
 
 
 def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:

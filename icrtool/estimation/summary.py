@@ -16,7 +16,13 @@ from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, mult
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.estimation.run_filter import Filtered
-from icrtool.estimation.run_warnings import antenna_warning, noise_warnings, run_warnings, unusable_reasons
+from icrtool.estimation.run_warnings import (
+    antenna_warning,
+    contradicts_windows,
+    noise_warnings,
+    run_warnings,
+    unusable_reasons,
+)
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.chords import chord_rows
 from icrtool.kernels.filter.measurement_codes import RECOVERED
@@ -69,10 +75,17 @@ def summarise(
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
-    scale = measurements.findings["wheel_scale"] if config.filter.preset == "field" else None
+    field = config.filter.preset == "field"
+    scale = measurements.findings["wheel_scale"] if field else None
     of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
     unusable = unusable_reasons(
-        excitation, filtered.gnss, filtered.heading, filtered.noise, scale, multiplier if of_twist else None
+        excitation,
+        filtered.gnss,
+        filtered.heading,
+        filtered.noise,
+        scale,
+        multiplier if of_twist else None,
+        contradicts_windows(table, covariance, measurements.findings) if field and not changes_s else "",
     )
     document: RunDocument = plain(
         {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -13,6 +14,9 @@ from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, Stream
 
 RESPONSE_S = 0.1
 """A robot answers its wheels by up to so much later, on rigid-body simulated drives."""
+
+MOVING_S, TURNING_MPS = 60.0, 0.01
+"""A robot is in use, and counts as moving, for so long before and after its wheels turn faster than that."""
 
 Scalar = str | float | bool | None
 """A value as JSON has it (an int is a float to Python's types)."""
@@ -79,6 +83,8 @@ class SensorData:
     heading_correlation_s : the errors of headings closer together than this are correlated
     heading_is_estimated : `headings` are estimated, with the positions; they do not exist without them
     heading_is_measured : the variance of `headings` is that of a reference's poses, as measured
+    turn_wander_rad : how far the heading wanders from the turn of the wheels in a second (rms), noise included; inf:
+        not known
     attitude : an attitude sensor's heading, its offset corrected, where `headings` are estimated with it; else None
     antenna_m : the antenna from the body origin, forward and right
     losses_ns : half-open spans in which RTK was lost, (k, 2)
@@ -99,12 +105,27 @@ class SensorData:
     icr_start: IcrStart | None = None
     heading_is_estimated: bool = False
     heading_is_measured: bool = False
+    turn_wander_rad: float = math.inf
     attitude: HeadingSamples | None = None
 
     @property
     def headings_are_precise(self) -> bool:
         """Whether the variance of a heading is its own, and not that of an error which lasts."""
         return self.heading_is_estimated or self.heading_is_measured
+
+    def moving(self, stamp_ns: Ints) -> Bools:
+        """Return at which stamps (m,) the wheels turn, or do within `MOVING_S`; all where they never do.
+
+        What a robot measures while it stands shows neither delays nor contradictions, however long it stands.
+        """
+        stamps = self.wheels.stamp_ns
+        turning = np.abs(self.wheels.v_left_mps) + np.abs(self.wheels.v_right_mps) > 2.0 * TURNING_MPS
+        so_far = np.concatenate([[0], np.cumsum(turning)])
+        near = max(round(MOVING_S * 1e9), 2 * int(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0
+        # the value before holds, too
+        first = np.maximum(np.searchsorted(stamps, stamp_ns - near) - 1, 0)
+        moving: Bools = so_far[np.searchsorted(stamps, stamp_ns + near, side="right")] > so_far[first]
+        return moving if moving.any() else np.ones(len(stamp_ns), np.bool_)
 
     def part(self, rows: slice) -> SensorData:
         """Return the part of some wheel samples, with the fixes and headings of that time."""

@@ -49,6 +49,7 @@ class MeasurementOutcome:
     nis : (m,) normalised innovation squared, NaN where unseen
     code : uint8 (m,), see `icrtool.kernels.filter.measurement_codes`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
+    moving : (m,) of `icrtool.records.measurements.SensorData.moving`; None: not known
     """
 
     stamp_ns: Ints
@@ -56,6 +57,7 @@ class MeasurementOutcome:
     nis: Floats
     code: Bytes
     difference: Floats
+    moving: Bools | None = None
 
     @property
     def used(self) -> Bools:

@@ -36,8 +36,8 @@ FROZEN_M, FROZEN_SHARE = 1.0, 0.5
 """A fix that repeats the one before to the last digit while the wheels go this far is old. Where they do so on more
 than half of the distance, the robot does not move."""
 
-LONGEST_INTERVAL_S = 1.0
-"""Between wheel samples further apart the path is not known."""
+LONGEST_INTERVAL_S, LONGEST_IN_INTERVALS = 1.0, 2.5
+"""Between wheel samples further apart, and further than so many usual intervals, the path is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,8 @@ def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:
 
 def unbroken(interval_s: Floats) -> Floats:
     """Return intervals between wheel samples [s], zero for those that are too long to show what happened in them."""
-    return np.where(interval_s < LONGEST_INTERVAL_S, interval_s, 0.0)
+    usual = float(np.median(interval_s)) if len(interval_s) else 0.0
+    return np.where(interval_s < max(LONGEST_INTERVAL_S, LONGEST_IN_INTERVALS * usual), interval_s, 0.0)
 
 
 def without_frozen(log: RobotLog) -> RobotLog:

@@ -14,7 +14,8 @@ def test_joined_samples_have_the_distances_and_gaps_of_all() -> None:
     dt = np.append(np.diff(t), 0.0)
     dt[rng.choice(n - 1, gaps, replace=False)] = 0.0
     left, right = rng.normal(1.0, 0.3, (2, n))
-    times, interval, one, other = drive_windows._joined(t, dt, left, right)
+    parts = drive_windows._joined(t, dt, left, right, np.ones(n, np.bool_))
+    times, interval, one, other = parts
     assert len(times) < n / 2
     assert np.count_nonzero(interval[:-1] == 0.0) == gaps
     for all_of_it, joined in ((left, one), (right, other)):
@@ -26,4 +27,14 @@ def test_joined_samples_have_the_distances_and_gaps_of_all() -> None:
 
 def test_a_short_drive_keeps_every_sample() -> None:
     t = np.arange(10.0)
-    assert drive_windows._joined(t, t, t, t)[0] is t
+    assert drive_windows._joined(t, t, t, t, np.ones(10, np.bool_))[0] is t
+
+
+def test_a_long_parking_leaves_every_sample_of_the_drive() -> None:
+    n = 3 * drive_windows.MOST_WHEEL_SAMPLES
+    t, turns = np.arange(float(n)), np.zeros(n, np.bool_)
+    turns[n // 2 : n // 2 + 600] = True
+    dt = np.append(np.diff(t), 0.0)
+    times = drive_windows._joined(t, dt, 1.0 * turns, 1.0 * turns, turns)[0]
+    assert np.isin(t[turns], times).all()
+    assert len(times) < drive_windows.MOST_WHEEL_SAMPLES + 1_000

@@ -16,8 +16,9 @@ from icrtool.estimation.run_filter import noise_of, set_up_again
 from icrtool.kernels.filter.ekf import run_ekf
 from icrtool.kernels.filter.measurement_codes import GATED
 from icrtool.records.run import Run
+from icrtool.records.samples import Datum
 from icrtool.records.tables import RobotLog
-from support.drives import make_log
+from support.drives import ICRS, make_log
 
 WIDTH = "robot.track_width_m=0.6"
 
@@ -121,3 +122,20 @@ def test_a_clean_drive_takes_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_preset_paper_keeps_the_paper_s_noise() -> None:
     run = fit(turning_errors(make_log(seed=2), 40.0), load_config(sets=[WIDTH, "filter.preset=paper"]))
     assert noise_of(run) == PAPER_NOISE
+
+
+def test_headings_are_as_noisy_as_the_wheels_turns_show_however_the_fixes_sway() -> None:
+    """An antenna on a mast sways across; headings that state 30 deg cannot answer for it, though they err by 0.3."""
+    log = make_log(0, 120.0, heading_std_deg=0.3)
+    t = (log.gnss.stamp_ns - log.gnss.stamp_ns[0]) / 1e9
+    psi = np.interp(log.gnss.stamp_ns, log.heading.stamp_ns, np.unwrap(log.heading.heading_rad))
+    sway = 0.15 * np.sin(2.0 * math.pi * t / 4.0)
+    gnss = replace(log.gnss, north_m=log.gnss.north_m - sway * np.sin(psi), east_m=log.gnss.east_m + sway * np.cos(psi))
+    stated = np.full(len(log.heading.stamp_ns), math.radians(30.0) ** 2)
+    log = replace(log, gnss=gnss, heading=replace(log.heading, var_rad2=stated), datum=Datum(40.8, -77.9, 350.0))
+    run = fit(log, load_config(sets=["robot.track_width_m=0.8"]))
+    assert run.usable
+    assert noise_of(run).heading_degps <= 2.0 * FIELD_NOISE.heading_degps
+    final = run.summary["icr"]["final"]
+    assert final["y_icr_right_m"] == pytest.approx(ICRS[0], abs=0.03)
+    assert final["y_icr_left_m"] == pytest.approx(ICRS[1], abs=0.03)
