@@ -40,7 +40,7 @@ def drive_around(hours: float) -> tuple[Drive, FrozenIcrs]:
     distance = integral(np.hypot(speed, turn * x))
     none = np.zeros(n, dtype=bool)
     dt_s = np.full(n, 1.0 / RATE_HZ)
-    drive = Drive(dt_s, speed - turn * y_left, speed - turn * y_right, north, east, heading, distance, none, none)
+    drive = Drive(dt_s, speed - turn * y_left, speed - turn * y_right, north, east, heading, distance, none, none, none)
     return drive, FrozenIcrs(y_right, y_left, x)
 
 

@@ -89,7 +89,8 @@ ModelRows = plain("ModelRows", {
     "name": str, "label": str, "knows": str | None, "by_horizon": list[SummaryRow], "blocks": list[Blocks],
 })  # fmt: skip
 NoTrial = plain("NoTrial", dict.fromkeys(
-    ("too_little_way_left", "across_wheel_gap", "ends_in_gnss_outage", "from_standstill", "across_slip_event"), int
+    ("too_little_way_left", "across_wheel_gap", "ends_in_gnss_outage", "from_standstill", "crosses_jump",
+     "across_slip_event"), int
 ))  # fmt: skip
 TrialCount = plain("TrialCount", {
     "horizon_m": float, "trials": int, "no_trial": NoTrial, "why_none": str | None,
@@ -136,7 +137,8 @@ Bootstrap = plain("Bootstrap", {"method": str, "block": str, "resamples": int, "
 DropoutDocument = plain("DropoutDocument", {
     "schema": Literal["icrtool/dropout/1"], "tool_version": str, "run": RunOfReport, "usable": bool,
     "unusable_because": str | None, "reference": str, "smoothed": bool, "starts": int,
-    "starts_counted": Literal["moving", "all"], "starts_standing": int, "without_events": EventCost | None,
+    "starts_counted": Literal["moving", "all"], "starts_standing": int, "with_jumps": bool,
+    "without_events": EventCost | None,
     "tolerance_m": float, "bootstrap": Bootstrap, "models": list[ModelRows], "trials": list[TrialCount],
     "reference_error": list[OwnError], "by_learning": Learned | None, "calibrations": list[Used],
     "recommended": Recommended | None, "budgets": list[record(BudgetDistance)], "by_turning": list[Split],

@@ -13,7 +13,7 @@ from icrtool.alignment.findings import alignment_findings, run_sections, start_i
 from icrtool.alignment.position.gnss_quality import grade_fixes
 from icrtool.alignment.position.gnss_steps import without_frozen
 from icrtool.alignment.position.sensor_noise import heading_variance, position_variance, reference_noise
-from icrtool.alignment.slip.slip_events import find_slip_events
+from icrtool.alignment.slip.slip_events import find_disagreements
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.wheels.wheel_alignment import bridged
 from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
@@ -98,18 +98,18 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
 
 
 def _with_events(log: RobotLog, config: Config, found: Measurements) -> Measurements:
-    """Return the streams with the slip events found in them, aligned a second time without those, where there are any.
+    """Return the streams with the slip events and jumps found in them; where there are events, aligned again without.
 
     A log with too little besides them keeps its first alignment.
     """
     width = width_or_usual_m(config.robot.track_width_m)
-    events = find_slip_events(found.sensors, width)
-    if events:
-        spans = tuple((event.begin_ns, event.end_ns) for event in events)
+    seen = find_disagreements(found.sensors, width)
+    if seen.events:
+        spans = tuple((event.begin_ns, event.end_ns) for event in seen.events)
         with suppress(DataError):
             found = _align_once(replace(log, slipping_ns=spans), config)
-            events = find_slip_events(found.sensors, width)
-    return replace(found, sensors=replace(found.sensors, events=events))
+            seen = find_disagreements(found.sensors, width)
+    return replace(found, sensors=replace(found.sensors, events=seen.events, jumps=seen.jumps))
 
 
 def sensors_as_sent(log: RobotLog, config: Config, measured: tuple[float, float] = (math.nan, math.nan)) -> SensorData:

@@ -76,6 +76,8 @@ def distances(text: str) -> tuple[float, ...]:
               help="Compare trials with the states of the filter, or of the smoother (fit --smooth).")  # fmt: skip
 @click.option("--without-events", is_flag=True,
               help="Leave out trials that cross a slip event, and report how much they change the errors.")  # fmt: skip
+@click.option("--with-jumps", is_flag=True,
+              help="Count trials that cross a jump of the reference too.")  # fmt: skip
 @click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
               help="moving: each standstill is one start; all: every recorded state is one.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
@@ -88,7 +90,7 @@ def command(
     sources: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
     horizons: tuple[float, ...] | None, calibrations: tuple[Path, ...], outages: tuple[float, ...],
     outages_at: tuple[float, ...], reference: Literal["filter", "smoothed"], without_events: bool,
-    starts: Literal["moving", "all"], trials: bool,
+    with_jumps: bool, starts: Literal["moving", "all"], trials: bool,
     seed: int | None, asked: ReportOptions, baseline: Path | None, junit: Path | None, markdown: Path | None,
     as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
@@ -113,7 +115,8 @@ def command(
         "horizons_m": horizons or (dropout.horizons_m if "dropout.horizons_m" in given else None),
         "outage_s": outages or (dropout.forced_outage_s if "dropout.forced_outage_s" in given else None),
         "calibrations": tuple(open_calibration(file) for file in calibrations), "outage_at_s": outages_at,
-        "starts": starts, "without_events": without_events, "reference": reference,
+        "starts": starts, "without_events": without_events, "with_jumps": with_jumps,
+        "reference": reference,
     } | ({"seed": seed} if seed is not None else {})  # fmt: skip
     request = Request(
         config=config, asked=asked, baseline=options.baseline_of(baseline, asked.gates), further=further,

@@ -178,11 +178,14 @@ def fit_log(
             **options_of_fit,
         )  # fmt: skip
     options.warn((*run.warnings, *_other_robot(warm_start, start, config), *notes), quiet=quiet)
+    from icrtool.output.text_format import jump_lines
     from icrtool.records.samples import ROLE_WORDS
 
     for stream in run.summary["streams"]:
         if verbose or ("chosen over" in stream["why"] and not quiet):
             click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
+    for line in jump_lines(run.summary["reference_jumps"]) if verbose else ():
+        click.echo(line, err=True)
     return run
 
 

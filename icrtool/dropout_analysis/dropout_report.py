@@ -39,6 +39,7 @@ def dropout_report(
     outage_at_s: Sequence[float] = (),
     starts: Starts = "moving",
     without_events: bool = False,
+    with_jumps: bool = False,
     calibrations: Sequence[Calibration] = (),
     comparison: bool = True,
     reference: Literal["filter", "smoothed"] = "filter",
@@ -60,6 +61,7 @@ def dropout_report(
     outage_at_s : their begins, seconds since the first state; default: spaced over the time the robot moves
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     without_events : leave out trials that cross a slip event; ``event_cost`` of the report holds the difference
+    with_jumps : count trials across jumps of the reference too, and fit across them
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
         ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro
     comparison : also test models on distance they were not fitted to; without it the rows are the filter's and no slip
@@ -80,6 +82,8 @@ def dropout_report(
     RunError
         `reference` is ``smoothed`` and the run has no smoothed states.
     """
+    if with_jumps:
+        run = replace(run, sensors=replace(run.sensors, jumps=()))
     whole = run
     run = leave_out_events(run) if without_events else run
     limits = [gate if isinstance(gate, Gate) else parse_gate(gate) for gate in gates]
@@ -103,6 +107,7 @@ def dropout_report(
     return replace(
         report,
         smoothed=reference == "smoothed",
+        with_jumps=with_jumps,
         examples=example_trials(compared),
         worst=worst_trials(compared, found, starts=starts),
         outages=(*forced, *real_outages(compared)),

@@ -124,13 +124,13 @@ def _meets(begin_s: Floats, length_s: float, from_s: Floats, to_s: Floats) -> Bo
 def _spaced(run: Run, length_s: float) -> list[float]:
     """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn.
 
-    Time from which an outage would reach into one of the log's own, or into a gap in the wheel data, is not one to
-    begin in.
+    Time from which an outage would reach into one of the log's own, a gap in the wheel data or a jump of the reference,
+    is not one to begin in.
     """
     t, last = run.table.t_s, float(run.table.t_s[-1])
     moves = ~standing_states(drive_of(run))[:-1]
     moves &= ~_in_real_outage(run, t[:-1], length_s)
-    gaps = np.flatnonzero(run.in_gap)
+    gaps = np.flatnonzero(run.in_gap | run.jumping)
     moves &= ~_meets(t[:-1], length_s, t[gaps], t[gaps + 1])
     moved = np.concatenate([[0.0], np.cumsum(np.diff(t) * moves)])
     before = float(np.interp(min(run.settled_s, last / 4), t, moved))

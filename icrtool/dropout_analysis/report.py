@@ -59,6 +59,7 @@ class DropoutReport:
     reference_error : what a perfect model would show
     by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
     reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
+    with_jumps : trials across jumps of the reference count, where the run has any
     smoothed : the reference is the smoother's trajectory, not the filter's
     budgets : by budget and model
     verdicts : of the acceptance limits
@@ -88,6 +89,7 @@ class DropoutReport:
     reference_error: ReferenceErrors | None = None
     by_learning: LearnedSplit | None = None
     smoothed: bool = False
+    with_jumps: bool = False
     budgets: tuple[BudgetDistance, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
     worst: tuple[ExampleTrial, ...] = ()

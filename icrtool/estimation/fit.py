@@ -9,6 +9,7 @@ from icrtool.alignment.align import align
 from icrtool.alignment.position.reference_choice import choose_reference
 from icrtool.config import Config
 from icrtool.estimation import smooth as smoother
+from icrtool.estimation.followed_jumps import followed_jumps
 from icrtool.estimation.run_filter import run_filter
 from icrtool.estimation.summary import summarise
 from icrtool.records.run import Run, WarmStart
@@ -43,6 +44,8 @@ def fit(
     del log
     begin("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)
+    jumps = followed_jumps(filtered.sensors, filtered.gnss, filtered.heading)
+    filtered = filtered._replace(sensors=replace(filtered.sensors, jumps=jumps))
     begin("summary")
     run = Run(
         name=name,

@@ -27,7 +27,7 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.chords import chord_rows
 from icrtool.kernels.filter.measurement_codes import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.records.events import SlipEvent
+from icrtool.records.events import ReferenceJump, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive, no_slip_icrs
@@ -46,9 +46,6 @@ SHORTEST_STEP_M, STEP_IN_STD = 0.1, 5.0
 
 LEAST_MODELLED = 0.5
 """Part of a chord that the model shows where the speed within it is the model's."""
-
-MOST_LISTED = 50
-"""Jumps of the position that run.json lists."""
 
 
 def summarise(
@@ -115,6 +112,7 @@ def summarise(
             "heading": measurements.sections["heading"] | counts(filtered.heading),
             "wheels": measurements.sections["wheels"],
             "events": event_summary(sensors.events, int(table.stamp_ns[0])),
+            "reference_jumps": span_rows(sensors.jumps, int(table.stamp_ns[0])),
             "outages_ns": filtered.outages_ns,
             "rtk_losses_ns": sensors.losses_ns,
             "wheel_gaps_ns": [[table.stamp_ns[k], table.stamp_ns[k + 1]] for k in np.flatnonzero(filtered.in_gap)],
@@ -220,11 +218,15 @@ def without_unlearned(document: RunDocument) -> RunDocument:
 
 def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str, Any]]:
     """Return the slip events with the columns of events.csv; `start_ns` is the stamp of the first recorded state."""
-    rows = [
-        event._asdict() | {"begin_s": (event.begin_ns - start_ns) / 1e9, "end_s": (event.end_ns - start_ns) / 1e9}
-        for event in events
+    return [{column: row[column] for column in EVENT_COLUMNS} for row in span_rows(events, start_ns)]
+
+
+def span_rows(spans: Sequence[SlipEvent | ReferenceJump], start_ns: int) -> list[dict[str, Any]]:
+    """Return spans as rows, begin and end also in seconds since the first recorded state, of stamp `start_ns`."""
+    return [
+        one._asdict() | {"begin_s": (one.begin_ns - start_ns) / 1e9, "end_s": (one.end_ns - start_ns) / 1e9}
+        for one in spans
     ]
-    return [{column: row[column] for column in EVENT_COLUMNS} for row in rows]
 
 
 def _end_errors(table: States, in_gap: Bools, track_width_m: float | None) -> dict[str, Any]:
@@ -237,7 +239,7 @@ def _end_errors(table: States, in_gap: Bools, track_width_m: float | None) -> di
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:
-    """Return how many fixes of each class there were and how they were used, and the jumps of the position."""
+    """Return how many fixes of each class there were and how they were used."""
     classes = {}
     for code, name in CLASSES.items():
         rows = fixes.fix_class == code
@@ -246,12 +248,7 @@ def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementO
             counted |= {"down_weighted": rows & fixes.down_weighted, "sold_as_fixed": rows & fixes.misreported}
             counts = {key: int(np.count_nonzero(marked)) for key, marked in counted.items()}
             classes[name] = counts | {"std_m": statistics.std_m[name], "step_std_m": statistics.step_std_m[name]}
-    jumps = list(zip(statistics.jump_stamp_ns, statistics.jump_m, strict=True))
-    return {
-        "classes": classes,
-        "jumps": len(jumps),
-        "jump_list": [{"stamp_ns": stamp, "size_m": size} for stamp, size in jumps[:MOST_LISTED]],
-    }
+    return {"classes": classes}
 
 
 def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:

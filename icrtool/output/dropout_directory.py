@@ -115,6 +115,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "starts": report.states,
         "starts_counted": report.starts,
         "starts_standing": report.standing,
+        "with_jumps": report.with_jumps,
         "without_events": _event_document(report),
         "tolerance_m": TOLERANCE_M,
         "bootstrap": {

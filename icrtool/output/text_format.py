@@ -65,6 +65,31 @@ def event_kinds(events: Sequence[Mapping[str, Any]]) -> str:
     return ", ".join(f"{count} {kind}" for kind, count in Counter(event["kind"] for event in events).items())
 
 
+def jump_lines(jumps: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line for each jump of the reference: when, how large, why it is one, and what follows."""
+    return [
+        f"reference jump from {one['begin_s']:.1f} to {one['end_s']:.1f} s: {_jump_size(one)}: {one['why']}; "
+        f"{'trials cross it' if one['undecided'] else 'no trial crosses it'}"
+        for one in jumps
+    ]
+
+
+def _jump_size(jump: Mapping[str, Any]) -> str:
+    turned = f"{abs(jump['turn_deg']):.0f}°"
+    return turned if jump["kind"] == "heading" else f"{error_text(jump['size_m'])} and {turned}"
+
+
+def jump_count(jumps: Sequence[Mapping[str, Any]]) -> str:
+    """Return how often the reference jumps, as ``2 jumps of the reference, up to 3.1 m``; empty where it does not."""
+    decided = [one for one in jumps if not one["undecided"]]
+    undecided = f"{counted(len(jumps) - len(decided), 'step')} of undecided cause" if len(jumps) > len(decided) else ""
+    if not decided:
+        return undecided
+    largest = max(decided, key=lambda one: (one["kind"] == "position", one["size_m"], abs(one["turn_deg"])))
+    text = f"{counted(len(decided), 'jump')} of the reference, up to {_jump_size(largest)}"
+    return f"{text}; {undecided}" if undecided else text
+
+
 def xml_text(text: str) -> str:
     """Return text without the characters that XML 1.0 cannot hold; the rest is escaped by the writer."""
     return _NOT_XML.sub("?", text)

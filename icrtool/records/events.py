@@ -1,4 +1,4 @@
-"""Slip events: time spans in which the robot does not move as its wheels do."""
+"""Time spans in which robot or reference do not move as the wheels do: slip events, jumps of the reference."""
 
 from __future__ import annotations
 
@@ -33,6 +33,37 @@ class SlipEvent(NamedTuple):
     distance_m: float
     severity: float
     confidence: float
+
+
+JumpKind = Literal["position", "heading"]
+"""What jumps: the position, alone or with the heading, or the heading alone."""
+
+
+class ReferenceJump(NamedTuple):
+    """One discontinuity of the reference: it moves as no robot can, or as its own messages explain.
+
+    Attributes
+    ----------
+    begin_ns, end_ns : stamps of the wheel clock, from the last pose before to the first after that the filter followed
+    north_m, east_m : position before it, in the local plane
+    size_m : largest step of the position within it, beyond the motion of the wheels
+    turn_deg : likewise of the heading, clockwise; 0 where the heading is not stated with the position
+    moved_north_m, moved_east_m : sum of its steps
+    why : what shows it
+    undecided : it may as well be the robot: its trials count
+    """
+
+    kind: JumpKind
+    begin_ns: int
+    end_ns: int
+    north_m: float
+    east_m: float
+    size_m: float
+    turn_deg: float
+    moved_north_m: float
+    moved_east_m: float
+    why: str
+    undecided: bool
 
 
 def intervals_in(stamps_ns: Ints, spans_ns: Iterable[tuple[int, int]]) -> Bools:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
-from icrtool.records.events import SlipEvent
+from icrtool.records.events import ReferenceJump, SlipEvent
 from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
 RESPONSE_S = 0.1
@@ -89,6 +89,7 @@ class SensorData:
     antenna_m : the antenna from the body origin, forward and right
     losses_ns : half-open spans in which RTK was lost, (k, 2)
     events : slip events, in order of time
+    jumps : of the reference, likewise
     icr_start : initial ICRs by the alignment, or typical ones of such robots; None: those of the preset
     """
 
@@ -102,6 +103,7 @@ class SensorData:
     antenna_m: tuple[float, float]
     losses_ns: Ints
     events: tuple[SlipEvent, ...] = ()
+    jumps: tuple[ReferenceJump, ...] = ()
     icr_start: IcrStart | None = None
     heading_is_estimated: bool = False
     heading_is_measured: bool = False
@@ -144,13 +146,10 @@ class FixStatistics:
     ----------
     std_m : by class name, median standard deviation stated or measured [m], NaN where none is known
     step_std_m : by class name, white noise from step to step [m]; NaN where too few steps show it
-    jump_stamp_ns : (j,) first fix after a jump, before any reference delay is corrected; jump_m : (j,) its size
     """
 
     std_m: dict[str, float]
     step_std_m: dict[str, float]
-    jump_stamp_ns: Ints
-    jump_m: Floats
 
 
 @dataclass(frozen=True, slots=True)

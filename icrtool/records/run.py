@@ -140,6 +140,12 @@ class Run:
         return intervals_in(self.table.stamp_ns, ((event.begin_ns, event.end_ns) for event in self.sensors.events))
 
     @property
+    def jumping(self) -> Bools:
+        """Whether the reference jumps in the interval after a state, and that is not what the robot did (n,)."""
+        decided = (jump for jump in self.sensors.jumps if not jump.undecided)
+        return intervals_in(self.table.stamp_ns, ((jump.begin_ns, jump.end_ns) for jump in decided))
+
+    @property
     def convergence_s(self) -> dict[IcrColumn, tuple[float, float] | None]:
         """By ICR column, first and last second of the 10-90 % convergence, or None."""
         spans = self.summary["icr"]["convergence_span_s"]
@@ -238,11 +244,11 @@ def no_slip_icrs(track_width_m: float) -> Icrs:
 
 def drive_of(run: Run) -> Drive:
     """Return the states of a run as input of the kernels."""
-    return make_drive(run.table, run.in_gap, run.outages_ns)
+    return make_drive(run.table, run.in_gap, run.outages_ns, run.jumping)
 
 
-def make_drive(table: States, in_gap: Bools, outages_ns: Ints) -> Drive:
-    """Return states as input of the kernels."""
+def make_drive(table: States, in_gap: Bools, outages_ns: Ints, jumping: Bools | None = None) -> Drive:
+    """Return states as input of the kernels; `jumping` as that of `Run`, None for no jumps."""
     in_outage = np.zeros(len(table), np.bool_)
     for begin, end in outages_ns:
         # The last fix is still good at `begin`, and the first one again at `end`.
@@ -259,6 +265,7 @@ def make_drive(table: States, in_gap: Bools, outages_ns: Ints) -> Drive:
         distance=table.distance_m,
         gap=in_gap,
         in_outage=in_outage,
+        jump=np.zeros(len(table), np.bool_) if jumping is None else jumping,
     )
 
 
@@ -267,5 +274,14 @@ def straight_drive() -> Drive:
     path = np.arange(20.0)
     no = np.zeros(len(path), np.bool_)
     return Drive(
-        np.ones_like(path), np.ones_like(path), np.ones_like(path), path, 0 * path, 0 * path, path, no, no.copy()
+        np.ones_like(path),
+        np.ones_like(path),
+        np.ones_like(path),
+        path,
+        0 * path,
+        0 * path,
+        path,
+        no,
+        no.copy(),
+        no.copy(),
     )

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import msgspec
 
-from icrtool.records.events import SlipKind
+from icrtool.records.events import JumpKind, SlipKind
 from icrtool.records.samples import Role
 
 Excited = Literal["shown", "weak", "not shown"]
@@ -140,11 +140,22 @@ class ClassDocument(TypedDict):
     sold_as_fixed: int
 
 
-class JumpDocument(TypedDict):
-    """A jump of the position."""
+class ReferenceJumpDocument(TypedDict):
+    """A discontinuity of the reference, as `icrtool.records.events.ReferenceJump`."""
 
-    stamp_ns: int
+    kind: JumpKind
+    begin_s: float
+    end_s: float
+    begin_ns: int
+    end_ns: int
+    north_m: float
+    east_m: float
     size_m: float
+    turn_deg: float
+    moved_north_m: float
+    moved_east_m: float
+    why: str
+    undecided: bool
 
 
 class GnssDocument(TypedDict):
@@ -161,8 +172,6 @@ class GnssDocument(TypedDict):
     delay_s: float | None
     delay_std_s: float | None
     classes: dict[str, ClassDocument]
-    jumps: int
-    jump_list: list[JumpDocument]
 
 
 class HeadingDocument(TypedDict):
@@ -315,6 +324,7 @@ class RunDocument(TypedDict):
     heading: HeadingDocument
     wheels: dict[str, Any]
     events: list[EventDocument]
+    reference_jumps: list[ReferenceJumpDocument]
     outages_ns: Spans
     rtk_losses_ns: Spans
     wheel_gaps_ns: Spans

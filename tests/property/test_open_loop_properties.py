@@ -58,7 +58,7 @@ def drives(draw, least_separation=0.0):
     reference = [np.cumsum(rng.normal(0.0, 0.02, n)) for _ in range(3)]
     gap, in_outage = (rng.random(n) < draw(st.sampled_from([0.0, 0.02])) for _ in range(2))
     icrs = FrozenIcrs(y_right, y_left, icr_track(0.1, jumps, n, rng))
-    return Drive(dt_s, v_left, v_right, *reference, distance, gap, in_outage), icrs
+    return Drive(dt_s, v_left, v_right, *reference, distance, gap, in_outage, np.zeros(len(gap), np.bool_)), icrs
 
 
 def assert_equal(errors, expected):

@@ -1,4 +1,4 @@
-"""Classes of the fixes: fixed, float or other by what they state and how they move; noise by class; jumps counted.
+"""Classes of the fixes: fixed, float or other by what they state and how they move; noise by class.
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
 tens of seconds: treated as independent they would mislead the filter. Some drivers still state a centimetre.
@@ -56,7 +56,7 @@ class GnssQuality:
     fix_class : uint8 (m,), keys of `CLASSES`
     misreported : bool (m,), reported as fixed and are not
     down_weighted : bool (m,), given a larger variance for their class
-    statistics : of the classes, and the jumps
+    statistics : of the classes
     losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
     """
 
@@ -96,7 +96,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
         fix_class=kinds,
         misreported=misreported,
         down_weighted=down,
-        statistics=FixStatistics(_class_std(gnss, kinds), white, gnss.stamp_ns[steps.jump_row], steps.jump_m),
+        statistics=FixStatistics(_class_std(gnss, kinds), white),
         losses_ns=_losses(gnss.stamp_ns, fixed) if norm else NO_SPANS,
         warnings=(),
     )

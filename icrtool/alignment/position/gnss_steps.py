@@ -59,11 +59,6 @@ class FixSteps:
     jump_row: Ints
     jump: Complexes
 
-    @property
-    def jump_m(self) -> Floats:
-        """Sizes of the jumps (j,) [m]."""
-        return np.asarray(np.abs(self.jump), np.float64)
-
     def white_std_m(self, rows: Bools) -> float:
         """Return the white noise of the fixes `rows` (m,), an axis [m]; NaN where there are too few steps."""
         inside = rows[:-2] & rows[1:-1] & rows[2:] & np.isfinite(self.product)

@@ -1,4 +1,4 @@
-"""Slip events: where wheels and motion disagree beyond what the motion model and the noise of the sensors allow.
+"""Where wheels and reference disagree beyond what motion model and noise of the sensors allow: slip events, and jumps.
 
 Pentzer 2014, Sections 2 and 7: ICRs that grow without bound mean pure slip or a robot that is stuck. Here it is found
 from the aligned measurements, before any filter, by a test over windows of half a second and more.
@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.slip.reference_jumps import decide_jumps, without_jumps
 from icrtool.alignment.slip.slip_extent import Extent, find_extent
 from icrtool.alignment.slip.slip_windows import Knots, Motion, Windows, compare, cut, fit_motion, lay_knots
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.records.events import SlipEvent
+from icrtool.records.events import ReferenceJump, SlipEvent
 from icrtool.records.measurements import SensorData
 
 WINDOWS_S = (0.5, 1.0, 2.0)
@@ -46,10 +47,6 @@ NORMAL_QUANTILE = {FIRST_QUANTILE: 1.0364, LATER_QUANTILE: 1.9600}
 MOST_FALSE = 0.25
 """Most windows that show what slip cannot do, for each that shows slip as clearly."""
 
-JUMP_SIGMAS = 6.0
-JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3
-"""A step beyond the noise by so many deviations, and beyond what wheels and a slide can do, is no motion."""
-
 RETURN_S, RETURNED_SHARE, RETURN_SIGMAS = 5.0, 0.5, 5.0
 """A reference that comes back by this share within this time was wrong; what is missed must stand out of its noise."""
 
@@ -76,8 +73,15 @@ class _Evidence(NamedTuple):
     false_rate: Floats
 
 
-def find_slip_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ...]:
-    """Find the spans in which the robot did not do what its wheels did.
+class Disagreements(NamedTuple):
+    """Where the reference does not do what the wheels do: by the robot, or by an error of its own; in order of time."""
+
+    events: tuple[SlipEvent, ...] = ()
+    jumps: tuple[ReferenceJump, ...] = ()
+
+
+def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
+    """Find the spans in which the robot did not do what its wheels did, and those in which the reference jumps.
 
     Parameters
     ----------
@@ -86,8 +90,8 @@ def find_slip_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ..
 
     Returns
     -------
-    tuple of SlipEvent
-        In order of time; none where the motion model cannot be fitted.
+    Disagreements
+        None where the motion model cannot be fitted.
 
     Notes
     -----
@@ -99,50 +103,36 @@ def find_slip_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ..
     A reference that is worse than it states makes the robot do too much as often as too little. Windows in which a side
     does more than its wheels, which no slip can cause, are counted: where there are many, the others are not used
     (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
+
+    Steps from fix to fix that may be jumps (`icrtool.alignment.slip.reference_jumps`) are in no window.
     """
     try:
-        return _found_events(sensors, width_m)
+        return _found(sensors, width_m)
     except np.linalg.LinAlgError:
         # Exact data, or intervals of very different lengths: nothing separates the parameters of the motion.
-        return ()
+        return Disagreements()
 
 
-def _found_events(sensors: SensorData, width_m: float) -> tuple[SlipEvent, ...]:
+def _found(sensors: SensorData, width_m: float) -> Disagreements:
     knots = lay_knots(sensors)
     if knots is None:
-        return ()
-    knots = _without_jumps(knots)
+        return Disagreements()
+    knots, steps = without_jumps(knots, width_m)
     quiet = np.ones(len(knots.t), np.bool_)
-    events: list[SlipEvent] = []
+    found = Disagreements()
     for quantile in (FIRST_QUANTILE, LATER_QUANTILE):
         model = fit_motion(knots, width_m, quiet)
         if model is None:
-            return ()
+            return Disagreements()
         evidence, error = _weigh(knots, model, quiet, quantile)
         quiet = np.ones(len(knots.t), np.bool_)
-        events = []
+        events: list[SlipEvent] = []
         for extent, row in _separate(knots, model, evidence, error):
             quiet[max(extent.first - 1, 0) : extent.last + 2] = False
             events.append(_event(knots, extent, float(evidence.distance2[row]), float(evidence.false_rate[row])))
-    return tuple(sorted(events, key=lambda event: event.begin_ns))
-
-
-def _without_jumps(knots: Knots) -> Knots:
-    """Return the knots without single outliers; a jump that stays becomes a hole, which no window spans."""
-
-    def impossible(first: Ints, last: Ints) -> Bools:
-        noise = np.sqrt(knots.variance[first] + knots.variance[last])
-        path, duration = knots.path_m[last] - knots.path_m[first], knots.t[last] - knots.t[first]
-        most = JUMP_SIGMAS * noise + JUMP_SPEED_SHARE * path + JUMP_MPS * duration
-        return np.asarray(np.abs(knots.place[last] - knots.place[first]) > most)
-
-    row = np.arange(len(knots.t))
-    step, over = impossible(row[:-1], row[1:]), impossible(row[:-2], row[2:])
-    kept = np.ones(len(row), np.bool_)
-    kept[1:-1] = ~(step[:-1] & step[1:] & ~over)
-    knots = knots.rows(kept)
-    row = row[: len(knots.t)]
-    return knots._replace(holes=knots.holes + np.concatenate([[0], np.cumsum(impossible(row[:-1], row[1:]))]))
+        events.sort(key=lambda event: event.begin_ns)
+        found = Disagreements(tuple(events), decide_jumps(knots, model, steps))
+    return found
 
 
 def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple[_Evidence, Floats]:

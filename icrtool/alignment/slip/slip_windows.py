@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.alignment.drive_windows import DriveArrays, cut_windows, join_streams, window_length
 from icrtool.alignment.estimator import estimate_alignment
-from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints
 from icrtool.kernels.robust import mad_std
 from icrtool.records.measurements import SensorData
 
@@ -48,6 +48,8 @@ class Knots(NamedTuple):
     path_m : (m,) mean distance of the sides, forward or not
     held_m2 : (m,) variance that values held from sample to sample add to a side's distance
     holes : (m,) number of holes in any stream so far
+    fix_class : (m,) classes of the fixes
+    turn_follows_place : the headings are estimated from the positions, and jump with them
     """
 
     epoch_ns: int
@@ -62,6 +64,8 @@ class Knots(NamedTuple):
     path_m: Floats
     held_m2: Floats
     holes: Ints
+    fix_class: Bytes
+    turn_follows_place: bool
 
     def rows(self, kept: Bools) -> Knots:
         """Return the knots marked in `kept` (m,)."""
@@ -153,6 +157,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         path_m=at((np.abs(left) + np.abs(right)) / 2),
         held_m2=np.interp(t, wheel_t, _held_variance(wheel_t, left, right)),
         holes=_holes(t, wheel_t) + _holes(t, drive.heading_t) + np.concatenate([[0], np.cumsum(gap)]),
+        fix_class=fixes.fix_class[rows], turn_follows_place=sensors.heading_is_estimated,
     )  # fmt: skip
 
 

@@ -25,6 +25,8 @@ OUTAGE = -3
 """No trial: it ends at a state without a reference (a real outage)."""
 STANDING = -4
 """No trial: the robot stands at the start, and another start counts for this standstill."""
+JUMP = -5
+"""No trial: the reference jumps between its start and its end."""
 
 
 @njit
@@ -150,7 +152,7 @@ def trial_ends(drive: Drive, horizons_m: Floats, lo: int = 0, hi: int | None = N
     Returns
     -------
     int64 (hi - lo, n_horizons), one horizon contiguous: index of the first state j with
-    ``distance[j] - distance[k] >= horizon``, or `SHORT`, `GAP`, `OUTAGE`. The same for every model.
+    ``distance[j] - distance[k] >= horizon``, or `SHORT`, `GAP`, `OUTAGE`, `JUMP`. The same for every model.
     """
     return ends_from(drive, horizons_m, np.arange(lo, len(drive.distance) if hi is None else hi))
 
@@ -160,12 +162,15 @@ def ends_from(drive: Drive, horizons_m: Floats, starts: Ints) -> Ints:
     horizons = np.require(horizons_m, np.float64, ["C", "A", "W"])
     ends = np.empty((len(horizons), len(starts)), np.int64)
     find_trial_ends(compiled_drive(drive), horizons, np.require(starts, np.int64, ["C", "A", "W"]), ends)
+    if drive.jump.any():
+        jumps: Ints = np.cumsum(drive.jump) - drive.jump
+        ends[(ends >= 0) & (jumps[np.maximum(ends, 0)] > jumps[starts])] = JUMP
     return ends.T
 
 
 def count_trials(ends: Ints) -> TrialCounts:
     """Count trials and the kinds of no trial per horizon in `ends` (n_starts, n_horizons)."""
-    kinds = [(ends == kind).sum(axis=0, dtype=np.int64) for kind in (SHORT, GAP, OUTAGE, STANDING)]
+    kinds = [(ends == kind).sum(axis=0, dtype=np.int64) for kind in (SHORT, GAP, OUTAGE, STANDING, JUMP)]
     return TrialCounts(len(ends) - np.sum(kinds, axis=0), *kinds)
 
 

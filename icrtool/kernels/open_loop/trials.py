@@ -23,6 +23,7 @@ class Drive(NamedTuple):
     distance : float64, path length [m], non-decreasing
     gap : bool, the interval from k to k + 1 is a gap in the wheel data
     in_outage : bool, state k has no reference to compare a trial's end with
+    jump : bool, the reference jumps in the interval from k to k + 1
     """
 
     dt_s: Floats
@@ -34,6 +35,7 @@ class Drive(NamedTuple):
     distance: Floats
     gap: Bools
     in_outage: Bools
+    jump: Bools
 
 
 class FrozenIcrs(NamedTuple):
@@ -70,6 +72,7 @@ class TrialCounts(NamedTuple):
     gap: Ints
     outage: Ints
     standing: Ints
+    crosses_jump: Ints
 
 
 class Summary(NamedTuple):

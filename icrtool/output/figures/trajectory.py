@@ -157,13 +157,12 @@ def _draw_events(axes: Axes, run: Run) -> None:
 
 
 def _draw_jumps(axes: Axes, run: Run) -> None:
-    """Mark where the position reference jumped, each where the filter was at that time."""
-    table = run.table
-    stamps = np.array([jump["stamp_ns"] for jump in run.summary["gnss"]["jump_list"]], np.int64)
-    if len(stamps):
-        rows = np.clip(np.searchsorted(table.stamp_ns, stamps), 0, len(table) - 1)
-        largest = max(jump["size_m"] for jump in run.summary["gnss"]["jump_list"])
-        axes.plot(table.east_m[rows], table.north_m[rows], label=f"jump, up to {error_text(largest)}", **JUMP_LOOK)
+    """Mark where the reference jumped, each where it was before."""
+    jumps = [jump for jump in run.sensors.jumps if not jump.undecided]
+    if jumps:
+        largest = max(jump.size_m for jump in jumps)
+        east, north = [jump.east_m for jump in jumps], [jump.north_m for jump in jumps]
+        axes.plot(east, north, label=f"jump, up to {error_text(largest)}", **JUMP_LOOK)
 
 
 def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:

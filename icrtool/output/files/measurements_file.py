@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Ints
-from icrtool.records.events import SlipEvent
+from icrtool.records.events import ReferenceJump, SlipEvent
 from icrtool.records.measurements import Fixes, IcrStart, SensorData
 from icrtool.records.regular_file import open_regular
 from icrtool.records.run import MeasurementOutcome, Run
@@ -85,7 +85,8 @@ def read_measurements(
     OSError
         The file cannot be read.
     """
-    facts, events = document["filter"], cast("list[dict[str, Any]]", document["events"])
+    facts = document["filter"]
+    events, jumps = (cast("list[dict[str, Any]]", document[key]) for key in ("events", "reference_jumps"))
     start = facts["icr_start"]
     try:
         with open_regular(directory / MEASUREMENTS_FILE, directory) as file, ZipFile(file) as stored:
@@ -107,6 +108,7 @@ def read_measurements(
             antenna_m=(facts["antenna_m"][0], facts["antenna_m"][1]),
             losses_ns=spans_of(document["rtk_losses_ns"]),
             events=tuple(SlipEvent(*(event[name] for name in SlipEvent._fields)) for event in events),
+            jumps=tuple(ReferenceJump(*(jump[name] for name in ReferenceJump._fields)) for jump in jumps),
             icr_start=None if start is None else IcrStart(_triple(start["icrs_m"]), _triple(start["std_m"])),
             heading_is_estimated=facts["heading_is_estimated"],
             heading_is_measured=facts.get("heading_is_measured", False),

@@ -10,7 +10,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import controller_rows, format_export
-from icrtool.output.text_format import controller_error_text, error_text, event_kinds, excitation_text
+from icrtool.output.text_format import controller_error_text, error_text, event_kinds, excitation_text, jump_count
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.text import counted
 
@@ -116,9 +116,9 @@ def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Ch
     if of := gnss["used"] + gnss["rejected"]:
         share = 100 * gnss["rejected"] / of
         found.append(("fact", f"{gnss['rejected']:,} of {of:,} positions ({share:.0f} %) were rejected."))
-    if gnss["jumps"]:
-        text = f"{counted(gnss['jumps'], 'jump')} of the position: a trial across one shows its size as an error."
-        found.append(("care", text))
+    if jumps := jump_count(summary["reference_jumps"]):
+        counts = "trials across them count" if report["with_jumps"] else "no trial crosses a jump"
+        found.append(("care", f"{jumps}: {counts}."))
     return found
 
 

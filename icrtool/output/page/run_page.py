@@ -162,12 +162,14 @@ def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[d
         end_s = one["t_s"] + (one["horizon_m"] / speed if speed else 0.0)
         end_ns = one["stamp_ns"] + round(1e9 * (end_s - one["t_s"]))
         sizes = [
-            jump["size_m"] for jump in summary["gnss"]["jump_list"] if one["stamp_ns"] <= jump["stamp_ns"] <= end_ns
+            jump["size_m"]
+            for jump in summary["reference_jumps"]
+            if jump["begin_ns"] < end_ns and jump["end_ns"] > one["stamp_ns"]
         ]
         real = [out for out in report["outages"] if out["kind"] == "real"]
         lost = [out for out in real if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
         slips = [slip["kind"] for slip in summary["events"] if slip["begin_s"] < end_s and slip["end_s"] > one["t_s"]]
-        notes = [f"the position jumps by {error_text(max(sizes))}"] if sizes else []
+        notes = [f"the position steps by {error_text(max(sizes))}"] if sizes else []
         notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]
         notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
         found.append({**one, "note": ", ".join(notes)})

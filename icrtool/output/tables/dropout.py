@@ -189,6 +189,7 @@ def no_trial(report: DropoutReport) -> tuple[NoTrial, ...]:
         NoTrial("across_wheel_gap", "  across a wheel gap", "the path crosses a gap in the wheel data", counts.gap),
         NoTrial("ends_in_gnss_outage", "  ends in GNSS outage", "it ends in a GNSS outage", counts.outage),
         NoTrial("from_standstill", "  from standstill", "the robot stands", counts.standing),
+        NoTrial("crosses_jump", "  across a reference jump", "the reference jumps on the path", counts.crosses_jump),
         NoTrial("across_slip_event", "  across a slip event", "the path crosses a slip event", slip),
     )  # fmt: skip
 

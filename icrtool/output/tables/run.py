@@ -17,6 +17,7 @@ from icrtool.output.text_format import (
     excitation_text,
     filter_agreement,
     icr_value_text,
+    jump_count,
     position_word,
     role_word,
     run_title,
@@ -153,7 +154,7 @@ def _position_rows(run: Run) -> list[Row]:
             f"{gnss['used']:,} used, {gnss['rejected']:,} rejected{f' ({why})' if why else ''}",
         )
     )
-    lines += _class_rows(gnss["classes"], gnss["jumps"])
+    lines += _class_rows(gnss["classes"], jump_count(run.summary["reference_jumps"]))
     if gnss["recoveries"]:
         times = "once" if gnss["recoveries"] == 1 else f"{gnss['recoveries']:,} times"
         lines.append(("", f"re-acquired after rejection: {times}"))
@@ -165,7 +166,7 @@ def _position_rows(run: Run) -> list[Row]:
     return lines
 
 
-def _class_rows(classes: dict[str, ClassDocument], jumps: int) -> list[Row]:
+def _class_rows(classes: dict[str, ClassDocument], jumps: str) -> list[Row]:
     """Return what classes the fixes were of, where they were not all of one, and what was done to them."""
     lines = []
     for name, one in classes.items() if len(classes) > 1 else ():
@@ -174,7 +175,7 @@ def _class_rows(classes: dict[str, ClassDocument], jumps: int) -> list[Row]:
         done += [f"{one['sold_as_fixed']:,} wrongly reported as fixed"] if one["sold_as_fixed"] else []
         lines.append(("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
     if jumps:
-        lines.append(("", f"{counted(jumps, 'jump')} of the position"))
+        lines.append(("", jumps))
     return lines
 
 

@@ -25,6 +25,13 @@ LOGS = {
 EQUAL_M = 1e-9
 """What the fast algorithm promises."""
 
+LIDAR_JUMPS, CLEAN = (
+    "real/husky_wet_grass",
+    ("real/warthog_grass.bag", "real/warthog_asphalt", "simulated/tracked_trouble"),
+)
+WITHIN_M = 2.5
+"""At 10 m (95 %), of a robot whose wheels stand for its motion; two paths of 10 m cannot end more than 20 m apart."""
+
 MOST_STEPS = 2e7
 """Steps of direct integration a model and log: above, every so many-th start is tried."""
 
@@ -49,3 +56,23 @@ def test_every_error_equals_brute_force(shared_logs: Path, name: str) -> None:
         np.testing.assert_allclose(
             errors, open_loop_errors_direct(drive, model.icrs, ends), rtol=0, atol=EQUAL_M, err_msg=model.name
         )
+
+
+def test_lidar_poses_that_jump_by_metres_are_not_charged_to_the_robot(shared_logs: Path) -> None:
+    config = icrtool.load_config(robot=LOGS[LIDAR_JUMPS])
+    run = icrtool.fit(icrtool.read_log(shared_logs / LIDAR_JUMPS, config), config)
+    decided = [jump for jump in run.sensors.jumps if not jump.undecided]
+    assert max(jump.size_m for jump in decided) > 10.0
+    report = dropout(run, [10.0])
+    for name in ("icr", "icr_final"):
+        result = report.result(name)
+        assert result is not None
+        assert result.summary.p95[0] < WITHIN_M
+    assert report.counts.trials[0] > report.counts.crosses_jump[0]
+
+
+@pytest.mark.parametrize("name", CLEAN)
+def test_references_without_jumps_keep_every_trial(shared_logs: Path, name: str) -> None:
+    config = icrtool.load_config(robot=LOGS[name])
+    run = icrtool.fit(icrtool.read_log(shared_logs / name, config), config)
+    assert not run.jumping.any()

@@ -13,7 +13,7 @@ HORIZON_M, STEP_M = 5.0, 0.6
 
 def drive_along(distance: np.ndarray, heading: np.ndarray) -> Drive:
     one, no = np.ones(len(distance)), np.zeros(len(distance), np.bool_)
-    return Drive(one, one, one, 0 * one, 0 * one, heading, distance, no, no.copy())
+    return Drive(one, one, one, 0 * one, 0 * one, heading, distance, no, no.copy(), no.copy())
 
 
 @pytest.mark.parametrize("seed", range(5))

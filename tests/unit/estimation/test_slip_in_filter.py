@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.align import align, sensors_as_sent
+from icrtool.alignment.slip.slip_events import Disagreements
 from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
@@ -123,7 +124,7 @@ def test_an_event_is_left_out_of_the_alignment(monkeypatch: pytest.MonkeyPatch) 
     log = log_with_spin()
     found = align(log, CONFIG)
     assert [event.kind for event in found.sensors.events] == ["spin"]
-    monkeypatch.setattr("icrtool.alignment.align.find_slip_events", lambda sensors, width_m: ())
+    monkeypatch.setattr("icrtool.alignment.align.find_disagreements", lambda sensors, width_m: Disagreements())
     once = align(log, CONFIG)
     true = ICRS[0] - ICRS[1]
     errors = [abs((one.findings["icr_separation_m"].value or 0.0) - true) for one in (found, once)]

@@ -97,6 +97,7 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
         "too_little_way_left",
         "across_wheel_gap",
         "across_slip_event",
+        "crosses_jump",
         "ends_in_gnss_outage",
         "from_standstill",
     }

@@ -145,7 +145,7 @@ def test_an_edited_calibration_is_refused_in_one_line_or_can_be_used(
 
 @pytest.mark.parametrize(
     ("section", "key", "wrong"),
-    [("alignment", "wheel_scale", -1), ("alignment", "x_icr_m", None), ("gnss", "jump_list", 1e300)],
+    [("alignment", "wheel_scale", -1), ("alignment", "x_icr_m", None), ("gnss", "classes", 1e300)],
 )
 def test_a_page_of_an_edited_run_is_refused_in_one_line(
     run_place: Path, tmp_path: Path, section: str, key: str, wrong: object

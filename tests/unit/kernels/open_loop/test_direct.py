@@ -42,9 +42,9 @@ def make_drive(v_left, v_right, icrs, dt=0.01, north0=0.0, east0=0.0, heading0=0
     north = north0 + integral(v_x * np.cos(heading) - v_y * np.sin(heading))
     east = east0 + integral(v_x * np.sin(heading) + v_y * np.cos(heading))
     none = np.zeros(n, dtype=bool)
-    return Drive(
-        dt_s, v_left.copy(), v_right.copy(), north, east, heading, integral(np.hypot(v_x, v_y)), none, none.copy()
-    )
+    distance = integral(np.hypot(v_x, v_y))
+    flags = none, none.copy(), none.copy()
+    return Drive(dt_s, v_left.copy(), v_right.copy(), north, east, heading, distance, *flags)
 
 
 def winding_drive(n=1500, dt=0.02, seed=0):
@@ -265,7 +265,7 @@ def test_read_only_strided_and_integer_columns_are_taken():
     expected = open_loop_errors(drive, icrs, trial_ends(drive, HORIZONS))
     table = np.stack(drive[:7], axis=1)
     table.flags.writeable = False
-    odd = Drive(*table.T, drive.gap.astype(int), drive.in_outage.tolist())
+    odd = Drive(*table.T, drive.gap.astype(int), drive.in_outage.tolist(), drive.jump)
     np.testing.assert_array_equal(open_loop_errors(odd, icrs, trial_ends(odd, HORIZONS)), expected)
     assert len(open_loop.find_trial_ends.signatures) == 1
 

@@ -22,6 +22,7 @@ from icrtool.output.dropout_directory import report_document
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
+from icrtool.records.events import ReferenceJump
 from icrtool.records.run import Run
 from support.barn import configured, simulate
 
@@ -90,11 +91,12 @@ def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> No
 
 
 def test_a_worst_trial_in_which_the_reference_jumped_is_marked(run: Run, report: DropoutReport) -> None:
-    jump = {"stamp_ns": report.worst[0].stamp_ns + 10**9, "size_m": 7.25}
-    jumping = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "jump_list": [jump]}})
+    at = report.worst[0].stamp_ns + 10**9
+    jump = ReferenceJump("position", at, at + 10**8, 0.0, 0.0, 7.25, 0.0, 7.25, 0.0, "", undecided=True)
+    jumping = replace(run, summary={**run.summary, "reference_jumps": [jump._asdict()]})
     found = [run_page(one, report_document(report), {}) for one in (run, jumping)]
     texts = [" ".join("".join(Elements(page).text).split()) for page in found]
-    assert ["jumps by 7.25 m" in text for text in texts] == [False, True]
+    assert ["steps by 7.25 m" in text for text in texts] == [False, True]
 
 
 def test_a_run_that_is_not_usable_begins_with_that(hostile_run: Run, report: DropoutReport) -> None:

@@ -1,0 +1,134 @@
+"""Jumps of the reference: steps between fixes that neither the wheels nor a robot that slides can make.
+
+A step beyond the motion of the wheels is the robot's slip or an error of the reference. Without a second reference
+nothing separates them, except that a robot has a largest speed, and that receivers state when their solution changes.
+What neither shows stays undecided, and is the robot's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.alignment.slip.slip_windows import Knots, Motion, Windows, compare
+from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.records.events import ReferenceJump
+
+JUMP_SIGMAS = 6.0
+JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3
+"""A step beyond the noise by so many deviations, and beyond what wheels and a slow slide can do, may be a jump."""
+
+SLIDE_MPS = 2.0
+"""A robot slides by up to this much faster than its wheels ever are: it needs 1 s of free slide at 0.2 g, and a robot
+that brakes on ice keeps its speed."""
+
+STAMP_STD_S = 0.1
+"""Stamps of poses jitter: by 0.1 s rms, and three times as much now and then, on recorded lidar poses."""
+
+
+class Steps(NamedTuple):
+    """Neighbouring knots between which the reference may jump.
+
+    Attributes
+    ----------
+    first, last : (s,) rows of the knots before and after
+    """
+
+    first: Ints
+    last: Ints
+
+
+def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Steps]:
+    """Return the knots without single outliers, and the steps that may be jumps: holes, which no window spans."""
+    row = np.arange(len(knots.t))
+    step, over = _beyond(knots, row[:-1], row[1:], width_m), _beyond(knots, row[:-2], row[2:], width_m)
+    kept = np.ones(len(row), np.bool_)
+    kept[1:-1] = ~(step[:-1] & step[1:] & ~over)
+    knots = knots.rows(kept)
+    row = row[: len(knots.t)]
+    first = np.flatnonzero(_beyond(knots, row[:-1], row[1:], width_m))
+    holes = np.searchsorted(first, row - 1, side="right")
+    return knots._replace(holes=knots.holes + holes), Steps(first, first + 1)
+
+
+def _beyond(knots: Knots, first: Ints, last: Ints, width_m: float) -> Bools:
+    """Return which windows (w,) move or turn further than noise, wheels and a slow slide explain."""
+    path, duration = knots.path_m[last] - knots.path_m[first], knots.t[last] - knots.t[first]
+    by_robot = JUMP_SPEED_SHARE * path + JUMP_MPS * duration
+    noise = np.sqrt(knots.variance[first] + knots.variance[last])
+    moved = np.abs(knots.place[last] - knots.place[first]) > JUMP_SIGMAS * noise + by_robot
+    if knots.turn_follows_place:
+        return np.asarray(moved)
+    turned = width_m * np.abs(knots.heading[last] - knots.heading[first])
+    turn_noise = width_m * math.sqrt(2 * knots.turn_variance)
+    return np.asarray(moved | (turned > JUMP_SIGMAS * turn_noise + by_robot))
+
+
+def decide_jumps(knots: Knots, motion: Motion, steps: Steps) -> tuple[ReferenceJump, ...]:
+    """Return the jumps of the reference among the steps that may be one.
+
+    Parameters
+    ----------
+    knots, steps : of `without_jumps`
+    motion : that the wheels make
+    """
+    windows = compare(knots, motion, steps.first, steps.last, 0.0)
+    duration = knots.t[steps.last] - knots.t[steps.first]
+    slide, jitter = (SLIDE_MPS + _fastest_mps(knots, motion)) * duration, _by_jitter(knots, motion, steps)
+    noise = JUMP_SIGMAS * np.sqrt(windows.sensor)
+    ahead = np.maximum(np.abs(windows.ahead) - jitter, 0.0)
+    moved = np.hypot(ahead, windows.aside) - noise[:, :2].max(axis=1)
+    turned = np.maximum(np.abs(windows.turned) - jitter, 0.0) - noise[:, 2]
+    turned = np.where(knots.turn_follows_place, 0.0, turned)
+    restated = knots.fix_class[steps.first] != knots.fix_class[steps.last]
+    shown = (moved > JUMP_MPS * duration) | (turned > JUMP_MPS * duration)
+    return tuple(
+        _jump(
+            knots, motion, windows, row,
+            _cause(far=bool(moved[row] > slide[row]), turn=bool(turned[row] > slide[row]), stated=bool(restated[row])),
+        )
+        for row in np.flatnonzero(shown).tolist()
+    )  # fmt: skip
+
+
+def _fastest_mps(knots: Knots, motion: Motion) -> float:
+    """Return how fast the wheels drive the robot at most [m/s], but for single samples."""
+    return motion.scale * float(np.quantile(np.diff(knots.path_m) / np.diff(knots.t), 0.99))
+
+
+def _by_jitter(knots: Knots, motion: Motion, steps: Steps) -> Floats:
+    """Return the distance of the wheels (s,) [m] in the time by which stamps are wrong, before and after each step."""
+    off = 3 * STAMP_STD_S
+    reach = np.interp(knots.t[steps.last] + off, knots.t, knots.path_m)
+    reach = reach - np.interp(knots.t[steps.first] - off, knots.t, knots.path_m)
+    return np.asarray(motion.scale * (reach - (knots.path_m[steps.last] - knots.path_m[steps.first])))
+
+
+def _cause(*, far: bool, turn: bool, stated: bool) -> str:
+    """Return why a step is no motion of the robot; empty where it may be."""
+    if stated:
+        return "the receiver changes its solution there"
+    return "faster than any slide" if far else "turns faster than any robot" if turn else ""
+
+
+def _jump(knots: Knots, motion: Motion, windows: Windows, row: int, why: str) -> ReferenceJump:
+    first, last = int(windows.begin[row]), int(windows.end[row])
+    level = np.exp(0.5j * (knots.heading[first] + knots.heading[last]))
+    moved = complex((windows.ahead[row] + 1j * windows.aside[row]) * level)
+    turned = 0.0 if knots.turn_follows_place else float(windows.turned[row]) / motion.lever_m
+    place = complex(knots.place[first])
+    return ReferenceJump(
+        kind="heading" if abs(turned) * motion.lever_m > abs(moved) else "position",
+        begin_ns=knots.epoch_ns + round(float(knots.t[first]) * 1e9),
+        end_ns=knots.epoch_ns + round(float(knots.t[last]) * 1e9),
+        north_m=place.real,
+        east_m=place.imag,
+        size_m=abs(moved),
+        turn_deg=math.degrees(turned),
+        moved_north_m=moved.real,
+        moved_east_m=moved.imag,
+        why=why or "may be slip: cause undecided",
+        undecided=not why,
+    )

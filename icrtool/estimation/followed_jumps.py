@@ -1,0 +1,112 @@
+"""Jumps of the reference as the filter followed them: from the last pose that it used before, to where it settled."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from icrtool.kernels.arrays import Ints
+from icrtool.records.events import ReferenceJump
+from icrtool.records.measurements import SensorData
+from icrtool.records.run import MeasurementOutcome
+
+NEAR_S = 1.0
+"""Jumps closer together than this are one: no trial fits between them."""
+
+SETTLED_SIGMAS, SETTLES_S = 3.0, 5.0
+"""The filter has followed where its estimate is this near to a fix; it takes no longer than this."""
+
+BRIDGED = 0.25
+"""Steps whose sum is less than this part of the largest have taken each other back."""
+
+
+def followed_jumps(
+    sensors: SensorData, gnss: MeasurementOutcome, heading: MeasurementOutcome
+) -> tuple[ReferenceJump, ...]:
+    """Return the jumps that the reference of the trials makes, the filter's states, in order of time.
+
+    Parameters
+    ----------
+    sensors : with the jumps of fixes and headings
+    gnss, heading : what the filter did with them
+
+    Notes
+    -----
+    A filter that rejects fixes drives on with its wheels, and jumps when it follows them again. Where they have come
+    back by then it does not jump at all.
+    """
+    used = gnss.stamp_ns[gnss.used], heading.stamp_ns[heading.used]
+    noise = np.sqrt(sensors.fixes.var_north_m2 + sensors.fixes.var_east_m2)
+    near = gnss.stamp_ns[gnss.used & (gnss.difference < SETTLED_SIGMAS * noise)]
+
+    def followed(jump: ReferenceJump) -> ReferenceJump:
+        stamps = used[jump.kind == "heading"]
+        begin, end = _last_until(stamps, jump.begin_ns), _first_from(stamps, jump.end_ns)
+        return jump._replace(begin_ns=begin, end_ns=end)
+
+    def settled(jump: ReferenceJump) -> ReferenceJump:
+        end = jump.end_ns if jump.kind == "heading" else _first_from(near, jump.end_ns)
+        return jump._replace(end_ns=min(end, jump.end_ns + round(SETTLES_S * 1e9)))
+
+    spans = _joined([followed(jump) for jump in sensors.jumps], _in_one_rejection)
+    spans = [settled(one) for one in spans if one.kind == "heading" or _remains(one)]
+    # what is decided takes in what is undecided about it
+    decided = _joined([one for one in spans if not one.undecided], _near)
+    free = [one for one in spans if one.undecided and not any(_near(*_in_order(one, other)) for other in decided)]
+    return tuple(sorted((*decided, *_joined(free, _near)), key=_begin))
+
+
+def _last_until(stamps: Ints, at: int) -> int:
+    row = int(np.searchsorted(stamps, at, side="right")) - 1
+    return int(stamps[row]) if row >= 0 else at
+
+
+def _first_from(stamps: Ints, at: int) -> int:
+    row = int(np.searchsorted(stamps, at))
+    return int(stamps[row]) if row < len(stamps) else at
+
+
+def _begin(jump: ReferenceJump) -> int:
+    return jump.begin_ns
+
+
+def _in_order(one: ReferenceJump, other: ReferenceJump) -> tuple[ReferenceJump, ReferenceJump]:
+    return (one, other) if one.begin_ns <= other.begin_ns else (other, one)
+
+
+def _in_one_rejection(one: ReferenceJump, other: ReferenceJump) -> bool:
+    """Return whether the filter followed nothing between two jumps."""
+    return other.begin_ns < one.end_ns
+
+
+def _near(one: ReferenceJump, other: ReferenceJump) -> bool:
+    return other.begin_ns <= one.end_ns + round(NEAR_S * 1e9)
+
+
+def _joined(jumps: list[ReferenceJump], belongs: Callable[[ReferenceJump, ReferenceJump], bool]) -> list[ReferenceJump]:
+    """Return jumps, each joined to the one before where it belongs to that."""
+    found: list[ReferenceJump] = []
+    for jump in sorted(jumps, key=_begin):
+        if not (found and belongs(found[-1], jump)):
+            found.append(jump)
+            continue
+        before = found[-1]
+        larger = max(before, jump, key=lambda one: (not one.undecided, one.size_m))
+        found[-1] = larger._replace(
+            begin_ns=before.begin_ns,
+            end_ns=max(before.end_ns, jump.end_ns),
+            north_m=before.north_m,
+            east_m=before.east_m,
+            size_m=max(before.size_m, jump.size_m),
+            turn_deg=max(before.turn_deg, jump.turn_deg, key=abs),
+            moved_north_m=before.moved_north_m + jump.moved_north_m,
+            moved_east_m=before.moved_east_m + jump.moved_east_m,
+        )
+    return found
+
+
+def _remains(jump: ReferenceJump) -> bool:
+    """Return whether the steps of a jump have not taken each other back."""
+    return math.hypot(jump.moved_north_m, jump.moved_east_m) >= BRIDGED * jump.size_m
