@@ -127,11 +127,7 @@ def decide_conventions(
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
         return Decision(AS_NAMED, None)
-    try:
-        shown = {hand: _show(drive, windows, hand) for hand in (1, -1)}
-    except np.linalg.LinAlgError:
-        # Exact data on one circle: nothing separates the hypotheses.
-        return Decision(AS_NAMED, None)
+    shown = {hand: _show(drive, windows, hand) for hand in (1, -1)}
     losses = _losses(shown, 0.5 * drive.fix_std_m / windows.length_m)
     costs: dict[Convention, tuple[float, float]] = {}
     for swapped, left, right, heading, position in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1)):

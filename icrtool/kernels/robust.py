@@ -22,8 +22,9 @@ MAD_TO_STD = 1.4826
 LOSS_SIGMAS = 2.0
 """Where the loss turns from square to linear, in robust standard deviations."""
 
-SMALLEST_SCALE = 1e-9
-"""Residuals of an exact fit have no spread; this keeps their weights finite."""
+SMALLEST_SCALE = 1e-5
+"""Residuals of an exact fit have no spread. No sensor is as exact as this [m, rad]; with less, the information of what
+exact data show is beyond 16 digits of that of a prior, and the covariance of what they do not show is of rounding."""
 
 SETTLED = 0.03
 """A Gauss-Newton step shorter than this in standard deviations, all parameters together, is the last one."""

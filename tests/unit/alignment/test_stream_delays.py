@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from icrtool.alignment.conventions import AS_NAMED, decide_conventions
 from icrtool.alignment.drive_windows import cut_windows, drive_arrays
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.stream_delays import Delay, StreamDelays, _clear_delays
@@ -108,7 +109,8 @@ def test_preset_paper_and_one_topic_for_both_take_nothing_out() -> None:
     assert fit(together, load_config(sets=[WIDTH])).summary["heading"]["applied_delay_s"] == 0.0
 
 
-def test_a_constant_speed_tells_no_delay_of_the_fixes() -> None:
+def exact_circle() -> RobotLog:
+    """Drive a circle at constant speed, without noise."""
     log = stop_and_go(fixes_late_s=0.3)
     even = np.full(len(log.wheels.stamp_ns), 0.6)
     turning = replace(log, wheels=replace(log.wheels, left=even + 0.1, right=even - 0.1))
@@ -116,14 +118,31 @@ def test_a_constant_speed_tells_no_delay_of_the_fixes() -> None:
     x[0] = [0.0, 0.0, 0.3, *ICRS]
     for k in range(len(even) - 1):
         x[k + 1] = step_state(x[k], 0.7, 0.5, 0.02)
-    circle = replace(
+    return replace(
         turning,
         gnss=replace(log.gnss, north_m=x[::5, 0], east_m=x[::5, 1]),
         heading=replace(log.heading, heading_rad=np.angle(np.exp(1j * x[:, 2]))),
     )
-    summary = fit(circle, load_config(sets=[WIDTH])).summary
+
+
+def test_a_constant_speed_shows_no_delay_of_the_fixes() -> None:
+    summary = fit(exact_circle(), load_config(sets=[WIDTH])).summary
     assert summary["filter"]["reference_delay_s"] == 0.0
     assert summary["heading"]["applied_delay_s"] == 0.0
+
+
+@pytest.mark.parametrize("relative", [1e-16, 1e-15, 1e-12, 1e-8])
+def test_last_bits_of_an_exact_circle_name_no_side_reversed(relative: float) -> None:
+    """It shows only sums of the parameters: their covariance is singular but for the prior."""
+    log, rng = exact_circle(), np.random.default_rng(0)
+    for _ in range(10):
+        north, east, psi = (
+            values * (1.0 + relative * rng.normal(size=len(values)))
+            for values in (log.gnss.north_m, log.gnss.east_m, log.heading.heading_rad)
+        )
+        moved = replace(log.gnss, north_m=north, east_m=east)
+        drive = drive_arrays(replace(log, gnss=moved, heading=replace(log.heading, heading_rad=psi)))
+        assert decide_conventions(drive, cut_windows(drive), metric=False).convention == AS_NAMED
 
 
 @pytest.mark.parametrize("row", [0, -1])
