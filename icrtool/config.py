@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-import stat
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -19,6 +18,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 import msgspec
 
 from icrtool.errors import ConfigError
+from icrtool.records.regular_file import read_regular
 from icrtool.records.text import LONGEST_NAME, did_you_mean, shortened
 
 LARGEST_FILE_BYTES = 1 << 20
@@ -270,13 +270,7 @@ def _builtin_robot(name: str) -> dict[str, Any]:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            # Reading a pipe would block, and a device may have no end.
-            raise ConfigError(path, "not a file", "a configuration is a TOML file")
-        if status.st_size > LARGEST_FILE_BYTES:
-            raise ConfigError(path, f"{status.st_size} bytes long", f"a configuration has at most {LARGEST_FILE_BYTES}")
-        return parse_toml(path.read_text(encoding="utf-8-sig"))
+        return parse_toml(read_regular(path, most_bytes=LARGEST_FILE_BYTES).decode("utf-8-sig"))
     except RecursionError as err:
         raise ConfigError(path, "not a configuration", "its values are nested too deeply") from err
     except OSError as err:

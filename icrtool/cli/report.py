@@ -56,11 +56,11 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
     import json
 
     from icrtool.errors import RunError
-    from icrtool.output.files.json_file import FLEET_FILE, schema_of
+    from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, schema_of
     from icrtool.output.page.comparison_page import comparison_in, comparison_page
-    from icrtool.output.page.fleet_page import FLEET_FAMILY, fleet_page
+    from icrtool.output.page.fleet_page import fleet_page
     from icrtool.output.run_directory import is_run_directory
-    from icrtool.records.regular_file import read_regular
+    from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_regular
 
     if is_run_directory(source):
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
@@ -71,6 +71,8 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
     if (file := comparison_in(source)) is not None:
         with _as_written(file, "run icrtool compare again"):
             return comparison_page(json.loads(read_regular(file, source if source.is_dir() else None)), file.stem)
+    if is_special(source):
+        raise RunError(source, NOT_REGULAR, SAVE_IT)
     what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
     raise RunError(source, what, "icrtool fit, batch and compare make one")
 

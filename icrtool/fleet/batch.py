@@ -16,6 +16,7 @@ from icrtool import __version__
 from icrtool.config import Config, builtin_robots, load_config
 from icrtool.errors import ConfigError, OutputError
 from icrtool.fleet.fit_and_report import ReportOptions
+from icrtool.fleet.fleet_files import ROWS, check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import Request, files_of, path_of
 from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
@@ -24,7 +25,7 @@ from icrtool.fleet.worker import close_all, process_apart
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.records.regular_file import read_regular
 
-RUNS, ROWS = "runs", ".rows"
+RUNS = "runs"
 
 PROCESS_BYTES = 400 << 20
 """Memory of a process with a small log."""
@@ -69,7 +70,7 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Re
     ConfigError
         A manifest or a configuration cannot be used, or a gate cannot be read.
     OutputError
-        `output` is a run, or something else than a directory.
+        `output` is a run, or something else than a directory, or holds somebody's own file of the name of a result.
     """
     from icrtool.dropout_analysis.acceptance_limits import parse_gate
     from icrtool.output.run_directory import RUN_FILE
@@ -80,6 +81,7 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Re
         raise OutputError(output, "is a run itself", "name another place for the batch")
     if output.exists() and not output.is_dir():
         raise OutputError(output, "a file is there", "name another place for the batch")
+    check_tables(output, page=options.report.page)
     # A table of simulated truth beside its log, from a pattern of the shell, is no manifest.
     beside = logs_among([place for place in places if place.is_file()])[1]
     places = [place for place in places if place not in beside]

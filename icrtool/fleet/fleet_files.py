@@ -11,13 +11,15 @@ from typing import Any
 import msgspec
 
 from icrtool import __version__
+from icrtool.errors import OutputError
 from icrtool.fleet.roll_up import MOST_POOLED_S, PooledCalibration
 from icrtool.fleet.row import SHOWN_ERROR, Row, as_text, columns_of
+from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import disk
-from icrtool.output.files.atomic_file import atomic_file, make_folders, write_file
+from icrtool.output.files.atomic_file import atomic_file, check_place, is_page, make_folders, write_file
 from icrtool.output.files.csv_file import csv_bytes
-from icrtool.output.files.json_file import json_bytes
-from icrtool.output.run_directory import PLOT_FORMATS
+from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, json_bytes, schema_of
+from icrtool.output.run_directory import PAGE_FILE, PLOT_FORMATS
 from icrtool.records.dropout import Verdict
 from icrtool.records.text import LogText, counted, escaped
 
@@ -27,6 +29,34 @@ FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
 
 
 PLOTS = "plots"
+
+ROWS = ".rows"
+"""Folder of the rows of the logs, written as they come."""
+
+TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
+
+
+def check_tables(folder: Path, *, page: bool) -> None:
+    """Refuse a folder in which a file that icrtool did not write has the name of a result, before any work is done.
+
+    Parameters
+    ----------
+    page : a page is written too
+
+    Raises
+    ------
+    OutputError
+        There is one.
+    """
+    if page and folder.is_dir():
+        check_place(folder / PAGE_FILE, folder, is_page)
+    if schema_of(folder / FLEET_FILE, folder).startswith(FLEET_FAMILY) or (folder / ROWS).is_dir():
+        return
+    pictures = [f"{PLOTS}/{name}.{form}" for name in FIGURES for form in PLOT_FORMATS if FIGURES[name].of == "fleet"]
+    for name in (*TABLES, *pictures):
+        file = folder / name
+        if file.exists() and not file.is_symlink():
+            raise OutputError(file, "a file that no batch wrote is there", "it is left alone; name another folder")
 
 
 def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration] = ()) -> dict[str, Any]:
@@ -83,7 +113,7 @@ def write_fleet(
     if plots:
         write_figures(rows, directory, tuple(plots))
     # Last: where it is, the others are of the same batch.
-    write_file(directory / "fleet.json", json_bytes(fleet_document(rows, calibrations)), directory)
+    write_file(directory / FLEET_FILE, json_bytes(fleet_document(rows, calibrations)), directory)
 
 
 def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool = True) -> str:
@@ -113,7 +143,7 @@ def write_figures(rows: Sequence[Row], folder: Path, formats: tuple[str, ...]) -
     ----------
     folder : of the batch
     """
-    from icrtool.output.figure_catalogue import FIGURES, figures_of
+    from icrtool.output.figure_catalogue import figures_of
     from icrtool.output.figures.fleet import FleetNumbers
     from icrtool.output.files.picture_file import save_picture
 

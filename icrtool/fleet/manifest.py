@@ -12,6 +12,7 @@ import msgspec
 
 from icrtool.config import parse_toml
 from icrtool.errors import ConfigError
+from icrtool.records.regular_file import read_regular
 
 COLUMNS = ("log", "robot", "config", "group", "tags")
 
@@ -79,9 +80,7 @@ def read_manifest(path: Path) -> list[Entry]:
         It cannot be read, has an unknown column, a log that does not exist or a pattern that matches nothing.
     """
     try:
-        if (size := path.stat().st_size) > LARGEST_BYTES:
-            raise ConfigError(path, f"{size} bytes long", f"a manifest has at most {LARGEST_BYTES}")
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_regular(path, most_bytes=LARGEST_BYTES).decode("utf-8-sig")
         rows = _toml_rows(path, text) if path.suffix.lower() == ".toml" else _csv_rows(path, text)
     except OSError as err:
         raise ConfigError(path, "cannot be read", err.strerror or str(err)) from err

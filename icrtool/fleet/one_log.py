@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -96,7 +97,9 @@ def process(request: Request, stage: Stage) -> Row:
 
 def failed(request: Request, reason: str, *, details: str = "", repeatable: bool) -> Row:
     """Return the row of a log that could not be processed."""
-    inputs = files_of(path_of(request.path)) if repeatable else ()
+    inputs: tuple[File, ...] = ()
+    with suppress(OSError):  # a log that was removed meanwhile, or is a device
+        inputs = files_of(path_of(request.path)) if repeatable else ()
     return replace(
         request.row, status="failed", reason=reason, details=details, repeatable=repeatable, inputs=inputs,
         robot=_robot(request), tool_version=__version__,

@@ -25,7 +25,7 @@ from icrtool.output.run_directory import (
     is_run_directory,
 )
 from icrtool.records.memory import give_back_freed
-from icrtool.records.regular_file import read_regular
+from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_regular
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.tables import States
@@ -167,6 +167,8 @@ def _read_document(directory: Path) -> dict[str, Any]:
     try:
         raw = read_regular(directory / RUN_FILE, directory)
     except (OSError, ValueError) as err:
+        if is_special(directory):
+            raise RunError(directory, NOT_REGULAR, SAVE_IT) from err
         why = "not a run directory" if directory.is_dir() else "no such run directory"
         raise RunError(directory, why, f"it holds no readable {RUN_FILE}; icrtool fit makes one") from err
     try:

@@ -25,13 +25,15 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 _FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
 
 NOT_REGULAR = "not a regular file"
+SAVE_IT = "save what it gives to a file, and name that"
 
 
 class NotRegularFileError(OSError):
     """A link, pipe, device or directory where a regular file is expected."""
 
     def __init__(self, path: Path, why: str = NOT_REGULAR) -> None:
-        super().__init__(errno.EINVAL, why, str(path))
+        advice = f"; {SAVE_IT}" if why == NOT_REGULAR else ""
+        super().__init__(errno.EINVAL, f"{why}{advice}", str(path))
 
 
 def open_regular(path: Path, inside: Path | None = None) -> BufferedReader:
@@ -71,6 +73,15 @@ def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGE
     if len(content) > most_bytes:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
     return content
+
+
+def is_special(path: Path) -> bool:
+    """Return whether there is a pipe or a device, which could be read for ever."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 def is_regular(path: Path, inside: Path) -> bool:

@@ -285,7 +285,7 @@ REFUSED: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         lambda folder: [str(in_folder(folder, "x.txt", b"x") and folder)],
         "not a ROS 2 bag dir",
     ),
-    "a pipe": (a_pipe, "not a file"),
+    "a pipe": (a_pipe, "not a regular file"),
     "an old bag": (
         lambda folder: in_folder(folder, "x.bag", b"#ROSBAG V1.2\n" + bytes(99)),
         "a bag of another version",

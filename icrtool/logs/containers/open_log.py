@@ -13,6 +13,7 @@ from icrtool.logs.containers.mcap_file import McapFile, is_mcap
 from icrtool.logs.containers.ros1_bag import Ros1Bag, is_ros1_bag
 from icrtool.logs.containers.split_files import split_files
 from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
+from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
 
 KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file"
 
@@ -40,12 +41,11 @@ def open_log(path: Path) -> Container:
 def _open(path: Path) -> Container:
     if files := split_files(path):
         return BagDirectory(path, files)
-    mode = path.stat().st_mode
-    if stat.S_ISDIR(mode):
+    if stat.S_ISDIR(path.stat().st_mode):
         return BagDirectory(path)
-    if not stat.S_ISREG(mode):
+    if is_special(path):
         # Opening a pipe would block, and every container needs random access.
-        raise LogError(path, "not a file", f"a log is {KINDS}")
+        raise LogError(path, NOT_REGULAR, SAVE_IT)
     with path.open("rb") as stream:
         if not stream.read(1):
             raise LogError(path, "an empty file", "the recording never began, or the copy failed")

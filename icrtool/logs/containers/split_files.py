@@ -13,6 +13,8 @@ from pathlib import Path
 from threading import Event
 from typing import NamedTuple
 
+from icrtool.records.regular_file import open_regular
+
 _NAME = re.compile(r"^(|.*?[_\-. ])((?:19|20)\d\d[\d_.\-T]*|\d+)(\.[A-Za-z]\w*)$")
 """What comes before a count or a date, the count or date (and count), the suffix."""
 
@@ -99,7 +101,7 @@ def file_sha256(file: Path, ended: Event | None = None) -> str:
     import hashlib
 
     digest, piece = hashlib.sha256(), bytearray(1 << 18)
-    with file.open("rb", buffering=0) as stream:
+    with open_regular(file) as stream:
         while not (ended and ended.is_set()) and (count := stream.readinto(piece)):
             digest.update(memoryview(piece)[:count])
     return digest.hexdigest()

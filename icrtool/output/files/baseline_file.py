@@ -18,7 +18,7 @@ from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
 from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet
 from icrtool.records.dropout import METRICS
-from icrtool.records.regular_file import is_regular, read_regular
+from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
 from icrtool.records.text import escaped
 
 LARGEST = 1e12
@@ -168,6 +168,8 @@ def _fleet_baseline(path: Path) -> Baseline:
 
 def _report_files(path: Path) -> list[Path]:
     if not path.is_dir():
+        if is_special(path):
+            raise ConfigError(f"--baseline {path}", NOT_REGULAR, SAVE_IT)
         raise ConfigError(f"--baseline {path}", "no such file or directory", ADVICE)
     if (path / REPORT_FILE).is_file():
         return [path / REPORT_FILE]

@@ -12,6 +12,7 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
+from icrtool.records.regular_file import open_regular
 from icrtool.records.text import table_cell
 
 
@@ -41,9 +42,9 @@ def read_numbers(
         The file cannot be read, is larger than `most_bytes`, lacks a column that is needed, or has fewer than two rows.
     """
     try:
-        if most_bytes is not None and path.stat().st_size > most_bytes:
-            raise DataError(path, f"larger than {most_bytes / 1e6:g} MB", "leave out some of its rows")
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig", newline="") as file:
+            if most_bytes is not None and path.stat().st_size > most_bytes:
+                raise DataError(path, f"larger than {most_bytes / 1e6:g} MB", "leave out some of its rows")
             reader = csv.DictReader(file, skipinitialspace=True)
             found = tuple(reader.fieldnames or ())
             if missing := [name for name in needed if name not in found]:

@@ -17,6 +17,9 @@ from icrtool.records.text import LogText
 FLEET_FILE = "fleet.json"
 """What a batch found, in its folder."""
 
+FLEET_FAMILY = "icrtool/fleet/"
+"""Schema of such a file, of whatever version."""
+
 
 class InputFile(msgspec.Struct, frozen=True):
     """A file that was read: what identifies its content."""

@@ -15,8 +15,6 @@ from icrtool.records.regular_file import is_regular
 
 PLOTS = "plots"
 
-FLEET_FAMILY = "icrtool/fleet/"
-
 HORIZON_M = 10.0
 """At this distance the table shows the errors of each model."""
 

@@ -506,7 +506,7 @@ def test_temporary_files_of_a_compressed_bag_are_gone_when_it_is_closed(tmp_path
 
 def test_a_pipe_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(LogError, match="not a file"):
+    with pytest.raises(LogError, match="not a regular file"):
         open_log(tmp_path / "pipe")
 
 

@@ -303,7 +303,7 @@ def test_a_configuration_that_is_a_pipe_or_a_device_is_refused(tmp_path: Path) -
 
     os.mkfifo(tmp_path / "pipe")
     for place in (tmp_path / "pipe", Path("/dev/zero")):
-        with pytest.raises(ConfigError, match="not a file"):
+        with pytest.raises(ConfigError, match="not a regular file"):
             load_config(place)
 
 
