@@ -1,6 +1,6 @@
 """Figures of runs and reports, each returned as a matplotlib Figure; imported when first used."""
 
-from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_summary
+from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_histograms, dropout_summary
 from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
 from icrtool.output.figures.gnss_difference import gnss_difference
 from icrtool.output.figures.icrs import icr_clusters, icr_estimates
@@ -9,6 +9,7 @@ from icrtool.output.figures.trajectory import trajectory
 __all__ = [
     "dropout_examples",
     "dropout_histogram",
+    "dropout_histograms",
     "dropout_outages",
     "dropout_summary",
     "dropout_worst",

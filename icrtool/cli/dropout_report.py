@@ -208,9 +208,9 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
         directory = place.directory
         # One result: where the report fails, an old run in this place stays, with its report.
         run = fit_log(
-            source, directory, request.config, plots=request.asked.plots, inside=place.inside,
-            smooth=request.further["reference"] == "smoothed", overwrite=request.overwrite, then=report_into,
-            quiet=request.quiet, verbose=request.verbose,
+            source, directory, request.config, plots=request.asked.plots, figures=request.asked.figures,
+            inside=place.inside, smooth=request.further["reference"] == "smoothed", overwrite=request.overwrite,
+            then=report_into, quiet=request.quiet, verbose=request.verbose,
         )  # fmt: skip
     report = reports[0]
     if report.baseline is not None:

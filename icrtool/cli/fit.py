@@ -17,6 +17,7 @@ from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
     from icrtool.config import Config
+    from icrtool.records.late_output import FigureSet
     from icrtool.records.run import Run, WarmStart
 
 RUNS = Path("icrtool-runs")
@@ -28,6 +29,7 @@ RUNS = Path("icrtool-runs")
 @click.option("--states", type=click.Choice(["csv", "parquet"]),
               help="Format of the states; default: csv, parquet for over a million states.")  # fmt: skip
 @options.plots
+@options.figures
 @click.option("--warm-start", metavar="RUN|CAL.json", type=options.FILE,
               help="Start from another run's final ICRs and covariance, or from those of a calibration.")  # fmt: skip
 @click.option("--terrain-change", "changes", metavar="T", type=float, multiple=True,
@@ -39,7 +41,7 @@ RUNS = Path("icrtool-runs")
 @options.verbosity
 def command(
     logs: tuple[Path, ...], output: Path | None, into: Path | None, overwrite: bool,
-    states: Literal["csv", "parquet"] | None, plots: tuple[str, ...],
+    states: Literal["csv", "parquet"] | None, plots: tuple[str, ...], figures: FigureSet,
     warm_start: Path | None, changes: tuple[float, ...], smooth: bool, as_json: bool,
     start: str | None, end: str | None,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
@@ -66,7 +68,8 @@ def command(
         try:
             run = fit_log(
                 log, directory, config, inside=inside, quiet=quiet, verbose=verbose, overwrite=overwrite, plots=plots,
-                states=states, span=(start, end), warm_start=warm_start, changes_s=changes, smooth=smooth,
+                figures=figures, states=states, span=(start, end), warm_start=warm_start, changes_s=changes,
+                smooth=smooth,
             )  # fmt: skip
         except IcrToolError as err:
             failed.append(log)

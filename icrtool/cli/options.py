@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from icrtool.errors import IcrToolError
     from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.dropout import Verdict
+    from icrtool.records.late_output import FigureSet
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -128,6 +129,12 @@ def plots(command: Command) -> Command:
                         help="Formats of the pictures.")(command)  # fmt: skip
 
 
+def figures(command: Command) -> Command:
+    """Add --figures, as a `FigureSet`."""
+    return click.option("--figures", type=click.Choice(["default", "all"]), default="default", show_default=True,
+                        help="all: also those of the paper, such as a histogram a distance.")(command)  # fmt: skip
+
+
 def budgets(command: Command) -> Command:
     """Add --budget, as `budgets`."""
     return click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,),
@@ -144,11 +151,12 @@ def report(command: Command) -> Command:
     @wraps(command)
     def with_options(
         *, plots: tuple[str, ...], gates: tuple[str, ...], budgets: tuple[float, ...], ladder: bool, strict: bool,
-        page: bool, allow_unusable: bool, junit: Path | None, markdown: Path | None, **others: object,
+        page: bool, allow_unusable: bool, figures: FigureSet, junit: Path | None, markdown: Path | None,
+        **others: object,
     ) -> object:  # fmt: skip
         from icrtool.fleet.fit_and_report import ReportOptions
 
-        asked = ReportOptions(plots, gates, budgets, ladder, strict, page, allow_unusable)
+        asked = ReportOptions(plots, gates, budgets, ladder, strict, page, allow_unusable, figures)
         return command(asked=asked, junit=junit, markdown=markdown, **others)
 
     return add_options(
@@ -169,6 +177,7 @@ def report(command: Command) -> Command:
         click.option("--markdown", metavar="FILE", type=NEW_FILE, help="Write a summary for a pull request."),
         allow_unusable,
         plots,
+        figures,
         click.option("--page/--no-page", default=True, show_default=True,
                      help="Also write report.html: pictures, tables and an interactive map in one file."),
     )  # fmt: skip

@@ -28,7 +28,7 @@ from icrtool.records.dropout import (
     Verdict,
     error_columns,
 )
-from icrtool.records.late_output import call_output
+from icrtool.records.late_output import FigureSet, call_output
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -145,13 +145,16 @@ class DropoutReport:
             **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
         }
 
-    def write(self, path: str | Path | None = None, *, plots: tuple[str, ...] = ("png",)) -> None:
+    def write(
+        self, path: str | Path | None = None, *, plots: tuple[str, ...] = ("png",), figures: FigureSet = "default"
+    ) -> None:
         """Write summary.csv, histogram.csv, report.json, the other tables and the figures, whole or not at all.
 
         Parameters
         ----------
         path : directory of the report; default: ``dropout`` in the directory the run was read from
         plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
+        figures : ``all``: those of the paper too
 
         Raises
         ------
@@ -162,7 +165,7 @@ class DropoutReport:
             if self.run_directory is None:
                 raise ValueError("path: this run was not read from a directory; name one for its report")
             path = self.run_directory / "dropout"
-        call_output("dropout_directory", "write_report", lambda _: self, Path(path), plots=plots)
+        call_output("dropout_directory", "write_report", lambda _: self, Path(path), plots=plots, figures=figures)
 
     def __repr__(self) -> str:
         icr, last = self.result("icr"), len(self.horizons_m) - 1

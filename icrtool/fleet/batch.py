@@ -186,7 +186,8 @@ def _all_of(
 def _request(one: FoundRecording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:
     config = _config(one, known, options)
     report = options.report
-    document = {"config": config.effective(), "version": __version__, "plots": report.plots, "gates": report.gates,
+    document = {"config": config.effective(), "version": __version__, "plots": report.plots, "figures": report.figures,
+                "gates": report.gates,
                 "budgets": report.budgets_m, "ladder": report.ladder, "robot": known.robot,
                 "baseline": baseline, "strict": report.strict, "allow_unusable": report.allow_unusable}  # fmt: skip
     key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()

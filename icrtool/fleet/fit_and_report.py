@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from icrtool.records.late_output import FigureSet
+
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.dropout_analysis.baseline import BaselineReport
@@ -26,6 +28,7 @@ class ReportOptions:
     Attributes
     ----------
     plots : formats of the pictures
+    figures : ``all``: those of the paper too
     ladder : compare all models on distance that they were not fitted to
     strict : as in `icrtool.dropout_report`
     page : write report.html
@@ -39,6 +42,7 @@ class ReportOptions:
     strict: bool = False
     page: bool = True
     allow_unusable: bool = False
+    figures: FigureSet = "default"
 
 
 def fit_and_write(
@@ -49,6 +53,7 @@ def fit_and_write(
     *,
     overwrite: bool = False,
     plots: tuple[str, ...] = ("png",),
+    figures: FigureSet = "default",
     states: Literal["csv", "parquet"] | None = None,
     span: tuple[str | None, str | None] = (None, None),
     warm_start: WarmStart | None = None,
@@ -64,7 +69,7 @@ def fit_and_write(
     Parameters
     ----------
     overwrite : the run of another recording may be replaced
-    plots, states, note, inside : as in `icrtool.output.run_directory.write_run`
+    plots, figures, states, note, inside : as in `icrtool.output.run_directory.write_run`
     span : from when to when the log is read, as in `icrtool.read_log`
     warm_start, changes_s, smooth : as in `icrtool.fit`
     share : called with the share of the log that was read
@@ -85,7 +90,7 @@ def fit_and_write(
         note(f"{directory}: replaced the run of another recording ({before})")
     begin("writing, pictures" if plots else "writing")
     more = partial(then, run) if then is not None else None
-    write_run(run, directory, states=states, plots=plots, note=note, inside=inside, then=more)
+    write_run(run, directory, states=states, plots=plots, figures=figures, note=note, inside=inside, then=more)
     return run
 
 
@@ -121,8 +126,10 @@ def report_and_write(
         return report
 
     stamps = run.table.stamp_ns if trials else None
-    report = write_report(analysed, directory / DROPOUT_DIRECTORY, plots=options.plots, stamp_ns=stamps,
-                          inside=directory)  # fmt: skip
+    report = write_report(
+        analysed, directory / DROPOUT_DIRECTORY, plots=options.plots, figures=options.figures, stamp_ns=stamps,
+        inside=directory,
+    )  # fmt: skip
     if options.page:
         from icrtool.output.page.run_page import write_page
 

@@ -35,6 +35,9 @@ ROWS = ".rows"
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
 
+SHOWN_ERRORS = {"recommended model": "recommended_p95_10m_m", "momentary ICRs": SHOWN_ERROR}
+"""By whose errors the picture shows: the first that a log has."""
+
 
 def check_tables(folder: Path, *, page: bool) -> None:
     """Refuse a folder in which a file that icrtool did not write has the name of a result, before any work is done.
@@ -137,7 +140,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool
 
 
 def write_figures(rows: Sequence[Row], folder: Path, formats: tuple[str, ...]) -> None:
-    """Draw the ICRs by robot and date, the error by group and the failures by reason; older pictures are removed.
+    """Draw the ICRs by robot and date, and the error of each log; older pictures are removed.
 
     Parameters
     ----------
@@ -148,31 +151,25 @@ def write_figures(rows: Sequence[Row], folder: Path, formats: tuple[str, ...]) -
     from icrtool.output.files.picture_file import save_picture
 
     points: list[dict[str, Any]] = []
-    errors: dict[str, list[float]] = {}
-    reasons: Counter[str] = Counter()
+    errors: dict[str, dict[str, float]] = {}
+    known = {name for row in rows for name in row.errors}
+    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", SHOWN_ERROR))
     for row in sorted(rows, key=lambda row: row.start_utc):
         shown = all(row.icr.get(name) is not None for name in ("y_icr_right_m", "y_icr_left_m"))
         if shown and row.start_utc:
             points.append(msgspec.to_builtins(row))
-        if (error := row.errors.get(SHOWN_ERROR)) is not None:
+        if (error := row.errors.get(error_name)) is not None:
             name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
-            errors.setdefault(name, []).append(error)
-        if row.status == "failed":
-            reasons[reason_of(row)] += 1
+            errors.setdefault(name, {})[row.log] = error
     directory = folder / PLOTS
     make_folders(directory, folder)
-    numbers = FleetNumbers(f"{len(rows)} logs", points, errors, dict(reasons.most_common()))
+    numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model)
     drawn = {directory / f"{name}.{form}": figure for name, figure in figures_of("fleet", numbers) for form in formats}
     for file, figure in drawn.items():
         save_picture(figure, file, folder)
     for name in (name for name, entry in FIGURES.items() if entry.of == "fleet"):
         for old in {directory / f"{name}.{form}" for form in PLOT_FORMATS} - set(drawn):
             disk.remove(old)
-
-
-def reason_of(row: Row) -> str:
-    """Return why a log failed without what is particular to it: the first part of ``why; advice``."""
-    return row.reason.split(";")[0].split(" (tried")[0]
 
 
 def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file: Path) -> None:

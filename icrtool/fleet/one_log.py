@@ -131,7 +131,7 @@ def _results(request: Request, stage: Stage) -> Row:
 
     run = fit_and_write(
         path_of(request.path), directory, request.config, stage, overwrite=request.overwrite,
-        plots=request.report.plots, inside=path_of(request.folder), then=report,
+        plots=request.report.plots, figures=request.report.figures, inside=path_of(request.folder), then=report,
     )  # fmt: skip
     return _row(request, run.summary, int(run.table.stamp_ns[0]), reports[0])
 

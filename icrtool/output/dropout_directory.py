@@ -25,6 +25,7 @@ from icrtool.output.files.trials_file import trials_file
 from icrtool.output.tables.dropout import no_trial, why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.records.dropout import ExampleTrial, ModelResult, error_columns
+from icrtool.records.late_output import FigureSet
 from icrtool.records.plain_data import rows_of
 
 REPORT_FILE = "report.json"
@@ -49,6 +50,7 @@ def write_report(
     directory: Path,
     *,
     plots: tuple[str, ...] = ("png",),
+    figures: FigureSet = "default",
     stamp_ns: Ints | None = None,
     inside: Path | None = None,
 ) -> DropoutReport:
@@ -58,6 +60,7 @@ def write_report(
     ----------
     analyse : gives the report; it is called with what takes every single trial, None where they are not written
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
+    figures : ``all``: those of the paper too
     stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: they are not written
     inside : as in `icrtool.output.files.atomic_directory.check_directory`
 
@@ -72,7 +75,7 @@ def write_report(
         if plots:
             from icrtool.output.figure_catalogue import draw_figures
 
-            draw_figures("report", report, partial / "plots", plots)
+            draw_figures("report", report, partial / "plots", plots, figures)
         write_tables(report, partial)
     return report
 

@@ -5,11 +5,13 @@ matplotlib is imported when the first figure is drawn: a page of finished pictur
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from icrtool.records.late_output import FigureSet
 from icrtool.records.memory import give_back_freed
 
 if TYPE_CHECKING:
@@ -32,9 +34,17 @@ def _where(content: Callable[[Any], object]) -> Callable[[Any], Parts]:
     return lambda subject: {"": ()} if content(subject) else {}
 
 
-def _histograms(report: DropoutReport) -> Parts:
+def _histogram_horizons_m(report: DropoutReport) -> tuple[float, ...]:
     trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))
-    return {f"_{metres:02.0f}m": (metres,) for metres in HISTOGRAM_HORIZONS_M if trials.get(metres)}
+    return tuple(metres for metres in HISTOGRAM_HORIZONS_M if trials.get(metres))
+
+
+def _all_histograms(report: DropoutReport) -> Parts:
+    return {"": found} if (found := _histogram_horizons_m(report)) else {}
+
+
+def _histograms(report: DropoutReport) -> Parts:
+    return {f"{metres:02.0f}m": (metres,) for metres in _histogram_horizons_m(report)}
 
 
 class Entry(NamedTuple):
@@ -47,6 +57,7 @@ class Entry(NamedTuple):
     place : module and name of its function in ``icrtool.output.figures``
     parts : what follows the name in the names of its files, with further arguments of the function; empty: no figure
     with_place : its axes may be coordinates of a map grid
+    further : of the paper; drawn where all figures are asked for
     """
 
     of: Subject
@@ -55,6 +66,7 @@ class Entry(NamedTuple):
     place: str
     parts: Callable[[Any], Parts] = _always
     with_place: bool = False
+    further: bool = False
 
     @property
     def draw(self) -> Callable[..., Figure]:
@@ -77,19 +89,19 @@ FIGURES = {
     "icr_clusters": Entry(
         "run", "Where the ICRs lay",
         "Good: three narrow peaks. A wide one is ground that changed, or an ICR that the drive hardly shows.",
-        "icrs.icr_clusters",
+        "icrs.icr_clusters", further=True,
     ),
     "gnss_difference": Entry(
         "run", "Filter and position reference",
         "Good: noise about a constant mean. Steps and long deviations are trouble of the receiver or of the clocks.",
         "gnss_difference.gnss_difference",
     ),
-    "examples": Entry(
+    "examples_": Entry(
         "report", "Two trials of {} m",
         "One of half a turn, and the straightest. The closer a coloured end is to the black one, the better its model.",
         "dropout_paths.dropout_examples",
-        lambda report: {f"_{one.horizon_m:02.0f}m": () for one in report.examples[:1]},
-        with_place=True,
+        lambda report: {f"{one.horizon_m:02.0f}m": () for one in report.examples[:1]},
+        with_place=True, further=True,
     ),
     "worst": Entry(
         "report", "The worst trials", "What they share (a turn, a slope, a place) is where the model fails.",
@@ -101,9 +113,14 @@ FIGURES = {
         "dropout_paths.dropout_outages", _where(lambda report: report.outages), with_place=True,
     ),
     "histogram": Entry(
-        "report", "Errors after {} m",
+        "report", "How the errors scatter",
+        "Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
+        "dropout_errors.dropout_histograms", _all_histograms,
+    ),
+    "histogram_": Entry(
+        "report", "Errors after {} m, by model",
         "A panel a model. Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
-        "dropout_errors.dropout_histogram", _histograms,
+        "dropout_errors.dropout_histogram", _histograms, further=True,
     ),
     "summary": Entry(
         "report", "Error over distance",
@@ -116,12 +133,8 @@ FIGURES = {
         "fleet.fleet_icrs", _where(lambda fleet: fleet.points),
     ),
     "errors": Entry(
-        "fleet", "Errors by robot and group", "Each point is a log: how much the logs of a group differ.",
+        "fleet", "Error of every log", "Which logs are worse than the others of their group?",
         "fleet.fleet_errors", _where(lambda fleet: fleet.errors_m),
-    ),
-    "failures": Entry(
-        "fleet", "Why logs failed", "The commonest reason first.",
-        "fleet.fleet_failures", _where(lambda fleet: fleet.reasons),
     ),
     "transfer": Entry(
         "comparison", "The cost of a foreign calibration",
@@ -129,19 +142,21 @@ FIGURES = {
         "transfer.transfer",
     ),
 }  # fmt: skip
-"""By the first words of the file's name."""
+"""By the name of the file; a name that ends in ``_`` goes on with a distance."""
 
 
-def figures_of(of: Subject, subject: object) -> Iterator[tuple[str, Figure]]:
+def figures_of(of: Subject, subject: object, figures: FigureSet = "default") -> Iterator[tuple[str, Figure]]:
     """Draw each figure for which a subject has numbers; yield it with the name of its file."""
     for name, entry in FIGURES.items():
-        if entry.of == of:
+        if entry.of == of and (figures == "all" or not entry.further):
             for part, more in entry.parts(subject).items():
                 yield f"{name}{part}", entry.draw(subject, *more)
 
 
-def draw_figures(of: Subject, subject: object, directory: Path, formats: tuple[str, ...]) -> None:
-    """Write every figure of a run or a report into a directory.
+def draw_figures(
+    of: Subject, subject: object, directory: Path, formats: tuple[str, ...], figures: FigureSet = "default"
+) -> None:
+    """Write the figures of a run or a report into a directory.
 
     Parameters
     ----------
@@ -156,13 +171,18 @@ def draw_figures(of: Subject, subject: object, directory: Path, formats: tuple[s
     directory.mkdir(exist_ok=True)
     from icrtool.output.figures.style import save
 
-    for name, figure in figures_of(of, subject):
-        save(figure, directory / name, formats)
-        give_back_freed()
+    # A figure is thousands of objects: the collector would go through those of the whole program for each.
+    gc.freeze()
+    try:
+        for name, figure in figures_of(of, subject, figures):
+            save(figure, directory / name, formats)
+            give_back_freed()
+    finally:
+        gc.unfreeze()
 
 
 def entry_of(file: str) -> tuple[Entry, str] | None:
     """Return the entry of a picture by the name of its file, and the distance in that name; None for any other file."""
-    word, _, rest = file.rpartition("_") if file not in FIGURES else (file, "", "")
-    entry = FIGURES.get(word)
+    word, _, rest = file.rpartition("_")
+    entry = FIGURES.get(file) or FIGURES.get(f"{word}_")
     return None if entry is None else (entry, rest.removesuffix("m").lstrip("0"))

@@ -17,6 +17,7 @@ from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.files.own_files import made_from
 from icrtool.output.files.states_file import StatesFormat, file_b2sum, write_states
+from icrtool.records.late_output import FigureSet
 from icrtool.records.regular_file import read_regular
 from icrtool.records.run import Run
 from icrtool.records.run_document import EVENT_COLUMNS
@@ -80,6 +81,7 @@ def write_run(
     *,
     states: StatesFormat | None = None,
     plots: tuple[str, ...] = ("png",),
+    figures: FigureSet = "default",
     note: Callable[[str], None] | None = None,
     inside: Path | None = None,
     then: Callable[[Path], None] | None = None,
@@ -92,6 +94,7 @@ def write_run(
     directory : where it shall appear; an old run there is replaced, with all that was made from it
     states : format of the states; default: ``csv``, of more than `MOST_CSV_STATES` ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
+    figures : ``all``: those of the paper too
     note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
     inside : as in `check_directory`
     then : called with the new directory before it is put in place: what it writes there belongs to the run, and where
@@ -126,7 +129,7 @@ def write_run(
         if plots:
             from icrtool.output.figure_catalogue import draw_figures
 
-            draw_figures("run", run, partial / "plots", plots)
+            draw_figures("run", run, partial / "plots", plots, figures)
         sums: dict[str, str] = {}
         if run.smoothed is not None:
             sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)

@@ -7,7 +7,10 @@ function up here by name when they are called, so that importing a record import
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import Any, Literal
+
+FigureSet = Literal["default", "all"]
+"""The figures that a run and its report are written with: those that answer a question, or the paper's too."""
 
 
 def call_output(module: str, function: str, *arguments: object, **options: object) -> Any:  # noqa: ANN401 - the type is that of the function called

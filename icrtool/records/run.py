@@ -14,7 +14,7 @@ from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.events import intervals_in
-from icrtool.records.late_output import call_output
+from icrtool.records.late_output import FigureSet, call_output
 from icrtool.records.measurements import SensorData
 from icrtool.records.tables import Icrs, States
 
@@ -194,6 +194,7 @@ class Run:
         *,
         states: Literal["csv", "parquet"] | None = None,
         plots: tuple[str, ...] = ("png",),
+        figures: FigureSet = "default",
     ) -> None:
         """Write the run directory, whole or not at all; an older run at `path` is replaced.
 
@@ -202,13 +203,14 @@ class Run:
         path : the directory
         states : format of the states; default: ``csv``, of over a million states ``parquet``
         plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
+        figures : ``all``: those of the paper too
 
         Raises
         ------
         OutputError
             A file or a directory of another program exists at `path`, or the disk cannot be written.
         """
-        call_output("run_directory", "write_run", self, Path(path), states=states, plots=plots)
+        call_output("run_directory", "write_run", self, Path(path), states=states, plots=plots, figures=figures)
 
     def __repr__(self) -> str:
         drive, icr = self.summary["drive"], self.summary["icr"]

@@ -2,89 +2,128 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.patches import Patch
 
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.kernels.arrays import Floats
 from icrtool.output.figures.style import (
-    ICR,
+    BUDGET,
     LABEL_BOX,
     MEAN,
-    NO_SLIP,
     Pen,
     add_legend,
     fill_bins,
+    logarithmic_errors,
+    model_pens,
     new_figure,
     styled,
 )
 from icrtool.output.text_format import MODEL_WORDS, error_text, run_title
-from icrtool.records.dropout import ModelResult
+from icrtool.records.dropout import BudgetDistance, ModelResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PANEL_HEIGHT_IN = 2.0
+OF_THE_FILTER = ("icr", "no_slip")
+PANEL_HEIGHT_IN, LOW_PANEL_IN = 2.0, 1.45
 
-LOOKS = {"icr": (ICR.color, "o", "#a6c4e0"), "no_slip": (NO_SLIP.color, "s", "#f6d3a8")}
-"""Colour, marker and colour of the band."""
-CONSTANT_COLORS = ("#1b7837", "#762a83", "#8c510a", "#01665e", "#c51b7d")
-"""Of the recommended model and of calibrations, in the order of the report."""
-
-BUDGET = Pen("#b2182b", (0, (1.5, 2.0)), 1.0)
 P95 = Pen("black", width=1.2)
 """The 95 % mark is a solid line, the expected value a dashed one (`MEAN`), in every picture."""
 
-DASH = (0, (4.0, 2.0))
-FLATTENING = 2.5
+DASH = (0, (1.2, 1.6))
+"""Of the expected errors of a model."""
+BAND_ALPHA = 0.18
+CURVE_POINTS = 200
+
+LEAST_SHOWN = 0.7
+"""The scale of errors begins at this part of the least that is drawn, and ends so much above the greatest."""
+MOST_DECADES = 4.0
+SPACE_OF_LABEL = 0.09
+"""A distance is written to the left of its mark where it leaves this part of the width."""
+
 LEAST_HISTOGRAM_IN_P95, MOST_HISTOGRAM_IN_P95 = 1.3, 4.0
-"""The histograms of a horizon share one scale: up to the largest p95 and a margin, but at most so many times that of
-the ICRs. The share of trials beyond it is written at its end."""
+"""The histograms of a picture share one scale: up to the largest p95 and a margin, but at most so many times that of
+the first model. The share of trials beyond it is written at its end."""
+
+KEY_COLUMNS, KEY_IN = 3, 0.19
+"""Columns of the legend of the summary, height of a row of it."""
 
 MOSTLY_BEYOND_PCT = 90.0
-
-SHORT_NAMES, KEY_IN = 4, 0.19
-"""So many models have short names in the legend; height of a row of it."""
 
 
 @styled
 def dropout_summary(report: DropoutReport) -> Figure:
-    """Return 95 % and expected error [m] over distance without GNSS [m], by model, and real outages.
+    """Return 95 % and expected error [m] over distance without GNSS [m]: how far each model stays within the budget.
 
-    Where no slip is so far off that the ICR curves would lie on the axis, a second panel has them alone.
+    The recommended model, what a controller makes of its numbers, and calibrations that were given; no slip for
+    comparison. Where there is no recommended model, the momentary ICRs.
     """
-    subtitle = (
-        f"Open-loop error over distance without GNSS, up to {int(report.counts.trials.max()):,} trials a distance"
-    )
-    apart = _flattened(report)
-    models = ("icr", "no_slip", *_constant_models(report), "icr_final")
-    # names of calibrations are long
-    columns = 4 if len(models) <= SHORT_NAMES else 3
-    more_in = KEY_IN * max(2 * len(models) // columns - 2, 0)
+    models = [*_held_out(report), *(one for one in report.results if one.name == "no_slip")]
+    budgets_m = list(dict.fromkeys(one.budget_m for one in report.budgets))
+    reached = [one for one in report.budgets if one.model in {model.name for model in models}]
+    best = next((one for one in reached if one.model == models[0].name), None)
+    pens = _pens(report)
+    title = f"Within {best.budget_m:g} m (95 %) for {best.reach_text}" if best is not None else "Error over distance"
+    # Beside the models: the mean of the first, budget, outages.
+    keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
+    trials = f"up to {int(report.counts.trials.max()):,} trials a distance"
     figure = new_figure(
-        run_title(report.run_summary), subtitle + ("; right: no slip left out" if apart else ""),
-        height_in=4.7 + more_in, margins_in=(0.7, 0.2, 0.65, 1.15 + more_in), wspace=0.28,
+        title, f"{run_title(report.run_summary)}: open-loop error without GNSS, {trials}; bands: 95 % intervals",
+        height_in=4.6 + keys_in, margins_in=(0.75, 0.25, 0.65, 0.95 + keys_in),
     )  # fmt: skip
-    panels = figure.subplots(1, 2 if apart else 1, squeeze=False)[0]
+    axes = figure.subplots()
+    # A line begins where trials do, or where its model has used up the budget.
+    first_m = min([report.horizons_m[0], *(one.distance_m for one in reached if one.model != "no_slip")])
+    for one in models:
+        _draw_model(axes, one, report.horizons_m, first_m, pens[one.name], first=one is models[0])
     outages = [one for one in report.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
-    for axes, without in zip(panels, ("", "no_slip"), strict=False):
-        for name in models:
-            if name != without and (result := report.result(name)) is not None:
-                _draw_model(axes, result, report)
-        for number, budget in enumerate(dict.fromkeys(one.budget_m for one in report.budgets)):
-            axes.axhline(budget, label="_" if number else "budget", **BUDGET.keywords())
-        if outages:
-            axes.plot(
-                [one.distance_m for one in outages], [one.end_error_m for one in outages], linestyle="none", marker="X",
-                color="black", markersize=7, zorder=5, clip_on=False, label="real outage",
-            )  # fmt: skip
-        axes.set(xlim=(0, report.horizons_m[-1] * 1.02), ylim=(0, None))
-        axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
-        axes.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]")
-    keys = [*panels[0].get_legend_handles_labels()[0], Patch(color="0.8", linewidth=0, label="95 % interval")]
-    figure.legend(handles=keys, ncols=columns, columnspacing=1.6)
+    if outages:
+        axes.plot(
+            [one.distance_m for one in outages], [one.end_error_m for one in outages], linestyle="none", marker="X",
+            color="black", markersize=7, zorder=5, label="real outage",
+        )  # fmt: skip
+    low, high = _shown_errors(models, [*budgets_m, *(one.end_error_m for one in outages)])
+    axes.set(xlim=(0, report.horizons_m[-1] * 1.02), ylim=(low, high), xlabel="Distance without GNSS [m]")
+    axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
+    logarithmic_errors(axes, "y")
+    for budget in budgets_m:
+        axes.axhline(budget, label=f"budget {' and '.join(f'{one:g}' for one in budgets_m)} m", **BUDGET.keywords())
+        marked = [one for one in reached if one.budget_m == budget and one.model != "no_slip" and not one.beyond]
+        _mark_reaches(axes, marked, pens, low)
+    add_legend(figure, ncols=KEY_COLUMNS)
+    return figure
+
+
+@styled
+def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
+    """Return the percent of the trials by error [m] of the recommended model, a panel a horizon, and the budget."""
+    asked = [_place(report, metres) for metres in horizons_m]
+    of_models = (
+        (one, [h for h in asked if len(one.histograms[h].left)]) for one in (*_held_out(report), *report.results)
+    )
+    model, places = next(found for found in of_models if found[1])
+    budgets_m = dict.fromkeys(one.budget_m for one in report.budgets)
+    errors = ", ".join(error_text(float(model.summary.p95[h])).removesuffix(" m") for h in places)
+    distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
+    figure = new_figure(
+        f"95 % of the trials end within {errors} m after {distances} m",
+        f"{run_title(report.run_summary)}: open-loop error, {MODEL_WORDS.get(model.name, model.label)}",
+        height_in=1.55 + LOW_PANEL_IN * len(places), margins_in=(0.75, 0.25, 0.85, 0.9), hspace=0.38,
+    )  # fmt: skip
+    panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
+    p95 = model.summary.p95[places]
+    end = _histogram_end([np.nanmax(p95), *(budget for budget in budgets_m if budget < 2 * np.nanmax(p95))])
+    for axes, h in zip(panels, places, strict=True):
+        heading = f"after {report.horizons_m[h]:g} m, {int(model.summary.trials[h]):,} trials"
+        _draw_bins(axes, model, h, _pens(report)[model.name].color, end, heading)
+        for budget in budgets_m:
+            axes.axvline(budget, label=f"budget {budget:g} m", **BUDGET.keywords())
+    panels[-1].set_xlabel("Error [m]")
+    add_legend(figure, columnspacing=3.0)
     return figure
 
 
@@ -97,77 +136,108 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     ValueError
         The report has no such horizon.
     """
-    if horizon_m not in report.horizons_m:
-        raise ValueError(f"horizon_m: {horizon_m:g} m is not among the report's horizons")
-    h = int(np.flatnonzero(report.horizons_m == horizon_m)[0])
-    found = [result for name in (*LOOKS, *_constant_models(report)) if (result := report.result(name)) is not None]
+    h = _place(report, horizon_m)
+    of_the_filter = [one for name in OF_THE_FILTER if (one := report.result(name)) is not None]
+    found = [*of_the_filter, *(one for one in _held_out(report) if one.name != "icr")]
     # A model of constant parameters may have no trial of a length that others have.
     results = [result for result in found if len(result.histograms[h].left)]
-    what = f"Open-loop error after {horizon_m:g} m, {int(report.counts.trials[h]):,} trials"
+    p95 = [float(result.summary.p95[h]) for result in results]
     figure = new_figure(
-        run_title(report.run_summary), what,
-        height_in=1.5 + PANEL_HEIGHT_IN * len(results), margins_in=(0.7, 0.2, 0.85, 0.9), hspace=0.45,
+        f"After {horizon_m:g} m 95 % of the trials end within {min(p95):.2f} to {max(p95):.2f} m, by model",
+        f"{run_title(report.run_summary)}: open-loop error of {int(report.counts.trials[h]):,} trials",
+        height_in=1.5 + PANEL_HEIGHT_IN * len(results), margins_in=(0.75, 0.2, 0.85, 0.9), hspace=0.45,
     )  # fmt: skip
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
-    end = _histogram_end([result.summary.p95[h] for result in results])
+    end = _histogram_end([min(max(p95), MOST_HISTOGRAM_IN_P95 / LEAST_HISTOGRAM_IN_P95 * p95[0])])
     for axes, result in zip(panels, results, strict=True):
-        _draw_bins(axes, result, h, _look(report, result.name)[0], end)
+        _draw_bins(axes, result, h, _pens(report)[result.name].color, end, MODEL_WORDS.get(result.name, result.label))
     panels[-1].set_xlabel("Error [m]")
     add_legend(figure, columnspacing=3.0)
     return figure
 
 
-def _constant_models(report: DropoutReport) -> tuple[str, ...]:
-    """Return the recommended model and the calibrations that the report has rows of."""
-    given = {one.name for one in report.calibrations}
-    return tuple(result.name for result in report.results if result.name in {"recommended", "controller"} | given)
+def _held_out(report: DropoutReport) -> list[ModelResult]:
+    """Return the recommended model, its numbers in a controller, and calibrations; else the momentary ICRs."""
+    found = [one for name in _pens(report) if name not in OF_THE_FILTER and (one := report.result(name)) is not None]
+    return found or [one for one in report.results if one.name == "icr"] or list(report.results[:1])
 
 
-def _look(report: DropoutReport, name: str) -> tuple[str, str, str]:
-    """Return colour, marker and colour of the band of a model."""
-    if name in LOOKS:
-        return LOOKS[name]
-    color = CONSTANT_COLORS[_constant_models(report).index(name) % len(CONSTANT_COLORS)]
-    return color, "D" if name == "recommended" else "^", "0.8"
+def _pens(report: DropoutReport) -> dict[str, Pen]:
+    """Return how the models are drawn that pictures show; final ICRs and rows with a gyro are in the tables alone."""
+    own = ("icr_final", "icr_gyro", "icr_final_gyro", "no_slip_gyro", "recommended_gyro", "controller_gyro")
+    left_out = {*own, *(one.name for one in report.calibrations if one.with_gyro)}
+    return model_pens([one.name for one in report.results if one.name not in left_out])
 
 
-def _flattened(report: DropoutReport) -> bool:
-    """Return whether no slip is so much worse that the ICR curves need a panel of their own."""
-    icr, no_slip = report.result("icr"), report.result("no_slip")
-    if icr is None or no_slip is None or not np.isfinite(no_slip.summary.p95).any():
-        return False
-    return bool(np.nanmax(no_slip.summary.p95) > FLATTENING * np.nanmax(icr.summary.p95))
+def _place(report: DropoutReport, horizon_m: float) -> int:
+    if horizon_m not in report.horizons_m:
+        raise ValueError(f"horizon_m: {horizon_m:g} m is not among the report's horizons")
+    return int(np.flatnonzero(report.horizons_m == horizon_m)[0])
 
 
-def _draw_model(axes: Axes, result: ModelResult, report: DropoutReport) -> None:
-    """Draw 95 % (filled marks, solid) and expected error (open marks, dashed) of a model with their intervals.
+def _draw_model(
+    axes: Axes, result: ModelResult, horizons_m: Floats, first_m: float, pen: Pen, *, first: bool
+) -> None:  # fmt: skip
+    """Draw the 95 % error of a model with its interval; of the `first` one also the expected error.
 
-    The final ICRs, which are fitted to what they are tested on, are thin lines without marks.
+    No slip is a thin line. Between horizons lines are as `budget_distances` has them, from no error at no distance.
     """
-    summary, intervals, x = result.summary, result.intervals, report.horizons_m
     label = MODEL_WORDS.get(result.name, result.label)
-    look: dict[str, Any] = {"color": "0.35", "linewidth": 0.9}
-    if result.name == "icr_final":
-        label = "final ICRs"
-    else:
-        color, marker, band = _look(report, result.name)
-        look = {"color": color, "marker": marker, "markersize": 4.5}
-        for low, high in (
-            (intervals.p95_low, intervals.p95_high),
-            (intervals.expected_low, intervals.expected_high),
-        ):
-            axes.fill_between(x, low, high, color=band, alpha=0.6, linewidth=0)
-    axes.plot(x, summary.p95, label=f"{label}, 95 %", **look)
-    axes.plot(x, summary.expected, label=f"{label}, expected", linestyle=DASH, markerfacecolor="white", **look)
+    x = np.linspace(first_m, horizons_m[-1], CURVE_POINTS)
+    known = np.isfinite(result.summary.p95)
+    at = np.append(0.0, horizons_m[known])
+
+    def between(errors: Floats) -> Floats:
+        drawn: Floats = np.where(x <= at[-1], np.interp(x, at, np.append(0.0, errors[known])), np.nan)
+        return drawn
+
+    thin = result.name == "no_slip"
+    look = pen.keywords() | ({"linewidth": 0.9} if thin else {})
+    axes.plot(x, between(result.summary.p95), label=f"{label}, 95 %", **look)
+    if not thin:
+        low, high = (between(values) for values in (result.intervals.p95_low, result.intervals.p95_high))
+        axes.fill_between(x, low, high, color=pen.color, alpha=BAND_ALPHA, linewidth=0)
+    if first:
+        mean = pen.keywords() | {"linestyle": DASH, "linewidth": 1.1}
+        axes.plot(x, between(result.summary.expected), label=f"{label}, mean", **mean)
 
 
-def _histogram_end(p95: list[np.floating[Any]]) -> float:
-    """Return the right end [m] of the scale that the panels share, by their p95, that of the ICRs first."""
-    end = min(LEAST_HISTOGRAM_IN_P95 * float(np.nanmax(p95)), MOST_HISTOGRAM_IN_P95 * float(p95[0]))
+def _shown_errors(models: list[ModelResult], others_m: list[float]) -> tuple[float, float]:
+    """Return the ends [m] of the scale: all that is drawn from the first horizon on, over at most `MOST_DECADES`."""
+    errors = np.concatenate([*(one.summary.p95 for one in models), models[0].summary.expected, others_m])
+    errors = errors[np.isfinite(errors) & (errors > 0)]
+    if not len(errors):
+        return 0.01, 1.0
+    high = float(errors.max()) / LEAST_SHOWN
+    return max(LEAST_SHOWN * float(errors.min()), high / 10**MOST_DECADES), high
+
+
+def _mark_reaches(
+    axes: Axes, reached: list[BudgetDistance], pens: Mapping[str, Pen], lowest_m: float
+) -> None:  # fmt: skip
+    """Mark where models use up a budget: the nearest is named to the left of its curve, others to the right."""
+    for number, one in enumerate(sorted(reached, key=lambda one: one.distance_m)):
+        pen = pens[one.model]
+        axes.plot([one.distance_m] * 2, [lowest_m, one.budget_m], color=pen.color, linewidth=0.7, zorder=1.5)
+        axes.plot(
+            [one.distance_m], [one.budget_m], linestyle="none", marker="o", color=pen.color, markerfacecolor="white",
+            markersize=5.5, zorder=5,
+        )  # fmt: skip
+        left = number == 0 and one.distance_m > SPACE_OF_LABEL * axes.get_xlim()[1]
+        axes.annotate(
+            f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), xytext=(-5, 5) if left else (5, -5),
+            textcoords="offset points", ha="right" if left else "left", va="bottom" if left else "top",
+            color=pen.color, fontweight="bold", zorder=6, bbox=LABEL_BOX,
+        )  # fmt: skip
+
+
+def _histogram_end(marks_m: list[Any]) -> float:
+    """Return the right end [m] of the scale that panels share, by what is marked on it."""
+    end = LEAST_HISTOGRAM_IN_P95 * float(max(marks_m))
     return end if end > 0 else 1.0
 
 
-def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float) -> None:
+def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float, heading: str) -> None:
     """Draw the bins of one model at horizon number `h` up to `end_m`, and its expected value and 95 %."""
     summary, bins = result.summary, result.histograms[h]
     p95, expected, largest = float(summary.p95[h]), float(summary.expected[h]), float(summary.largest[h])
@@ -176,11 +246,11 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
     axes.axvline(p95, label="95 % of the trials", **P95.keywords())
     axes.axvline(expected, label="expected value", **MEAN.keywords())
-    label = MODEL_WORDS.get(result.name, result.label)
-    axes.set_title(label, loc="left", pad=4.0, fontweight="bold")
+    axes.set_title(heading, loc="left", pad=4.0, fontweight="bold")
     facts = f"expected {error_text(expected)},  95 % within {error_text(p95)},  max {error_text(largest)}"
     axes.set_title(facts, loc="right", pad=4.0)
     axes.set_xlim(0, end_m)
+    axes.locator_params(axis="y", nbins=4)
     beyond = float(bins.percent[bins.left >= end_m].sum())
     where: dict[str, Any] = {"transform": axes.transAxes, "bbox": LABEL_BOX}
     if beyond >= MOSTLY_BEYOND_PCT:

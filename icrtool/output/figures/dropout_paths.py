@@ -13,19 +13,24 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
-from icrtool.output.figures.ground import draw_path, fitted_box_in, look_down, name_directions
+from icrtool.output.figures.ground import (
+    CELLS,
+    JUMP_LOOK,
+    draw_path,
+    fitted_box_in,
+    look_down,
+    name_directions,
+)
 from icrtool.output.figures.style import (
     FILTER,
     FIX_COLOR,
     FORCED,
-    ICR,
     LABEL_BOX,
-    NO_SLIP,
     REAL,
-    WHOLE,
     WIDTH_IN,
     Pen,
     add_legend,
+    model_pens,
     new_figure,
     spot,
     styled,
@@ -37,11 +42,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WORST_COLUMNS = 4
-WORST_CELL_IN = 1.95
+WORST_COLUMNS, WORST_ROWS = 4, 2
+WORST_WIDTH_IN, WORST_CELL_IN = 9.6, 2.15
 CELL_TITLE: dict[str, Any] = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
 
-PENS = {"icr": ICR, "no_slip": NO_SLIP, "recommended": WHOLE}
+PICTURED = ("no_slip",)
+"""Drawn beside the model that trials were chosen by."""
 OUTAGES = {"forced": FORCED, "real": REAL}
 PATH = Pen(FIX_COLOR, width=1.4)
 
@@ -55,8 +61,10 @@ LABEL_OFFSETS_PT = tuple(
 )
 LINE_FROM_PT = 20.0
 """A label further than this from its point has a line to it."""
-NUMBERS_APART = 0.16
-"""Trials that start closer together than this share of the overview's width have one place for their numbers."""
+BAR_SHARE = 0.4
+"""The bar of a scale is at most this part of the width."""
+FRAME_COLOR = "0.75"
+SLOWEST_MPS = 0.001
 
 
 @styled
@@ -69,19 +77,17 @@ def dropout_examples(report: DropoutReport) -> Figure:
         The report holds none; `icrtool.dropout_report` makes one that does.
     """
     examples = _needed(report, report.examples, "example trials")
-    horizon = examples[0].horizon_m
+    errors = " and ".join(error_text(one.errors_m[one.model]) for one in examples)
     what = "about half a turn (left), as straight as the drive has it (right)"
     figure = new_figure(
-        run_title(report.run_summary), f"Trials without GNSS over {horizon:g} m: {what}",
-        height_in=4.7, margins_in=(0.7, 0.2, 1.0, 0.9), wspace=0.34,
+        f"Typical trials of {examples[0].horizon_m:g} m end {errors} off", f"{run_title(report.run_summary)}: {what}",
+        height_in=4.7, margins_in=(0.75, 0.2, 1.0, 0.9), wspace=0.34,
     )  # fmt: skip
     panels = figure.subplots(1, len(examples), squeeze=False)[0]
     for axes, drive in zip(panels, examples, strict=True):
-        _draw_drive(axes, drive, shape=3.0 / 2.75)
+        _draw_drive(axes, report, drive, shape=3.0 / 2.75)
         facts = f"at {drive.t_s:.0f} s, turns {_turn_text(drive)} at {drive.speed_mean_mps:.2f} m/s"
-        errors = ",  ".join(
-            f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in drive.errors_m.items() if name in PENS
-        )
+        errors = ",  ".join(f"{_word(report, name)} {error_text(error)}" for name, error in drive.errors_m.items())
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
@@ -98,46 +104,82 @@ def dropout_worst(report: DropoutReport) -> Figure:
     DataError
         The report holds none; `icrtool.dropout_report` makes one that does.
     """
-    worst = _needed(report, report.worst, "worst trials")
-    rows = -(-(len(worst) + 1) // WORST_COLUMNS)
+    worst = _needed(report, report.worst, "worst trials")[: WORST_COLUMNS * WORST_ROWS - 1]
+    rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), worst[0].model
+    which = f"the {len(worst)} worst trials of the model {_word(report, model)}, none overlapping"
     figure = new_figure(
-        run_title(report.run_summary),
-        f"The {len(worst)} worst trials without GNSS over {worst[0].horizon_m:g} m, momentary ICRs, none overlapping",
-        width_in=9.6, height_in=1.25 + rows * (WORST_CELL_IN + 0.75), margins_in=(0.65, 0.15, 1.07, 0.9), wspace=0.3,
-        hspace=0.5,
+        f"The worst trial of {worst[0].horizon_m:g} m ends {error_text(worst[0].errors_m[model])} off",
+        f"{run_title(report.run_summary)}: {which}",
+        width_in=WORST_WIDTH_IN, height_in=1.0 + rows * (WORST_CELL_IN + 0.5), margins_in=(0.15, 0.15, 0.98, 0.5),
+        wspace=0.12, hspace=0.27,
     )  # fmt: skip
     panels = figure.subplots(rows, WORST_COLUMNS, squeeze=False).ravel()
-    figure.supxlabel("East of start [m]", fontsize=9.0, y=0.42 / figure.get_figheight())
-    figure.supylabel("North of start [m]", fontsize=9.0, x=0.12 / figure.get_figwidth())
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(True)
+        axes.spines[:].set_color(FRAME_COLOR)
     _draw_overview(panels[0], worst, report.reference_north_m, report.reference_east_m)
     for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
-        _draw_drive(axes, drive, shape=1.0)
-        what = f"{rank}.  {MODEL_WORDS[drive.model]}: {error_text(drive.errors_m[drive.model])}"
-        text = f"{what}\nat {drive.t_s:.0f} s, turns {_turn_text(drive)}"
-        axes.set_title(f"{text}\nat {drive.speed_mean_mps:.2f} m/s", **CELL_TITLE)
-        axes.tick_params(labelsize=7.5)
+        _draw_drive(axes, report, drive, shape=1.0, ticks=0)
+        _draw_scale(axes)
+        facts = f"at {duration_text(drive.t_s)}, {_turn_text(drive)}, {drive.speed_mean_mps:.2f} m/s"
+        axes.set_title(f"{rank}:  {error_text(drive.errors_m[model])}\n{facts}", **CELL_TITLE)
     for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
     add_legend(figure)
     return figure
 
 
+def _word(report: DropoutReport, model: str) -> str:
+    result = report.result(model)
+    return MODEL_WORDS.get(model) or (result.label if result is not None else model)
+
+
 def _draw_overview(axes: Axes, worst: Sequence[ExampleTrial], north_m: Floats, east_m: Floats) -> None:
-    """Draw the whole path and, numbered, where the trials start."""
-    norths, easts = north_m - north_m[0], east_m - east_m[0]
-    cell = look_down(axes, norths, easts, 1.0, ticks=4)
-    draw_path(axes, norths, easts, cell, PATH, zorder=2)
-    apart = NUMBERS_APART * float(np.ptp(axes.get_xlim()))
-    together: dict[tuple[float, float], list[int]] = {}
+    """Draw the whole path and, numbered, where the trials start; numbers that would touch stand in a row."""
+    cell = look_down(axes, north_m, east_m, 1.0, ticks=0)
+    draw_path(axes, north_m, east_m, cell, PATH, zorder=2)
+    number_pt, line_pt = 1.1 * CHARACTER_PT, 0.8 * LINE_PT
+    point_m = cell * CELLS / (72.0 * WORST_CELL_IN)
+    together: list[tuple[float, float, list[int]]] = []
     for rank, drive in enumerate(worst, start=1):
-        place = drive.east_m - float(east_m[0]), drive.north_m - float(north_m[0])
-        near = (one for one in together if math.dist(one, place) < apart)
-        together.setdefault(next(near, place), []).append(rank)
-    for place, ranks in together.items():
-        text = ",".join(map(str, ranks))
-        axes.text(*place, text, fontsize=7.5, fontweight="bold", ha="center", va="center", zorder=3)
-    axes.tick_params(labelsize=7.5)
-    axes.set_title("where they start\non the whole path\n(from its first point)", **CELL_TITLE)
+        for north, east, ranks in together:
+            half_pt = number_pt * (len(ranks) + 1) + 2.0
+            if abs(drive.north_m - north) < line_pt * point_m and abs(drive.east_m - east) < half_pt * point_m:
+                ranks.append(rank)
+                break
+        else:
+            together.append((drive.north_m, drive.east_m, [rank]))
+    for north, east, ranks in together:
+        axes.text(
+            east, north, " ".join(map(str, ranks)), fontsize=8.0, fontweight="bold", ha="center", va="center",
+            zorder=3, bbox=LABEL_BOX,
+        )  # fmt: skip
+    _draw_scale(axes)
+    axes.set_title("where they start\non the whole path", **CELL_TITLE)
+
+
+def _draw_scale(axes: Axes) -> None:
+    """Draw a bar of a round length in a corner of a view without lines, in place of ticks."""
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    width, height = east - west, north - south
+    longest = BAR_SHARE * width
+    decade = 10.0 ** math.floor(math.log10(longest))
+    length = max(step * decade for step in (1.0, 2.0, 5.0) if step * decade <= longest)
+    drawn = np.concatenate([line.get_xydata() for line in axes.lines])
+
+    def crossed(corner: tuple[float, float]) -> int:
+        beside, above = (drawn[:, 0] - corner[0]) / width, (drawn[:, 1] - corner[1]) / height
+        inside = (beside > -0.03) & (beside < length / width + 0.03) & (above > -0.04) & (above < 0.13)
+        return int(np.count_nonzero(inside))
+
+    left, right = west + 0.05 * width, east - 0.05 * width - length
+    low, high = south + 0.04 * height, south + 0.87 * height
+    x, y = min([(right, low), (left, low), (right, high), (left, high)], key=crossed)
+    axes.plot([x, x + length], [y, y], color="black", linewidth=1.6, zorder=7, solid_capstyle="butt")
+    axes.annotate(
+        f"{length:g} m", (x + length / 2, y), xytext=(0, 2), textcoords="offset points", ha="center", va="bottom",
+        fontsize=7.5, zorder=7, bbox=LABEL_BOX,
+    )  # fmt: skip
 
 
 @styled
@@ -154,7 +196,7 @@ def dropout_outages(report: DropoutReport) -> Figure:
     easts = np.concatenate([report.reference_east_m, *(one.east_m for one in outages)])
     width_in = WIDTH_IN - 0.95
     box_in = fitted_box_in(norths, easts, width_in)
-    figure = new_figure(run_title(report.run_summary), _outages_text(outages), height_in=box_in + 1.65)
+    figure = new_figure(_outages_text(outages), run_title(report.run_summary), height_in=box_in + 1.65)
     axes = figure.subplots()
     cell = look_down(axes, norths, easts, width_in / box_in, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
@@ -178,15 +220,17 @@ def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> t
     return content
 
 
-def _draw_drive(axes: Axes, drive: ExampleTrial, shape: float) -> None:
+def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: float, ticks: int = 5) -> None:
     """Draw one trial about its start in axes `shape` times as wide as high."""
+    pens = model_pens(list(drive.paths))
     lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, "filter")]
     lines += [
-        (path.north, path.east, PENS[name], MODEL_WORDS[name]) for name, path in drive.paths.items() if name in PENS
-    ]
+        (path.north, path.east, pens[name], _word(report, name))
+        for name, path in drive.paths.items() if name in (*PICTURED, drive.model)
+    ]  # fmt: skip
     lines = [(north - drive.north_m, east - drive.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
-    cell = look_down(axes, norths, easts, shape)
+    cell = look_down(axes, norths, easts, shape, ticks=ticks)
     axes.plot([0.0], [0.0], zorder=6, label="start", **spot("white"))
     for order, (north, east, pen, label) in enumerate(lines):
         draw_path(axes, north, east, cell, pen, zorder=2 + min(order, 1), label=label)
@@ -195,10 +239,20 @@ def _draw_drive(axes: Axes, drive: ExampleTrial, shape: float) -> None:
             east[-1:], north[-1:], linestyle="none", marker="D", color=pen.color, markersize=4.5, zorder=5,
             label="where each ends",
         )  # fmt: skip
+    end_s = drive.t_s + drive.horizon_m / max(drive.speed_mean_mps, SLOWEST_MPS)
+    jumps = [
+        one for one in report.run_summary["reference_jumps"] if drive.t_s <= one["end_s"] and one["begin_s"] <= end_s
+    ]
+    if jumps:
+        axes.plot(
+            [one["east_m"] - drive.east_m for one in jumps], [one["north_m"] - drive.north_m for one in jumps],
+            label="step of the reference", **JUMP_LOOK,
+        )  # fmt: skip
 
 
 def _turn_text(drive: ExampleTrial) -> str:
-    return f"{abs(math.degrees(drive.heading_change_rad)):.0f}°"
+    turn_deg = math.degrees(drive.heading_change_rad)
+    return f"{abs(turn_deg):.0f}° {'right' if turn_deg > 0 else 'left'}"
 
 
 def _outages_text(outages: Sequence[Outage]) -> str:

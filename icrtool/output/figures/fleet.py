@@ -1,4 +1,4 @@
-"""Figures of a batch: ICRs by robot and date, error by group, failures by reason."""
+"""Figures of a batch: ICRs by robot and date, error by log."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from icrtool.output.figures.style import add_legend, drawable, logarithmic_errors, new_figure, styled
+from icrtool.output.text_format import error_text
+from icrtool.records.text import counted
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ROW_IN = 0.32
+ROW_IN = 0.22
+MOST_ROWS = 40
 LEAST_DAYS = 1.0
 """Shown of the calendar: matplotlib gives a single date four years."""
-LONGEST_ROBOT, LONGEST_GROUP, LONGEST_REASON = 24, 24, 40
+LONGEST_ROBOT, LONGEST_GROUP, LONGEST_LOG = 24, 24, 34
 """Characters of a label that there is space for."""
 
 COLORS = ("#1b6ca8", "#d95f02", "#1b9e77", "#7570b3", "#a6761d", "#666666")
@@ -29,14 +31,14 @@ class FleetNumbers(NamedTuple):
     Attributes
     ----------
     points : the logs with a date and both lateral ICRs, as fleet.json has them
-    errors_m : 95 % error after 10 m of each log, by group
-    reasons : how many logs failed, by reason
+    errors_m : 95 % error after 10 m of each log, by group and name
+    model : whose errors they are
     """
 
     title: str
     points: Sequence[Mapping[str, Any]]
-    errors_m: Mapping[str, Sequence[float]]
-    reasons: Mapping[str, int]
+    errors_m: Mapping[str, Mapping[str, float]]
+    model: str
 
 
 @styled
@@ -44,8 +46,14 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     """Return both lateral ICRs of every log over its date, ±σ, a colour and marker per robot."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
+    ranges = {
+        side: [f"{edge([point['icr'][f'y_icr_{side}_m'] for point in fleet.points]):+.2f}" for edge in (min, max)]
+        for side in ("right", "left")
+    }
+    answer = ", ".join(f"y {side} {' to '.join(ends)} m" for side, ends in ranges.items()).replace("-", "−")
     figure = new_figure(
-        fleet.title, "final ICRs of every log, ±σ", height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12
+        f"ICRs: {answer}", f"{fleet.title}: of each log, ±σ", height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95),
+        hspace=0.12,
     )  # fmt: skip
     panels = figure.subplots(2, 1, sharex=True)
     for axes, side in zip(panels, ("right", "left"), strict=True):
@@ -68,40 +76,36 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     panels[-1].xaxis.set_major_locator(locator)
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
     years = sorted({point["start_utc"][:4] for point in fleet.points})
-    panels[-1].set_xlabel(f"Date (UTC), {'-'.join(dict.fromkeys((years[0], years[-1])))} [-]")
+    panels[-1].set_xlabel(f"Date, UTC, {' to '.join(dict.fromkeys((years[0], years[-1])))}")
     add_legend(figure, ncols=4)
     return figure
 
 
 @styled
 def fleet_errors(fleet: FleetNumbers) -> Figure:
-    """Return the 95 % error of the ICRs after 10 m of every log by group, the median marked."""
-    what = "95 % error after 10 m without GNSS, momentary ICRs; bar: median of the logs"
-    labels = [f"{drawable(name, LONGEST_GROUP)} ({len(values)})" for name, values in fleet.errors_m.items()]
-    figure, axes = _rows(fleet.title, what, labels, left_in=2.4)
-    for row, values in enumerate(fleet.errors_m.values()):
-        axes.plot(values, [row] * len(values), linestyle="none", marker="o", markersize=4.5, color=COLORS[0], alpha=0.6)
-        axes.plot([float(np.median(values))] * 2, [row - 0.3, row + 0.3], color="black", linewidth=2.0)
-    logarithmic_errors(axes)
-    return figure
-
-
-@styled
-def fleet_failures(fleet: FleetNumbers) -> Figure:
-    """Return how many logs could not be used, by reason."""
-    labels = [drawable(reason, LONGEST_REASON) for reason in fleet.reasons]
-    figure, axes = _rows(fleet.title, "logs that could not be used, by reason", labels, left_in=3.3)
-    axes.barh(range(len(labels)), list(fleet.reasons.values()), height=0.6, color=COLORS[1])
-    axes.set_xlabel("Logs [-]")
-    axes.locator_params(axis="x", integer=True)
-    return figure
-
-
-def _rows(title: str, what: str, labels: Sequence[str], *, left_in: float) -> tuple[Figure, Axes]:
-    """Return a figure with a row for each label, the first one at the top."""
-    height_in = 1.7 + ROW_IN * max(len(labels), 2)
-    figure = new_figure(title, what, height_in=height_in, margins_in=(left_in, 0.3, 0.85, 0.6))
+    """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs those of the largest."""
+    errors = [(group, log, error) for group, logs in fleet.errors_m.items() for log, error in logs.items()]
+    largest = sorted(errors, key=lambda one: -one[2])[:MOST_ROWS]
+    shown = [one for one in errors if one in largest]
+    cut = f", the {MOST_ROWS} largest" if len(errors) > MOST_ROWS else ""
+    median = error_text(float(np.median([error for *_, error in errors])))
+    labels = [drawable(log, LONGEST_LOG) for _, log, _ in shown]
+    figure = new_figure(
+        f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}",
+        f"{fleet.title}: 95 % error after 10 m without GNSS, {fleet.model}{cut}", height_in=1.9 + ROW_IN * len(shown),
+        margins_in=(2.9, 0.3, 0.65, 1.05),
+    )  # fmt: skip
     axes = figure.subplots()
     axes.set_yticks(range(len(labels)), labels, parse_math=False)
     axes.set_ylim(len(labels) - 0.4, -0.6)
-    return figure, axes
+    for number, (group, logs) in enumerate(fleet.errors_m.items()):
+        rows = [row for row, one in enumerate(shown) if one[0] == group]
+        middle = error_text(float(np.median(list(logs.values()))))
+        axes.plot(
+            [shown[row][2] for row in rows], rows, linestyle="none", marker=MARKERS[number % len(MARKERS)],
+            color=COLORS[number % len(COLORS)], markersize=5.5,
+            label=f" {drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}",
+        )  # fmt: skip
+    logarithmic_errors(axes)
+    add_legend(figure, ncols=2)
+    return figure

@@ -50,14 +50,19 @@ def gnss_difference(run: Run) -> Figure:
     Of many fixes, the range and the median in each of `BINS` equal times are drawn.
     """
     facts = run.summary["gnss"]
-    subtitle = f"Distance between filter and {position_word(run.summary)}"
-    figure = new_figure(run_title(run.summary), subtitle, height_in=3.9)
+    mean, most = facts["mean_difference_m"], facts["max_difference_m"]
+    of, word = facts["used"] + facts["rejected"], position_word(run.summary)
+    apart = f"{error_text(mean)} from the {word} on average, " if mean is not None else ""
+    figure = new_figure(
+        f"Filter {apart}{100 * facts['rejected'] / max(of, 1):.0f} % rejected",
+        f"{run_title(run.summary)}: distance between filter and {word}, {of:,} of them", height_in=3.9,
+    )  # fmt: skip
     axes = figure.subplots()
     unit, seconds = time_unit(float(run.table.t_s[-1]))
     t, difference = run.gnss.t_s / seconds, run.gnss.difference
     used, gated = run.gnss.used, run.gnss.rejected
     top = _top(difference[used])
-    if (mean := facts["mean_difference_m"]) is not None and (most := facts["max_difference_m"]) is not None:
+    if mean is not None and most is not None:
         trusted = used & ~run.sensors.fixes.down_weighted
         _draw_used(axes, t[trusted], difference[trusted], f"used, max {error_text(most)}")
         axes.axhline(mean, label=f"mean {error_text(mean)}", **MEAN.keywords())

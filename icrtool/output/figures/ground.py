@@ -8,7 +8,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
-from icrtool.output.figures.style import Pen
+from icrtool.output.figures.style import BAD_FIX_COLOR, Pen
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +23,13 @@ CELLS = 1500.0
 """Points closer than this fraction of the view are one point: about a pixel."""
 
 
+JUMP_LOOK: dict[str, Any] = {
+    "marker": "s", "markersize": 6.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "color": BAD_FIX_COLOR,
+    "linestyle": "none", "zorder": 4.4,
+}  # fmt: skip
+"""Where the position reference jumps."""
+
+
 def fitted_box_in(norths: Floats, easts: Floats, width_in: float) -> float:
     """Return the height [in] of axes of a given width that suits points (n,) [m]."""
     north, east = (max(float(np.ptp(column)), SMALLEST_VIEW_M) for column in (norths, easts))
@@ -30,14 +37,20 @@ def fitted_box_in(norths: Floats, easts: Floats, width_in: float) -> float:
 
 
 def look_down(axes: Axes, norths: Floats, easts: Floats, shape: float, margin: float = 0.08, ticks: int = 5) -> float:
-    """Show all points (n,) [m] in axes `shape` times as wide as high, with a margin; return the side of a cell [m]."""
+    """Show all points (n,) [m] in axes `shape` times as wide as high, with a margin; return the side of a cell [m].
+
+    About so many `ticks` are on each axis; 0: none.
+    """
     spans = float(np.ptp(norths)), float(np.ptp(easts))
     height = (1 + 2 * margin) * max(spans[0], spans[1] / shape, SMALLEST_VIEW_M)
     for set_range, column, half in ((axes.set_ylim, norths, height / 2), (axes.set_xlim, easts, height * shape / 2)):
         middle = (float(column.min()) + float(column.max())) / 2
         set_range(middle - half, middle + half)
     axes.set_aspect("equal")
-    axes.locator_params(nbins=ticks, steps=[1, 2, 5, 10])
+    if ticks:
+        axes.locator_params(nbins=ticks, steps=[1, 2, 5, 10])
+    else:
+        axes.set(xticks=[], yticks=[])
     return height * shape / CELLS
 
 

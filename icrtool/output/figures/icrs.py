@@ -26,7 +26,7 @@ from icrtool.output.figures.style import (
     time_unit,
 )
 from icrtool.output.text_format import run_title, signed
-from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import IcrColumn
 
 if TYPE_CHECKING:
@@ -66,9 +66,14 @@ def icr_estimates(run: Run) -> Figure:
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
     spans = _spans_s(run)
-    subtitle = "ICR estimates" + ("; left: learning, right: after it" if len(spans) > 1 else "")
+    finals = ((ICR_WORDS[column], run.summary["icr"]["final"][column]) for column in ICR_COLUMNS)
+    ends = ", ".join(
+        f"{word} {signed(value)} m" if value is not None else f"{word} not shown" for word, value in finals
+    )
+    learning = "; left: learning, right: after it" if len(spans) > 1 else ""
     figure = new_figure(
-        run_title(run.summary), subtitle, height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3
+        f"The ICRs end at {ends}", f"{run_title(run.summary)}: estimates of the filter{learning}",
+        height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3,
     )  # fmt: skip
     panels = figure.subplots(
         3, len(spans), squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 3)[: len(spans)]}
@@ -90,8 +95,13 @@ def icr_clusters(run: Run) -> Figure:
     """Return histograms of the three ICR estimates [m] after convergence, in percent of the time."""
     settled = run.settled_s
     after = run.table.t_s >= settled
-    subtitle = f"Clustering of the ICR estimates from {settled:.1f} s on"
-    figure = new_figure(run_title(run.summary), subtitle, height_in=3.9, margins_in=(0.65, 0.2, 1.0, 0.9))
+    mean, std = run.summary["icr"]["mean"], run.summary["icr"]["std"]
+    spread = (f"{ICR_WORDS[column]} ±{std[column]:.3f} m" for column in ICR_COLUMNS if mean[column] is not None)
+    known = any(value is not None for value in mean.values())
+    figure = new_figure(
+        f"The ICRs scatter by {', '.join(spread)}" if known else "No ICR is shown",
+        f"{run_title(run.summary)}: estimates from {settled:.1f} s on", height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.9),
+    )  # fmt: skip
     panels = figure.subplots(1, 3, sharey=True)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
     columns: tuple[IcrColumn, ...] = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
@@ -174,7 +184,7 @@ def _draw_convergence(axes: Axes, run: Run, column: IcrColumn, unit_s: float) ->
 
 def _convergence_text(run: Run, column: IcrColumn) -> str:
     span = run.convergence_s[column]
-    return f"10–90 % in {span[1] - span[0]:.1f} s" if span is not None else "hardly moved from its start"
+    return f"10–90 % in {span[1] - span[0]:.1f} s" if span is not None else "starts near its final value"
 
 
 def _final_text(run: Run, column: IcrColumn) -> str:

@@ -10,7 +10,14 @@ from icrtool.alignment.position.gnss_quality import CLASSES, REFERENCE
 from icrtool.estimation.odometry import OdometryPath, drive_wheels
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
-from icrtool.output.figures.ground import CELLS, draw_path, fitted_box_in, look_down, name_directions
+from icrtool.output.figures.ground import (
+    CELLS,
+    JUMP_LOOK,
+    draw_path,
+    fitted_box_in,
+    look_down,
+    name_directions,
+)
 from icrtool.output.figures.style import (
     BAD_FIX_COLOR,
     FILTER,
@@ -28,6 +35,7 @@ from icrtool.output.figures.style import (
 )
 from icrtool.output.text_format import distance_text, driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run, no_slip_icrs
+from icrtool.records.run_document import OdometryDocument
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
 
@@ -43,6 +51,11 @@ LARGEST_DETOUR = 0.75
 SMALLEST_DRIVE_M = 2.0
 TIME_STEPS_S = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 7200.0, 14400.0)
 MOST_TIMES = 12
+MOST_JUMPS = 5
+REJECTED_CELLS = 40.0
+MOST_REJECTED = 60
+"""Rejected fixes closer together than this part of the view are one cross, and there are at most so many: they would
+bury the path."""
 TIME_CLEARANCE = 0.06
 """At most so many times are written beside the path, none closer to another than this share of the view."""
 
@@ -59,10 +72,6 @@ FIX_LOOKS: dict[int, dict[str, Any]] = {
 SLIP_LOOK: dict[str, Any] = {
     "marker": "D", "markersize": 6.5, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": FLOAT_COLOR,
     "linestyle": "none", "zorder": 4.6,
-}  # fmt: skip
-JUMP_LOOK: dict[str, Any] = {
-    "marker": "s", "markersize": 6.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "color": BAD_FIX_COLOR,
-    "linestyle": "none", "zorder": 4.4,
 }  # fmt: skip
 REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": BAD_FIX_COLOR}
 """Markers by class: shape and luminance distinguish them."""
@@ -82,7 +91,7 @@ def trajectory(run: Run) -> Figure:
     width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
     figure = new_figure(
-        run_title(run.summary), f"Trajectory, {driven_text(run.summary['drive'])}; ICR odometry: final ICRs",
+        _end_errors_text(run.summary["odometry"]), f"{run_title(run.summary)}: {driven_text(run.summary['drive'])}",
         height_in=box_in + MARGINS_IN[2] + MARGINS_IN[3], margins_in=MARGINS_IN,
     )  # fmt: skip
     axes = figure.subplots()
@@ -100,6 +109,13 @@ def trajectory(run: Run) -> Figure:
     name_directions(axes)
     add_legend(figure, ncols=2, columnspacing=3.0)
     return figure
+
+
+def _end_errors_text(odometry: OdometryDocument) -> str:
+    ends = {"the final ICRs": odometry["icr"], "no slip": odometry["no_slip"]}
+    return "Wheels alone end " + ", ".join(
+        f"{distance_text(end['end_error_m'])} off with {name}" for name, end in ends.items() if end is not None
+    )
 
 
 def _extent(drive: Corners, *paths: Corners) -> Corners:
@@ -138,10 +154,13 @@ def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Fl
     ]
     place = np.column_stack([fixes.north_m, fixes.east_m])
     seen = ((place >= lowest) & (place <= highest)).all(axis=1)
-    for chosen, look, label in (*groups, (gnss.rejected, REJECTED_LOOK, f"{word}, rejected")):
+    rejected = gnss.rejected, REJECTED_LOOK, f"{word}, {np.count_nonzero(gnss.rejected):,} rejected"
+    for chosen, look, label in (*groups, rejected):
         if chosen.any():
             north, east = place[chosen & seen].T
-            shown = places(north, east, cell_m)
+            shown = places(north, east, cell_m if look is not REJECTED_LOOK else cell_m * CELLS / REJECTED_CELLS)
+            if look is REJECTED_LOOK:
+                shown = shown[:: 1 + len(shown) // MOST_REJECTED]
             axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, label=label, **look)
 
 
@@ -157,12 +176,13 @@ def _draw_events(axes: Axes, run: Run) -> None:
 
 
 def _draw_jumps(axes: Axes, run: Run) -> None:
-    """Mark where the reference jumped, each where it was before."""
+    """Mark the largest jumps of the reference, each where it was before."""
     jumps = [jump for jump in run.sensors.jumps if not jump.undecided]
-    if jumps:
-        largest = max(jump.size_m for jump in jumps)
-        east, north = [jump.east_m for jump in jumps], [jump.north_m for jump in jumps]
-        axes.plot(east, north, label=f"jump, up to {error_text(largest)}", **JUMP_LOOK)
+    largest = sorted(jumps, key=lambda jump: -jump.size_m)[:MOST_JUMPS]
+    if largest:
+        marked = f", the {MOST_JUMPS} largest of {len(jumps)} marked" if len(jumps) > MOST_JUMPS else ""
+        east, north = [jump.east_m for jump in largest], [jump.north_m for jump in largest]
+        axes.plot(east, north, label=f"jump, up to {error_text(largest[0].size_m)}{marked}", **JUMP_LOOK)
 
 
 def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:

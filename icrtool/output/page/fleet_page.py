@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -61,7 +62,13 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
         choices={key: sorted({log[key] for log in logs} - {""}) for key in ("status", "robot", "group")},
         horizon_m=HORIZON_M,
         pictures=list(pictures_in(folder / PLOTS, folder).values()),
+        reasons=Counter(_reason(log) for log in logs if log["status"] == "failed").most_common(),
     )  # fmt: skip
+
+
+def _reason(log: Mapping[str, Any]) -> str:
+    """Return why a log failed without what is particular to it: the first part of ``why; advice``."""
+    return str(log["reason"]).split(";")[0].split(" (tried")[0]
 
 
 def _budgets(logs: Sequence[Mapping[str, Any]]) -> list[str]:

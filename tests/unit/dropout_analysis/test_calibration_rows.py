@@ -131,7 +131,7 @@ def test_files_and_figures_hold_every_row(report: DropoutReport, tmp_path: Path)
     document = json.loads((tmp_path / "dropout" / "report.json").read_bytes())
     assert [one["fitted"] for one in document["calibrations"]] == ["fitted to this log", "not fitted to this log"]
     assert document["recommended"]["model"] == report.calibration.recommended  # type: ignore[union-attr]
-    assert (tmp_path / "dropout" / "plots" / "histogram_10m.png").is_file()
+    assert (tmp_path / "dropout" / "plots" / "histogram.png").is_file()
 
 
 def test_one_calibration_has_the_plain_name_and_no_comparison_no_recommended_row(drive: Run, own: Calibration) -> None:

@@ -12,16 +12,17 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from icrtool.dropout_analysis.acceptance_limits import budget_distances
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout, models_of
 from icrtool.output.figure_catalogue import draw_figures
-from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_summary
+from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_histograms, dropout_summary
 from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
 from icrtool.output.figures.style import style
-from icrtool.records.dropout import Outage
+from icrtool.records.dropout import ModelResult, Outage
 from icrtool.records.run import Run
 
 HORIZONS_M = [1.0, 2.0, 5.0, 10.0]
@@ -41,14 +42,16 @@ def figures(run: Run, report: DropoutReport, outages: tuple[Outage, ...]) -> dic
     whole = replace(report, outages=outages, examples=example_trials(run, 5.0), worst=worst_trials(run, horizon_m=2.0))
     return {
         "summary": lambda: dropout_summary(whole),
-        "histogram": lambda: dropout_histogram(whole, 5.0),
+        "histogram": lambda: dropout_histograms(with_rows(whole), 2.0, 5.0, 10.0),
+        "histogram of all": lambda: dropout_histogram(with_rows(whole), 5.0),
+        "summary of all": lambda: dropout_summary(with_rows(whole)),
         "examples": lambda: dropout_examples(whole),
         "worst": lambda: dropout_worst(whole),
         "outages": lambda: dropout_outages(whole),
     }
 
 
-NAMES = ["summary", "histogram", "examples", "worst", "outages"]
+NAMES = ["summary", "summary of all", "histogram", "histogram of all", "examples", "worst", "outages"]
 
 
 def drawn(draw: Callable[[], Figure]) -> Figure:
@@ -70,6 +73,8 @@ def test_axes_have_units_and_no_text_lies_on_another(
     figure = drawn(figures(run, report, outages)[name])
     labels = [axes.get_xlabel() for axes in figure.axes] + [axes.get_ylabel() for axes in figure.axes]
     labels += [text.get_text() for text in figure.texts]
+    # The cells of the worst trials have a bar of a length in place of ticks.
+    labels += [f"[{axes.texts[-1].get_text().split()[-1]}]" for axes in figure.axes if name == "worst" and axes.axison]
     assert sum("[m]" in label for label in labels) >= 1
     assert sum("[" in label for label in labels) >= 2
     written = [text for text in figure.texts if text.get_text()]
@@ -90,22 +95,80 @@ def test_axes_have_units_and_no_text_lies_on_another(
 
 
 def test_the_summary_draws_the_numbers_of_both_models(report: DropoutReport, outages: tuple[Outage, ...]) -> None:
-    figure = drawn(lambda: dropout_summary(replace(report, outages=outages)))
-    lines = [line.get_ydata() for line in figure.axes[0].lines]
-    for name in ("icr", "no_slip", "icr_final"):
+    (axes,) = drawn(lambda: dropout_summary(replace(report, outages=outages))).axes
+    found = {str(line.get_label()): line.get_xydata().T for line in axes.lines}
+    for name, label in (("icr", "ICR"), ("no_slip", "no slip")):
         result = report.result(name)
         assert result is not None
-        for values in (result.summary.p95, result.summary.expected):
-            assert any(len(line) == len(values) and np.array_equal(line, values) for line in lines)
-    assert any(len(line) == 1 and line[0] == outages[-1].end_error_m for line in lines)
-    assert {"ICR, 95 %", "ICR, expected", "no slip, 95 %", "no slip, expected", "real outage"} <= set(texts_of(figure))
+        for metric, values in (("95 %", result.summary.p95), ("mean", result.summary.expected)):
+            if (name, metric) != ("no_slip", "mean"):
+                assert np.allclose(np.interp(HORIZONS_M, *found[f"{label}, {metric}"]), values, rtol=0.02)
+    assert found["real outage"][1].tolist() == [outages[-1].end_error_m]
+    low, high = axes.get_ylim()
+    assert low < min(outages[-1].end_error_m, float(report.results[0].summary.expected[0]))
+    assert high > float(np.nanmax(report.results[1].summary.p95))
 
 
-def test_a_flattened_icr_curve_gets_a_panel_of_its_own(report: DropoutReport) -> None:
-    icr, no_slip = report.results[0], report.results[1]
-    near = replace(report, results=(icr, no_slip._replace(summary=icr.summary)))
-    far = replace(report, results=(icr, no_slip._replace(summary=icr.summary._replace(p95=10 * icr.summary.p95))))
-    assert [len(drawn(lambda one=one: dropout_summary(one)).axes) for one in (near, far)] == [1, 2]
+def named(one: ModelResult, name: str, factor: float) -> ModelResult:
+    summary, intervals = (
+        part._replace(
+            **{
+                key: factor * value
+                for key, value in part._asdict().items()
+                if "low" in key or "high" in key or key in ("p50", "p95", "expected", "largest")
+            }
+        )
+        for part in (one.summary, one.intervals)
+    )
+    return one._replace(name=name, label=name, summary=summary, intervals=intervals)
+
+
+def with_rows(report: DropoutReport) -> DropoutReport:
+    """Return the report with the rows of a comparison, and how far each of them stays within 0.1 m."""
+    icr = report.results[0]
+    rows = {"recommended": 0.6, "controller": 0.9, "recommended_gyro": 0.3, "calibration:season": 0.7}
+    further = [named(icr, name, factor) for name, factor in rows.items()]
+    whole = replace(report, results=(*report.results, *further))
+    return replace(whole, budgets=budget_distances(whole, 0.1))
+
+
+def test_the_summary_marks_the_distances_that_the_report_states(report: DropoutReport) -> None:
+    whole = with_rows(report)
+    reaches = {one.model: one for one in whole.budgets}
+    figure = drawn(lambda: dropout_summary(whole))
+    written = [text.get_text() for text in figure.axes[0].texts]
+    shown = ("recommended", "controller", "calibration:season")
+    assert sorted(written) == sorted(f"{reaches[name].distance_m:.1f} m" for name in shown)
+    assert reaches["recommended"].reach_text in figure.texts[0].get_text()
+    marks = [line.get_xydata()[0].tolist() for line in figure.axes[0].lines if line.get_marker() == "o"]
+    assert sorted(marks) == sorted([reaches[name].distance_m, 0.1] for name in shown)
+
+
+def test_the_summary_has_a_handful_of_entries_and_none_of_the_tables_alone(
+    report: DropoutReport, outages: tuple[Outage, ...]
+) -> None:
+    entries = texts_of(drawn(lambda: dropout_summary(replace(with_rows(report), outages=outages))))
+    entries = [text for text in entries if text]
+    assert len(entries) <= 7
+    assert not any(text.startswith(("ICR", "icr", "recommended_gyro", "final")) for text in entries)
+
+
+def test_a_distance_beyond_all_trials_is_not_marked(report: DropoutReport) -> None:
+    far = replace(report, budgets=budget_distances(report, 1000.0))
+    figure = drawn(lambda: dropout_summary(far))
+    assert [text.get_text() for text in figure.axes[0].texts] == []
+    assert "more than 10 m" in figure.texts[0].get_text()
+
+
+def test_the_histogram_shows_the_recommended_model_at_three_distances_with_the_budget(report: DropoutReport) -> None:
+    whole = with_rows(report)
+    model = whole.result("recommended")
+    assert model is not None
+    figure = drawn(lambda: dropout_histograms(whole, 2.0, 5.0, 10.0))
+    assert len(figure.axes) == 3
+    for axes, h in zip(figure.axes, (1, 2, 3), strict=True):
+        places = {float(line.get_xdata()[0]) for line in axes.lines}
+        assert places == {float(model.summary.p95[h]), float(model.summary.expected[h]), 0.1}
 
 
 def test_a_histogram_marks_expected_value_and_95_percent_in_lines_and_words(report: DropoutReport) -> None:
@@ -138,11 +201,14 @@ def test_a_report_draws_what_it_holds(
     whole = replace(report, examples=example_trials(run, 15.0), worst=worst_trials(run), outages=outages)
     draw_figures("report", whole, tmp_path, ("png", "svg"))
     names = {path.stem for path in tmp_path.iterdir()}
-    assert names == {"summary", "histogram_05m", "histogram_10m", "examples_15m", "worst", "outages"}
+    assert names == {"summary", "histogram", "worst", "outages"}
     assert len(list(tmp_path.iterdir())) == 2 * len(names)
+    draw_figures("report", whole, tmp_path, ("png",), "all")
+    further = {path.stem for path in tmp_path.iterdir()} - names
+    assert further == {"histogram_05m", "histogram_10m", "examples_15m"}
 
 
 def test_a_picture_that_cannot_be_written_is_named(report: DropoutReport, tmp_path: Path) -> None:
-    (tmp_path / "histogram_05m.png").mkdir()
-    with pytest.raises(OSError, match="histogram_05m"):
+    (tmp_path / "histogram.png").mkdir()
+    with pytest.raises(OSError, match="histogram"):
         draw_figures("report", report, tmp_path, ("png",))

@@ -11,10 +11,12 @@ from matplotlib.figure import Figure
 
 from icrtool.estimation.fit import fit
 from icrtool.estimation.odometry import drive_wheels
+from icrtool.kernels.filter.measurement_codes import GATED
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.gnss_difference import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style
 from icrtool.output.page.pictures import drawn_pictures
+from icrtool.records.events import ReferenceJump
 from icrtool.records.run import Run
 from support.barn import configured, simulate
 
@@ -46,7 +48,22 @@ def test_every_axis_has_a_name_and_a_unit(name: str, run: Run) -> None:
     first_column = [axes for axes in figure.axes if axes.get_subplotspec().is_first_col()]
     for label in [axes.get_xlabel() for axes in lowest_row] + [axes.get_ylabel() for axes in first_column]:
         assert label.endswith(("[m]", "[s]", "[%]")), label
-    assert figure.texts[0].get_text() == "barn  (segway-rmp400)"
+    assert figure.texts[1].get_text().startswith("barn  (segway-rmp400): ")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_title_answers_with_the_number_of_the_summary(name: str, run: Run) -> None:
+    icr, gnss = run.summary["icr"], run.summary["gnss"]
+    ends = [end["end_error_m"] for end in run.summary["odometry"].values() if end is not None]
+    numbers = {
+        "trajectory": [f"{end:.1f} m" for end in ends],
+        "icr_estimates": [f"{abs(value):.3f} m" for value in icr["final"].values()],
+        "icr_clusters": [f"±{value:.3f} m" for value in icr["std"].values()],
+        "gnss_difference": [f"{gnss['mean_difference_m']:.4f} m"],
+    }[name]
+    title = drawn(name, run).texts[0].get_text()
+    assert len(numbers) > 0
+    assert [number for number in numbers if number not in title] == []
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -95,7 +112,7 @@ def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: Run) -> N
     texts = legend_texts(figure)
     for begin in (
         "GNSS fixes",
-        "GNSS fixes, rejected",
+        f"GNSS fixes, {BAD_FIXES} rejected",
         "filter",
         "ICR odometry, ends",
         "no-slip odometry, ends",
@@ -112,7 +129,25 @@ def test_trajectory_shows_fixes_filter_and_both_odometries_square(run: Run) -> N
     for states, line in ((run.table.east_m, path[:, 0]), (run.table.north_m, path[:, 1])):
         assert abs(line.max() - states.max()) < CELL * view
         assert abs(line.min() - states.min()) < CELL * view
-    assert len(line_labelled(axes, "GNSS fixes, rejected")) == BAD_FIXES
+    assert len(line_labelled(axes, f"GNSS fixes, {BAD_FIXES} rejected")) > 0
+
+
+def test_many_rejected_fixes_and_jumps_leave_the_path_in_sight(run: Run) -> None:
+    jumps = tuple(
+        ReferenceJump(
+            kind="position", begin_ns=int(run.table.stamp_ns[row]), end_ns=int(run.table.stamp_ns[row]),
+            north_m=float(run.table.north_m[row]), east_m=float(run.table.east_m[row]), size_m=0.01 * number,
+            turn_deg=0.0, moved_north_m=0.0, moved_east_m=0.0, why="", undecided=False,
+        )
+        for number, row in enumerate(range(0, len(run.table), 10))
+    )  # fmt: skip
+    refused = np.full_like(run.gnss.code, GATED)
+    outcome = replace(run.gnss, code=refused)
+    (axes,) = drawn("trajectory", replace(run, gnss=outcome, sensors=replace(run.sensors, jumps=jumps))).axes
+    assert len(line_labelled(axes, f"GNSS fixes, {len(refused)} rejected")) <= 60
+    marked = line_labelled(axes, "jump, up to ")
+    assert len(marked) == 5
+    assert np.allclose(marked[0], [jumps[-1].east_m, jumps[-1].north_m])
 
 
 def test_trajectory_without_width_has_no_no_slip_path(make_run: Callable[..., Run]) -> None:
@@ -141,7 +176,7 @@ def test_icr_estimates_show_bands_and_outage(run: Run) -> None:
     assert legend_texts(figure) == ["estimate", "±2σ", "no slip (±b/2, 0)", "no usable GNSS"]
     # the alignment starts the filter where this drive has its ICRs
     rises = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
-    assert rises == ["hardly moved from its start"] * 3
+    assert rises == ["starts near its final value"] * 3
     finals = [axes.get_title(loc="right") for axes in figure.axes if axes.get_title(loc="right")]
     assert finals[1].startswith("final −0.6")
     assert [axes.get_ylabel() for axes in figure.axes if axes.get_ylabel()] == [

@@ -33,11 +33,14 @@ def names_in(directory: Path) -> list[str]:
 
 def test_a_run_directory_holds_what_the_contract_says(tmp_path: Path, run: Run) -> None:
     write_run(run, tmp_path / "runs" / "barn", plots=("png", "svg"))
-    figures = ("trajectory", "icr_estimates", "icr_clusters", "gnss_difference")
+    figures = ("trajectory", "icr_estimates", "gnss_difference")
     plots = [f"plots/{name}.{form}" for name in figures for form in ("png", "svg")]
     assert names_in(tmp_path / "runs" / "barn") == sorted(
         ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.csv", *plots]
     )
+    write_run(run, tmp_path / "runs" / "barn", plots=("svg",), figures="all")
+    drawn = sorted(path.stem for path in (tmp_path / "runs" / "barn" / "plots").iterdir())
+    assert drawn == sorted([*figures, "icr_clusters"])
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["barn"]
 

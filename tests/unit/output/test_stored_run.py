@@ -138,7 +138,7 @@ def test_the_library_gives_what_the_command_gives(stored: Run, tmp_path: Path) -
         "plots",
         ".icrtool-files",
     }
-    assert {"summary.png", "histogram_05m.png", "worst.png", "examples_15m.png", "outages.png"} == {
+    assert {"summary.png", "histogram.png", "worst.png", "outages.png"} == {
         path.name for path in (tmp_path / "report" / "plots").iterdir()
     }
     report.write(plots=())
@@ -150,6 +150,7 @@ def test_the_library_gives_what_the_command_gives(stored: Run, tmp_path: Path) -
         icrtool.figures.trajectory(stored), icrtool.figures.icr_estimates(stored), icrtool.figures.icr_clusters(stored),
         icrtool.figures.gnss_difference(stored), icrtool.figures.dropout_summary(report),
         icrtool.figures.dropout_histogram(report, 5.0), icrtool.figures.dropout_examples(report),
+        icrtool.figures.dropout_histograms(report, 5.0),
         icrtool.figures.dropout_worst(report), icrtool.figures.dropout_outages(report),
     ):  # fmt: skip
         assert figure.axes
