@@ -194,8 +194,6 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
 
 def _report_one(source: Path, place: RunPlace | None, request: Request) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
-    from icrtool.output.run_directory import PAGE_FILE
-
     reports: list[DropoutReport] = []
 
     def report_into(run: Run, directory: Path) -> None:
@@ -216,11 +214,7 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
     if report.baseline is not None:
         options.warn([f"{run.name}: {change}" for change in report.baseline.changes(run.summary)], quiet=request.quiet)
     if request.prints:
-        from icrtool.output.tables.dropout import format_dropout
-
-        show(format_dropout(report))
-        page = f"; page: {directory / PAGE_FILE}" if request.asked.page else ""
-        click.echo(f"\nwritten to {directory / 'dropout'}{page}")
+        _print(report, directory, request)
     else:
         for verdict in report.verdicts:
             if not verdict.passed:
@@ -241,6 +235,20 @@ def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
             run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
             further=request.further,
         )  # fmt: skip
+
+
+def _print(report: DropoutReport, directory: Path, request: Request) -> None:
+    """Print the answer, with -v all that was found."""
+    from icrtool.output.run_directory import PAGE_FILE
+    from icrtool.output.tables.brief import brief_dropout
+    from icrtool.output.tables.dropout import format_dropout
+
+    page, place = directory / PAGE_FILE, directory / "dropout"
+    if request.verbose:
+        show(format_dropout(report))
+        click.echo(f"\nwritten to {place}{f'; page: {page}' if request.asked.page else ''}")
+    else:
+        show(brief_dropout(report, escaped(str(page if request.asked.page else place))))
 
 
 def _read(directory: Path) -> Run:

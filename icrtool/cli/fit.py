@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -79,13 +80,22 @@ def command(
         place = escaped(str(directory))
         documents.append({"log": escaped(str(log)), "status": "done", "directory": place, "run": run.summary})
         if not (quiet or as_json):
-            from icrtool.output.tables.run import format_run
-
-            show(format_run(run))
-            click.echo(f"\nwritten to {place}")
+            _print(run, place, verbose=verbose)
     if as_json:
         print_json("fit", {"logs": documents})
     options.leave(failed, len(logs), "logs")
+
+
+def _print(run: Run, place: str, *, verbose: bool) -> None:
+    """Print the answer, with -v all that was found."""
+    from icrtool.output.tables.brief import brief_run
+    from icrtool.output.tables.run import format_run
+
+    if verbose:
+        show(format_run(run))
+        click.echo(f"\nwritten to {place}")
+    else:
+        show(brief_run(run, place))
 
 
 def check_times(times: tuple[float, ...]) -> None:
@@ -180,15 +190,17 @@ def fit_log(
             log, directory, config, stages.begin, warm_start=start, share=stages.share, note=notes.append,
             **options_of_fit,
         )  # fmt: skip
-    options.warn((*run.warnings, *_other_robot(warm_start, start, config), *notes), quiet=quiet)
-    from icrtool.output.text_format import jump_lines
-    from icrtool.records.samples import ROLE_WORDS
+    # On a terminal the answer names the gravest one.
+    everything = verbose or not sys.stderr.isatty()
+    options.warn((*(run.warnings if everything else ()), *_other_robot(warm_start, start, config), *notes), quiet=quiet)
+    if verbose:
+        from icrtool.output.text_format import jump_lines
+        from icrtool.records.samples import ROLE_WORDS
 
-    for stream in run.summary["streams"]:
-        if verbose or ("chosen over" in stream["why"] and not quiet):
+        for stream in run.summary["streams"]:
             click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
-    for line in jump_lines(run.summary["reference_jumps"]) if verbose else ():
-        click.echo(line, err=True)
+        for line in jump_lines(run.summary["reference_jumps"]):
+            click.echo(line, err=True)
     return run
 
 

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 WIDEST = 120
 """Columns of a terminal that are used."""
 
+FEWEST_COLUMNS = 3
+"""Columns of a table that stay on the narrowest terminal."""
+
 STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
 
 
@@ -42,7 +45,31 @@ def _print(text: Text, console: Console) -> None:
         elif isinstance(block, str):
             console.print(RichText(str(block)))
         else:
-            console.print(_rich_table(block, RichTable(box=None, pad_edge=False, show_header=bool(block.head))))
+            table, left_out = _fitting(block, console.width)
+            console.print(_rich_table(table, RichTable(box=None, pad_edge=False, show_header=bool(table.head))))
+            if left_out:
+                why = f"the terminal has {console.width} columns"
+                console.print(RichText(f"  ({', '.join(left_out)} left out: {why})", "dim"))
+
+
+def _fitting(table: Table, width: int) -> tuple[Table, list[str]]:
+    """Return a table of numbers without the columns that a terminal has no place for, and their names.
+
+    The first and the last one stay; a last column of text is wrapped and needs no more than a few words.
+    """
+    sides, rows = table.sides(), [[str(cell) for cell in row] for row in (table.head, *table.rows) if row]
+    sizes = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
+    if sides[-1] == "l":
+        sizes[-1] = min(sizes[-1], width // 4)
+    kept, left_out = list(range(len(sides))), []
+    while sum(sizes[column] for column in kept) - 2 > width and len(kept) > FEWEST_COLUMNS:
+        out = kept.pop(len(kept) // 2)
+        left_out.append(str(table.head[out]) if table.head else f"column {out + 1}")
+    if not left_out:
+        return table, []
+    chosen = [[row[column] for column in kept] for row in table.rows]
+    head = [table.head[column] for column in kept] if table.head else ()
+    return Table("".join(sides[column] for column in kept), chosen, head), left_out
 
 
 def _rich_table(table: Table, shown: RichTable) -> RichTable:
@@ -52,10 +79,10 @@ def _rich_table(table: Table, shown: RichTable) -> RichTable:
     for number, side in enumerate(sides):
         head = RichText(str(table.head[number])) if table.head else ""
         justify: JustifyMethod = "left" if side == "l" else "right"
-        # A name is cut rather than broken into lines; a sentence, in the last column, is wrapped.
+        # A sentence, in the last column, is wrapped; a name or a number is not broken.
         last = number == len(sides) - 1
         shown.add_column(
-            head, justify=justify, no_wrap=not last, header_style="bold", style="" if number else "cyan",
+            head, justify=justify, no_wrap=not last or side == "r", header_style="bold", style="" if number else "cyan",
             overflow="fold" if last else "ellipsis",
         )  # fmt: skip
     for row in table.rows:

@@ -175,6 +175,12 @@ def controller_error_text(errors: ControllerErrors | None) -> str:
     )
 
 
+def turn_text(turn_rad: float) -> str:
+    """Return a turn as ``62° right``."""
+    degrees = math.degrees(turn_rad)
+    return f"{abs(degrees):.0f}° {'right' if degrees >= 0 else 'left'}"
+
+
 def error_text(metres: float) -> str:
     """Return an error as ``0.0034 m``, ``0.123 m`` or ``3.45 m``: one unit, and the same digits, in all places."""
     if not math.isfinite(metres):

@@ -25,7 +25,7 @@ from icrtool.output.text_format import (
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance, ModelResult, Outage, TurningSplit
 from icrtool.records.text import counted
 
-MODEL = 21
+MODEL = 26
 """Characters of a model's name that are printed."""
 
 LISTED_HORIZONS = 4

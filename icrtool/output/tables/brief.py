@@ -1,0 +1,289 @@
+"""What a command prints unless -v is given: the answer, in at most 22 lines of 80 columns."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.estimation.observability import lacking_turns
+from icrtool.output.tables.dropout import shown_horizons
+from icrtool.output.text_blocks import Block, Line, Table, Text
+from icrtool.output.text_format import (
+    duration_text,
+    error_text,
+    event_kinds,
+    filter_agreement,
+    position_word,
+    run_title,
+    turn_text,
+    unusable_lines,
+)
+from icrtool.records.dropout import BudgetDistance
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
+from icrtool.records.run_document import RunDocument
+from icrtool.records.text import counted, shortened
+
+WIDTH, LABEL = 80, 12
+"""Columns of a line, and of its label."""
+
+NOTED_SHARE = 0.05
+"""From this share of rejected fixes on, they are a reason for care."""
+
+NOTED_SCALE = 0.002
+"""A correction of wheel speeds below this is not mentioned."""
+
+SMALLEST_OFFSET_DEG = 0.05
+"""A correction of the heading below this is not mentioned."""
+
+Check = tuple[bool, str, str]
+"""Whether it is in order, what was checked, and the finding."""
+
+
+def brief_run(run: Run, directory: str) -> Text:
+    """Return what `icrtool fit` prints: usable or not, the numbers, why to trust them, what is next.
+
+    Parameters
+    ----------
+    directory : of the run
+    """
+    summary = run.summary
+    blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary), "title"), *_state_lines(summary)]
+    if summary["usable"]:
+        blocks += [Line(line, "as is") for line in (*_controller_lines(run), _icr_line(run))]
+    for number, (good, what, text) in enumerate(run_checks(summary)):
+        label = "checks" if not number else ""
+        blocks.append(Line(_cut(f"{label:{LABEL}}{'ok' if good else '!':4}{what:12}{text}"), "as is"))
+    if corrected := corrections(summary):
+        blocks.append(_row("corrected", "; ".join(corrected)))
+    blocks.append(_row("inputs", "; ".join(_inputs(summary))))
+    blocks.append(_row("written to", directory))
+    blocks.append(_row("next", f"icrtool dropout-report {directory}" if summary["usable"] else _advice(summary)))
+    return Text(blocks)
+
+
+def brief_dropout(report: DropoutReport, place: str) -> Text:
+    """Return what `icrtool dropout-report` prints: how far, whether to trust it, where it was worst.
+
+    Parameters
+    ----------
+    place : page or directory of the report
+    """
+    summary = report.run_summary
+    blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary), "title")]
+    if report.usable:
+        blocks += _reach_blocks(report)
+        blocks.append(_row("Trust?", _trust(report)))
+    if report.usable and report.worst:
+        one = report.worst[0]
+        turn, speed = turn_text(one.heading_change_rad), one.speed_mean_mps
+        text = f"{error_text(one.errors_m[one.model])} after {one.horizon_m:g} m, turning {turn} at {speed:.2f} m/s"
+        blocks.append(_row("Worst", f"at {duration_text(one.t_s)}: {text}"))
+    blocks += [_row("Outages", text) for text in _outages(report)]
+    blocks += [_error_table(report)]
+    blocks += [Line(one.line(), "good" if one.passed else "bad") for one in report.verdicts]
+    blocks.append(_row("page" if place.endswith(".html") else "written to", place))
+    return Text(blocks)
+
+
+def _title(summary: RunDocument) -> str:
+    drive, excitation = summary["drive"], summary["excitation"]
+    turned = f"{excitation['turned_right_deg']:,.0f}° right, {excitation['turned_left_deg']:,.0f}° left"
+    facts = f"{drive['distance_m']:.1f} m, {duration_text(drive['duration_s'])}, turned {turned}"
+    title = run_title(summary)
+    return f"{shortened(title, max(WIDTH - len(facts) - 3, LABEL))}   {facts}"
+
+
+def _state_lines(summary: RunDocument) -> list[Line]:
+    """Return that a run can be used, and its gravest warning: the first that the alignment did not mend."""
+    warnings = [one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]]
+    first = next((one for one in warnings if ": corrected" not in one), next(iter(warnings), ""))
+    head = f"{counted(len(warnings), 'warning')} (-v), first: {first}" if len(warnings) > 1 else first
+    if summary["usable"]:
+        return [Line(_cut(f"{'USABLE':{LABEL}}{head}"), "good")]
+    return [Line(_cut(f"{'':{LABEL}}{head}"), "as is")] if warnings else []
+
+
+def _controller_lines(run: Run) -> Iterator[str]:
+    numbers: Mapping[str, Any] = run.summary.get("controller") or {}
+    if run.track_width_m is None:
+        yield f"{'controller':{LABEL}}no multiplier: robot.track_width_m is not known (--robot, --set)"
+    elif not numbers:
+        yield f"{'controller':{LABEL}}no multiplier: y right and y left are not shown"
+    else:
+        multiplier = f"{numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}"
+        radii = f"{numbers['left_radius']:.3f}, {numbers['right_radius']:.3f}"
+        std = max(numbers.get("left_radius_std") or 0.0, numbers.get("right_radius_std") or 0.0)
+        yield f"{'controller':{LABEL}}wheel_separation_multiplier  {multiplier}"
+        yield f"{'':{LABEL}}left, right wheel radius     {radii} ± {std:.3f} of the configured"
+        b = run.track_width_m
+        yield f"{'':{LABEL}}= (right - left) / {b:g} m; without slip: ±{b / 2:.3g} m"
+
+
+def _icr_line(run: Run) -> str:
+    geometry: Mapping[str, Any] = run.summary.get("geometry") or {}
+    parts = []
+    for column in ICR_COLUMNS:
+        value, std = geometry.get(column), geometry.get(f"{column}_std")
+        found = f"{value:+.3f} ± {std:.3f}" if value is not None else "not shown"
+        parts.append(f"{ICR_WORDS[column].removeprefix('y ')} {found}")
+    return f"{'ICRs [m]':{LABEL}}{'  '.join(parts)}"
+
+
+def run_checks(summary: RunDocument) -> list[Check]:
+    """Return what was checked of a run, each with its finding."""
+    found: list[Check] = []
+    if agreement := filter_agreement(summary):
+        found.append((agreement.endswith("agrees"), "EKF", agreement))
+    excitation, gnss, heading = summary["excitation"], summary["gnss"], summary["heading"]
+    verdicts: Mapping[Any, Any] = excitation["verdict"]
+    lacks = lacking_turns(*np.radians([excitation["turned_right_deg"], excitation["turned_left_deg"]]).tolist())
+    if set(verdicts.values()) == {"shown"}:
+        found.append((not lacks, "excitation", f"all three ICRs shown{f'; {lacks}' if lacks else ''}"))
+    else:
+        weak = ", ".join(f"{ICR_WORDS[name]} {one}" for name, one in verdicts.items() if one != "shown")
+        found.append((False, "excitation", f"{weak}{f': {lacks}' if lacks else ''}"))
+    if of := gnss["used"] + gnss["rejected"]:
+        jumps = f", {counted(gnss['jumps'], 'jump')}" if gnss["jumps"] else ""
+        good = gnss["rejected"] < NOTED_SHARE * of
+        word = "fixes" if position_word(summary) == "GNSS fixes" else "positions"
+        found.append((good and not jumps, word, f"{gnss['rejected']:,} of {of:,} rejected{jumps}"))
+    if heading["offset_deg"] is not None:
+        value = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f}°"
+        found.append((True, "heading", f"{value} from the course over ground"))
+    if spans := summary["outages_ns"]:
+        away = duration_text(sum(end - begin for begin, end in spans) / 1e9)
+        found.append((False, "outages", f"{len(spans)}, {away} in all"))
+    if events := summary["events"]:
+        found.append((False, "slip events", f"{event_kinds(events)}; left out of the fit"))
+    return found
+
+
+def corrections(summary: RunDocument) -> list[str]:
+    """Return what the alignment corrected, a few words each."""
+    applied = {name: one["applied"] for name, one in summary["alignment"].items()}
+    scale, left, right = (applied.get(name) or 1.0 for name in ("wheel_scale", "left_scale", "right_scale"))
+    found = [f"wheels {100 * scale:.1f} %"] if abs(scale - 1.0) > NOTED_SCALE else []
+    if abs(left - right) > NOTED_SCALE:
+        side, share = ("left", (right - left) / right) if left < right else ("right", (left - right) / left)
+        found.append(f"{side} {100 * share:.1f} % less")
+    if abs(offset := summary["heading"]["applied_offset_deg"]) >= SMALLEST_OFFSET_DEG:
+        found.append(f"heading {0.0 - offset:+.1f}°")
+    delays = (("position", summary["filter"]["reference_delay_s"]), ("heading", summary["heading"]["applied_delay_s"]))
+    found += [f"{word} {'lag' if delay > 0 else 'lead'} {abs(delay):.2f} s" for word, delay in delays if delay]
+    return found
+
+
+def _inputs(summary: RunDocument) -> list[str]:
+    """Return the topics, each once, with what was taken from it."""
+    roles: dict[str, list[str]] = {}
+    for stream in summary["streams"]:
+        topics = " + ".join(dict.fromkeys(stream["topic"].split(" + ")))
+        roles.setdefault(topics, []).append("position" if stream["role"] == "gnss" else stream["role"])
+    return [f"{topic} ({', '.join(taken)})" for topic, taken in roles.items()]
+
+
+def _advice(summary: RunDocument) -> str:
+    excitation = summary["excitation"]
+    right, left = np.radians([excitation["turned_right_deg"], excitation["turned_left_deg"]]).tolist()
+    return lacking_turns(right, left) or "icrtool info LOG -v names what is wrong in the log"
+
+
+NOTES = {"controller": "in any diff_drive_controller"}
+"""What stands beside a distance."""
+
+REACH_ROWS = ("controller", "recommended", "recommended_gyro", "recommended_heading", "icr", "no_slip")
+"""Models whose distance is printed, as far as they are there; the momentary ICRs where nothing is held out."""
+
+REACH_LABELS = {"recommended_gyro": "with the gyro", "recommended_heading": "with the heading"}
+
+
+def reach_rows(report: DropoutReport, budget_m: float) -> list[tuple[str, BudgetDistance, str]]:
+    """Return label, distance and note of each model whose distance within a budget is stated, in their order."""
+    by_model = {one.model: one for one in report.budgets if one.budget_m == budget_m}
+    rows = [
+        (f"calibration {one.label}" if one.label != "calibration" else one.label, by_model[one.name],
+         "fitted to this log" if one.fitted_to_this else "fitted to other logs")
+        for one in report.calibrations if one.name in by_model
+    ]  # fmt: skip
+    for name in REACH_ROWS:
+        if name in by_model and not (name == "icr" and "recommended" in by_model):
+            label = REACH_LABELS.get(name, by_model[name].label)
+            note = NOTES.get(name, by_model[name].interval_text if name.startswith("recommended") else "")
+            rows.append((label, by_model[name], note))
+    return rows
+
+
+def _reach_blocks(report: DropoutReport) -> list[Block]:
+    """Return how far the robot stays within each budget."""
+    blocks: list[Block] = []
+    for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
+        rows = [
+            (f"   {shortened(label, 28)}", one.reach_text, note) for label, one, note in reach_rows(report, budget_m)
+        ]
+        blocks += [Line(f"How far within {budget_m:g} m (95 %)?", "title"), Table("lrl", rows)]
+    return blocks or ["How far?  No trial is as long as the shortest horizon."]
+
+
+def _trust(report: DropoutReport) -> str:
+    """Return whether the distances can be trusted, and the reasons for care."""
+    summary = report.run_summary
+    reasons = [f"{what} {text}" for good, what, text in run_checks(summary) if not good and what != "slip events"]
+    if events := summary["events"]:
+        crossed = "left out" if report.event_cost is not None else "trials across them count"
+        reasons.append(f"{counted(len(events), 'slip event')}, {crossed}")
+    if not report.passed:
+        return "no: an acceptance limit is not met"
+    return f"yes, with care: {'; '.join(reasons)}" if reasons else "yes"
+
+
+def _outages(report: DropoutReport) -> list[str]:
+    """Return how many outages of each kind there are, and the worst; none: no text."""
+    found = []
+    for kind in ("forced", "real"):
+        if ours := [one for one in report.outages if one.kind == kind]:
+            worst = max(ours, key=lambda one: one.end_error_m)
+            found.append(
+                f"{len(ours)} {kind}, the worst {error_text(worst.end_error_m)} after {worst.distance_m:.1f} m"
+            )
+    return ["; ".join(found)] if found else []
+
+
+TABLE_ROWS = ("recommended", "controller", "icr", "no_slip")
+
+
+def _error_table(report: DropoutReport) -> Table:
+    """Return the 95 % error of the models that count, at a few distances."""
+    shown = shown_horizons(report.horizons_m)
+    given = [one.name for one in report.calibrations]
+    found = [result for name in (*given, *TABLE_ROWS) if (result := report.result(name)) is not None]
+    if report.result("recommended") is not None:
+        found = [one for one in found if one.name != "icr"]
+    rows = [
+        [shortened(one.label, 22), *(_metres(float(one.summary.p95[h])) for h in shown)] for one in found
+    ]  # fmt: skip
+    return Table("lr", rows, ("95 % error [m]".ljust(22), *(f"{report.horizons_m[h]:g} m" for h in shown)))
+
+
+def _metres(error_m: float) -> str:
+    return f"{error_m:7.2f}" if np.isfinite(error_m) else "-"
+
+
+def _row(label: str, text: str) -> Line:
+    return Line(_wrapped(label, text), "as is")
+
+
+def _wrapped(label: str, text: str) -> str:
+    """Return a label and a text in lines of at most `WIDTH`; a path is not broken."""
+    lines = textwrap.wrap(
+        text, WIDTH, initial_indent=f"{label:{LABEL}}", subsequent_indent=" " * LABEL, break_long_words=False,
+        break_on_hyphens=False, max_lines=2, placeholder=" …",
+    )  # fmt: skip
+    return "\n".join(lines) or label
+
+
+def _cut(line: str) -> str:
+    return line if len(line) <= WIDTH else f"{line[: WIDTH - 1].rstrip()}…"

@@ -1,0 +1,112 @@
+"""What a person sees: the answer in a terminal of 80 columns and 24 lines, nothing scrolls."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+ROWS, COLUMNS, MOST_LINES = 24, 80, 22
+ROBOT = ("--robot", "segway-rmp400")
+CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+
+Screen = Callable[..., tuple[int, list[str]]]
+
+
+@pytest.fixture
+def screen(tmp_path: Path) -> Screen:
+    """Run a command in a terminal; give its status and the lines that stay on it, standard error among them."""
+
+    def run(*arguments: object, columns: int = COLUMNS) -> tuple[int, list[str]]:
+        leader, follower = pty.openpty()
+        fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, columns, 0, 0))
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "", "LINES": ""}
+        command = [sys.executable, "-m", "icrtool", *map(str, arguments)]
+        process = subprocess.Popen(
+            command, cwd=tmp_path, env=environment, stdin=follower, stdout=follower, stderr=follower, close_fds=True
+        )
+        os.close(follower)
+        shown = b""
+        while True:
+            try:
+                part = os.read(leader, 1 << 16)
+            except OSError:  # the terminal of a process that ended
+                break
+            if not part:
+                break
+            shown += part
+        os.close(leader)
+        text = CONTROL.sub("", shown.decode())
+        # a line that is rewritten leaves its last state
+        lines = [line.rstrip("\r").rpartition("\r")[2].rstrip() for line in text.split("\n")]
+        while lines and not lines[-1]:
+            lines.pop()
+        return process.wait(), lines
+
+    return run
+
+
+def check_fits(lines: list[str]) -> None:
+    assert len(lines) <= MOST_LINES, "\n".join(lines)
+    assert max(map(len, lines)) <= COLUMNS, "\n".join(lines)
+
+
+def test_a_good_drive_is_answered_on_one_screen(screen: Screen) -> None:
+    status, lines = screen("fit", ROOT / "sample_logs" / "wheeled_lawnmower.mcap", *ROBOT, "--plots", "none")
+    check_fits(lines)
+    text = "\n".join(lines)
+    assert status == 0
+    assert any(line.startswith("USABLE") for line in lines)
+    found = re.search(
+        r"wheel_separation_multiplier +([\d.]+) ±.*right ([+-][\d.]+) ±.*left ([+-][\d.]+) ±", text, re.DOTALL
+    )
+    assert found is not None
+    multiplier, right, left = map(float, found.groups())
+    assert (right - left) / 0.61 == pytest.approx(multiplier, abs=2e-3)
+    status, lines = screen("dropout-report", "--plots", "none")
+    check_fits(lines)
+    text = "\n".join(lines)
+    assert status == 0
+    for question in ("How far within 0.5 m (95 %)?", "controller numbers", "whole model", "Trust?", "Worst", "20 m"):
+        assert question in text
+    assert lines[-1].endswith("report.html")
+
+
+def test_a_drive_that_shows_too_little_says_what_to_drive(screen: Screen) -> None:
+    straight = ("--path", "straight", "--duration", "60", "-q")
+    assert screen("simulate", "-o", "straight.mcap", *straight)[0] == 0
+    status, lines = screen("fit", "straight.mcap", *ROBOT, "--plots", "none")
+    check_fits(lines)
+    assert status == 0
+    assert lines[0].startswith("Do not use: ")
+    assert "two full turns" in " ".join(lines)
+    assert "wheel_separation_multiplier" not in " ".join(lines)
+    status, lines = screen("dropout-report", "--plots", "none")
+    check_fits(lines)
+    assert (status, lines[0][:11]) == (0, "Do not use:")
+    assert "How far within" not in " ".join(lines)
+
+
+def test_all_is_printed_on_request(screen: Screen) -> None:
+    log = ROOT / "sample_logs" / "wheeled_figure_eight"
+    brief, full = (screen("dropout-report", log, *ROBOT, "--plots", "none", *more)[1] for more in ((), ("-v",)))
+    check_fits(brief)
+    assert len(full) > 2 * len(brief)
+
+
+def test_a_narrow_terminal_loses_no_column_without_notice(screen: Screen) -> None:
+    log = ROOT / "sample_logs" / "wheeled_figure_eight"
+    _, lines = screen("dropout-report", log, *ROBOT, "--plots", "none", "-v", columns=60)
+    text = " ".join(" ".join(lines).split())
+    assert "left out: the terminal has 60 columns" in text
+    assert "…" not in "".join(line for line in lines if "%" in line)
