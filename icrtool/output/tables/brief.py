@@ -17,6 +17,7 @@ from icrtool.output.text_format import (
     error_text,
     event_kinds,
     filter_agreement,
+    jump_count,
     position_word,
     run_title,
     turn_text,
@@ -147,10 +148,11 @@ def run_checks(summary: RunDocument) -> list[Check]:
         weak = ", ".join(f"{ICR_WORDS[name]} {one}" for name, one in verdicts.items() if one != "shown")
         found.append((False, "excitation", f"{weak}{f': {lacks}' if lacks else ''}"))
     if of := gnss["used"] + gnss["rejected"]:
-        jumps = f", {counted(gnss['jumps'], 'jump')}" if gnss["jumps"] else ""
         good = gnss["rejected"] < NOTED_SHARE * of
         word = "fixes" if position_word(summary) == "GNSS fixes" else "positions"
-        found.append((good and not jumps, word, f"{gnss['rejected']:,} of {of:,} rejected{jumps}"))
+        found.append((good, word, f"{gnss['rejected']:,} of {of:,} rejected"))
+    if jumps := jump_count(summary["reference_jumps"]):
+        found.append((False, "reference", jumps))
     if heading["offset_deg"] is not None:
         value = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f}°"
         found.append((True, "heading", f"{value} from the course over ground"))
