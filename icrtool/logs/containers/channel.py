@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
@@ -135,6 +136,25 @@ class Container(Protocol):
     def close(self) -> None:
         """Release files."""
         ...
+
+
+def made_ahead(blocks: Iterator[Block], stop: Callable[[], object] | None = None) -> Generator[Block]:
+    """Yield blocks; the next one is made in a thread while one is used.
+
+    Parameters
+    ----------
+    stop : called where no more blocks are wanted, to end the making of the next one
+    """
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            pending = pool.submit(next, blocks, None)
+            while (block := pending.result()) is not None:
+                pending = pool.submit(next, blocks, None)
+                yield block
+        except BaseException:
+            if stop is not None:
+                stop()
+            raise
 
 
 class Problems(list[str]):

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import WHOLE, Block, Cut, Problems, with_possible_times
+from icrtool.logs.containers.channel import WHOLE, Block, Cut, Problems, made_ahead, with_possible_times
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
     DecompressionError,
@@ -134,12 +134,7 @@ class ChunkedFile(ABC):
         if not wanted:
             return
         if self._chunks is None:
-            with ThreadPoolExecutor(1) as pool:
-                in_order = self._read_in_order()
-                pending = pool.submit(next, in_order, None)
-                while (block := pending.result()) is not None:
-                    pending = pool.submit(next, in_order, None)
-                    yield block
+            yield from made_ahead(self._read_in_order())
         else:
             needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
             yield from self._indexed(self._located(chunk, wanted) for chunk in needed)

@@ -14,7 +14,16 @@ from urllib.parse import quote
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, Problems, ros_type_name, with_possible_times
+from icrtool.logs.containers.channel import (
+    WHOLE,
+    Block,
+    Channel,
+    Cut,
+    Problems,
+    made_ahead,
+    ros_type_name,
+    with_possible_times,
+)
 from icrtool.logs.containers.decompress import ZSTD_MAGIC, unpack_messages
 from icrtool.records.text import LogText
 
@@ -28,7 +37,7 @@ _STEPS, _LEAST_STEPS, _STEPS_PER_BYTE = 1 << 16, 1 << 26, 16
 """Steps of SQLite's virtual machine: between two checks whether to stop; the most that a query may take; and so many
 more per byte of the file. The pages of a damaged table may refer to one another without end."""
 
-_FIRST_ROWS, _MOST_ROWS = 64, 4096
+_FIRST_ROWS, _MOST_ROWS = 64, 1 << 14
 _BLOCK_BYTES = _LARGEST_MESSAGE_BYTES = 1 << 24
 """Of several messages together, and of one: those that icrtool uses have some kilobytes."""
 
@@ -106,7 +115,8 @@ class SqliteBag:
         """Yield the messages of the wanted topics in the order they were stored."""
         if not wanted:
             return
-        blocks = self._stored(wanted, cut)
+        self._interruption = None
+        blocks: Iterator[Block] = made_ahead(self._stored(wanted, cut), self._end_query)
         if self._message_compression:
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
@@ -167,6 +177,10 @@ class SqliteBag:
         except BaseException as err:  # noqa: BLE001 - it is raised again where the query ends
             self._interruption = err
         return self._interruption is not None or self._steps_left < 0
+
+    def _end_query(self) -> None:
+        """End the query that is running in another thread."""
+        self._interruption = GeneratorExit()
 
     def _query(self, query: str, parameters: tuple[int, ...] = ()) -> sqlite3.Cursor:
         """Run a query, with its own limit of steps."""

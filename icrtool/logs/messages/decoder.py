@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.channel import Block
-from icrtool.logs.messages.schema import COUNTED, NUMBERS, SIZES, TEXT, Layout, Operation, Slot
+from icrtool.logs.messages.schema import COUNTED, NUMBERS, SIZES, TEXT, Layout, Operation
 from icrtool.records.text import LONGEST_TEXT
 
 _MESSAGES_AT_ONCE = 1 << 14
@@ -237,26 +238,27 @@ class Decoded:
 
         What a message lacks is NaN or 0.
         """
-        slot = self.layout.slots[path]
-        kind, result = _type_of(slot)
-        offsets: list[list[int]] = [shape.taken[slot.number] if shape.readable else [] for shape in self.shapes]
+        number, (kind, result) = self.layout.slots[path].number, _types(self.layout.slots[path].kind)
+        offsets: list[list[int]] = [shape.taken[number] if shape.readable else [] for shape in self.shapes]
         width = max(map(len, offsets), default=0) if len(self.start) else 0
         if width == 0:
             return np.empty((len(self.start), 0) if "[*]" in path else 0, result)
-        step = offsets[0][1] - offsets[0][0] if width > 1 and len(offsets[0]) > 1 else 0
-        if len(offsets) == 1 and (width == 1 or offsets[0] == [*range(offsets[0][0], offsets[0][-1] + step, step)]):
-            values = self._fields(offsets[0][0], kind, width, step)
+        first = offsets[0]
+        step = first[1] - first[0] if len(first) > 1 else 0
+        if len(offsets) == 1 and (width == 1 or first == [*range(first[0], first[-1] + step, step)]):
+            values = self._fields(first[0], kind, width, step)
         else:
             values = self._scattered(offsets, kind, width)
         if any(shape.big for shape in self.shapes):
             big = np.array([shape.big for shape in self.shapes])
             values = np.where(big[self.shape_of, None], values.byteswap(), values)
-        if kind != result:
+        if kind.char == "f":
             with np.errstate(invalid="ignore"):  # a signalling NaN becomes a NaN
                 values = values.astype(result)
-        counts = np.array([*map(len, offsets)])
-        if counts.min() < width:
-            lacking = np.arange(width) >= counts[self.shape_of, None]
+        else:
+            values = values.astype(result, copy=False)
+        if len(offsets) > 1:
+            lacking = np.arange(width) >= np.array([*map(len, offsets)])[self.shape_of, None]
             values = np.where(lacking, result.type(np.nan if result.kind == "f" else 0), values)
         return values if "[*]" in path else values[:, 0]
 
@@ -281,17 +283,25 @@ class Decoded:
         if not len(self.start):
             return np.empty((0, 0) if "[*]" in path else 0, np.int64)
         width = max((len(shape.taken[slot.number]) for shape in self.shapes if shape.readable), default=0)
-        numbers = np.full((len(self.start), width), -1, np.int64)
+        numbers: Ints = np.full((len(self.start), width), -1, np.int64)
         for shape, rows in self._by_shape():
-            for place, (at, length) in enumerate(shape.taken[slot.number]):
-                if len(self.shapes) == 1:
-                    texts = self._fields(at, np.dtype((np.void, length)))[:, 0]
-                else:
-                    texts = _unaligned(self.data, np.dtype((np.void, length)))[self.start[rows] + at]
-                one = length == 0 or bool((texts == texts[0]).all())
-                codes = [known.setdefault(text, len(known)) for text in texts[: 1 if one else None].tolist()]
-                numbers[rows, place] = codes
+            codes = [self._codes(at, length, rows, known) for at, length in shape.taken[slot.number]]
+            if len(self.shapes) == 1 and all(len(one) == 1 for one in codes):
+                numbers = np.broadcast_to(np.array(codes, np.int64).reshape(1, width), numbers.shape)
+                break
+            for place, one in enumerate(codes):
+                numbers[rows, place] = one
         return numbers if "[*]" in path else numbers[:, 0]
+
+    def _codes(self, at: int, length: int, rows: Ints | slice, known: dict[bytes, int]) -> list[int]:
+        """Return the numbers of the texts at an offset in messages of one shape; of only one where all are the same."""
+        kind = np.dtype((np.void, length))
+        if len(self.shapes) == 1:
+            texts = self._fields(at, kind)[:, 0]
+        else:
+            texts = _unaligned(self.data, kind)[self.start[rows] + at]
+        is_one = length == 0 or bool((texts == texts[0]).all())
+        return [known.setdefault(text, len(known)) for text in texts[: 1 if is_one else None].tolist()]
 
     def _by_shape(self) -> Iterator[tuple[Shape, Ints | slice]]:
         """Yield each shape with the rows that have it."""
@@ -310,7 +320,8 @@ def _unaligned(data: Bytes, kind: np.dtype[Any]) -> NDArray[Any]:
     return np.ndarray(max(len(data) - kind.itemsize + 1, 0), kind, data, strides=(1,))
 
 
-def _type_of(slot: Slot) -> tuple[np.dtype[Any], np.dtype[Any]]:
+@cache
+def _types(kind: str) -> tuple[np.dtype[Any], np.dtype[Any]]:
     """Return the type of a slot's numbers in little-endian messages, and in columns."""
-    kind = slot.kind[0] if slot.kind.startswith(("int", "float")) else "u"
-    return np.dtype(f"<{kind}{SIZES[slot.kind]}"), np.dtype(np.float64 if kind == "f" else np.int64)
+    letter = kind[0] if kind.startswith(("int", "float")) else "u"
+    return np.dtype(f"<{letter}{SIZES[kind]}"), np.dtype(np.float64 if letter == "f" else np.int64)

@@ -180,7 +180,8 @@ class TopicCollector:
                 if len(known) > MOST_TEXTS:
                     why = f"its {path} has over {MOST_TEXTS} different texts"
                     raise DefinitionError(self.channel.topic, why, "not read")
-            self._columns.setdefault(path, []).append(_compact(values))
+            parts = self._columns.setdefault(path, [])
+            parts.append(_compact(values) if not parts or _is_one_row(parts[-1]) else np.array(values))
 
     def table(self) -> TopicTable:
         """Return what was gathered since the last call, sorted by log time."""
@@ -274,8 +275,8 @@ def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
 def _compact(rows: NDArray[Any]) -> NDArray[Any]:
     """Return rows (n,) or (n, k) that are equal bit by bit in the memory of one; they cannot be written to then."""
     bits = rows.view(np.int64)
-    if (bits[-1] != bits[0]).any() or (bits != bits[0]).any():
-        return np.ascontiguousarray(rows)
+    if not _is_one_row(rows) and ((bits[-1] != bits[0]).any() or (bits != bits[0]).any()):
+        return np.array(rows)
     return np.broadcast_to(rows[:1].copy(), rows.shape)
 
 
