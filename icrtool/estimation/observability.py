@@ -31,6 +31,8 @@ UNLEARNED = 0.7
 """An ICR whose standard deviation is still more than this share of the start's was not learned."""
 
 TURNS_NEEDED_RAD = math.pi
+STEERS, SURELY_TURNED_RAD = 0.1, 0.1
+"""Sides that turn by less than this part of what the robot turns do not turn it; and more than headings err."""
 ONE_DIRECTION = 0.15
 """Turns are in one direction where those to the other side are less than this share of them."""
 SPIN_RATIO = 3.0
@@ -116,7 +118,7 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None, wi
         turned_left_rad=left,
         spun_right_rad=spun_right,
         spun_left_rad=spun_left,
-        sentences=_sentences(stds, verdicts, right, left, windows.distance_m),
+        sentences=_sentences(stds, verdicts, right, left, windows.distance_m, _turned_otherwise(table, windows)),
     )
 
 
@@ -177,17 +179,26 @@ def _verdict(share: float) -> Excited:
 
 
 def _sentences(
-    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, distance_m: float
+    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, distance_m: float, steered: float
 ) -> tuple[str, ...]:
-    """Return sentences: what is not shown, why, and what to drive."""
+    """Return sentences: what is not shown, why, and what to drive; `steered` of `_turned_otherwise`."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return ()
     unshown = ", ".join(f"{ICR_WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
     first = f"this drive could not show the ICRs well: {unshown}"
+    if steered > TURNS_NEEDED_RAD and right + left < STEERS * steered:
+        angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(right + left):.0f}°"
+        return (first, f"{angles}: it steers as a car does, and has no track ICRs, or one side is a copy of the other")
     if lacks := lacking_turns(right, left):
         return (first, lacks)
     return (first, f"too few turns in {distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}")
+
+
+def _turned_otherwise(table: States, windows: StateWindows) -> float:
+    """Return how far the robot turned in the windows, by its headings, to whichever side [rad]."""
+    turned = np.abs(np.diff(np.interp(windows.end_s, table.t_s, table.heading_rad)))
+    return float(turned[turned > SURELY_TURNED_RAD].sum())
 
 
 def lacking_turns(right_rad: float, left_rad: float) -> str:

@@ -70,6 +70,12 @@ class Filtered(NamedTuple):
     began_with: WarmStart | None
     changes_s: tuple[float, ...]
 
+    @property
+    def in_use(self) -> tuple[MeasurementOutcome, MeasurementOutcome]:
+        """Fixes and headings while the robot was in use."""
+        gnss, heading = (one.rows(self.sensors.moving(one.stamp_ns)) for one in (self.gnss, self.heading))
+        return gnss, heading
+
 
 def run_filter(
     sensors: SensorData,
@@ -98,16 +104,13 @@ def run_filter(
     fixes_ns, headings_ns = sensors.fixes.stamp_ns, sensors.headings.stamp_ns
     fixes_s, headings_s = ((one - table.stamp_ns[0]) / 1e9 for one in (fixes_ns, headings_ns))
     residual_m = np.hypot(*output.gnss_residual.T)
-    gnss = MeasurementOutcome(
-        fixes_ns, fixes_s, output.gnss_nis, output.gnss_code, residual_m, sensors.moving(fixes_ns)
-    )
+    gnss = MeasurementOutcome(fixes_ns, fixes_s, output.gnss_nis, output.gnss_code, residual_m)
     heading = MeasurementOutcome(
         headings_ns,
         headings_s,
         output.heading_nis,
         output.heading_code,
         output.heading_innovation,
-        sensors.moving(headings_ns),
     )
     in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
     start_std_m, least_icr_m = np.sqrt(np.diag(setup.P0)[3:]), setup.parameters.least_icr

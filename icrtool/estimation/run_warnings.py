@@ -36,6 +36,7 @@ LEAST_SEPARATION = 1.1
 that knows the slip, or is fused with a gyro."""
 
 WORTH_WARNING_SHARE = 0.1
+DELAY_SIGMAS = 3.0
 USELESS_HEADING_DEGPS = 50.0
 """The heading by wheels with more noise than this errs by 5 deg after a second."""
 
@@ -54,14 +55,18 @@ def unusable_reasons(
     wheel_scale: Finding | None = None,
     twist_separation: float | None = None,
     contradiction: str = "",
+    filtered: str = "",
 ) -> list[str]:
     """Return why the ICRs of a run must not be used; empty where they can be.
 
     Parameters
     ----------
     contradiction : of `contradicts_windows`
+    filtered : how the wheels show that a filter made them; nothing else is then worth a reason
     twist_separation : (y_r - y_l) / b by a body twist that was converted with b, None for other wheels
     """
+    if filtered:
+        return [f"filtered or fused odometry ({filtered}); wheel speeds are needed: topics.wheels names their topic"]
     hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
     reasons = [f"{', '.join(hidden)} not shown by this drive"] if hidden else []
     for word, outcome in (("fixes", gnss), ("headings", heading)):
@@ -115,10 +120,8 @@ def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str
 
 
 def rejected_share(outcome: MeasurementOutcome) -> float:
-    """Return the share of the measurements of a moving robot that the innovation gate rejected; 0 for none."""
+    """Return the share of the measurements within the run that the innovation gate rejected; 0 for none."""
     seen = outcome.code > UNSEEN
-    if outcome.moving is not None:
-        seen &= outcome.moving
     return float(outcome.rejected[seen].mean()) if seen.any() else 0.0
 
 
@@ -143,12 +146,14 @@ def run_warnings(
     heading: MeasurementOutcome,
     multiplier: tuple[float, float] | None,
     excitation: Excitation,
+    findings: Mapping[str, Finding],
 ) -> list[str]:
     """Return what a user should know before trusting the numbers.
 
     Parameters
     ----------
-    multiplier : (y_r - y_l) / b and its standard deviation, None where b is not known
+    multiplier : (y_r - y_l) / b and its standard deviation; None where b is not known, or the run is not usable
+    findings : of the alignment
     """
     found = []
     if multiplier is not None and excitation.shows_sides:
@@ -157,13 +162,22 @@ def run_warnings(
         found.append(
             "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
         )
-    for word, outcome, causes in (
-        ("fixes", gnss, "clocks, position of the antenna, quality of the fixes"),
-        ("headings", heading, "clocks, mounting of the sensor, quality of the headings"),
-    ):
+    for word, outcome, key in (("fixes", gnss, "position_delay_s"), ("headings", heading, "heading_delay_s")):
         if (share := rejected_share(outcome)) > WORTH_WARNING_SHARE:
-            found.append(f"{100 * share:.0f} % of the {word} were rejected: check {causes}")
+            cause = _cause_of_rejection(findings.get(key))
+            found.append(f"{100 * share:.0f} % of the {word} were rejected: {cause}")
     return [f"{name}: {warning}" for warning in found]
+
+
+def _cause_of_rejection(delay: Finding | None) -> str:
+    """Return why measurements were rejected, as far as their delay against the wheels shows it."""
+    scatter = "they jump or scatter by more than they state"
+    if delay is None or delay.value is None or delay.std is None:
+        return f"their clock, or {scatter}; this drive does not show their delay"
+    left = delay.value - delay.applied
+    if abs(left) > DELAY_SIGMAS * delay.std:
+        return f"they {'lag' if left > 0 else 'lead'} the wheels by {abs(left):.2f} ± {delay.std:.2f} s, or {scatter}"
+    return f"{scatter} (their clock agrees with the wheels to {max(delay.std, abs(left)):.2f} s)"
 
 
 def _multiplier_warnings(multiplier: float, std: float) -> list[str]:

@@ -77,12 +77,12 @@ def summarise(
     of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
     unusable = unusable_reasons(
         excitation,
-        filtered.gnss,
-        filtered.heading,
+        *filtered.in_use,
         filtered.noise,
         scale,
         multiplier if of_twist else None,
         contradicts_windows(table, covariance, measurements.findings) if field and not changes_s else "",
+        str(measurements.sections["wheels"]["filtered"] or "") if field else "",
     )
     document: RunDocument = plain(
         {
@@ -92,7 +92,9 @@ def summarise(
             "inputs": [asdict(file) for file in inputs],
             "config": config.effective(),
             "streams": [asdict(stream) for stream in measurements.streams],
-            "warnings": _warnings(measurements, filtered, config, multiplier, excitation, changes_s, covariance),
+            "warnings": _warnings(
+                measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance
+            ),
             "alignment": {key: asdict(finding) for key, finding in measurements.findings.items()},
             "drive": drive_summary(table),
             "usable": not unusable,
@@ -133,7 +135,7 @@ def _warnings(
     end_s = float(table.t_s[-1])
     return [
         *measurements.warnings,
-        *run_warnings(name, table, filtered.gnss, filtered.heading, apart, excitation),
+        *run_warnings(name, table, *filtered.in_use, apart, excitation, measurements.findings),
         *(
             []
             if measurements.antenna_is_known or not excitation.shows_sides
@@ -161,6 +163,7 @@ def filter_summary(measurements: Measurements, filtered: Filtered, config: Confi
         "heading_from_position": sensors.heading_from_position,
         "heading_is_estimated": sensors.heading_is_estimated,
         "heading_is_measured": sensors.heading_is_measured,
+        "turn_wander_rad": sensors.turn_wander_rad,
         "antenna_m": sensors.antenna_m,
         "antenna_is_known": measurements.antenna_is_known,
         "states": len(filtered.table),

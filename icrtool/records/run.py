@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -49,7 +49,6 @@ class MeasurementOutcome:
     nis : (m,) normalised innovation squared, NaN where unseen
     code : uint8 (m,), see `icrtool.kernels.filter.measurement_codes`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
-    moving : (m,) of `icrtool.records.measurements.SensorData.moving`; None: not known
     """
 
     stamp_ns: Ints
@@ -57,7 +56,10 @@ class MeasurementOutcome:
     nis: Floats
     code: Bytes
     difference: Floats
-    moving: Bools | None = None
+
+    def rows(self, kept: Bools) -> MeasurementOutcome:
+        """Return the measurements marked in `kept` (m,)."""
+        return MeasurementOutcome(*(getattr(self, field.name)[kept] for field in fields(self)))
 
     @property
     def used(self) -> Bools:

@@ -219,6 +219,7 @@ class FilterDocument(TypedDict):
     heading_from_position: bool
     heading_is_estimated: bool
     heading_is_measured: NotRequired[bool]
+    turn_wander_rad: NotRequired[float | None]
     antenna_m: tuple[float, float]
     warm_start: WarmStartDocument | None
     icr_start: IcrStartDocument | None

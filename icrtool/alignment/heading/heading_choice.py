@@ -15,7 +15,7 @@ from icrtool.alignment.heading.courses import TurnRate
 from icrtool.alignment.heading.gyro_heading import LAG, OFFSET, AbsoluteHeading, HeadingEstimate, estimate_heading
 from icrtool.alignment.heading.turn_rates import gyro_rate, wheel_rate
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.records.samples import NO_HEADINGS, GyroAxes, GyroSamples, HeadingSamples, StreamChoice, thin
 from icrtool.records.tables import RobotLog
 
@@ -31,6 +31,9 @@ LARGEST_SPREAD = 2.0
 
 LARGEST_DRIFT = math.radians(10.0)
 """A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
+
+COMPARED_S, FOLLOWS, LEAST_GAIN, LARGEST_GAIN = 1.0, 0.9, 0.15, 1.3
+"""A gyro whose turns within a second explain this share of the wheels', with such a gain, turns with the robot."""
 
 LONGEST_HOLE_S = 1.0
 """No heading is estimated within a longer hole of the turn rate."""
@@ -91,14 +94,25 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             log.name, "no heading in it, and too few wheel or position samples", "record at least two of each"
         )
     drive = drive_arrays(log)
-    found = _with_gyro(log, drive, None)
+    found, against = _with_gyro(log, drive, None)
     if found is not None and _is_alive(found.estimate):
         return found
     turn = wheel_rate(drive, width_m)
     pair, length = _pair(log, turn)
     estimate = estimate_heading(drive, turn, [pair] if pair is not None else [], stands=False)
+    doubted = found if found is not None else against
+    if doubted is not None and _follows_wheels(doubted, drive, width_m, int(log.wheels.stamp_ns[0])):
+        # what contradicts it contradicts the wheels as much: it is the fixes that err
+        return doubted
     if estimate is not None and (found is None or estimate.median_std < found.estimate.median_std):
-        return _derived(log, estimate, turn, None, length, None)
+        why = "no turn rate in the log"
+        if found is not None:
+            why = "the turn rate drifts more"
+        elif against is not None:
+            why = "the turn rate contradicts the course over ground more"
+        elif log.gyros:
+            why = "the turn rate does not cover enough of the drive"
+        return _derived(log, estimate, turn, None, length, None, instead=why)
     if found is None:
         raise DataError(
             log.name, "no heading in it, and too little distance to find one from positions", "drive some metres"
@@ -118,7 +132,7 @@ def fuse_heading(log: RobotLog, drive: DriveArrays) -> DerivedHeading | None:
     """
     if drive.same_clock:
         return None
-    found = _with_gyro(log, drive, log.heading)
+    found, _ = _with_gyro(log, drive, log.heading)
     if found is None or not _is_alive(found.estimate):
         return None
     return found if found.estimate.median_std <= math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD) else None
@@ -129,14 +143,40 @@ def _is_alive(estimate: HeadingEstimate) -> bool:
     return estimate.noises["angle"] < LARGEST_DRIFT
 
 
+def _follows_wheels(derived: DerivedHeading, drive: DriveArrays, width_m: float, epoch_ns: int) -> bool:
+    """Return whether a gyro turns as the wheels of a robot that may slip do, in windows of time."""
+    gyro = derived.gyro
+    if gyro is None:
+        return False
+    begin = np.arange(drive.wheel_t[0], drive.wheel_t[-1] - COMPARED_S, COMPARED_S)
+    t = (gyro.stamp_ns - epoch_ns) / 1e9
+    turned = trapezoids(t, gyro.rate_radps)
+    wheels = drive.cumulate(2.0 * drive.half_difference / width_m).real
+    by_gyro, by_wheels = (
+        np.interp(begin + COMPARED_S, times, angle) - np.interp(begin, times, angle)
+        for times, angle in ((t, turned), (drive.wheel_t, wheels))
+    )
+    both, own = float(by_gyro @ by_wheels), float(by_wheels @ by_wheels)
+    if min(own, float(by_gyro @ by_gyro)) <= 0.0:
+        return False
+    explained = both**2 / own / float(by_gyro @ by_gyro)
+    return explained > FOLLOWS and LEAST_GAIN < both / own < LARGEST_GAIN
+
+
 def attitude_error(estimate: HeadingEstimate) -> float:
     """Return the standard deviation of the wandering error of the first absolute heading [rad]."""
     return estimate.noises["0 size"]
 
 
-def _with_gyro(log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None) -> DerivedHeading | None:
-    """Return the estimate with the gyro that follows the courses over ground best; None where none does."""
+def _with_gyro(
+    log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None
+) -> tuple[DerivedHeading | None, DerivedHeading | None]:
+    """Return the estimates with the gyro that follows the courses over ground best, and that contradicts them least.
+
+    None where no gyro does.
+    """
     best: DerivedHeading | None = None
+    against: DerivedHeading | None = None
     epoch = int(log.wheels.stamp_ns[0])
     for gyro in log.gyros:
         found = gyro_rate(drive, gyro, epoch)
@@ -149,12 +189,15 @@ def _with_gyro(log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None)
         pair, length = _pair(log, turn)
         absolute += [pair] if pair is not None else []
         estimate = estimate_heading(drive, turn, absolute)
-        if estimate is None or estimate.spread > LARGEST_SPREAD:
+        if estimate is None:
             continue
-        if best is None or estimate.median_std < best.estimate.median_std:
-            topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
+        topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
+        if estimate.spread > LARGEST_SPREAD:
+            if against is None or estimate.spread < against.estimate.spread:
+                against = _derived(log, estimate, turn, topic, length, stated)
+        elif best is None or estimate.median_std < best.estimate.median_std:
             best = _derived(log, estimate, turn, topic, length, stated)
-    return best
+    return best, against
 
 
 def _pair(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]:
@@ -165,12 +208,12 @@ def _pair(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]
 
 def _derived(
     log: RobotLog, estimate: HeadingEstimate, turn: TurnRate, gyro_topic: str | None,
-    baseline_m: float, stated: HeadingSamples | None,
+    baseline_m: float, stated: HeadingSamples | None, instead: str = "",
 ) -> DerivedHeading:  # fmt: skip
-    """Return the record of an estimate."""
+    """Return the record of an estimate; `instead` is why the wheels' turn is used and no gyro's."""
     epoch = int(log.wheels.stamp_ns[0])
     bias = f"turn rate (bias {math.degrees(estimate.constants[1]):+.2f} deg/s at the end)"
-    parts = [bias if gyro_topic else "wheels (no usable turn rate in the log)", "course over ground"]
+    parts = [bias if gyro_topic else f"wheels ({instead})", "course over ground"]
     names = [gyro_topic or "wheels", log.topic("gnss", "positions")]
     source: Source = "gyro_course" if gyro_topic else "wheels_course"
     if baseline_m > 0.0:

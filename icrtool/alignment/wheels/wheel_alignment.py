@@ -11,6 +11,7 @@ import numpy as np
 from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.position.gnss_steps import unbroken
+from icrtool.alignment.wheels.filtered_odometry import find_filtering
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
@@ -59,6 +60,7 @@ class WheelAlignment:
     applied : what the speeds of the left and of the right side were multiplied with
     configured : what they were multiplied with before, by the configuration
     held_share : share of samples, while moving, that repeat the one before
+    filtered : how they show that a filter made them, `icrtool.alignment.wheels.filtered_odometry`; empty for none
     """
 
     scale: float
@@ -66,6 +68,7 @@ class WheelAlignment:
     applied: tuple[float, float]
     configured: tuple[float, float]
     held_share: float
+    filtered: str
     warnings: tuple[str, ...]
 
     @property
@@ -82,6 +85,7 @@ class WheelAlignment:
             "applied_left_scale": self.applied[0] * self.configured[0],
             "applied_right_scale": self.applied[1] * self.configured[1],
             "held_share": self.held_share,
+            "filtered": self.filtered or None,
         }
 
 
@@ -142,7 +146,8 @@ def dead_or_copied(log: RobotLog) -> list[str]:
             meaning = "if so, do not use the ICRs: topics.wheels chooses others, --from and --to read the rest"
             return [f"the {side} wheels hardly ever move {span}: is their encoder dead? {meaning}"]
     if np.array_equal(left, right) and float(np.ptp(np.unwrap(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
-        return ["left and right wheels are equal throughout while the robot turns: one is a copy of the other"]
+        cause = "one is a copy of the other, or the robot steers as a car does, and has no track ICRs"
+        return [f"left and right wheels are equal throughout while the robot turns: {cause}"]
     return []
 
 
@@ -212,12 +217,13 @@ def align_wheels(
     notes : what else was found
     sound : no side is dead or a copy of the other
     """
-    applied, of_scale = _find_scales(fit, config, sound=sound)
+    filtered = "" if fit is None or not sound else find_filtering(fit)
+    applied, of_scale = ((1.0, 1.0), []) if filtered else _find_scales(fit, config, sound=sound)
     a, a_std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
     share = _held_share(log.wheels)
     notes = [*notes, *of_scale, *_held_note(log.wheels, share), *_fused_note(log)]
     return WheelAlignment(
-        a, a_std, applied, (abs(configured[0]), abs(configured[1])), share,
+        a, a_std, applied, (abs(configured[0]), abs(configured[1])), share, filtered,
         tuple(f"{log.name}: {note}" for note in notes),
     )  # fmt: skip
 

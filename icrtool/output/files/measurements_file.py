@@ -5,6 +5,7 @@ The wheel samples from the first recorded state on are columns of the states; on
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from tokenize import TokenError
@@ -112,6 +113,7 @@ def read_measurements(
             icr_start=None if start is None else IcrStart(_triple(start["icrs_m"]), _triple(start["std_m"])),
             heading_is_estimated=facts["heading_is_estimated"],
             heading_is_measured=facts.get("heading_is_measured", False),
+            turn_wander_rad=math.inf if (wander := facts.get("turn_wander_rad")) is None else wander,
             attitude=_attitude(columns) if "attitude_stamp_ns" in columns else None,
         )
         outcomes = [

@@ -50,21 +50,21 @@ def verdict_rows(run: Run | None, problem: IcrToolError | None, config: Config) 
 
 
 def verdict(run: Run | None, problem: IcrToolError | None) -> str:
-    """Return in a sentence whether a log can be fitted, and whether it shows the ICRs."""
+    """Return in a sentence whether a log can be fitted and used, and whether it shows the ICRs."""
     if run is None:
         return f"cannot be fitted: {problem}" if problem is not None else "cannot be fitted"
     if not run.usable:
-        return f"can be fitted, but its ICRs are not usable: {run.summary['unusable_because']}"
+        return f"not usable: {run.summary['unusable_because']}"
     verdicts = run.summary["excitation"]["verdict"].values()
     return f"can be fitted, {'all ICRs are shown' if set(verdicts) == {'shown'} else 'not all ICRs are shown'}"
 
 
 def next_command(log: str, options: Sequence[str], run: Run | None) -> str | None:
-    """Return the command to run next with a log, by the options of this one; None where it cannot be fitted."""
-    if run is None:
+    """Return the command to run next with a log, by the options of this one; None where it is of no use."""
+    if run is None or not run.usable:
         return None
     cut = "--from" in options or "--to" in options
-    command = "dropout-report" if run.usable and not cut else "fit"
+    command = "fit" if cut else "dropout-report"
     return shlex.join(["icrtool", command, log, *options])
 
 

@@ -23,12 +23,16 @@ from icrtool.output.text_format import (
     run_title,
     unusable_lines,
 )
+from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import ClassDocument
 from icrtool.records.text import counted
 
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
 """A delay that receivers have, to show what it does; at lower speeds than this it does little."""
+
+SLIPPING_MULTIPLIER = 1.1
+"""A robot that turns by less than its wheels show by this factor slips."""
 
 SMALLEST_DELAY_S = 0.05
 """A delay below this is not worth a line."""
@@ -207,7 +211,10 @@ def _delay_rows(run: Run) -> list[Row]:
         delay, std = facts["delay_s"], facts["delay_std_s"]
         if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, SIGNIFICANT_SIGMAS * std):
             found.append(f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {abs(delay):.2f} ± {std:.2f} s")
-    lines = [*found, "not corrected: slip of the wheels has the same effect"] if found else []
+    multiplier = run.summary["icr"]["separation_multiplier"]
+    slips = multiplier is None or multiplier > SLIPPING_MULTIPLIER
+    cause = "slip of the wheels" if slips else f"the robot's response to its wheels, up to {RESPONSE_S:g} s,"
+    lines = [*found, f"not corrected: {cause} has the same effect"] if found else []
     speed = run.summary["drive"]["speed_mean_mps"]
     if run.summary["gnss"]["delay_s"] is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
         shift = error_text(TYPICAL_DELAY_S * speed)
