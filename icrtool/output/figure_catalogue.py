@@ -5,7 +5,6 @@ matplotlib is imported when the first figure is drawn: a page of finished pictur
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -171,14 +170,9 @@ def draw_figures(
     directory.mkdir(exist_ok=True)
     from icrtool.output.figures.style import save
 
-    # A figure is thousands of objects: the collector would go through those of the whole program for each.
-    gc.freeze()
-    try:
-        for name, figure in figures_of(of, subject, figures):
-            save(figure, directory / name, formats)
-            give_back_freed()
-    finally:
-        gc.unfreeze()
+    for name, figure in figures_of(of, subject, figures):
+        save(figure, directory / name, formats)
+        give_back_freed()
 
 
 def entry_of(file: str) -> tuple[Entry, str] | None:

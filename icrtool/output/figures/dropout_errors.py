@@ -34,14 +34,14 @@ PANEL_HEIGHT_IN, LOW_PANEL_IN = 2.0, 1.45
 P95 = Pen("black", width=1.2)
 """The 95 % mark is a solid line, the expected value a dashed one (`MEAN`), in every picture."""
 
-DASH = (0, (1.2, 1.6))
-"""Of the expected errors of a model."""
+THIN = 0.9
 BAND_ALPHA = 0.18
 CURVE_POINTS = 200
 
 LEAST_SHOWN = 0.7
 """The scale of errors begins at this part of the least that is drawn, and ends so much above the greatest."""
 MOST_DECADES = 4.0
+LABEL_PT, LABEL_LINE_PT = 5.0, 13.0
 SPACE_OF_LABEL = 0.09
 """A distance is written to the left of its mark where it leaves this part of the width."""
 
@@ -69,10 +69,10 @@ def dropout_summary(report: DropoutReport) -> Figure:
     pens = _pens(report)
     title = f"Within {best.budget_m:g} m (95 %) for {best.reach_text}" if best is not None else "Error over distance"
     # Beside the models: the mean of the first, budget, outages.
+    most = int(report.counts.trials.max())
     keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
-    trials = f"up to {int(report.counts.trials.max()):,} trials a distance"
     figure = new_figure(
-        title, f"{run_title(report.run_summary)}: open-loop error without GNSS, {trials}; bands: 95 % intervals",
+        title, f"{run_title(report.run_summary)}: up to {most:,} trials a distance; bands: 95 % intervals",
         height_in=4.6 + keys_in, margins_in=(0.75, 0.25, 0.65, 0.95 + keys_in),
     )  # fmt: skip
     axes = figure.subplots()
@@ -192,14 +192,13 @@ def _draw_model(
         return drawn
 
     thin = result.name == "no_slip"
-    look = pen.keywords() | ({"linewidth": 0.9} if thin else {})
+    look = pen.keywords() | ({"linewidth": THIN} if thin else {}) | {"zorder": 2.6 if first else 2.4}
     axes.plot(x, between(result.summary.p95), label=f"{label}, 95 %", **look)
     if not thin:
         low, high = (between(values) for values in (result.intervals.p95_low, result.intervals.p95_high))
         axes.fill_between(x, low, high, color=pen.color, alpha=BAND_ALPHA, linewidth=0)
     if first:
-        mean = pen.keywords() | {"linestyle": DASH, "linewidth": 1.1}
-        axes.plot(x, between(result.summary.expected), label=f"{label}, mean", **mean)
+        axes.plot(x, between(result.summary.expected), label=f"{label}, mean", **look | {"linewidth": THIN})
 
 
 def _shown_errors(models: list[ModelResult], others_m: list[float]) -> tuple[float, float]:
@@ -215,7 +214,8 @@ def _shown_errors(models: list[ModelResult], others_m: list[float]) -> tuple[flo
 def _mark_reaches(
     axes: Axes, reached: list[BudgetDistance], pens: Mapping[str, Pen], lowest_m: float
 ) -> None:  # fmt: skip
-    """Mark where models use up a budget: the nearest is named to the left of its curve, others to the right."""
+    """Mark where models use up a budget: the nearest is named to the left of its curve, others below to the right."""
+    below_pt = LABEL_PT
     for number, one in enumerate(sorted(reached, key=lambda one: one.distance_m)):
         pen = pens[one.model]
         axes.plot([one.distance_m] * 2, [lowest_m, one.budget_m], color=pen.color, linewidth=0.7, zorder=1.5)
@@ -225,10 +225,11 @@ def _mark_reaches(
         )  # fmt: skip
         left = number == 0 and one.distance_m > SPACE_OF_LABEL * axes.get_xlim()[1]
         axes.annotate(
-            f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), xytext=(-5, 5) if left else (5, -5),
+            f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), xytext=(-5, 5) if left else (5, -below_pt),
             textcoords="offset points", ha="right" if left else "left", va="bottom" if left else "top",
             color=pen.color, fontweight="bold", zorder=6, bbox=LABEL_BOX,
         )  # fmt: skip
+        below_pt += 0.0 if left else LABEL_LINE_PT
 
 
 def _histogram_end(marks_m: list[Any]) -> float:

@@ -106,7 +106,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
     """
     worst = _needed(report, report.worst, "worst trials")[: WORST_COLUMNS * WORST_ROWS - 1]
     rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), worst[0].model
-    which = f"the {len(worst)} worst trials of the model {_word(report, model)}, none overlapping"
+    which = f"{_word(report, model)}, the {len(worst)} worst trials, none overlapping"
     figure = new_figure(
         f"The worst trial of {worst[0].horizon_m:g} m ends {error_text(worst[0].errors_m[model])} off",
         f"{run_title(report.run_summary)}: {which}",
