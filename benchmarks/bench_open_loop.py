@@ -6,8 +6,9 @@ import numpy as np
 from table import Table, seconds_of
 
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
-from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
+from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
 
@@ -60,14 +61,18 @@ def open_loop_rows(table: Table, hours: float, repeats: int) -> None:
             raise SystemExit(f"open loop, {name}: {apart_m:.1e} m apart from direct integration")
     errors = open_loop_errors(drive, NO_SLIP, ends)
 
-    def bootstrap() -> None:
-        blocks = [cut_blocks(column >= 0, drive.distance, h) for column, h in zip(ends.T, HORIZONS_M, strict=True)]
-        bootstrap_intervals(errors, blocks, seed=0)
+    summary = error_summary(errors)
+
+    def intervals() -> None:
+        for h, horizon in enumerate(HORIZONS_M):
+            blocks, p95 = cut_blocks(ends[:, h] >= 0, drive.distance, horizon), float(summary.p95[h])
+            sums = block_sums(errors[:, h], blocks, sort_trials(errors[:, h]), float(summary.p50[h]), p95)
+            error_intervals(errors[:, h], blocks, sums, p95)
 
     jobs = {
         "trial ends, for all models": lambda: trial_ends(drive, HORIZONS_M),
         "percentiles of a model": lambda: error_summary(errors),
-        "bootstrap of a model": bootstrap,
+        "intervals of a model": intervals,
     }
     for name, job in jobs.items():
         table.add(name, seconds_of(job, repeats), direct, f"for its errors {by_direct}")

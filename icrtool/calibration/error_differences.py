@@ -8,9 +8,11 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.block_sums import LEVEL
-from icrtool.kernels.open_loop.error_statistics import RESAMPLES, error_summary
+from icrtool.kernels.open_loop.error_statistics import error_summary
 from icrtool.kernels.open_loop.trials import Drive
 from icrtool.records.dropout import DEFAULT_SEED
+
+RESAMPLES = 300
 
 SHORTEST_BLOCK_M = 10.0
 

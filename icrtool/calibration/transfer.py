@@ -21,11 +21,12 @@ from icrtool.calibration.pooled import CalibrationResult, predictor
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.error_statistics import bootstrap_intervals, cut_blocks, error_summary
+from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals
+from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
 from icrtool.motion.models import RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import cut_trials
-from icrtool.records.dropout import CHOICE_HORIZON_M, DEFAULT_SEED
+from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.run import Run
 
 HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
@@ -118,8 +119,8 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> Transfer:
     Notes
     -----
     Parameters of different logs are independent, and their covariances are clustered by distance; errors have intervals
-    of a moving-block bootstrap over the distance of all runs of a group, blocks as long as the horizon. Differences of
-    errors have a bootstrap of their own, over pairs of blocks where both are of the same trials or the same route
+    from blocks of the distance of all runs of a group (`icrtool.kernels.open_loop.block_sums`). Differences of errors
+    have a bootstrap over blocks, over pairs of blocks where both are of the same trials or the same route
     (`icrtool.calibration.error_differences`).
     """
     if len(groups) < 2:
@@ -192,13 +193,17 @@ def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested]) -> 
     """Yield the cells of one row and column, a horizon each."""
     errors, path = tested[row, column]
     summary = error_summary(errors)
-    blocks = [cut_blocks(np.isfinite(errors[:, h]), path, horizon) for h, horizon in enumerate(HORIZONS_M)]
-    interval = bootstrap_intervals(errors, blocks, DEFAULT_SEED)
+    intervals = []
+    for h, horizon in enumerate(HORIZONS_M):
+        of_horizon, p95 = errors[:, h], float(summary.p95[h])
+        blocks = cut_blocks(np.isfinite(of_horizon), path, horizon)
+        sums = block_sums(of_horizon, blocks, sort_trials(of_horizon), float(summary.p50[h]), p95)
+        intervals.append(error_intervals(of_horizon, blocks, sums, p95))
+    expected_low, expected_high, p95_low, p95_high = np.array(intervals).T
     own, foreign = tested[column, column], tested[row, column]
     costs = [None] * len(HORIZONS_M) if row == column else _differences(own, foreign, paired=True)
     of_horizons = np.column_stack([
-        summary.p95, interval.p95_low, interval.p95_high, summary.expected, interval.expected_low,
-        interval.expected_high,
+        summary.p95, p95_low, p95_high, summary.expected, expected_low, expected_high,
     ])  # fmt: skip
     for horizon, trials, values, cost in zip(HORIZONS_M, summary.trials, of_horizons.tolist(), costs, strict=True):
         yield Cell(row, column, horizon, int(trials), ErrorEstimate(*values), cost)

@@ -81,7 +81,7 @@ def distances(text: str) -> tuple[float, ...]:
 @click.option("--starts", type=click.Choice(["moving", "all"]), default="moving", show_default=True,
               help="moving: each standstill is one start; all: every recorded state is one.")  # fmt: skip
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
-@click.option("--seed", type=click.IntRange(min=0), help="Seed of the confidence intervals.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of the random draws.")
 @options.report
 @json_option
 @options.configuration

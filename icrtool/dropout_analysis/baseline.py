@@ -12,7 +12,7 @@ import numpy as np
 from icrtool import __version__
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.block_sums import LEVEL, BlockSums, variance_of_sum
+from icrtool.kernels.open_loop.block_sums import BlockSums, student_factor, variance_of_sum
 from icrtool.records.dropout import Gate
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import listed
@@ -113,9 +113,7 @@ def difference_half_width(
         variance = sum(part for part, _ in parts)
         weight = sum(part**2 / degrees for part, degrees in parts)
         freedom = variance**2 / weight if weight > 0 else 1.0
-    from scipy.special import stdtrit
-
-    return float(stdtrit(freedom, 0.5 + 0.5 * LEVEL)) * math.sqrt(variance)
+    return student_factor(freedom) * math.sqrt(variance)
 
 
 def _different_keys(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

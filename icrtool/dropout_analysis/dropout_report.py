@@ -70,7 +70,7 @@ def dropout_report(
     strict : compare such limits by the number alone, without the confidence interval of the difference
     allow_unusable : report on a run that is not usable as on any other; else it has the rows of the filter and of no
         slip alone, no distance, and every limit fails
-    seed : of the bootstrap
+    seed : of what the reference's own error is drawn from
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
     Raises

@@ -52,7 +52,7 @@ class DropoutReport:
     counts : trials, and starts without a trial, by horizon; the same for every model
     states : recorded states
     standing : states in which the robot stood: their trials are nearly copies of one another
-    seed : of the bootstrap
+    seed : of what the reference's own error is drawn from
     run_summary : of the run, equal to its run.json
     run_directory : where the run was read from, None for one just made
     starts : ``moving``: each standstill is one start; ``all``: every state is one

@@ -16,10 +16,9 @@ from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_sta
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.open_loop.block_sums import Blocks, block_sums
+from icrtool.kernels.open_loop.block_sums import Blocks, block_sums, error_intervals
 from icrtool.kernels.open_loop.direct import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
 from icrtool.kernels.open_loop.error_statistics import (
-    bootstrap_intervals,
     cut_blocks,
     error_summary,
     histogram_sorted,
@@ -96,7 +95,7 @@ def dropout(
     models : what to predict with; default `models_of` of the run
     further : models of constant parameters, in addition
     starts_of_further : states from which theirs, and all heading errors, are measured: nearer ones are copies
-    seed : of the bootstrap
+    seed : of what the reference's own error is drawn from
     sink : receives every single error (for ``--trials``)
     drive : `icrtool.records.run.drive_of` the run, where it is at hand: of a long log it is large
 
@@ -121,7 +120,7 @@ def dropout(
     start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
     where it ends in a real GNSS outage. Of a standstill only the last state starts trials: the others would be copies,
     and a parked robot would set the result. Overlapping trials are not independent: the
-    intervals come from a moving-block bootstrap (Kuensch 1989) with blocks of the horizon's length.
+    intervals come from blocks of path of at least two horizons (`icrtool.kernels.open_loop.block_sums`).
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
@@ -200,7 +199,7 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
             tested = blocks
         if asked.sink is not None:
             asked.sink(model.name, horizons, errors if len(errors) == len(drive.distance) else _spread(errors, asked))
-        results.append(_result_of(model, errors, turned, tested, asked.seed, pool))
+        results.append(_result_of(model, errors, turned, tested, pool))
         if model.name == "icr":
             first = len(errors) if learned is None else learned
             by_learning = error_summary(errors[:first]), error_summary(errors[first:])
@@ -264,12 +263,10 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
 def load_kernels() -> None:
     """Have the compiled kernels ready, to be called while a run is still being read."""
     drive = straight_drive()
-    path = drive.distance
     icrs = FrozenIcrs.constant(1.0, -1.0, 0.0)
     ends = trial_ends(drive, np.array([1.0]))
     open_loop_errors_direct(drive, icrs, ends)
-    errors = open_loop_errors(drive, icrs, ends)
-    bootstrap_intervals(errors, [cut_blocks(path < path[-1], path, 0.5)], DEFAULT_SEED)
+    open_loop_errors(drive, icrs, ends)
     open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
 
 
@@ -330,7 +327,7 @@ def _learned_split(run: Run, learned: int | None, splits: Sequence[tuple[Summary
 
 
 def _blocks(path_m: Floats, horizons: Floats, ends: NDArray[np.signedinteger], pool: Executor) -> list[Blocks | None]:
-    """Return what the bootstrap resamples, for each horizon; `ends` (h, n) are negative where there is no trial."""
+    """Return the blocks of path of each horizon; `ends` (h, n) are negative where there is no trial."""
 
     def cut(h: int) -> Blocks | None:
         return cut_blocks(ends[h] >= 0, path_m, float(horizons[h]))
@@ -351,18 +348,19 @@ def _errors(drive: Drive, model: Model, ends: NDArray[np.int32], pool: Executor)
 
 
 def _result_of(
-    model: Model | ConstantModel, errors: Floats, turned: Floats, blocks: Sequence[Blocks | None], seed: int,
-    pool: Executor,
-) -> ModelResult:  # fmt: skip
+    model: Model | ConstantModel, errors: Floats, turned: Floats, blocks: Sequence[Blocks | None], pool: Executor
+) -> ModelResult:
     """Return the errors of one model in numbers, horizon by horizon; `turned` are those of its turns [rad]."""
 
     def at_horizon(h: int) -> ModelResult:
         column = errors[:, h : h + 1]
         ordered = sort_trials(column[:, 0])
         summary = summary_of_sorted([ordered])
-        intervals = bootstrap_intervals(column, blocks[h : h + 1], seed)
         bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
-        sums = block_sums(column[:, 0], blocks[h], ordered, float(summary.p50[0]), float(summary.p95[0]))
+        p50, p95 = float(summary.p50[0]), float(summary.p95[0])
+        sums = block_sums(column[:, 0], blocks[h], ordered, p50, p95)
+        found = error_intervals(column[:, 0], blocks[h], sums, p95)
+        intervals = Intervals(*(np.array([end]) for end in found))
         of_turns = error_summary(np.degrees(turned[:, h : h + 1]))
         heading = HeadingErrors(of_turns.expected, of_turns.p95)
         return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,), heading)

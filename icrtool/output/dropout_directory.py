@@ -14,8 +14,7 @@ from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.kernels.arrays import Ints
-from icrtool.kernels.open_loop.block_sums import LEVEL
-from icrtool.kernels.open_loop.error_statistics import RESAMPLES
+from icrtool.kernels.open_loop.block_sums import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
 from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 from icrtool.kernels.open_loop.trials import Summary
 from icrtool.output.files.atomic_directory import atomic_directory
@@ -121,10 +120,11 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "with_jumps": report.with_jumps,
         "without_events": _event_document(report),
         "tolerance_m": TOLERANCE_M,
+        # the key and its parts keep their names; nothing is resampled
         "bootstrap": {
-            "method": "moving blocks of path",
-            "block": "the horizon",
-            "resamples": RESAMPLES,
+            "method": "Student's t over blocks of path",
+            "block": f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",
+            "resamples": 0,
             "level": LEVEL,
             "seed": report.seed,
         },

@@ -17,7 +17,7 @@ from icrtool.kernels.open_loop.trials import Histogram, Intervals, OpenLoopPath,
 OutageKind = Literal["forced", "real"]
 
 DEFAULT_SEED = 20140311
-"""Seed of the bootstrap: any number, but the same for every run and every model."""
+"""Seed of random draws: any number, but the same for every run and every model."""
 
 CHOICE_HORIZON_M = 10.0
 """The distance that headlines, tables of calibrations and the worst trials are about."""

@@ -1,4 +1,4 @@
-"""Sums of trials over blocks of path: what the confidence interval of a difference between two reports needs.
+"""Sums of trials over blocks of path, and the confidence intervals that follow from them.
 
 No compiled kernel is here: a process that only reads or draws these records need not load numba.
 """
@@ -14,36 +14,32 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 
 SHARES = {"p50": 0.5, "p95": 0.95}
 
-MOST_BLOCKS = 16
-"""More would narrow an interval by less than 2 %: the factor of Student's distribution is 2.13, without limit 1.96."""
+FEWEST_BLOCKS, MOST_BLOCKS, HORIZONS_A_BLOCK = 5, 10, 2
+"""Blocks of at least so many horizons: a path of less than ten horizons is too short for an interval. More than ten
+blocks would be narrower by a seventh at most (Student's factor is 2.26, without limit 1.96), and less independent."""
+
+LARGEST_GROWTH = 10.0
+"""Logarithm of the widest interval: one block with all of the error shows nothing."""
 
 LEVEL = 0.95
-"""An interval holds the truth with this probability, as far as blocks of the horizon's length are independent."""
-
-BLOCK_PARTS = 4
-"""Blocks begin at every quarter of their length."""
+"""An interval holds the truth with this probability, as far as blocks are independent."""
 
 
 class Blocks(NamedTuple):
-    """The path of one horizon's trials, cut for resampling; the same for every model.
+    """The path of one horizon's trials, cut into `k` blocks; the same for every model.
 
     Attributes
     ----------
     rows : where the trials stand among all starts
-    first : (s,) first trial of each segment
-    kept : (k,) trials that p95 is resampled from; segments : (k,) where they lie
-    per_segment : (s, 2) trials, and kept ones
+    first : (k,) first trial of each block
     """
 
     rows: slice | Bools
     first: Ints
-    kept: Ints
-    segments: Ints
-    per_segment: Floats
 
 
 class BlockSums(NamedTuple):
-    """The trials of one model and horizon, summed over `k` blocks of path of at least the horizon's length.
+    """The trials of one model and horizon, summed over `k` blocks of path of at least two horizons.
 
     Attributes
     ----------
@@ -89,6 +85,51 @@ def variance_of_sum(influence: Floats) -> float:
     return max(squares, squares + float(influence[1:] @ influence[:-1])) * k / (k - 1)
 
 
+def student_factor(freedom: float) -> float:
+    """Return how many standard deviations half an interval is, estimated with so many degrees of freedom."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, 0.5 + 0.5 * LEVEL))
+
+
+def error_intervals(
+    errors_m: Floats, blocks: Blocks | None, sums: BlockSums | None, p95_m: float
+) -> tuple[float, float, float, float]:
+    """Return confidence intervals of one horizon's expected error and p95.
+
+    Parameters
+    ----------
+    errors_m, blocks : as of `block_sums`, which gave `sums`
+    p95_m : of all trials
+
+    Returns
+    -------
+    expected_low, expected_high, p95_low, p95_high [m]; NaN without blocks
+
+    Notes
+    -----
+    Student's t (1908) of what each block moves the logarithm of the number. p95 moves as the root mean square does,
+    which blocks show better than the few trials above p95; the variance is the larger of both. 300 simulated paths of
+    10, 16, 30 and 200 horizons, errors the length of a moving sum over the horizon: intervals of p95 hold the truth in
+    0.90-0.97, those of the mean in 0.91-0.95; noise that stays for a horizon 0.88-0.95 and 0.90-0.97. A bootstrap of
+    blocks held 0.67, 0.72, 0.82 and 0.91 (p95), and 0.44-0.84. What changes over tens of horizons no short path shows.
+    """
+    if blocks is None or sums is None:
+        return (math.nan,) * 4
+    squares, trials = np.add.reduceat(errors_m[blocks.rows] ** 2, blocks.first), sums.trials
+    total, count = float(squares.sum()), int(trials.sum())
+    expected_m = float(sums.errors_m.sum()) / count
+    if not (total > 0.0 and expected_m > 0.0 and p95_m > 0.0):
+        return expected_m, expected_m, p95_m, p95_m
+    of_rms = variance_of_sum(np.asarray(squares / total - trials / count) / 2.0)
+    variances = variance_of_sum(sums.influence("expected") / expected_m), max(
+        of_rms, variance_of_sum(sums.influence("p95") / p95_m)
+    )  # fmt: skip
+    factor = student_factor(len(trials) - 1.0)
+    grown = [math.exp(min(factor * math.sqrt(variance), LARGEST_GROWTH)) for variance in variances]
+    return expected_m / grown[0], expected_m * grown[0], p95_m / grown[1], p95_m * grown[1]
+
+
 def block_sums(
     errors_m: Floats, blocks: Blocks | None, ordered: Floats, p50_m: float, p95_m: float
 ) -> BlockSums | None:
@@ -107,10 +148,7 @@ def block_sums(
     """
     if blocks is None:
         return None
-    errors = errors_m[blocks.rows]
-    segments = len(blocks.first)
-    k = min(MOST_BLOCKS, segments // BLOCK_PARTS)
-    first = blocks.first[-(-np.arange(k) * segments // k)]
+    errors, first = errors_m[blocks.rows], blocks.first
     trials = np.diff(first, append=len(errors))
     sums = np.add.reduceat(errors, first)
     above = [np.add.reduceat(errors > limit, first, dtype=np.int64) for limit in (p50_m, p95_m)]

@@ -148,12 +148,12 @@ def test_small_tables_and_small_ranges_give_the_same(run: Run, monkeypatch: pyte
         np.testing.assert_allclose(np.array(ours.intervals), np.array(theirs.intervals), rtol=0, atol=EQUAL_M)
 
 
-def test_intervals_hold_the_estimate_and_depend_on_the_seed_alone(run: Run) -> None:
-    reports = [dropout(run, [2.0], seed=seed) for seed in (1, 1, 2)]
+def test_intervals_hold_the_estimate_and_depend_on_no_seed(run: Run) -> None:
+    reports = [dropout(run, [2.0], seed=seed) for seed in (1, 2)]
     spans = [(r.results[0].intervals.p95_low[0], r.results[0].intervals.p95_high[0]) for r in reports]
-    assert spans[0] == spans[1] != spans[2]
-    assert spans[0][0] <= reports[0].results[0].summary.p95[0] <= spans[0][1]
-    assert [r.seed for r in reports] == [1, 1, 2]
+    assert spans[0] == spans[1]
+    assert spans[0][0] < reports[0].results[0].summary.p95[0] < spans[0][1]
+    assert [r.seed for r in reports] == [1, 2]
 
 
 def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: Run) -> None:
@@ -266,9 +266,9 @@ def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
 def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:
     code = (
         "from icrtool.dropout_analysis.trials import load_kernels; load_kernels()\n"
-        "from icrtool.kernels.open_loop import direct as open_loop, error_statistics, prefix_sums as fast\n"
+        "from icrtool.kernels.open_loop import direct as open_loop, prefix_sums as fast\n"
         "kernels = [open_loop.find_trial_ends, open_loop.integrate_trials, open_loop.integrate_path, fast.last_end,\n"
-        "    fast.plan_block, fast.solve_block, error_statistics.resample_blocks]\n"
+        "    fast.plan_block, fast.solve_block]\n"
         "print([kernel.__name__ for kernel in kernels if len(kernel.signatures) != 1])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

@@ -112,7 +112,7 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
         assert [row["trials"] for row in rows] == summary.trials.tolist()
         assert [row["p95_m"] for row in rows] == [None if np.isnan(p95) else p95 for p95 in summary.p95]
     assert document["bootstrap"]["seed"] == content.seed
-    assert {"resamples", "level", "block"} <= document["bootstrap"].keys()
+    assert {"method", "level", "block"} <= document["bootstrap"].keys()
     assert document["tolerance_m"] <= 1e-9
     assert document["run"]["inputs"] == json.loads(json_bytes({"x": run.summary["inputs"]}))["x"]
     assert [gate["passed"] for gate in document["gates"]] == [True, False, False]
