@@ -57,7 +57,7 @@ def make_recording(
         np.append(np.full(n - 1, dt), 0.0), v_left, v_right,
         place.real + rng.normal(0.0, noise_m, n), place.imag + rng.normal(0.0, noise_m, n),
         heading + rng.normal(0.0, noise_rad, n),
-        np.concatenate([[0.0], np.cumsum(dt * np.hypot(v_x, v_y))[:-1]]), no, no.copy(),
+        np.concatenate([[0.0], np.cumsum(dt * np.hypot(v_x, v_y))[:-1]]), no, no.copy(), no.copy(),
     )  # fmt: skip
     rate_radps = omega + rng.normal(0.0, 0.005, n) + 0.002 if gyro else None
     return Recording(name, t, drive, rate_radps, WIDTH_M, f"/logs/{name}", name)

@@ -21,8 +21,9 @@ blocks would be narrower by a seventh at most (Student's factor is 2.26, without
 LARGEST_GROWTH = 10.0
 """Logarithm of the widest interval: one block with all of the error shows nothing."""
 
-LEVEL = 0.95
-"""An interval holds the truth with this probability, as far as blocks are independent."""
+LEVEL, NORMAL_FACTOR = 0.95, 1.959964
+"""An interval holds the truth with this probability, as far as blocks are independent: so many standard deviations of a
+normal value."""
 
 
 class Blocks(NamedTuple):
@@ -86,10 +87,22 @@ def variance_of_sum(influence: Floats) -> float:
 
 
 def student_factor(freedom: float) -> float:
-    """Return how many standard deviations half an interval is, estimated with so many degrees of freedom."""
-    from scipy.special import stdtrit
+    """Return how many standard deviations half an interval is, estimated with so many degrees of freedom.
 
-    return float(stdtrit(freedom, 0.5 + 0.5 * LEVEL))
+    Notes
+    -----
+    Student's t expanded about the normal quantile z (Abramowitz and Stegun 1964, 26.7.5): within 1 % from two degrees
+    on, 0.1 % from four.
+    """
+    z, inverse = NORMAL_FACTOR, 1.0 / freedom
+    terms = (
+        z,
+        (z**3 + z) / 4.0,
+        (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,
+        (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0,
+        (79.0 * z**9 + 776.0 * z**7 + 1482.0 * z**5 - 1920.0 * z**3 - 945.0 * z) / 92160.0,
+    )
+    return sum(term * inverse**power for power, term in enumerate(terms))
 
 
 def error_intervals(

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
-from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals
+from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals, student_factor
 from icrtool.kernels.open_loop.error_statistics import (
     cut_blocks,
     error_summary,
@@ -70,6 +71,10 @@ class TestIntervals:
             covered += [interval[0] <= truth[0] <= interval[1], interval[2] <= truth[1] <= interval[3]]
         assert (covered / 300 > 0.95 - 4 * BINOMIAL_STD).all()
         assert (covered / 300 < 0.95 + 3 * BINOMIAL_STD).all()
+
+    @pytest.mark.parametrize(("freedom", "tolerance"), [(2.0, 0.01), (4.0, 1e-3), (9.0, 1e-4), (1e6, 1e-5)])
+    def test_have_the_width_of_students_distribution(self, freedom, tolerance):
+        assert student_factor(freedom) == pytest.approx(stdtrit(freedom, 0.975), rel=tolerance)
 
     def test_narrow_as_the_path_grows(self):
         rng = np.random.default_rng(6)
