@@ -17,6 +17,9 @@ PIP   := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-c
 # Python then keeps its compiled modules: the commands that the tests run would each compile numpy and numba again.
 export PYTHONDONTWRITEBYTECODE =
 
+# Compiles what the commands load, and nothing else of a gigabyte: where Python may not write, each would compile it.
+LOAD = import pkgutil, icrtool; [__import__(one.name) for one in pkgutil.walk_packages(icrtool.__path__, 'icrtool.')]
+
 .DEFAULT_GOAL := help
 AXE           = $(VENV)/axe-core/axe.min.js
 AXE_VERSION   = 4.14.1
@@ -36,6 +39,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) --no-deps --require-hashes -r constraints.txt
 	@$(PIP) --no-deps --no-build-isolation -e .
+	@$(BIN)/python -c "$(LOAD)"
 	@touch $@
 
 demo: $(READY)  ## learn the ICRs of the sample robot, report its GPS dropouts, say where the plots are
