@@ -8,8 +8,8 @@ from typing import Self
 LONGEST_NAME = 80
 """Characters of a name that are printed; of a longer one the beginning and the end are."""
 
-LONGEST_TEXT = 1 << 16
-"""Characters of a text from a log that are used: names of 40 MB took minutes to look through."""
+LONGEST_TEXT = 512
+"""Characters of a text from a log that are used (a topic of ROS has up to 255): long ones take time to look through."""
 
 LONGEST_MESSAGE = 4000
 """Characters of an error or a warning that are printed."""

@@ -52,7 +52,7 @@ class BagDirectory:
 
     def __init__(self, path: Path, files: Sequence[Path] = ()) -> None:
         self._path = path
-        self._problems = Problems(path.name)
+        self.own_problems = Problems(path.name)
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._parts: list[Container] = []
         self._by_name = False
@@ -66,7 +66,7 @@ class BagDirectory:
             for file in files:
                 self._open_part(file, metadata.message_compression)
             if not self._parts:
-                raise LogError(path, "no storage file in it can be read", "; ".join(self._problems))
+                raise LogError(path, "no storage file in it can be read", "; ".join(self.own_problems))
         except BaseException:
             self.close()
             raise
@@ -76,7 +76,7 @@ class BagDirectory:
     @property
     def problems(self) -> list[str]:
         """What could not be read, of the directory and of each file."""
-        return self._problems + [problem for part in self._parts for problem in part.problems]
+        return self.own_problems + [problem for part in self._parts for problem in part.problems]
 
     def share_read(self) -> float:
         """Return the mean over the files, which are read one after the other."""
@@ -123,20 +123,20 @@ class BagDirectory:
                 spans.append(Span(min(begins), max(ends), file.name))
         if self._by_name:
             for odd in check_spans(self._path, spans):
-                self._problems.add(odd)
+                self.own_problems.add(odd)
 
     def _read_metadata(self) -> _Metadata:
         """Return the content of metadata.yaml; a recorder that was killed leaves no such file, or half of it."""
         file = self._path / "metadata.yaml"
         if not file.is_file():
-            self._problems.add("no metadata.yaml; its storage files were found by their names")
+            self.own_problems.add("no metadata.yaml; its storage files were found by their names")
             return _Metadata()
         try:
             if file.stat().st_size > _LARGEST_METADATA_BYTES:
                 raise ValueError("too long")
             return _metadata(file.read_text(encoding="utf-8"))
         except (ValueError, OSError, RecursionError):
-            self._problems.add("its metadata.yaml cannot be read; its storage files were found by their names")
+            self.own_problems.add("its metadata.yaml cannot be read; its storage files were found by their names")
             return _Metadata()
 
     def _find_files(self, names: tuple[str, ...]) -> list[Path]:
@@ -146,7 +146,7 @@ class BagDirectory:
         if len(there) < len(named):
             found = frozenset(there)
             missing = [file.name for file in named if file not in found]
-            self._problems.add(f"metadata.yaml names files that are not there: {some_of(missing)}")
+            self.own_problems.add(f"metadata.yaml names files that are not there: {some_of(missing)}")
         if there:
             return there
         self._by_name = True
@@ -158,9 +158,9 @@ class BagDirectory:
             self._parts.append(_part(storage, message_compression))
             self.files.append(file)
         except LogError as err:
-            self._problems.add(f"{file.name}: {err.why}; {err.advice}")
+            self.own_problems.add(f"{file.name}: {err.why}; {err.advice}")
         except OSError as err:
-            self._problems.add(f"{file.name}: cannot be read; {err.strerror}")
+            self.own_problems.add(f"{file.name}: cannot be read; {err.strerror}")
 
     def _unpacked(self, file: Path) -> Path:
         """Decompress a storage file to a temporary folder, a piece at a time."""
@@ -183,13 +183,13 @@ class BagDirectory:
                     sink.write(piece)
                     left -= len(piece)
             if left <= 0:
-                self._problems.add(
+                self.own_problems.add(
                     f"{file.name}: is more than {LARGEST_RATIO} times its size when decompressed; the rest was not read"
                 )
         except zstandard.ZstdError as err:
             if not target.stat().st_size:
                 raise LogError(file, "does not decompress", str(err)) from err
-            self._problems.add(f"{file.name}: cut off or damaged ({err}); what could be decompressed was read")
+            self.own_problems.add(f"{file.name}: cut off or damaged ({err}); what could be decompressed was read")
         except OSError as err:
             free = shutil.disk_usage(self._scratch.name).free
             raise LogError(file, f"cannot be decompressed: {err.strerror}", f"{free} bytes are free for it") from err

@@ -15,6 +15,9 @@ from icrtool.logs.containers.split_files import split_files
 from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
 
+MOST_CHANNELS = 2048
+"""Topics of a log, each publisher of a ROS 1 bag by itself, that are looked at: some 0.5 ms of time each."""
+
 KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file"
 
 
@@ -32,13 +35,18 @@ def open_log(path: Path) -> Container:
         raise LogError(path, "no such file or directory") from err
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
+    if (count := len(container.channels)) > MOST_CHANNELS:
+        kept = sorted(container.channels, key=lambda channel: -(channel.count or 0))[:MOST_CHANNELS]
+        container.channels = sorted(kept, key=lambda channel: channel.id)
+        problems = container.own_problems if isinstance(container, BagDirectory) else container.problems
+        problems.add(f"{count:,} topics and publishers: the {MOST_CHANNELS:,} of most messages are used")
     if container.problems and not container.channels:
         container.close()
         raise LogError(path, "nothing in it can be read", container.problems[0])
     return container
 
 
-def _open(path: Path) -> Container:
+def _open(path: Path) -> BagDirectory | McapFile | Ros1Bag | SqliteBag:
     if files := split_files(path):
         return BagDirectory(path, files)
     if stat.S_ISDIR(path.stat().st_mode):

@@ -35,6 +35,13 @@ end. The second limit keeps the time of one message at about a second."""
 _CDR_LITTLE, _CDR_BIG = 1, 0
 
 
+MOST_TEXTS = 4096
+"""Different texts of a field, as names of joints: with one for each message, time and memory would grow tenfold."""
+
+FURTHER = "…".encode()
+"""Stands for all further ones."""
+
+
 class _UnreadableError(Exception):
     """A message is shorter than its layout, or takes too many steps."""
 
@@ -301,7 +308,7 @@ class Decoded:
         else:
             texts = _unaligned(self.data, kind)[self.start[rows] + at]
         is_one = length == 0 or bool((texts == texts[0]).all())
-        return [known.setdefault(text, len(known)) for text in texts[: 1 if is_one else None].tolist()]
+        return _text_numbers(texts[: 1 if is_one else None].tolist(), known)
 
     def _by_shape(self) -> Iterator[tuple[Shape, Ints | slice]]:
         """Yield each shape with the rows that have it."""
@@ -313,6 +320,17 @@ class Decoded:
         for shape, rows in zip(self.shapes, np.split(order, ends[:-1]), strict=True):
             if len(rows):
                 yield shape, rows
+
+
+def _text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
+    """Return the numbers of texts; new ones become known, those beyond `MOST_TEXTS` as one."""
+    if len(known) + len(texts) <= MOST_TEXTS:
+        return [known.setdefault(text, len(known)) for text in texts]
+    numbers = []
+    for text in texts:
+        kept = text if text in known or len(known) < MOST_TEXTS else FURTHER
+        numbers.append(known.setdefault(kept, len(known)))
+    return numbers
 
 
 def _unaligned(data: Bytes, kind: np.dtype[Any]) -> NDArray[Any]:

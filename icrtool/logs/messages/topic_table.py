@@ -19,9 +19,6 @@ from icrtool.records.text import LogText
 READ_ENCODINGS = ("cdr", "ros1")
 """Serializations of messages that are read: of ROS 2 and of ROS 1."""
 
-MOST_TEXTS = 1 << 16
-"""Different texts of a field, as names of joints: with one for each message, memory would grow tenfold."""
-
 
 class SetBack(NamedTuple):
     """How far log time goes back at most from one stored message to the next, and how mixed messages are once sorted.
@@ -156,13 +153,7 @@ class TopicCollector:
         self._decoder = Decoder(self.layout)
 
     def feed(self, block: Block, number: int) -> None:
-        """Add the messages of a block whose channel is `number`.
-
-        Raises
-        ------
-        DefinitionError
-            They have too many different texts.
-        """
+        """Add the messages of a block whose channel is `number`."""
         for rows, decoded in self._decoder.decode(block, number):
             readable = rows[decoded.readable]
             self._unreadable += len(rows) - len(readable)
@@ -177,9 +168,6 @@ class TopicCollector:
             else:
                 known = self._texts.setdefault(path, {})
                 values = decoded.text_numbers(path, known)
-                if len(known) > MOST_TEXTS:
-                    why = f"its {path} has over {MOST_TEXTS} different texts"
-                    raise DefinitionError(self.channel.topic, why, "not read")
             parts = self._columns.setdefault(path, [])
             parts.append(_compact(values) if not parts or _is_one_row(parts[-1]) else np.array(values))
 

@@ -14,6 +14,7 @@ from icrtool.logs.containers.record_table import scan_bag, scan_mcap
 from icrtool.logs.messages import decoder
 from icrtool.logs.messages.decoder import Decoder
 from icrtool.logs.messages.schema import COUNTED, LOOP, NUMBERS, TEXT, Layout, Operation, compile_layout
+from icrtool.records.text import LONGEST_TEXT
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 WANTED = {
@@ -157,7 +158,7 @@ def test_messages_without_a_like_are_decoded_one_by_one(monkeypatch):
     rows, found = decoded(layout, *joined(messages))
     assert rows == [*range(len(messages))]
     assert [values[0] for values in found["temperature"]] == [float(row) for row in rows]
-    assert [texts[0] for texts in found["header.frame_id"]] == [b"f" * length for length in lengths]
+    assert [texts[0] for texts in found["header.frame_id"]] == [b"f" * min(length, LONGEST_TEXT) for length in lengths]
 
 
 def layout_of(operation, columns=1):
