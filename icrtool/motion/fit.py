@@ -30,7 +30,7 @@ from icrtool.kernels.robust import (
 )
 from icrtool.kernels.window_residuals import OMEGA, path_at, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
-from icrtool.motion.recording import STRETCH_M, LogConstants, Windows
+from icrtool.motion.recording import STRETCH_M, LogConstants, Windows, size_of
 
 CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
 """Prior of `LogConstants` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
@@ -306,9 +306,10 @@ class Pool:
         sizes = [one.shape[1] for one in both]
         self.first = np.cumsum([0, *sizes])
         self.recording = np.repeat(np.arange(len(windows)), sizes)
-        stretch = np.column_stack([self.recording, np.floor(self.start_m / STRETCH_M)])
+        stretch_m = STRETCH_M * np.array([size_of(one) for one in widths_m])
+        stretch = np.column_stack([self.recording, np.floor(self.start_m / stretch_m[self.recording])])
         self.group = np.unique(stretch, axis=0, return_inverse=True)[1].reshape(-1)
-        covered_m = STRETCH_M * (int(self.group.max()) + 1)
+        covered_m = float(stretch_m[np.unique(stretch, axis=0)[:, 0].astype(np.int64)].sum())
         self.overlap = max(float(self.length_m.sum()) / 2.0 / covered_m, 1.0)
 
     def prior(self, model: MotionModel) -> tuple[Floats, Floats]:

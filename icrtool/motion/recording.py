@@ -18,6 +18,10 @@ from icrtool.motion.models import NO_LEVER, Lever
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
 
+USUAL_WIDTH_M = 0.5
+"""Windows, their distances and stretches are those of robots of this track width and wider; smaller ones drive, and
+err, in proportion."""
+
 EVERY_M = 0.5
 """A window of each length starts every so much distance."""
 
@@ -197,11 +201,19 @@ def totals_of(*recordings: Recording) -> Totals:
     )
 
 
-def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, pooled: Totals | None = None) -> Windows:
+def size_of(width_m: float) -> float:
+    """Return the part of the usual distances that is used for a robot of track width b [m], at most 1."""
+    return min(1.0, width_m / USUAL_WIDTH_M)
+
+
+def cut_windows(
+    recording: Recording, lengths_m: Sequence[float] | None = None, pooled: Totals | None = None
+) -> Windows:
     """Cut a recording into windows of driven distance; none crosses a gap or a slip event, or ends in an outage.
 
     Parameters
     ----------
+    lengths_m : default `WINDOWS_M`, less for small robots
     pooled : of all that is fitted together, default the recording: the more it is, the coarser windows and steps
 
     Raises
@@ -210,8 +222,9 @@ def cut_windows(recording: Recording, lengths_m: Sequence[float] = WINDOWS_M, po
         There are fewer than `FEWEST_WINDOWS`.
     """
     drive = recording.drive
-    pooled = pooled or totals_of(recording)
-    every = min(max(EVERY_M, pooled.metres / MOST_STARTS), LEAST_OFTEN_M)
+    pooled, size = pooled or totals_of(recording), size_of(recording.width_m)
+    lengths_m = [size * one for one in WINDOWS_M] if lengths_m is None else lengths_m
+    every = min(max(size * EVERY_M, pooled.metres / MOST_STARTS), size * LEAST_OFTEN_M)
     begins = rows_at_steps(drive.distance, every)
     begins = begins[~drive.in_outage[begins]]
     ends = ends_from(drive, np.array(lengths_m, np.float64), begins)
