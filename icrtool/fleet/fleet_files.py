@@ -20,6 +20,7 @@ from icrtool.output.files.atomic_file import atomic_file, check_place, is_page, 
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, json_bytes, schema_of
 from icrtool.output.run_directory import PAGE_FILE, PLOT_FORMATS
+from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records.dropout import Verdict
 from icrtool.records.text import LogText, counted, escaped
 
@@ -35,7 +36,7 @@ ROWS = ".rows"
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
 
-SHOWN_ERRORS = {"recommended model": "recommended_p95_10m_m", "momentary ICRs": SHOWN_ERROR}
+SHOWN_ERRORS = {MODEL_WORDS["recommended"]: "recommended_p95_10m_m", MODEL_WORDS["icr"]: SHOWN_ERROR}
 """By whose errors the picture shows: the first that a log has."""
 
 

@@ -405,7 +405,7 @@ def test_the_table_of_a_fleet_sorts_and_filters(chrome: Browser, tmp_path: Path)
     file.write_text(fleet_page(FLEET, tmp_path), encoding="utf-8")
     page = chrome.page()
     page.open(file)
-    names = "[...document.querySelectorAll('tbody tr:not([hidden]) th')].map((one) => one.textContent)"
+    names = "[...document.querySelectorAll('#table tbody tr:not([hidden]) th')].map((one) => one.textContent)"
     sort = "[...document.querySelectorAll('thead button')].find((one) => one.textContent === '{}').click()"
     page.evaluate(sort.format("multiplier"))
     assert page.evaluate(names) == ["a10.bag", "b.bag", HOSTILE]

@@ -84,7 +84,11 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
 @styled
 def fleet_errors(fleet: FleetNumbers) -> Figure:
     """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs those of the largest."""
-    errors = [(group, log, error) for group, logs in fleet.errors_m.items() for log, error in logs.items()]
+    errors = [
+        (group, log, error)
+        for group, logs in fleet.errors_m.items()
+        for log, error in sorted(logs.items(), key=lambda one: -one[1])
+    ]
     largest = sorted(errors, key=lambda one: -one[2])[:MOST_ROWS]
     shown = [one for one in errors if one in largest]
     cut = f", the {MOST_ROWS} largest" if len(errors) > MOST_ROWS else ""
@@ -93,7 +97,7 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
     figure = new_figure(
         f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}",
         f"{fleet.title}: 95 % error after 10 m without GNSS, {fleet.model}{cut}", height_in=1.9 + ROW_IN * len(shown),
-        margins_in=(2.9, 0.3, 0.65, 1.05),
+        margins_in=(2.9, 0.7, 0.65, 1.05),
     )  # fmt: skip
     axes = figure.subplots()
     axes.set_yticks(range(len(labels)), labels, parse_math=False)
@@ -105,6 +109,11 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
             [shown[row][2] for row in rows], rows, linestyle="none", marker=MARKERS[number % len(MARKERS)],
             color=COLORS[number % len(COLORS)], markersize=5.5,
             label=f" {drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}",
+        )  # fmt: skip
+    for row, (*_, error) in enumerate(shown):
+        axes.annotate(
+            error_text(error), (error, row), xytext=(6, 0), textcoords="offset points", va="center", fontsize=8.0,
+            annotation_clip=False,
         )  # fmt: skip
     logarithmic_errors(axes)
     add_legend(figure, ncols=2)
