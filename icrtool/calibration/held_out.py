@@ -17,11 +17,12 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.error_statistics import error_summary
 from icrtool.kernels.open_loop.trials import OpenLoopPath, Summary
+from icrtool.kernels.within_budget import within_budget
 from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, FittedModel, controller_model
 from icrtool.motion.recording import NO_CONSTANTS, Recording, Steps, cut_windows, totals_of
 from icrtool.motion.trials import TrialErrors, Trials, cut_trials, predicted_path, trial_errors
-from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 
 HORIZONS_M = (5.0, 10.0, 20.0)
 
@@ -49,6 +50,11 @@ class HeldOutRow:
     label: str
     folds: tuple[Summary, ...]
     together: Summary
+
+    def within(self, horizons_m: Sequence[float], budget_m: float) -> BudgetDistance | None:
+        """Return how far p95 of all trials stays within a budget [m]; None without trials."""
+        reached = within_budget(np.array(horizons_m), self.together.p95, budget_m)
+        return None if reached is None else BudgetDistance(self.name, self.label, budget_m, *reached)
 
     def worst(self, column: str, h: int) -> float:
         """Return the largest ``p95`` or ``expected`` over folds at a horizon; NaN without trials."""

@@ -78,7 +78,7 @@ def command(
     drawn = (output / PLOTS).is_dir() and not any(row.status == "done" for row in rows)
     write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
     missing = compared.missing(row.log for row in rows) if compared is not None else []
-    write_exports(rows, missing, output if asked.page else None, junit=junit, markdown=markdown)
+    write_exports(rows, calibrations, missing, output if asked.page else None, junit=junit, markdown=markdown)
     if compared is not None:
         from icrtool.fleet.acceptance import changes_of
 
@@ -110,8 +110,9 @@ def run_all(
 
 
 def write_exports(
-    rows: Sequence[Row], missing: Sequence[str], page: Path | None, *, junit: Path | None, markdown: Path | None
-) -> None:
+    rows: Sequence[Row], calibrations: Sequence[PooledCalibration], missing: Sequence[str], page: Path | None, *,
+    junit: Path | None, markdown: Path | None,
+) -> None:  # fmt: skip
     """Write the page of the fleet, and what machines that watch pull requests read, where they are asked for."""
     from icrtool.output.files.atomic_file import is_page, write_file
 
@@ -129,7 +130,7 @@ def write_exports(
         from icrtool.output.page.fleet_page import fleet_page
         from icrtool.output.run_directory import PAGE_FILE
 
-        write_file(page / PAGE_FILE, fleet_page(fleet_document(rows), page), page, is_page)
+        write_file(page / PAGE_FILE, fleet_page(fleet_document(rows, calibrations), page), page, is_page)
 
 
 def print_results(
@@ -233,18 +234,14 @@ class View:
 
 def line_of(row: Row) -> str:
     """Return a line about a log that could be used."""
-    from icrtool.fleet.row import SHOWN_ERROR
-
     parts = [f"{row.status:7}", str(LogText(row.log))]
-    if row.duration_s is not None and row.distance_m is not None:
-        parts.append(f"{row.duration_s:.0f} s  {row.distance_m:.0f} m")
-    right, left = row.icr.get("y_icr_right_m"), row.icr.get("y_icr_left_m")
-    if right is not None and left is not None:
-        std = [row.icr.get(f"std_{name}") or 0.0 for name in ("y_icr_right_m", "y_icr_left_m")]
-        parts.append(f"ICRs {right:+.3f} ± {std[0]:.3f} m, {left:+.3f} ± {std[1]:.3f} m")
-    elif row.reason:
-        parts.append(escaped(row.reason))
-    if (p95 := row.errors.get(SHOWN_ERROR)) is not None:
+    if row.distance_m is not None:
+        parts.append(f"{row.distance_m:.0f} m")
+    if not row.usable:
+        return "  ".join([*parts, f"do not use: {escaped(row.reason.removeprefix('not usable: '))}"])
+    if row.multiplier is not None:
+        parts.append(f"multiplier {row.multiplier:.3f} ± {row.multiplier_std or 0.0:.3f}")
+    if (p95 := row.shown_error()) is not None:
         parts.append(f"95 % within {p95:.3g} m after 10 m")
     return "  ".join(parts)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from icrtool.cli.terminal import show
 
 if TYPE_CHECKING:
     from icrtool.calibration.one_log import LogCalibration
+    from icrtool.calibration.pooled import CalibrationResult
     from icrtool.config import Config
     from icrtool.records.run import Run
 
@@ -58,8 +60,6 @@ def command(
         calibration_file(output)
     runs = _runs(sources, config, quiet=quiet)
     from icrtool.calibration.from_runs import calibrate_runs
-    from icrtool.output.tables.calibration import format_calibration
-    from icrtool.output.tables.held_out import format_result
 
     sensors = _sensors(runs[0], x_icr, quiet=quiet, verbose=verbose) if len(runs) == 1 else None
     result = None
@@ -70,10 +70,9 @@ def command(
         if sensors is None or not (runs[0].usable or allow_unusable):
             raise
         options.warn([f"no motion model: {err}"], quiet=quiet)
-    texts: list[str] = [format_result(result)] if result is not None else []
+    texts = _texts(result, sensors, verbose=verbose)
     document = result.calibration.summary() if result is not None else {}
     if sensors is not None:
-        texts.append(format_calibration(sensors))
         document = sensors.summary() | document | {"alignment": sensors.summary()["parameters"]}
     if output is not None:
         texts.append(f"written to {write_calibration(document, output)}")
@@ -85,8 +84,21 @@ def command(
     elif not quiet:
         show(texts[0])
         for text in texts[1:]:
-            click.echo()
+            if verbose:
+                click.echo()
             show(text)
+
+
+def _texts(result: CalibrationResult | None, sensors: LogCalibration | None, *, verbose: bool) -> list[str]:
+    """Return the answer, with -v all tables."""
+    from icrtool.output.tables.brief import brief_calibration
+    from icrtool.output.tables.calibration import format_calibration
+    from icrtool.output.tables.held_out import format_result
+
+    if not verbose:
+        return [brief_calibration(result, sensors)]
+    texts: list[str] = [format_result(result)] if result is not None else []
+    return [*texts, format_calibration(sensors)] if sensors is not None else texts
 
 
 def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run]:
@@ -115,7 +127,8 @@ def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> Lo
     """Return what one log shows of antenna, offsets, delays and scales."""
     from icrtool.calibration.one_log import calibrate_log
 
-    options.warn(run.warnings, quiet=quiet)
+    if verbose or not sys.stderr.isatty():
+        options.warn(run.warnings, quiet=quiet)
     if verbose:
         for stream in run.summary["streams"]:
             click.echo(f"{stream['role']}: {stream['topic']}: {stream['why']}", err=True)

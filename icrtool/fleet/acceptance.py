@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from icrtool.fleet.row import SHOWN_ERROR, Row
+from icrtool.fleet.row import Row
 
 if TYPE_CHECKING:
     from icrtool.output.exports.acceptance import Suite
@@ -41,10 +41,10 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
         if row.status == "failed":
             errors.append([escaped_markdown(row.log), f"could not be used: {escaped_markdown(row.reason)}", "", ""])
             continue
-        now, before = row.errors.get(SHOWN_ERROR), row.baseline.get(SHOWN_ERROR)
+        now, before = row.shown_error(), row.shown_error(baseline=True)
         difference = f"{now - before:+.3f} m" if now is not None and before is not None else "-"
         errors.append([escaped_markdown(row.log), _metres(now), _metres(before), difference])
-    lines += markdown_table(("log", "95 % after 10 m, ICR", "baseline", "difference"), errors)
+    lines += markdown_table(("log", "95 % after 10 m", "baseline", "difference"), errors)
     changes = changes_of(rows, missing)
     return "\n".join([*lines, *([""] if changes else []), *(f"- {escaped_markdown(change)}" for change in changes), ""])
 

@@ -13,7 +13,7 @@ import msgspec
 from icrtool import __version__
 from icrtool.errors import OutputError
 from icrtool.fleet.roll_up import MOST_POOLED_S, PooledCalibration
-from icrtool.fleet.row import SHOWN_ERROR, Row, as_text, columns_of
+from icrtool.fleet.row import SHOWN_ERROR, SHOWN_WITHOUT, Row, as_text, columns_of
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import disk
 from icrtool.output.files.atomic_file import atomic_file, check_place, is_page, make_folders, write_file
@@ -36,7 +36,7 @@ ROWS = ".rows"
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
 
-SHOWN_ERRORS = {MODEL_WORDS["recommended"]: "recommended_p95_10m_m", MODEL_WORDS["icr"]: SHOWN_ERROR}
+SHOWN_ERRORS = {MODEL_WORDS["recommended"]: SHOWN_ERROR, MODEL_WORDS["icr"]: SHOWN_WITHOUT}
 """By whose errors the picture shows: the first that a log has."""
 
 
@@ -122,8 +122,6 @@ def write_fleet(
 
 def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool = True) -> str:
     """Return the pooled calibrations, a line each, or with their leave-one-log-out tables."""
-    from icrtool.motion.models import FAMILY
-
     parts = []
     for one in calibrations:
         name = ", ".join(str(LogText(part)) for part in (one.robot, one.group) if part) or "all logs"
@@ -133,9 +131,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool
         if one.reason:
             parts.append(f"{head}: no calibration: {escaped(one.reason)}")
             continue
-        known = FAMILY.get(one.recommended)
-        model = known.label if known is not None else one.recommended
-        head += f": {model}, multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}, in {one.file}"
+        head += f": multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}{one.within_text}, in {one.file}"
         parts.append(f"{head}\n{one.table}" if tables else head)
     return ("\n\n" if tables else "\n").join(parts) + "\n"
 
@@ -154,7 +150,7 @@ def write_figures(rows: Sequence[Row], folder: Path, formats: tuple[str, ...]) -
     points: list[dict[str, Any]] = []
     errors: dict[str, dict[str, float]] = {}
     known = {name for row in rows for name in row.errors}
-    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", SHOWN_ERROR))
+    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", SHOWN_WITHOUT))
     for row in sorted(rows, key=lambda row: row.start_utc):
         shown = all(row.icr.get(name) is not None for name in ("y_icr_right_m", "y_icr_left_m"))
         if shown and row.start_utc:

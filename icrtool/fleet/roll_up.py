@@ -30,6 +30,10 @@ MOST_POOLED_S = 86_400.0
 """Of the logs of a robot and group, so much time is calibrated together, evenly spaced over all: about 1 GB."""
 
 
+BUDGET_M = 0.5
+"""Error within which the distance of a pooled calibration counts."""
+
+
 @dataclass(frozen=True, slots=True)
 class PooledCalibration:
     """The calibration of all logs of one robot in one group.
@@ -40,6 +44,8 @@ class PooledCalibration:
     left_out : logs that are not usable, copies, or beyond `MOST_POOLED_S`
     file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
     recommended, multiplier, multiplier_std : of the calibration
+    icrs_m : right, left, x of the calibration
+    within_m : distance over which 95 % of the held-out errors stay within `BUDGET_M`; within_beyond : at least that
     table : leave-one-log-out table as text
     """
 
@@ -52,8 +58,18 @@ class PooledCalibration:
     recommended: str = ""
     multiplier: float | None = None
     multiplier_std: float | None = None
+    icrs_m: tuple[float, ...] = ()
+    within_m: float | None = None
+    within_beyond: bool = False
     table: str = ""
     key: str = ""
+
+    @property
+    def within_text(self) -> str:
+        """How far, as ``, within 0.5 m for 14.6 m``; empty where that is not known."""
+        if self.within_m is None:
+            return ""
+        return f", within {BUDGET_M:g} m (95 %) for {'more than ' if self.within_beyond else ''}{self.within_m:.1f} m"
 
 
 def pooled_calibrations(
@@ -150,12 +166,16 @@ def _pooled(
         return replace(one, left_out=left_out, reason=str(err))
     numbers = result.calibration.controller_numbers()
     table = str(Text(held_out_blocks(result.table)))
+    reached = result.table.score("recommended").within(result.table.horizons_m, BUDGET_M)
     short = {name for name, _ in result.left_out}
     used = [log for log, logged in zip(used, opened, strict=True) if logged not in short]
     return replace(
         one, logs=tuple(used), left_out=tuple(log for log in one.logs if log not in used), file=file,
         recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),
         multiplier_std=float(numbers.multiplier_std), table=table,
+        icrs_m=tuple(result.calibration.geometry()[0][:3]),
+        within_m=None if reached is None else float(reached.distance_m),
+        within_beyond=reached is not None and reached.beyond,
     )  # fmt: skip
 
 

@@ -11,8 +11,8 @@ from icrtool.records.run import ICR_COLUMNS
 
 HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 
-SHOWN_ERROR = "icr_p95_10m_m"
-"""The error of each log that is printed, drawn, and compared with the baseline."""
+SHOWN_ERROR, SHOWN_WITHOUT = "recommended_p95_10m_m", "icr_p95_10m_m"
+"""The error of each log that is printed, drawn, and compared with the baseline; without a held-out one the second."""
 
 BEFORE_ICRS = ("log", "status", "reason", "robot", "group", "start_utc", "duration_s", "distance_m")
 AFTER_ERRORS = ("events", "outages", "warnings", "tool_version", "run")
@@ -79,6 +79,11 @@ class Row:
     key: str = ""
     tool_version: str = ""
     took_s: float = 0.0
+
+    def shown_error(self, *, baseline: bool = False) -> float | None:
+        """Return the error [m] that stands for the log, or for its baseline."""
+        errors = self.baseline if baseline else self.errors
+        return errors.get(SHOWN_ERROR if SHOWN_ERROR in self.errors else SHOWN_WITHOUT)
 
     @property
     def gates_failed(self) -> int:

@@ -204,14 +204,25 @@ class BudgetDistance(NamedTuple):
     high_m: float = math.nan
 
     @property
-    def reach_text(self) -> str:
-        """``14.1 m`` or ``more than 20 m``."""
+    def short_text(self) -> str:
+        """``14.1 m``, ``about 14 m`` between far horizons, or ``more than 20 m``."""
         if self.beyond:
             return f"more than {self.distance_m:g} m"
-        low, high = self.between_m
         # The error grows faster than the distance: on a straight line between far horizons it comes out too long.
-        far = f" (interpolated between {low:g} and {high:g} m)" if high - low > NEAR_HORIZONS_M else ""
-        return f"{self.distance_m:.1f} m{far}"
+        return f"about {self.distance_m:.0f} m" if self._far else f"{self.distance_m:.1f} m"
+
+    @property
+    def reach_text(self) -> str:
+        """As `short_text`, with the horizons that it was interpolated between where they are far."""
+        low, high = self.between_m
+        if self.beyond or not self._far:
+            return self.short_text
+        return f"{self.distance_m:.1f} m (interpolated between {low:g} and {high:g} m)"
+
+    @property
+    def _far(self) -> bool:
+        low, high = self.between_m
+        return high - low > NEAR_HORIZONS_M
 
     @property
     def interval_text(self) -> str:

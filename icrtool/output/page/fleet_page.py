@@ -60,7 +60,7 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
         "fleet.html", ("fleet.js",), None, title=folder.absolute().name, lines=lines, columns=_columns(budgets),
         counts=document["counts"], gates_failed=document["gates_failed"], made_with=document["tool_version"],
         choices={key: sorted({log[key] for log in logs} - {""}) for key in ("status", "robot", "group")},
-        horizon_m=HORIZON_M,
+        horizon_m=HORIZON_M, calibrations=document.get("calibrations", []),
         pictures=list(pictures_in(folder / PLOTS, folder).values()),
         reasons=Counter(_reason(log) for log in logs if log["status"] == "failed").most_common(),
     )  # fmt: skip

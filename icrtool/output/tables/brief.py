@@ -8,11 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from icrtool.calibration.one_log import LogCalibration
+from icrtool.calibration.pooled import CalibrationResult
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.observability import lacking_turns
+from icrtool.output.tables.calibration import setting_blocks
 from icrtool.output.tables.dropout import shown_horizons
 from icrtool.output.text_blocks import Block, Line, Table, Text
 from icrtool.output.text_format import (
+    distance_text,
     duration_text,
     error_text,
     event_kinds,
@@ -40,6 +44,9 @@ NOTED_SCALE = 0.002
 SMALLEST_OFFSET_DEG = 0.05
 """A correction of the heading below this is not mentioned."""
 
+BUDGET_M = 0.5
+"""Error within which a distance counts, where none is asked for."""
+
 Check = tuple[bool, str, str]
 """Whether it is in order, what was checked, and the finding."""
 
@@ -54,7 +61,9 @@ def brief_run(run: Run, directory: str) -> Text:
     summary = run.summary
     blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary), "title"), *_state_lines(summary)]
     if summary["usable"]:
-        blocks += [Line(line, "as is") for line in (*_controller_lines(run), _icr_line(run))]
+        blocks += [
+            Line(line, "as is") for line in (*_controller_lines(run), _icr_line(run.summary.get("geometry") or {}))
+        ]
     for number, (good, what, text) in enumerate(run_checks(summary)):
         label = "checks" if not number else ""
         blocks.append(Line(_cut(f"{label:{LABEL}}{'ok' if good else '!':4}{what:12}{text}"), "as is"))
@@ -109,23 +118,25 @@ def _state_lines(summary: RunDocument) -> list[Line]:
 
 
 def _controller_lines(run: Run) -> Iterator[str]:
-    numbers: Mapping[str, Any] = run.summary.get("controller") or {}
     if run.track_width_m is None:
         yield f"{'controller':{LABEL}}no multiplier: robot.track_width_m is not known (--robot, --set)"
-    elif not numbers:
+    elif not (numbers := run.summary.get("controller")):
         yield f"{'controller':{LABEL}}no multiplier: y right and y left are not shown"
     else:
-        multiplier = f"{numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}"
-        radii = f"{numbers['left_radius']:.3f}, {numbers['right_radius']:.3f}"
-        std = max(numbers.get("left_radius_std") or 0.0, numbers.get("right_radius_std") or 0.0)
-        yield f"{'controller':{LABEL}}wheel_separation_multiplier  {multiplier}"
-        yield f"{'':{LABEL}}left, right wheel radius     {radii} ± {std:.3f} of the configured"
-        b = run.track_width_m
-        yield f"{'':{LABEL}}= (right - left) / {b:g} m; without slip: ±{b / 2:.3g} m"
+        yield from _number_lines(numbers, run.track_width_m)
 
 
-def _icr_line(run: Run) -> str:
-    geometry: Mapping[str, Any] = run.summary.get("geometry") or {}
+def _number_lines(numbers: Mapping[str, Any], width_m: float) -> Iterator[str]:
+    """Yield what a controller is given, from the keys of `icrtool.calibration.record.ControllerNumbers`."""
+    multiplier = f"{numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}"
+    radii = f"{numbers['left_radius']:.3f}, {numbers['right_radius']:.3f}"
+    std = max(numbers.get("left_radius_std") or 0.0, numbers.get("right_radius_std") or 0.0)
+    yield f"{'controller':{LABEL}}wheel_separation_multiplier  {multiplier}"
+    yield f"{'':{LABEL}}left, right wheel radius     {radii} ± {std:.3f} of the configured"
+    yield f"{'':{LABEL}}= (right - left) / {width_m:g} m; without slip: ±{width_m / 2:.3g} m"
+
+
+def _icr_line(geometry: Mapping[str, Any]) -> str:
     parts = []
     for column in ICR_COLUMNS:
         value, std = geometry.get(column), geometry.get(f"{column}_std")
@@ -224,7 +235,7 @@ def _reach_blocks(report: DropoutReport) -> list[Block]:
     blocks: list[Block] = []
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows = [
-            (f"   {shortened(label, 28)}", one.reach_text, note) for label, one, note in reach_rows(report, budget_m)
+            (f"   {shortened(label, 28)}", one.short_text, note) for label, one, note in reach_rows(report, budget_m)
         ]
         blocks += [Line(f"How far within {budget_m:g} m (95 %)?", "title"), Table("lrl", rows)]
     return blocks or ["How far?  No trial is as long as the shortest horizon."]
@@ -289,3 +300,32 @@ def _wrapped(label: str, text: str) -> str:
 
 def _cut(line: str) -> str:
     return line if len(line) <= WIDTH else f"{line[: WIDTH - 1].rstrip()}…"
+
+
+def brief_calibration(result: CalibrationResult | None, sensors: LogCalibration | None) -> Text:
+    """Return what `icrtool calibrate` prints: numbers, how far on what they were not fitted to, settings of one log."""
+    blocks: list[Block] = []
+    if result is not None:
+        calibration, table = result.calibration, result.table
+        geometry, covariance = calibration.geometry()
+        std = np.sqrt(np.diag(covariance)).tolist()
+        named = dict(zip(geometry._fields, geometry, strict=True))
+        named |= {f"{name}_std": one for name, one in zip(geometry._fields, std, strict=True)}
+        distance_m = sum(log.distance_m for log in calibration.logs)
+        robot = calibration.robot["name"] or "robot"
+        title = f"{robot}: {counted(len(calibration.logs), 'log')}, {distance_text(distance_m)}"
+        blocks += [Line(title, "title")]
+        numbers = calibration.controller_numbers()._asdict()
+        blocks += [Line(line, "as is") for line in (*_number_lines(numbers, calibration.width_m), _icr_line(named))]
+        rows = [
+            (f"   {REACH_LABELS.get(row.name, row.label)}", reached.short_text, NOTES.get(row.name, ""))
+            for row in sorted(table.scores, key=lambda row: (*REACH_ROWS, row.name).index(row.name))
+            if row.name in REACH_ROWS and (reached := row.within(table.horizons_m, BUDGET_M)) is not None
+        ]
+        what = "log" if table.folds[0].whole else "block of distance"
+        blocks += [Line(f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?", "title")]
+        blocks += [Table("lrl", rows)]
+        blocks += [_row("not shown", ", ".join(calibration.fitted.not_shown))] if calibration.fitted.not_shown else []
+    if sensors is not None:
+        blocks += setting_blocks(sensors)
+    return Text(blocks)

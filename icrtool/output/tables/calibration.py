@@ -27,7 +27,7 @@ def format_calibration(calibration: LogCalibration) -> Text:
         for one in calibration.parameters
     ]
     blocks: list[Block] = [Line(calibration.name, "title"), "", *labelled(head), ""]
-    return Text([*blocks, Table("l", rows, ("parameter", "value ± std", "verdict")), "", *_settings(calibration)])
+    return Text([*blocks, Table("l", rows, ("parameter", "value ± std", "verdict")), "", *setting_blocks(calibration)])
 
 
 def value_text(one: Parameter) -> str:
@@ -40,7 +40,8 @@ def value_text(one: Parameter) -> str:
     return f"{number}{spread} {unit}".rstrip()
 
 
-def _settings(calibration: LogCalibration) -> list[Block]:
+def setting_blocks(calibration: LogCalibration) -> list[Block]:
+    """Return the settings that one log proposes."""
     if not calibration.settings:
         shown = any(one.verdict == "shown" for one in calibration.parameters)
         why = "the drive confirms the configuration" if shown else "the drive showed nothing well enough"

@@ -7,8 +7,8 @@ from typing import Any
 
 from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
-from icrtool.dropout_analysis.acceptance_limits import within_budget
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.within_budget import within_budget
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text, fitted_model_text
 from icrtool.records.text import counted

@@ -12,14 +12,13 @@ from scipy.optimize import isotonic_regression
 from icrtool.dropout_analysis.acceptance_limits import (
     budget_distances,
     check_gate,
-    never_falling,
     parse_gate,
-    within_budget,
 )
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import ConfigError
+from icrtool.kernels.within_budget import never_falling, within_budget
 from icrtool.records.run import Run
 
 METRICS = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}
