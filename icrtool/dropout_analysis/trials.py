@@ -188,6 +188,7 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
     ends, counts = _ends(drive, horizons, asked.left_out, pool)
     blocks = _blocks(drive.distance, horizons, ends, pool)
     sparse = Trials(asked.sparse, ends[:, asked.sparse].T.astype(np.int64))
+    slipping = _slipping_trials(asked.run, ends)
     results = []
     for model in asked.predictors:
         give_back_freed()
@@ -199,12 +200,21 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
             tested = blocks
         if asked.sink is not None:
             asked.sink(model.name, horizons, errors if len(errors) == len(drive.distance) else _spread(errors, asked))
-        results.append(_result_of(model, errors, turned, tested, pool))
+        touching = slipping if slipping is None or len(errors) == len(slipping) else slipping[asked.sparse]
+        results.append(_result_of(model, errors, turned, tested, touching, pool))
         if model.name == "icr":
             first = len(errors) if learned is None else learned
             by_learning = error_summary(errors[:first]), error_summary(errors[first:])
         del errors  # before those of the next model are made
     return _Part(counts, reference_error(asked.run, drive, ends, asked.seed), results, by_learning)
+
+
+def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> Bools | None:
+    """Return which trials (n, h) touch a slip event, by their ends (h, n); None where the run has no event."""
+    if not run.sensors.events:
+        return None
+    before: Ints = np.cumsum(run.slipping) - run.slipping
+    return np.asarray((before[np.maximum(ends, 0)] > before).T)
 
 
 def _spread(errors: Floats, asked: _Asked) -> Floats:
@@ -348,9 +358,13 @@ def _errors(drive: Drive, model: Model, ends: NDArray[np.int32], pool: Executor)
 
 
 def _result_of(
-    model: Model | ConstantModel, errors: Floats, turned: Floats, blocks: Sequence[Blocks | None], pool: Executor
-) -> ModelResult:
-    """Return the errors of one model in numbers, horizon by horizon; `turned` are those of its turns [rad]."""
+    model: Model | ConstantModel, errors: Floats, turned: Floats, blocks: Sequence[Blocks | None],
+    slipping: Bools | None, pool: Executor,
+) -> ModelResult:  # fmt: skip
+    """Return the errors of one model in numbers, horizon by horizon; `turned` are those of its turns [rad].
+
+    `slipping` (n, h) marks the trials that touch a slip event.
+    """
 
     def at_horizon(h: int) -> ModelResult:
         column = errors[:, h : h + 1]
@@ -363,7 +377,8 @@ def _result_of(
         intervals = Intervals(*(np.array([end]) for end in found))
         of_turns = error_summary(np.degrees(turned[:, h : h + 1]))
         heading = HeadingErrors(of_turns.expected, of_turns.p95)
-        return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,), heading)
+        free = None if slipping is None else error_summary(column[~slipping[:, h]])
+        return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,), heading, free)
 
     return _joined(list(pool.map(at_horizon, range(len(blocks)))))
 
@@ -385,4 +400,5 @@ def _joined(parts: Sequence[ModelResult]) -> ModelResult:
         tuple(one for part in parts for one in part.histograms),
         tuple(one for part in parts for one in part.block_sums),
         HeadingErrors(*_columns(part.heading for part in parts)),
+        Summary(*_columns(free)) if (free := [one.without_events for one in parts if one.without_events]) else None,
     )

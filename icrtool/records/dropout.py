@@ -43,7 +43,13 @@ class HeadingErrors(NamedTuple):
 
 
 class ModelResult(NamedTuple):
-    """The errors of one model's trials, by horizon; `block_sums` has None where there is too little path."""
+    """The errors of one model's trials, by horizon.
+
+    Attributes
+    ----------
+    block_sums : None where there is too little path
+    without_events : of the trials among them that touch no slip event; None where the run has none
+    """
 
     name: str
     label: str
@@ -52,6 +58,7 @@ class ModelResult(NamedTuple):
     histograms: tuple[Histogram, ...]
     block_sums: tuple[BlockSums | None, ...]
     heading: HeadingErrors
+    without_events: Summary | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,6 +197,7 @@ class BudgetDistance(NamedTuple):
     distance_m : interpolated between horizons, from 0 m at 0 m
     beyond : `distance_m` is a lower bound: the error is within the budget at the last horizon with trials
     between_m : horizons interpolated between
+    without_events_m, beyond_without_events : the same of the trials that touch no slip event; NaN without an event
     low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; NaN where
         they stay within it, and where there is no interval
     """
@@ -202,6 +210,8 @@ class BudgetDistance(NamedTuple):
     between_m: tuple[float, float]
     low_m: float = math.nan
     high_m: float = math.nan
+    without_events_m: float = math.nan
+    beyond_without_events: bool = False
 
     @property
     def short_text(self) -> str:

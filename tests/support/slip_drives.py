@@ -21,16 +21,22 @@ def no_slip(t: Floats) -> Floats:
     return np.zeros((3, len(t)))
 
 
+def curves(t: Floats, seed: int) -> Floats:
+    """Speeds of left and right (2, n) [m/s]."""
+    return np.array([
+        0.5 + 0.25 * np.sin(0.5 * t) + 0.05 * np.sin(1.3 * t + seed), 0.5 + 0.2 * np.sin(0.31 * t + 1.0)
+    ])  # fmt: skip
+
+
 def drive(
-    slip: Slip = no_slip, *, seed: int = 0, fix_hz: int = 20, fix_std_m: float = 0.01, gyro: bool = True,
-    position_error: Callable[[Floats], Floats] | None = None,
+    slip: Slip = no_slip, *, wheels: Callable[[Floats, int], Floats] = curves, seed: int = 0, fix_hz: int = 20,
+    fix_std_m: float = 0.01, gyro: bool = True, position_error: Callable[[Floats], Floats] | None = None,
 ) -> SensorData:  # fmt: skip
     """Drive curves with sensors as in Pentzer 2014, Section 4; `position_error` gives north errors [m]."""
     rng = np.random.default_rng(seed)
     n = int(SECONDS * RATE_HZ)
     t = np.arange(n) / RATE_HZ
-    left = 0.5 + 0.25 * np.sin(0.5 * t) + 0.05 * np.sin(1.3 * t + seed)
-    right = 0.5 + 0.2 * np.sin(0.31 * t + 1.0)
+    left, right = wheels(t, seed)
     share_left, share_right, aside = slip(t)
     true_left, true_right = (1 - share_left) * left, (1 - share_right) * right
     omega = (true_left - true_right) / (Y_RIGHT - Y_LEFT)

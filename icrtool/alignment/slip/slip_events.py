@@ -44,6 +44,15 @@ FIRST_QUANTILE, LATER_QUANTILE = 0.7, 0.95
 NORMAL_QUANTILE = {FIRST_QUANTILE: 1.0364, LATER_QUANTILE: 1.9600}
 """Of the absolute value of a standard normal."""
 
+KEEPING_SHARE = 1 / 3
+"""A side that disagrees by less than this part of what the other does keeps to its wheels."""
+
+STEADY_SHARE = 0.8
+"""... and what the other lacks has the same sign, but for this."""
+
+LONGEST_STAMP_ERROR_S = 1.0
+"""For longer no reference lags by a wrong stamp."""
+
 MOST_FALSE = 0.25
 """Most windows that show what slip cannot do, for each that shows slip as clearly."""
 
@@ -152,7 +161,7 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
         # while the robot parks, sensors without noise leave no variance to divide by
         windows = windows.rows(windows.path_m > TURNING_MPS * duration)
         square = (windows.residual**2 / (windows.sensor + (error * windows.path_m[:, None]) ** 2)).sum(axis=1)
-        missed = np.abs(windows.residual).max(axis=1)
+        missed = np.hypot(np.hypot(windows.ahead, windows.turned), windows.aside)
         shows = (square > LEAST_DISTANCE2) & (missed > LEAST_SHARE * windows.path_m)
         windows, square = windows.rows(shows), square[shows]
         begin.append(windows.begin)
@@ -216,7 +225,13 @@ def _exceeds(windows: Windows) -> Bools:
         missed = -np.sign(model) * residual
         return np.asarray((missed < -least) | (missed > np.abs(model) + least))
 
-    return (beyond(*left) | beyond(*right)) & (beyond(*ahead) | beyond(*turned))
+    return (beyond(*left) | beyond(*right)) & (beyond(*ahead) | beyond(*turned)) & ~_of_one_side(windows)
+
+
+def _of_one_side(windows: Windows) -> Bools:
+    """Return in which windows one side keeps to its wheels: the other has no grip, and may be dragged along."""
+    sides = np.abs([windows.ahead + windows.turned, windows.ahead - windows.turned])
+    return np.asarray(sides.min(axis=0) < KEEPING_SHARE * sides.max(axis=0))
 
 
 def _from_doubled(windows: Windows) -> Floats:
@@ -252,26 +267,52 @@ def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) 
         if evidence.false_rate[at] > MOST_FALSE or not free[core].all():
             continue
         extent = find_extent(knots.t, steps, error, whole & free, core)
-        if extent is not None and extent.severity >= LEAST_SHARE and not _returns(knots, steps, extent):
+        if extent is not None and _shows_slip(knots, steps, extent):
             free[extent.first : extent.last] = False
             found.append((extent, int(at)))
     return found
 
 
-def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
-    """Return whether the reference makes up, shortly before or after, for the distance that is missing in the event.
+def _shows_slip(knots: Knots, steps: Windows, extent: Extent) -> bool:
+    """Return whether an event is severe enough, and no error of the reference.
 
-    A position that is wrong for a while comes back; distance lost by slip does not.
+    Of a side without grip the severity counts as the root mean square over both sides.
+    """
+    if _keeps_one_side(steps, extent):
+        return extent.severity >= LEAST_SHARE * math.sqrt(0.5)
+    return extent.severity >= LEAST_SHARE and not _returns(knots, steps, extent)
+
+
+def _keeps_one_side(steps: Windows, extent: Extent) -> bool:
+    """Return whether one side does what its wheels do, and the other lacks a steady part of it.
+
+    No error of a position or of a heading does that, except that of a stamp while the robot turns about a side: it is
+    short, or comes and goes.
+    """
+    rows = slice(extent.first, extent.last)
+    sides = np.array([steps.ahead[rows] + steps.turned[rows], steps.ahead[rows] - steps.turned[rows]])
+    noise2 = steps.sensor[rows, 0] + steps.sensor[rows, 2]
+    total, each = np.abs(sides.sum(axis=1)), np.sqrt(np.maximum(sides**2 - noise2, 0.0)).sum(axis=1)
+    keeping, missing = np.argsort(total)
+    steady = total[missing] > STEADY_SHARE * each[missing] and total[keeping] < KEEPING_SHARE * total[missing]
+    return bool(steady) and extent.end_s - extent.begin_s > LONGEST_STAMP_ERROR_S
+
+
+def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
+    """Return whether the reference makes up, shortly before or after, for the motion that is missing in the event.
+
+    A reference that is wrong for a while comes back; distance and turn lost by slip do not.
     """
     middle = (knots.heading[1:] + knots.heading[:-1]) / 2
     low, high = np.searchsorted(knots.t, [extent.begin_s - RETURN_S, extent.end_s + RETURN_S])
     rows = np.arange(max(int(low), 0), min(int(high), len(steps.begin)))
-    step = (steps.ahead[rows] + 1j * steps.aside[rows]) * np.exp(1j * middle[rows])
-    inside = (rows >= extent.first) & (rows < extent.last)
-    missed = complex(step[inside].sum())
-    if abs(missed) < RETURN_SIGMAS * math.sqrt(float(knots.variance[extent.first] + knots.variance[extent.last])):
+    place = (steps.ahead[rows] + 1j * steps.aside[rows]) * np.exp(1j * middle[rows])
+    step = np.column_stack([place.real, place.imag, steps.turned[rows]])
+    missed = step[(rows >= extent.first) & (rows < extent.last)].sum(axis=0)
+    square = float(missed @ missed)
+    if square < RETURN_SIGMAS**2 * float(knots.variance[extent.first] + knots.variance[extent.last]):
         return False
-    made_up = -(step * np.conj(missed)).real / abs(missed) ** 2
+    made_up = -(step @ missed) / square
     after, before = np.cumsum(made_up[rows >= extent.last]), np.cumsum(made_up[rows < extent.first][::-1])
     return float(max(after.max(initial=0.0), before.max(initial=0.0))) > RETURNED_SHARE
 

@@ -12,6 +12,7 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop.direct import trial_ends
+from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.events import SlipEvent
 from icrtool.records.run import Run, drive_of
@@ -52,6 +53,26 @@ def test_only_trials_across_an_event_are_left_out(run: Run) -> None:
         assert cost.with_events["icr"].p95[h] == pytest.approx(np.nanpercentile(errors, 95.0))
         assert icr.summary.expected[h] < cost.with_events["icr"].expected[h]
     assert sum(int(column[0]) for column in report.counts) + int(cost.trials[0]) == report.states
+
+
+def test_the_distance_within_a_budget_is_given_with_and_without_events_from_the_same_trials(run: Run) -> None:
+    whole = dropout_report(run, horizons_m=HORIZONS_M, comparison=False, budgets_m=(0.4,))
+    without = dropout_report(run, horizons_m=HORIZONS_M, comparison=False, budgets_m=(0.4,), without_events=True)
+    quiet = dropout_report(
+        replace(run, sensors=replace(run.sensors, events=())), horizons_m=HORIZONS_M, comparison=False, budgets_m=(0.4,)
+    )
+    for one, free, unknown in zip(whole.budgets, without.budgets, quiet.budgets, strict=True):
+        assert (one.without_events_m, one.beyond_without_events) == (free.distance_m, free.beyond)
+        assert one.distance_m == unknown.distance_m <= one.without_events_m
+        assert np.isnan(unknown.without_events_m)
+    icr = next(one for one in whole.budgets if one.model == "icr")
+    assert icr.distance_m < icr.without_events_m
+    rows = {row["model"]: row for row in report_document(whole)["budgets"]}
+    assert rows["icr"]["without_events_m"] == icr.without_events_m
+    for result, free in zip(whole.results, without.results, strict=True):
+        assert result.without_events is not None
+        np.testing.assert_allclose(result.without_events.p95, free.summary.p95, rtol=1e-9)
+        np.testing.assert_array_equal(result.without_events.trials, free.summary.trials)
 
 
 def test_the_cost_is_printed_and_a_log_without_events_says_so(run: Run) -> None:

@@ -13,7 +13,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import Fixes, SensorData
 from icrtool.records.samples import HeadingSamples, WheelSamples
-from support.slip_drives import RATE_HZ, SECONDS, START_NS, WIDTH_M, Y_LEFT, Y_RIGHT, drive
+from support.slip_drives import RATE_HZ, SECONDS, START_NS, WIDTH_M, Y_LEFT, Y_RIGHT, curves, drive
 
 HOLD = (60.0, 63.0)
 LEFT_FAST = (64.5, 67.5)
@@ -89,6 +89,51 @@ def test_holds_of_a_second_and_a_half_are_all_found(seed: int) -> None:
     spans = [(begin, begin + 1.5) for begin in begins]
     events = found_events(drive(lambda t: np.maximum.reduce([hold(t, span) for span in spans]), seed=seed), WIDTH_M)
     assert [span_s(event) for event in events] == [pytest.approx(span, abs=TIMING_S) for span in spans]
+
+
+SPIN = (55.0, 68.0)
+
+
+def spinning(t: Floats, seed: int) -> Floats:
+    """Drive curves, but turn on the spot for a while."""
+    inside = (t >= SPIN[0]) & (t < SPIN[1])
+    return np.where(inside, np.array([[0.6], [-0.6]]), curves(t, seed))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("fix_hz", [20, 5])
+@pytest.mark.parametrize("antenna", [0.0, 0.4])
+def test_a_hold_while_the_wheels_spin_on_the_spot_is_found(seed: int, fix_hz: int, antenna: float) -> None:
+    sensors = drive(hold, wheels=spinning, seed=seed, fix_hz=fix_hz)
+    if antenna:
+        psi = np.interp(sensors.fixes.stamp_ns, sensors.headings.stamp_ns, np.unwrap(sensors.headings.heading_rad))
+        fixes = replace(
+            sensors.fixes, north_m=sensors.fixes.north_m + antenna * np.cos(psi),
+            east_m=sensors.fixes.east_m + antenna * np.sin(psi),
+        )  # fmt: skip
+        sensors = replace(sensors, fixes=fixes)
+    (event,) = found_events(sensors, WIDTH_M)
+    assert event.kind == "immobilised"
+    assert span_s(event) == pytest.approx(HOLD, abs=TIMING_S)
+
+
+@pytest.mark.parametrize("seed", range(9))
+def test_one_event_of_a_side_without_grip_is_found_also_where_it_is_dragged_along(seed: int) -> None:
+    """The driver steers against it: the side is first slower than the ground, then faster."""
+    rng = np.random.default_rng(seed)
+    begin, side = 40.0 + rng.uniform(0.0, 20.0), seed % 2
+    middle, end = begin + rng.uniform(1.5, 2.5), begin + rng.uniform(4.0, 5.0)
+
+    def no_grip(t: Floats) -> Floats:
+        missed = np.zeros((3, len(t)))
+        missed[side] = np.where((t >= begin) & (t < middle), -1.2, np.where((t >= middle) & (t < end), 0.85, 0.0))
+        return missed
+
+    events = found_events(drive(no_grip, seed=seed), WIDTH_M)
+    assert events
+    assert all(event.kind in {"slip", "spin"} for event in events)
+    first, last = span_s(events[0])[0], span_s(events[-1])[1]
+    assert (first, last) == pytest.approx((begin, end), abs=TIMING_S)
 
 
 def test_a_side_without_grip_is_slip_and_not_a_robot_that_stands() -> None:
