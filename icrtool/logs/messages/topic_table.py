@@ -13,6 +13,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
 from icrtool.logs.messages.decoder import Decoded, Decoder
 from icrtool.logs.messages.definitions import definitions_of
+from icrtool.logs.messages.growing_column import GrowingColumn
 from icrtool.logs.messages.schema import MOST_ELEMENTS, Definitions, Layout, compile_layout
 from icrtool.records.text import LogText
 
@@ -137,8 +138,8 @@ class TopicCollector:
     most: int = MOST_ELEMENTS
     layout: Layout = field(init=False)
     _decoder: Decoder = field(init=False)
-    _times: list[Ints] = field(default_factory=list)
-    _columns: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
+    _columns: dict[str, GrowingColumn] = field(default_factory=dict)
     _texts: dict[str, dict[bytes, int]] = field(default_factory=dict)
     _unreadable: int = 0
 
@@ -161,28 +162,28 @@ class TopicCollector:
                 self._add(decoded, block.log_time_ns[readable])
 
     def _add(self, decoded: Decoded, times: Ints) -> None:
-        self._times.append(times)
+        expected = self.channel.count or 0
+        self._times.add(times, expected)
         for path, slot in self.layout.slots.items():
             if slot.kind != "string":
                 values = decoded.numbers(path)
             else:
                 known = self._texts.setdefault(path, {})
                 values = decoded.text_numbers(path, known)
-            parts = self._columns.setdefault(path, [])
-            parts.append(_compact(values) if not parts or _is_one_row(parts[-1]) else np.array(values))
+            lacking = -1 if slot.kind == "string" else 0
+            self._columns.setdefault(path, GrowingColumn(lacking)).add(values, expected)
 
     def table(self) -> TopicTable:
         """Return what was gathered since the last call, sorted by log time."""
-        times = np.concatenate(self._times) if self._times else np.empty(0, np.int64)
-        gathered, unreadable = self._columns, self._unreadable
-        self._times, self._columns, self._unreadable = [], {}, 0
+        times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
+        self._times, self._columns, self._unreadable = GrowingColumn(0), {}, 0
         back, order = time_order(times)
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
         for path in [*gathered]:
             if path in self._texts:
                 texts[path] = [LogText(text.decode("utf-8", "replace")) for text in self._texts[path]]
-            values = _joined(gathered.pop(path), -1 if path in texts else 0)
+            values = gathered.pop(path).taken()
             columns[path] = values if order is None else values[order]
         return TopicTable(
             self.channel.topic,
@@ -245,12 +246,9 @@ def _merged(group: list[TopicTable]) -> TopicTable:
 
 def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
     """Concatenate parts; those with fewer columns are padded with NaN, or with `lacking` where they hold integers."""
-    first = parts[0]
-    if all(_is_one_row(part) and part[:1].tobytes() == first[:1].tobytes() for part in parts):
-        return np.broadcast_to(first[:1], (sum(map(len, parts)), *first.shape[1:]))
-    if first.ndim == 2:
+    if parts[0].ndim == 2:
         width = max(part.shape[1] for part in parts)
-        lacking = np.nan if first.dtype.kind == "f" else lacking
+        lacking = np.nan if parts[0].dtype.kind == "f" else lacking
         parts = [
             np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=lacking)
             if part.shape[1] < width
@@ -258,15 +256,3 @@ def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
             for part in parts
         ]
     return np.concatenate(parts)
-
-
-def _compact(rows: NDArray[Any]) -> NDArray[Any]:
-    """Return rows (n,) or (n, k) that are equal bit by bit in the memory of one; they cannot be written to then."""
-    bits = rows.view(np.int64)
-    if not _is_one_row(rows) and ((bits[-1] != bits[0]).any() or (bits != bits[0]).any()):
-        return np.array(rows)
-    return np.broadcast_to(rows[:1].copy(), rows.shape)
-
-
-def _is_one_row(rows: NDArray[Any]) -> bool:
-    return len(rows) > 0 and rows.strides[0] == 0
