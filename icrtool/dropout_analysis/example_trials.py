@@ -10,7 +10,7 @@ from icrtool.calibration.model_comparison import ComparedModels, ComparedRow
 from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
 from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.open_loop.direct import open_loop_errors_direct, open_loop_path, trial_ends
+from icrtool.kernels.open_loop.direct import open_loop_path, trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import Drive, OpenLoopPath
 from icrtool.motion.models import RECOMMENDED
@@ -96,7 +96,7 @@ def _change(column: Floats, starts: Ints, ends: Ints) -> Floats:
 def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:
     """Return the start with the median error of a group, or of evenly spaced ones where it is large."""
     sample = group[:: -(-len(group) // TYPICAL_OF)]
-    errors = [open_loop_errors_direct(drive, model.icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
+    errors = [open_loop_errors(drive, model.icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
     return int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
 
 

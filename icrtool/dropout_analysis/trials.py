@@ -17,7 +17,7 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop.block_sums import Blocks, block_sums, error_intervals
-from icrtool.kernels.open_loop.direct import count_trials, open_loop_errors_direct, open_loop_path, trial_ends
+from icrtool.kernels.open_loop.direct import count_trials, trial_ends
 from icrtool.kernels.open_loop.error_statistics import (
     cut_blocks,
     error_summary,
@@ -275,9 +275,7 @@ def load_kernels() -> None:
     drive = straight_drive()
     icrs = FrozenIcrs.constant(1.0, -1.0, 0.0)
     ends = trial_ends(drive, np.array([1.0]))
-    open_loop_errors_direct(drive, icrs, ends)
     open_loop_errors(drive, icrs, ends)
-    open_loop_path(drive, 1.0, -1.0, 0.0, 0, 1)
 
 
 def models_of(run: Run) -> tuple[Model, ...]:

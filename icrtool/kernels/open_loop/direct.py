@@ -7,6 +7,7 @@ trajectory and is the oracle; ``icrtool.kernels.open_loop.prefix_sums`` gives th
 
 from __future__ import annotations
 
+import cmath
 import math
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE
-from icrtool.kernels.kinematics import euler_step
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, euler_step
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, OpenLoopPath, TrialCounts
 
 SHORT = -1
@@ -28,35 +29,8 @@ STANDING = -4
 JUMP = -5
 """No trial: the reference jumps between its start and its end."""
 
-
-@njit
-def find_trial_ends(drive: Drive, horizons_m: Floats, starts: Ints, ends: Ints) -> None:
-    """Fill `ends` (n_horizons, n_starts) for ascending starts: two pointers a horizon, O(n).
-
-    Notes
-    -----
-    Both pointers only move forward: distance[j] - distance[k] never grows with k, in floating point too.
-    """
-    distance, gap = drive.distance, drive.gap
-    for h in range(ends.shape[0]):
-        end, next_gap = 0, 0
-        for row in range(ends.shape[1]):
-            start = starts[row]
-            end = max(end, start)
-            while end < len(distance) and distance[end] - distance[start] < horizons_m[h]:
-                end += 1
-            if end == len(distance):
-                ends[h, row] = SHORT
-                continue
-            next_gap = max(next_gap, start)
-            while next_gap < end and not gap[next_gap]:
-                next_gap += 1
-            if next_gap < end:
-                ends[h, row] = GAP
-            elif drive.in_outage[end]:
-                ends[h, row] = OUTAGE
-            else:
-                ends[h, row] = end
+BEFORE = 1.0 - 2.0**-51
+"""Of a path length: less than rounding may add to it."""
 
 
 @njit
@@ -105,24 +79,6 @@ def integrate_trials(
                     errors[h, row] = math.sqrt(miss_north * miss_north + miss_east * miss_east)
 
 
-@njit
-def integrate_path(drive: Drive, y_icr_right: float, y_icr_left: float, x_icr: float, start: int, path: Floats) -> None:
-    """Fill `path` (3, m): north, east, heading from the origin with heading zero."""
-    path[0, 0], path[1, 0], path[2, 0] = 0.0, 0.0, 0.0
-    for i in range(path.shape[1] - 1):
-        path[0, i + 1], path[1, i + 1], path[2, i + 1] = euler_step(
-            path[0, i],
-            path[1, i],
-            path[2, i],
-            drive.dt_s[start + i],
-            drive.v_left[start + i],
-            drive.v_right[start + i],
-            y_icr_right,
-            y_icr_left,
-            x_icr,
-        )
-
-
 def compiled_drive(drive: Drive) -> Drive:
     """Return `drive` with its columns in the one form the kernels are compiled for; copies only what is not in it.
 
@@ -159,9 +115,23 @@ def trial_ends(drive: Drive, horizons_m: Floats, lo: int = 0, hi: int | None = N
 
 def ends_from(drive: Drive, horizons_m: Floats, starts: Ints) -> Ints:
     """Return `trial_ends` (k, n_horizons) of some starts (k,), ascending."""
-    horizons = np.require(horizons_m, np.float64, ["C", "A", "W"])
-    ends = np.empty((len(horizons), len(starts)), np.int64)
-    find_trial_ends(compiled_drive(drive), horizons, np.require(starts, np.int64, ["C", "A", "W"]), ends)
+    distance, states = np.asarray(drive.distance, np.float64), len(drive.distance)
+    ends = np.empty((len(horizons_m), len(starts)), np.int64)
+    first = int(starts[0]) if len(starts) else 0
+    gaps = np.concatenate([[0], np.cumsum(np.asarray(drive.gap, np.bool_)[first:])])
+    in_outage, begin = np.asarray(drive.in_outage, np.bool_), distance[starts]
+    for end, horizon in zip(ends, horizons_m, strict=True):
+        # the sum may be rounded up: begin the search a little before it
+        end[:] = np.searchsorted(distance, (begin + horizon) * BEFORE)
+        while True:
+            last, inside = np.minimum(end, states - 1), end < states
+            short = np.flatnonzero(inside & (distance[last] - begin < horizon))
+            if not len(short):
+                break
+            end[short] = np.searchsorted(distance, distance[end[short]], side="right")
+        end[inside & in_outage[last]] = OUTAGE
+        end[inside & (gaps[last - first] > gaps[starts - first])] = GAP
+        end[~inside] = SHORT
     if drive.jump.any():
         jumps: Ints = np.cumsum(drive.jump) - drive.jump
         ends[(ends >= 0) & (jumps[np.maximum(ends, 0)] > jumps[starts])] = JUMP
@@ -207,15 +177,20 @@ def open_loop_path(
     -------
     The path at every state from `start` to `end`, both included, beginning at the reference pose of `start`.
     """
-    local = np.empty((3, end - start + 1))
-    integrate_path(compiled_drive(drive), float(y_icr_right), float(y_icr_left), float(x_icr), start, local)
-    ahead, aside, turned = local
-    cos_psi, sin_psi = math.cos(drive.heading[start]), math.sin(drive.heading[start])
-    for lo in range(0, len(turned), ROWS_AT_ONCE):  # paths of whole drives are as long as a column of the run
-        some = slice(lo, lo + ROWS_AT_ONCE)
-        ahead[some], aside[some] = (
-            ahead[some] * cos_psi - aside[some] * sin_psi + drive.north[start],
-            aside[some] * cos_psi + ahead[some] * sin_psi + drive.east[start],
-        )
-    turned += drive.heading[start]
-    return OpenLoopPath(*local)
+    path = OpenLoopPath(*np.empty((3, end - start + 1)))
+    path.north[0], path.east[0], path.heading[0] = drive.north[start], drive.east[start], drive.heading[start]
+    separation, turned, place = max(abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M), 0.0, 0j
+    ahead = cmath.exp(1j * drive.heading[start])
+    for lo in range(start, end, ROWS_AT_ONCE):  # paths of whole drives are as long as a column of the run
+        some = slice(lo, min(lo + ROWS_AT_ONCE, end))
+        reached, over = slice(some.start - start + 1, some.stop - start + 1), drive.dt_s[some] / separation
+        left, right = drive.v_left[some] * over, drive.v_right[some] * over
+        turn = left - right
+        heading = turned + np.cumsum(np.append(0.0, turn))
+        moved = (left * y_icr_right - right * y_icr_left - 1j * x_icr * turn) * np.exp(1j * heading[:-1])
+        places = place + np.cumsum(moved)
+        turned, place = heading[-1], places[-1]
+        places *= ahead
+        path.north[reached], path.east[reached] = drive.north[start] + places.real, drive.east[start] + places.imag
+        path.heading[reached] = drive.heading[start] + heading[1:]
+    return path

@@ -18,13 +18,14 @@ as many sums but a sine and cosine for each of them, and was 1.7 times slower.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.kinematics import icr_separation
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop.direct import compiled_drive, compiled_icrs, integrate_trials
 from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
 
@@ -36,27 +37,13 @@ MAX_MOMENTS = 16
 """A block that needs more moments is split: halving the block is cheaper than doubling its moments."""
 MIN_BLOCK = 8
 """Blocks of this size are integrated directly instead of split: that is not slower."""
-BLOCK = 2048
+BLOCK = 4096
 """Starts a block (at least as many as the states of its first trial: then the window is about twice the block)."""
 CONSTANT_BLOCK = 8192
 """The same where every start has the same ICRs: one moment is enough for any block, and longer blocks share more."""
 MAX_BLOCK = 32768
-"""Bounds the memory of a block to a few MB."""
-TILE = 128
-"""States whose moments are kept at once: they stay in the first-level cache while their trials are evaluated."""
+"""Starts of the longest block, and states whose moments are kept at once: bounds the memory to a few MB."""
 _EPS = 2.220446049250313e-16
-
-
-@njit
-def last_end(ends: Ints, row_lo: int, row_hi: int) -> int:
-    """Return the last state at which a trial of these starts ends; -1 if none has one."""
-    last = -1
-    for h in range(ends.shape[0]):
-        for row in range(row_hi - 1, row_lo - 1, -1):
-            if ends[h, row] >= 0:
-                last = max(last, ends[h, row])
-                break
-    return last
 
 
 class BlockPlan(NamedTuple):
@@ -75,32 +62,49 @@ class BlockPlan(NamedTuple):
     first_turn: float
 
 
-@njit
-def plan_block(drive: Drive, icrs: FrozenIcrs, start_lo: int, start_hi: int, last: int) -> BlockPlan:
-    """Choose the moments for the starts [start_lo, start_hi) whose trials end at state `last` at the latest.
+class WheelSteps(NamedTuple):
+    """Steps of the wheels from state `first` on.
+
+    Attributes
+    ----------
+    left, right : (n,) [m]; 0 over gaps, which no trial spans
+    turn : (n + 1,) D [m] at their states
+    """
+
+    first: int
+    left: Floats
+    right: Floats
+    turn: Floats
+
+
+def wheel_steps(drive: Drive, first: int, last: int, turn: float) -> Iterator[WheelSteps]:
+    """Yield the steps from state `first`, where D is `turn` [m], to state `last`, some at a time."""
+    for lo in range(first, last, MAX_BLOCK):
+        some = slice(lo, min(lo + MAX_BLOCK, last))
+        held = np.where(drive.gap[some], 0.0, drive.dt_s[some])
+        left, right = held * drive.v_left[some], held * drive.v_right[some]
+        turns = turn + np.cumsum(np.append(0.0, left - right))
+        yield WheelSteps(lo, left, right, turns)
+        turn = turns[-1]
+
+
+def plan_block(drive: Drive, icrs: FrozenIcrs, last: int, starts: slice) -> BlockPlan:
+    """Choose the moments for some starts and their `icrs`, whose trials end at state `last` at the latest.
 
     Notes
     -----
     What is left out after M moments is below scale (w r)^M / M! / (1 - w r / (M + 1)), with r the half range of D and
     scale the length of a path on which nothing cancels.
     """
-    turn, turn_min, turn_max, travel_left, travel_right = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(start_lo, last):
-        if not drive.gap[i]:
-            turn += drive.dt_s[i] * (drive.v_left[i] - drive.v_right[i])
-            turn_min, turn_max = min(turn_min, turn), max(turn_max, turn)
-            travel_left += abs(drive.dt_s[i] * drive.v_left[i])
-            travel_right += abs(drive.dt_s[i] * drive.v_right[i])
-    each = 0 if len(icrs.x_icr) == 1 else 1
-    a_min, a_max, arm_left, arm_right = math.inf, 0.0, 0.0, 0.0
-    for k in range(start_lo, start_hi):
-        y_icr_right, y_icr_left = icrs.y_icr_right[k * each], icrs.y_icr_left[k * each]
-        a = 1.0 / icr_separation(y_icr_right, y_icr_left)
-        a_min, a_max = min(a_min, a), max(a_max, a)
-        arm_left = max(arm_left, abs(y_icr_right) + abs(icrs.x_icr[k * each]))
-        arm_right = max(arm_right, abs(y_icr_left) + abs(icrs.x_icr[k * each]))
+    turn_min, turn_max, travel_left, travel_right = 0.0, 0.0, 0.0, 0.0
+    for steps in wheel_steps(drive, starts.start, last, 0.0):
+        turn_min, turn_max = min(turn_min, steps.turn.min()), max(turn_max, steps.turn.max())
+        travel_left, travel_right = travel_left + np.abs(steps.left).sum(), travel_right + np.abs(steps.right).sum()
+    a, forward = _turn_gain(icrs), np.abs(icrs.x_icr)
+    a_min, a_max = float(a.min()), float(a.max())
     half_width, half_range = 0.5 * (a_max - a_min), 0.5 * (turn_max - turn_min)
-    scale = a_max * (arm_left * travel_left + arm_right * travel_right)
+    arms = (float((np.abs(y_icr) + forward).max()) for y_icr in icrs[:2])
+    scale = a_max * sum(arm * travel for arm, travel in zip(arms, (travel_left, travel_right), strict=True))
     moments, left_out = 1, scale * half_width * half_range
     while 2.0 * left_out > TOLERANCE_M and moments <= MAX_MOMENTS:
         moments += 1
@@ -110,134 +114,111 @@ def plan_block(drive: Drive, icrs: FrozenIcrs, start_lo: int, start_hi: int, las
     return BlockPlan(moments, 0.5 * (a_min + a_max), half_width, -0.5 * (turn_min + turn_max))
 
 
-@njit
-def sum_moments(drive: Drive, plan: BlockPlan, state_lo: int, rows: int, turns: Floats, sums: Floats) -> None:
-    """Continue D [m] in `turns` (rows + 1,) and the prefix sums from row 0, which is `state_lo`, to row `rows`.
+def _turn_gain(icrs: FrozenIcrs) -> Floats:
+    """Return a = 1/W [1/m]."""
+    gain: Floats = 1.0 / np.maximum(np.abs(icrs.y_icr_left - icrs.y_icr_right), MIN_ICR_SEPARATION_M)
+    return gain
 
-    `sums` is (rows + 1, moments, 4): real and imaginary part of the left sum, then of the right one.
+
+@njit
+def sum_moments(
+    left: Floats, right: Floats, turn: Floats, a_centre: float, half_width: float, moments: int, sums: Floats
+) -> None:
+    """Continue the prefix sums of `WheelSteps` from row 0.
+
+    `sums` is (n + 1, moments, 4), highest first: real and imaginary part of the left sum, then of the right one.
     """
-    for row in range(rows):
-        i = state_lo + row
-        turn, dt = turns[row], 0.0 if drive.gap[i] else drive.dt_s[i]
-        step_left, step_right = dt * drive.v_left[i], dt * drive.v_right[i]
+    for i in range(len(left)):
         real, imag = 0.0, 0.0
-        if step_left != 0.0 or step_right != 0.0:
-            # no trial spans a gap, and standstill adds nothing: a parked robot costs no sine
-            real, imag = math.cos(plan.a_centre * turn), math.sin(plan.a_centre * turn)
-        turns[row + 1] = turn + dt * (drive.v_left[i] - drive.v_right[i])
-        for m in range(sums.shape[1]):
-            sums[row + 1, m, 0] = sums[row, m, 0] + step_left * real
-            sums[row + 1, m, 1] = sums[row, m, 1] + step_left * imag
-            sums[row + 1, m, 2] = sums[row, m, 2] + step_right * real
-            sums[row + 1, m, 3] = sums[row, m, 3] + step_right * imag
-            factor = plan.half_width * turn / (m + 1)
+        if left[i] != 0.0 or right[i] != 0.0:
+            # standstill adds nothing: a parked robot costs no sine
+            real, imag = math.cos(a_centre * turn[i]), math.sin(a_centre * turn[i])
+        for m in range(moments):
+            c = moments - 1 - m
+            sums[i + 1, c, 0] = sums[i, c, 0] + left[i] * real
+            sums[i + 1, c, 1] = sums[i, c, 1] + left[i] * imag
+            sums[i + 1, c, 2] = sums[i, c, 2] + right[i] * real
+            sums[i + 1, c, 3] = sums[i, c, 3] + right[i] * imag
+            factor = half_width * turn[i] / (m + 1)
             real, imag = -imag * factor, real * factor
 
 
-@njit
-def weigh_moments(sums: Floats, row: int, q: float) -> tuple[float, float, float, float]:
-    """Evaluate the polynomials in q whose coefficients are the moments at `row` (Horner)."""
-    left_re, left_im, right_re, right_im = 0.0, 0.0, 0.0, 0.0
-    for m in range(sums.shape[1] - 1, -1, -1):
-        left_re = left_re * q + sums[row, m, 0]
-        left_im = left_im * q + sums[row, m, 1]
-        right_re = right_re * q + sums[row, m, 2]
-        right_im = right_im * q + sums[row, m, 3]
-    return left_re, left_im, right_re, right_im
+def freeze_starts(plan: BlockPlan, icrs: FrozenIcrs, heading: Floats, turn: Floats) -> Floats:
+    """Return what each start keeps (k, 7): q, the factors of the left and the right sum, and, still 0, its own place.
 
-
-@njit
-def freeze_start(
-    heading: float, y_icr_right: float, y_icr_left: float, x_icr: float, turn: float
-) -> tuple[float, float, float, float, float]:
-    """Return a = 1/W and the factors of the left and the right sum: a e^{j(psi - a D)} (y_r - j x), ... (y_l - j x)."""
-    a = 1.0 / icr_separation(y_icr_right, y_icr_left)
+    The factors are a e^{j(psi - a D)} (y_r - j x) and a e^{j(psi - a D)} (y_l - j x).
+    """
+    a, frozen = _turn_gain(icrs), np.zeros((len(heading), 7))
     # two angles, not their difference: psi may be thousands of radians, a D is small
-    cos_psi, sin_psi = math.cos(heading), math.sin(heading)
-    cos_turn, sin_turn = math.cos(a * turn), math.sin(a * turn)
-    real = a * (cos_psi * cos_turn + sin_psi * sin_turn)
-    imag = a * (sin_psi * cos_turn - cos_psi * sin_turn)
-    return (
-        a,
-        real * y_icr_right + imag * x_icr,
-        imag * y_icr_right - real * x_icr,
-        real * y_icr_left + imag * x_icr,
-        imag * y_icr_left - real * x_icr,
-    )
+    common = a * np.exp(1j * heading) * np.exp(-1j * a * turn)
+    frozen[:, 0] = (a - plan.a_centre) / plan.half_width if plan.half_width > 0.0 else 0.0
+    for column, y_icr in ((1, icrs.y_icr_right), (3, icrs.y_icr_left)):
+        factor = common * (y_icr - 1j * icrs.x_icr)
+        frozen[:, column], frozen[:, column + 1] = factor.real, factor.imag
+    return frozen
 
 
 @njit
-def solve_block(
-    drive: Drive,
-    icrs: FrozenIcrs,
-    plan: BlockPlan,
-    ends: Ints,
-    lo: int,
-    row_lo: int,
-    row_hi: int,
-    last: int,
-    sums: Floats,
-    turns: Floats,
-    frozen: Floats,
-    next_row: Ints,
+def fill_errors(
+    ends: Ints, row_lo: int, first: int, sums: Floats, frozen: Floats, start: int, north: Floats, east: Floats,
     errors: Floats,
-) -> None:
-    """Fill `errors` for the rows [row_lo, row_hi): march over the window once, a tile of states at a time.
+) -> None:  # fmt: skip
+    """Fill `errors` of the trials that end at the states of `sums`, which begin at `first`.
+
+    Parameters
+    ----------
+    ends, errors : (horizons, starts); row_lo : the block's first start there, which is state `start`
+    frozen : of `freeze_starts`; the place of each start is filled in where its state is among those of `sums`
 
     Notes
     -----
-    For one horizon the ends grow with the starts, so `next_row` (n_horizons,) points to the next start to reach its
-    end, and moments are needed only for the current tile: memory is that of the block's starts, for any window.
-    `frozen` (row_hi - row_lo, 9) keeps q, both factors and both sums of each start. `sums` and `turns` come with their
-    row 0 filled. The caller allocates: in here that would double the time to compile. The trial stands in the loop: a
-    function which takes the arrays would not be inlined, and be half as fast.
+    A trial is the polynomial in q whose coefficients are the moments at its end (Horner), less that at its start.
     """
-    each = 0 if len(icrs.x_icr) == 1 else 1
-    for tile_lo in range(lo + row_lo, last + 1, TILE):
-        tile_hi = min(tile_lo + TILE, last + 1)
-        sum_moments(drive, plan, tile_lo, min(TILE, last - tile_lo), turns, sums)
-        for k in range(tile_lo, min(tile_hi, lo + row_hi)):
-            s = k - lo - row_lo
-            tried = False
-            for h in range(ends.shape[0]):
-                if ends[h, k - lo] >= 0:
-                    tried = True
-                    break
-            if not tried:
+    for h in range(-1, len(ends)):
+        for s in range(len(frozen)):
+            e = (start + s if h < 0 else ends[h, row_lo + s]) - first
+            # the state at a border is the last of one part and the first of the next
+            if e < 0 or e >= len(sums):
                 continue
-            a, frozen[s, 1], frozen[s, 2], frozen[s, 3], frozen[s, 4] = freeze_start(
-                drive.heading[k],
-                icrs.y_icr_right[k * each],
-                icrs.y_icr_left[k * each],
-                icrs.x_icr[k * each],
-                turns[k - tile_lo],
+            q, left_re, left_im, right_re, right_im = (
+                frozen[s, 0],
+                frozen[s, 1],
+                frozen[s, 2],
+                frozen[s, 3],
+                frozen[s, 4],
             )
-            frozen[s, 0] = (a - plan.a_centre) / plan.half_width if plan.half_width > 0.0 else 0.0
-            frozen[s, 5], frozen[s, 6], frozen[s, 7], frozen[s, 8] = weigh_moments(sums, k - tile_lo, frozen[s, 0])
-        for h in range(ends.shape[0]):
-            row = next_row[h]
-            while row < row_hi and ends[h, row] < tile_hi:
-                end = ends[h, row]
-                if end >= 0:
-                    s = row - row_lo
-                    left_re, left_im, right_re, right_im = weigh_moments(sums, end - tile_lo, frozen[s, 0])
-                    left_re -= frozen[s, 5]
-                    left_im -= frozen[s, 6]
-                    right_re -= frozen[s, 7]
-                    right_im -= frozen[s, 8]
-                    moved_north = frozen[s, 1] * left_re - frozen[s, 2] * left_im
-                    moved_north -= frozen[s, 3] * right_re - frozen[s, 4] * right_im
-                    moved_east = frozen[s, 1] * left_im + frozen[s, 2] * left_re
-                    moved_east -= frozen[s, 3] * right_im + frozen[s, 4] * right_re
-                    miss_north = moved_north - (drive.north[end] - drive.north[lo + row])
-                    miss_east = moved_east - (drive.east[end] - drive.east[lo + row])
-                    errors[h, row] = math.sqrt(miss_north * miss_north + miss_east * miss_east)
-                row += 1
-            next_row[h] = row
-        turns[0] = turns[TILE]
-        for m in range(sums.shape[1]):
-            for c in range(4):
-                sums[0, m, c] = sums[TILE, m, c]
+            l_re, l_im, r_re, r_im = 0.0, 0.0, 0.0, 0.0
+            for m in range(sums.shape[1]):
+                l_re = l_re * q + sums[e, m, 0]
+                l_im = l_im * q + sums[e, m, 1]
+                r_re = r_re * q + sums[e, m, 2]
+                r_im = r_im * q + sums[e, m, 3]
+            n = left_re * l_re - left_im * l_im - right_re * r_re + right_im * r_im
+            o = left_re * l_im + left_im * l_re - right_re * r_im - right_im * r_re
+            if h < 0:
+                frozen[s, 5], frozen[s, 6] = n, o
+            else:
+                n -= frozen[s, 5] + (north[first + e] - north[start + s])
+                o -= frozen[s, 6] + (east[first + e] - east[start + s])
+                errors[h, row_lo + s] = math.sqrt(n * n + o * o)
+
+
+def solve_block(
+    drive: Drive, icrs: FrozenIcrs, plan: BlockPlan, ends: Ints, row_lo: int, starts: slice, last: int, errors: Floats
+) -> None:
+    """Fill `errors` of some starts, rows of `ends` from `row_lo` on; all parameters as in `plan_block`."""
+    rows, frozen = np.zeros((min(max(last - starts.start, 0), MAX_BLOCK) + 1, plan.moments, 4)), np.zeros((0, 7))
+    for steps in wheel_steps(drive, starts.start, last, plan.first_turn):
+        # the starts are all among the first states
+        if steps.first == starts.start:
+            turn = steps.turn[: starts.stop - starts.start]
+            heading, own = drive.heading[starts][: len(turn)], FrozenIcrs(*(column[: len(turn)] for column in icrs))
+            frozen = freeze_starts(plan, own, heading, turn)
+        else:
+            rows[0] = rows[-1]
+        sums = rows[: len(steps.turn)]
+        sum_moments(steps.left, steps.right, steps.turn, plan.a_centre, plan.half_width, plan.moments, sums)
+        fill_errors(ends, row_lo, steps.first, sums, frozen, starts.start, drive.north, drive.east, errors)
 
 
 def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
@@ -252,22 +233,21 @@ def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) ->
     by_horizon = np.ascontiguousarray(ends.T)
     errors = np.full(by_horizon.shape, np.nan)
     drive, icrs = compiled_drive(drive), compiled_icrs(icrs)
-    block = CONSTANT_BLOCK if len(icrs.x_icr) == 1 else BLOCK
+    constant = len(icrs.x_icr) == 1
     row_lo, size, starts = 0, MAX_BLOCK, len(ends)
     while row_lo < starts:
         # a robot that hardly moves has long windows: longer blocks share them
-        first_window = last_end(by_horizon, row_lo, row_lo + 1) - lo - row_lo
-        row_hi = min(row_lo + min(max(block, first_window), size), starts)
+        first_window = int(by_horizon[:, row_lo].max(initial=-1)) - lo - row_lo
+        row_hi = min(row_lo + min(max(CONSTANT_BLOCK if constant else BLOCK, first_window), size), starts)
         while True:
-            last = last_end(by_horizon, row_lo, row_hi)
-            plan = plan_block(drive, icrs, lo + row_lo, lo + row_hi, last)
+            block, last = slice(lo + row_lo, lo + row_hi), int(by_horizon[:, row_lo:row_hi].max(initial=-1))
+            own = icrs if constant else FrozenIcrs(*(column[block] for column in icrs))
+            plan = plan_block(drive, own, last, block)
             if plan.moments or row_hi - row_lo <= MIN_BLOCK:
                 break
             row_hi = row_lo + (row_hi - row_lo) // 2
         if plan.moments:
-            sums, turns = np.zeros((TILE + 1, plan.moments, 4)), np.full(TILE + 1, plan.first_turn)
-            frozen, next_row = np.empty((row_hi - row_lo, 9)), np.full(len(by_horizon), row_lo)
-            solve_block(drive, icrs, plan, by_horizon, lo, row_lo, row_hi, last, sums, turns, frozen, next_row, errors)
+            solve_block(drive, own, plan, by_horizon, row_lo, block, last, errors)
         else:
             integrate_trials(drive, icrs, by_horizon, lo, row_lo, row_hi, errors)
         row_lo, size = row_hi, min(2 * (row_hi - row_lo), MAX_BLOCK)

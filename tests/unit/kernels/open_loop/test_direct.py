@@ -211,7 +211,7 @@ def test_icrs_too_wild_for_moments_are_integrated_directly(monkeypatch):
 
 
 def test_memory_does_not_grow_with_the_window():
-    n = 60_000
+    n = 150_000
     rng = np.random.default_rng(0)
     creep = 1e-3 * rng.random(n)  # 100 times slower than a robot drives: every window reaches to the end
     icrs = FrozenIcrs.constant(0.5, -0.5, 0.0)
@@ -222,7 +222,7 @@ def test_memory_does_not_grow_with_the_window():
     open_loop_errors(drive, icrs, ends)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < n * 8 + 3e6  # the result, and one block of 32768 starts
+    assert peak < n * 8 + 8e6  # the result, and one block of 32768 starts and as many states
 
 
 def test_path_is_the_circular_arc_of_closed_form_as_the_step_shrinks():
@@ -267,16 +267,9 @@ def test_read_only_strided_and_integer_columns_are_taken():
     table.flags.writeable = False
     odd = Drive(*table.T, drive.gap.astype(int), drive.in_outage.tolist(), drive.jump)
     np.testing.assert_array_equal(open_loop_errors(odd, icrs, trial_ends(odd, HORIZONS)), expected)
-    assert len(open_loop.find_trial_ends.signatures) == 1
 
 
 class TestKernelsAgainstTheirPythonFunction:
-    def test_trial_ends(self):
-        drive, _ = troubled_drive()
-        ends = np.empty((len(HORIZONS), 260), dtype=np.int64)
-        open_loop.find_trial_ends.py_func(drive, HORIZONS, np.arange(ends.shape[1]), ends)
-        np.testing.assert_array_equal(ends.T, trial_ends(drive, HORIZONS))
-
     def test_direct_integration(self):
         drive, icrs = troubled_drive()
         ends = np.ascontiguousarray(trial_ends(drive, HORIZONS).T)
@@ -284,17 +277,10 @@ class TestKernelsAgainstTheirPythonFunction:
         open_loop.integrate_trials.py_func(drive, icrs, ends, 0, 0, 260, errors)
         np.testing.assert_allclose(errors.T, open_loop_errors_direct(drive, icrs, ends.T), rtol=0.0, atol=ROUNDING)
 
-    def test_path(self):
-        drive, _ = troubled_drive()
-        compiled, plain = np.empty((3, 50)), np.empty((3, 50))
-        open_loop.integrate_path(drive, 0.5, -0.4, 0.1, 7, compiled)
-        open_loop.integrate_path.py_func(drive, 0.5, -0.4, 0.1, 7, plain)
-        np.testing.assert_allclose(compiled, plain, rtol=0.0, atol=ROUNDING)
-
     def test_fast_algorithm(self, monkeypatch):
         drive, icrs = troubled_drive()
         ends = trial_ends(drive, HORIZONS)
         compiled = open_loop_errors(drive, icrs, ends)
-        for name in ("last_end", "plan_block", "sum_moments", "weigh_moments", "freeze_start", "solve_block"):
+        for name in ("sum_moments", "fill_errors"):
             monkeypatch.setattr(open_loop_fast, name, getattr(open_loop_fast, name).py_func)
         np.testing.assert_allclose(open_loop_errors(drive, icrs, ends), compiled, rtol=0.0, atol=ROUNDING)
