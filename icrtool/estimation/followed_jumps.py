@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable
 
 import numpy as np
@@ -54,7 +55,14 @@ def followed_jumps(
     spans = [settled(one) for one in spans if one.kind == "heading" or _remains(one)]
     # what is decided takes in what is undecided about it
     decided = _joined([one for one in spans if not one.undecided], _near)
-    free = [one for one in spans if one.undecided and not any(_near(*_in_order(one, other)) for other in decided)]
+    begins = [one.begin_ns for one in decided]
+
+    def is_apart(one: ReferenceJump) -> bool:
+        row = bisect_right(begins, one.begin_ns)
+        before, after = decided[max(row - 1, 0) : row], decided[row : row + 1]
+        return not (any(_near(other, one) for other in before) or any(_near(one, other) for other in after))
+
+    free = [one for one in spans if one.undecided and is_apart(one)]
     return tuple(sorted((*decided, *_joined(free, _near)), key=_begin))
 
 
@@ -70,10 +78,6 @@ def _first_from(stamps: Ints, at: int) -> int:
 
 def _begin(jump: ReferenceJump) -> int:
     return jump.begin_ns
-
-
-def _in_order(one: ReferenceJump, other: ReferenceJump) -> tuple[ReferenceJump, ReferenceJump]:
-    return (one, other) if one.begin_ns <= other.begin_ns else (other, one)
 
 
 def _in_one_rejection(one: ReferenceJump, other: ReferenceJump) -> bool:

@@ -23,6 +23,9 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 MODEL_WORDS = {"recommended": "whole model", "controller": "controller numbers", "icr": "ICR", "no_slip": "no slip"}
 
+MOST_LINES = 50
+"""Jumps of the reference that are printed, the largest decided ones first."""
+
 FITTED = {"never": "not fitted", "before": "up to the start", "all": "in sample", "others": "held out"}
 """What the numbers of a row were fitted to, by the values of `icrtool.calibration.model_comparison.FITTED_TO`."""
 
@@ -67,11 +70,13 @@ def event_kinds(events: Sequence[Mapping[str, Any]]) -> str:
 
 def jump_lines(jumps: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return a line for each jump of the reference: when, how large, why it is one, and what follows."""
-    return [
+    listed = sorted(jumps, key=lambda one: (one["undecided"], -one["size_m"]))[:MOST_LINES]
+    lines = [
         f"reference jump from {one['begin_s']:.1f} to {one['end_s']:.1f} s: {_jump_size(one)}: {one['why']}; "
         f"{'trials cross it' if one['undecided'] else 'no trial crosses it'}"
-        for one in jumps
+        for one in sorted(listed, key=lambda one: one["begin_ns"])
     ]
+    return [*lines, f"and {len(jumps) - len(lines):,} more in run.json"] if len(jumps) > len(lines) else lines
 
 
 def _jump_size(jump: Mapping[str, Any]) -> str:
