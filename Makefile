@@ -72,7 +72,7 @@ test: $(READY)  ## the tests, without the stress tests; JOBS=0 runs them in one 
 stress: $(READY)  ## the long and large tests alone
 	$(BIN)/python -m pytest -q -m stress
 
-fuzz: $(READY)  ## read, fit and report damaged logs; FUZZ="--logs 100000 --fitted 20" sets how many
+fuzz: $(READY)  ## use damaged logs, or forged runs; FUZZ="--logs 100000 --fitted 20" or "--runs 5000" sets how many
 	$(BIN)/python scripts/fuzz.py $(FUZZ)
 
 axe: $(AXE)  ## fetch the checker of accessibility that the tests of pages use (npm; MPL 2.0, not part of icrtool)

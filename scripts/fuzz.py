@@ -1,4 +1,4 @@
-"""Fuzz icrtool with logs of damaged structure: read, align, fit and report each within bounds of time and memory.
+"""Fuzz icrtool with damaged logs and forged runs: each is used within bounds of time and memory, without a warning.
 
 ``make fuzz`` runs it; ``python scripts/fuzz.py --help`` lists the options. A finding is a traceback or a limit that
 is exceeded; its log is kept below ``--keep`` with the traceback beside it. Logs are used in worker processes, which
@@ -32,11 +32,15 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
 
-import fuzz_structures  # noqa: E402 - beside this script
+import fuzz_runs  # noqa: E402 - beside this script
+import fuzz_structures  # noqa: E402
 
 Random = np.random.Generator
 EXTREMES = [0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFF_FFFF, 0x8000_0000, 0xFFFF_FFFF, 1 << 40, (1 << 63) - 1]
 FLOATS = [0.0, -0.0, 1e-300, 1e300, -1e300, float("inf"), float("nan"), 1e9, -1.0, 3.0e8, 1e-9]
+SIGNALLING = b"\1\0\0\0\0\0\xf0\x7f"
+"""A signalling NaN: arithmetic with it warns."""
+
 HOUR_NS, YEAR_NS = 3_600_000_000_000, 31_557_600_000_000_000
 
 
@@ -71,7 +75,17 @@ def shorter(columns: dict[str, np.ndarray], rng: Random) -> str:
     return f"{count} samples of {stream}"
 
 
-COLUMN_MUTATIONS: tuple[Callable[[dict[str, np.ndarray], Random], str], ...] = (values, clocks, shorter)
+def standing(columns: dict[str, np.ndarray], rng: Random) -> str:
+    """Have the robot stand for most of the log."""
+    share = float(rng.choice([0.5, 0.9, 0.99, 1.0]))
+    names = [n for n, c in columns.items() if c.dtype == np.float64]
+    for name in names:
+        column = columns[name] = columns[name].copy()
+        column[int(len(column) * (1 - share)) :] = 0.0 if name.endswith(("mps", "radps")) else column[-1:]
+    return "standing"
+
+
+COLUMN_MUTATIONS: tuple[Callable[[dict[str, np.ndarray], Random], str], ...] = (values, clocks, shorter, standing)
 
 
 def numbers(content: bytearray, rng: Random) -> str:
@@ -85,7 +99,7 @@ def numbers(content: bytearray, rng: Random) -> str:
 def doubles(content: bytearray, rng: Random) -> str:
     """Overwrite an aligned double."""
     at = place(content, rng) & ~3
-    content[at : at + 8] = struct.pack("<d", rng.choice(FLOATS))
+    content[at : at + 8] = SIGNALLING if rng.random() < 0.1 else struct.pack("<d", rng.choice(FLOATS))
     return "double"
 
 
@@ -171,6 +185,9 @@ def database(path: Path, rng: Random) -> str:
 KINDS = (("mcap", "none"), ("mcap", "none"), ("mcap", "zstd"), ("bag", "none"), ("bag", "lz4"), ("db3", "none"),
          ("db3", "zstd"), ("csv", "none"))  # fmt: skip
 
+VENDOR_LOGS = 0.1
+"""Share of logs that hold messages of every type that is read, in place of a drive."""
+
 MUTATED_COLUMNS = 0.12
 """Share of logs that are written with spoilt columns: writing one takes several times as long as reading it."""
 
@@ -219,6 +236,24 @@ def clean_log(count: int, kind: int, wheels: str) -> Path:
 
 
 @cache
+def vendor_log(seed: int, wide: bool) -> bytes:
+    """Return an MCAP file with every message type that is read, its numbers drawn; not compressed."""
+    from unit.logs.test_message_types import START_NS, STEP_NS, TYPES, draw, full, make_store, topic_of, write_mcap
+
+    rng, store = np.random.default_rng(seed), make_store(ros1=False)
+    topics = {}
+    for message_type in TYPES:
+        if wide or rng.random() < 0.2:
+            messages = [draw(store, full(message_type), rng) for _ in range(int(rng.choice([2, 31])))]
+            for i, message in enumerate(messages):
+                if hasattr(message, "header"):
+                    stamp_ns = START_NS + i * STEP_NS
+                    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+            topics[topic_of(message_type)] = (message_type, messages)
+    return write_mcap(scratch() / f"vendor-{seed}", topics, store).read_bytes()
+
+
+@cache
 def scratch() -> Path:
     """Return the folder of this run, in memory where that can be."""
     memory = Path("/dev/shm")  # noqa: S108 - the fastest place for small files
@@ -237,11 +272,20 @@ def make_log(folder: Path, rng: Random) -> tuple[Path, list[str]]:
 
     from tests.property.test_fuzz_logs import WHEELS, drive
 
+    if rng.random() < VENDOR_LOGS:
+        path = folder / "log.mcap"
+        content = bytearray(vendor_log(int(rng.integers(20)), bool(rng.random() < 0.5)))
+        done = [str(rng.choice([doubles, numbers])(content, rng)) for _ in range(int(rng.choice([1, 10, 1000])))]
+        path.write_bytes(content)
+        return path, ["vendor types", *sorted(set(done))]
     count, kind, wheels = int(rng.choice(COUNTS)), int(rng.integers(len(KINDS))), str(rng.choice(WHEELS))
     done = []
     if rng.random() < MUTATED_COLUMNS:
         columns = asdict(drive(count))
-        done = [COLUMN_MUTATIONS[int(rng.integers(3))](columns, rng) for _ in range(int(rng.integers(1, 4)))]
+        done = [
+            COLUMN_MUTATIONS[int(rng.integers(len(COLUMN_MUTATIONS)))](columns, rng)
+            for _ in range(int(rng.integers(1, 4)))
+        ]
         path = write(folder, columns, kind, wheels)
     else:
         path = Path(shutil.copytree(clean_log(count, kind, wheels), folder, dirs_exist_ok=True)) / name_of(kind)
@@ -298,7 +342,7 @@ def use(path: Path, *, whole: bool) -> str:
     return stage
 
 
-Job = tuple[int, bool, float, int, str, bool]
+Job = tuple[int, bool, float, int, str, bool, str]
 Result = tuple[int, str, list[str], str, float, set[str]]
 
 
@@ -307,14 +351,18 @@ def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
 
     `begun` is called when it is made.
     """
-    seed, whole, seconds, megabytes, keep, measure = job
+    seed, whole, seconds, megabytes, keep, measure, runs = job
     folder = Path(tempfile.mkdtemp(dir=scratch()))
     reached: set[str] = set()
     done: list[str] = []
     outcome, text = "", ""
     began = time.process_time()
     try:
-        path, done = make_log(folder, np.random.default_rng(seed))
+        if runs:
+            home, done, command = fuzz_runs.make_run(folder, Path(runs), seed)
+        else:
+            path, done = make_log(folder, np.random.default_rng(seed))
+            seconds += bytes_of(path) / BYTES_A_SECOND
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         began = time.process_time()
         begun()
@@ -325,7 +373,7 @@ def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
         with warnings.catch_warnings():
             # A warning of a library prints lines of code to whoever uses the log.
             warnings.simplefilter("error")
-            outcome = use(path, whole=whole)
+            outcome = fuzz_runs.use_run(folder, home, command) if runs else use(path, whole=whole)
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
         if grown > megabytes:
             outcome, text = "FOUND", f"{grown:.0f} MB"
@@ -340,10 +388,17 @@ def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
     used = time.process_time() - began
     if outcome == "FOUND" and keep:
         place = Path(keep) / str(seed)
-        shutil.copytree(folder, place, dirs_exist_ok=True)
+        place.mkdir(parents=True, exist_ok=True)
+        if not runs:  # a forged run leads to devices without end; its seed makes it again
+            shutil.copytree(folder, place, dirs_exist_ok=True)
         (place / "finding.txt").write_text(f"{done}\n{text}", encoding="utf-8", errors="replace")
     shutil.rmtree(folder, ignore_errors=True)
     return seed, outcome, done, text, used, reached
+
+
+def bytes_of(path: Path) -> int:
+    """Return the size of a log."""
+    return sum(file.stat().st_size for file in (path.iterdir() if path.is_dir() else [path]))
 
 
 def too_long(*_: object) -> None:
@@ -380,6 +435,12 @@ def serve(connection: Connection, megabytes: int) -> None:
 
 RENEWED = 500
 """Logs a worker uses: what leaks is seen, and is not taken for the fault of one log."""
+
+BYTES_A_SECOND = 1e7
+"""Of a log, beyond the seconds of any log."""
+
+RUN_SECONDS = 20.0
+"""CPU time of a command on a forged run, with its start-up; --baseline and batch fit or read several."""
 
 WALL_FACTOR = 200
 """A worker that gets no share of the processor is no finding; one that waits is ended after this many limits."""
@@ -473,21 +534,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--logs", type=int, default=2000, help="logs that are made and read")
     parser.add_argument("--fitted", type=int, default=10, help="one of so many is also fitted and reported")
+    parser.add_argument("--runs", type=int, default=0, help="forged runs that are made and used, in place of logs")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=5.0, help="CPU time a log may take")
+    parser.add_argument("--seconds", type=float, default=2.0, help="CPU time a log may take, and 1 s for each 10 MB")
     parser.add_argument("--megabytes", type=int, default=1000, help="memory a log may take")
     parser.add_argument("--coverage", type=int, default=50, help="functions reached are recorded for one of so many")
     parser.add_argument("--minutes", type=float, default=0.0, help="stop after this time; default: never")
     parser.add_argument("--keep", default="", help="directory for the logs of findings")
     given = parser.parse_args()
-    seeds = range(given.first, given.first + given.logs)
+    seeds = range(given.first, given.first + (given.runs or given.logs))
+    source = str(fuzz_runs.made(scratch())) if given.runs else ""
+    seconds = RUN_SECONDS if given.runs else given.seconds
     jobs: Iterator[Job] = (
-        (seed, seed % given.fitted == 0, given.seconds, given.megabytes, given.keep, seed % given.coverage == 0)
+        (seed, seed % given.fitted == 0, seconds, given.megabytes, given.keep, seed % given.coverage == 0, source)
         for seed in seeds
     )
     # The kernels are loaded once, outside the limits.
-    work((0, True, 600.0, 4000, "", False))
+    work((0, True, 600.0, 4000, "", False, source))
     counts: Counter[str] = Counter()
     kinds: Counter[str] = Counter()
     reached: set[str] = set()
@@ -504,7 +568,8 @@ def main() -> int:
             if given.keep and not (Path(given.keep) / str(seed)).exists():
                 place = Path(given.keep) / str(seed)
                 place.mkdir(parents=True)
-                make_log(place, np.random.default_rng(seed))
+                if not given.runs:
+                    make_log(place, np.random.default_rng(seed))
         if given.minutes and time.monotonic() - begun > 60 * given.minutes:
             print(f"stopped after {given.minutes:g} minutes; go on with --first {max(seed, given.first) + 1}")
             break

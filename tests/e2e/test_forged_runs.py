@@ -163,7 +163,6 @@ def test_no_forged_run_changes_shows_or_hangs(
         random = Random(seed)
         place = Path(shutil.copytree(made, run_place / f"run-{seed}", symlinks=True))
         done = forge(place, home, random)
-        assert home.is_untouched()
         command = random.choice(COMMANDS)
         try:
             use(icrtool, place, home, command)
