@@ -29,9 +29,12 @@ from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_
 from icrtool.records.run import RUN_SCHEMA, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.tables import States
-from icrtool.records.text import LogText, escaped
+from icrtool.records.text import LONGEST_NAME, LogText, escaped, shortened
 
 FIT_AGAIN = "fit the log again"
+
+LONGEST_STORED = 1000
+"""Characters of a text of run.json that are used: a warning of ours has a few hundred."""
 
 NAMES = ("topic", "message_type")
 """Keys of run.json whose texts stand there as in the log."""
@@ -179,7 +182,9 @@ def _read_document(directory: Path) -> dict[str, Any]:
     if not (isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)):
         raise RunError(directory, "not a run directory", f"its {RUN_FILE} is not icrtool's")
     if schema != RUN_SCHEMA:
-        raise RunError(directory, f"its schema is {schema}, this icrtool reads {RUN_SCHEMA}", FIT_AGAIN)
+        raise RunError(
+            directory, f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}", FIT_AGAIN
+        )
     # What a log wrote there is printed from here on.
     return {escaped(key): value if key == "inputs" else _escaped(value) for key, value in document.items()}
 
@@ -193,7 +198,7 @@ def _escaped(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
         }
     if isinstance(value, list):
         return [_escaped(item) for item in value]
-    return escaped(value) if isinstance(value, str) else value
+    return shortened(escaped(value), LONGEST_STORED) if isinstance(value, str) else value
 
 
 def _read_states(directory: Path, names: Mapping[str, StatesFormat], sums: Mapping[str, str]) -> States | None:

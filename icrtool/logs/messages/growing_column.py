@@ -45,7 +45,7 @@ class GrowingColumn:
         if part.ndim == 2 and part.shape[1] < rows.shape[1]:
             rows[:, part.shape[1] :] = np.nan if rows.dtype.kind == "f" else self._lacking
             rows = rows[:, : part.shape[1]]
-        rows[...] = part
+        _copy(part, rows)
 
     def taken(self) -> NDArray[Any]:
         """Return the rows (n,) or (n, k); they cannot be written to where all are the same."""
@@ -58,4 +58,15 @@ def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
     bits = rows.view(np.int64)
     if len(rows) == 0 or (rows.strides[0] and ((bits[-1] != bits[0]).any() or (bits != bits[0]).any())):
         return None
-    return rows[:1].copy()
+    row = np.empty_like(rows[:1])
+    _copy(rows[:1], row)
+    return row
+
+
+def _copy(source: NDArray[Any], target: NDArray[Any]) -> None:
+    """Copy numbers; a signalling NaN, with which any arithmetic would warn, becomes a NaN."""
+    if target.dtype.kind != "f":
+        target[...] = source
+        return
+    with np.errstate(invalid="ignore"):
+        np.multiply(source, 1.0, out=target)

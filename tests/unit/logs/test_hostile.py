@@ -596,3 +596,17 @@ def test_stamps_that_are_no_whole_numbers_are_none(kind: str) -> None:
     table = collected("sensor_msgs/JointState", definition, JOINT_FIELDS, [(START_NS, message)] * 3)
     assert stamp_rows(table).header_ns is None
     assert table.column("position[*]").tolist() == [[1.0, 2.0]] * 3
+
+
+def test_a_signalling_nan_warns_nobody() -> None:
+    """Arithmetic with one warns of an invalid value, with a line of code, on the terminal of whoever uses the log."""
+    rows = [[0.1 * i, 0.2 * i] for i in range(50)]
+    messages = [(START_NS + i, joints(START_NS + i, WHEELS, row)) for i, row in enumerate(rows)]
+    stamp, data = messages[7]
+    at = data.index(struct.pack("<d", rows[7][1]))
+    messages[7] = stamp, data[:at] + b"\1\0\0\0\0\0\xf0\x7f" + data[at + 8 :]
+    positions = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, messages).column("position[*]")
+    assert np.isnan(positions[7, 1])
+    with np.errstate(invalid="raise"):
+        assert np.isnan(positions * 2.0)[7, 1]
+        assert np.count_nonzero(np.isnan(np.abs(positions - 1.0))) == 1

@@ -85,6 +85,19 @@ def test_a_recommendation_of_other_types_is_refused(run_place: Path, tmp_path: P
         icrtool.open_run(place)
 
 
+def test_a_long_text_of_a_run_is_shortened(run_place: Path, tmp_path: Path) -> None:
+    place = Path(shutil.copytree(run_place, tmp_path / "run"))
+    document = json.loads((place / "run.json").read_text())
+    write_run(place, document | {"warnings": ["w" * 3000], "unusable_because": "u" * 3000, "usable": False})
+    run = icrtool.open_run(place)
+    assert max(map(len, run.warnings)) <= LONGEST_LINE
+    assert max(map(len, format_run(run).splitlines())) <= LONGEST_LINE + 100
+    write_run(place, document | {"schema": "icrtool/run/" + "9" * 3000})
+    with pytest.raises(IcrToolError) as caught:
+        icrtool.open_run(place)
+    assert len(str(caught.value)) < LONGEST_LINE
+
+
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.stress), 11])
 def test_an_edited_run_is_refused_in_one_line_or_can_be_used(run_place: Path, tmp_path: Path, every: int) -> None:
     document = json.loads((run_place / "run.json").read_text())
