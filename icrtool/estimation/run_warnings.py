@@ -77,7 +77,7 @@ def unusable_reasons(
         reasons.append("the wheels explain almost none of the motion")
     elif noise.heading_degps > USELESS_HEADING_DEGPS:
         reasons.append("the wheels explain almost none of the turns: do they slip, as on ice?")
-    if contradiction and not hidden:
+    elif contradiction and not hidden:
         reasons.append(contradiction)
     if wheel_scale is not None and wheel_scale.value is not None and wheel_scale.std is not None:
         left = wheel_scale.value / wheel_scale.applied
@@ -116,7 +116,7 @@ def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str
             apart.append(
                 f"y {word} is {final:+.2f} m by the filter and {found.value:+.2f} ± {found.std:.2f} m by windows"
             )
-    return f"wheels and reference contradict each other ({'; '.join(apart)}): check their clocks" if apart else ""
+    return f"wheels and reference contradict each other ({'; '.join(apart)}): clocks or slip" if apart else ""
 
 
 def rejected_share(outcome: MeasurementOutcome) -> float:
