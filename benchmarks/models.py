@@ -1,125 +1,219 @@
-"""Compare every motion model on recordings that it was not fitted to: ``benchmarks/models.py FOLDER --robot NAME``.
+"""Compare motion models and their priors, each held out: ``benchmarks/models.py FOLDER... --robot NAME``.
 
-Each recording or run below FOLDER belongs to the ground that its folder is named after; with --ground PATTERN=NAME, to
-NAME where its path holds PATTERN. For each ground every recording is left out in turn; in a single one
-each trial is predicted by a fit to the rest of it.
-The table is Markdown.
+Every recording or run below a FOLDER is tested alone: each trial is predicted by a fit to the rest of its drive. Those
+whose path holds the text after --pool are tested together too, each left out whole. --drives adds simulated drives of
+`benchmarks/unseen_drives.py`, made where they are lacking. The tables are Markdown: expected error [m], geometric mean
+over what was tested, and the largest ratio to the best row of one log.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
+from unseen import robot_config
+from unseen_drives import is_on_ice, load_drives
+from unseen_logs import draw_case, make_log
 
-from icrtool.calibration.forecast import forecast_trials
-from icrtool.calibration.held_out import HORIZONS_M, HeldOut, hold_out
-from icrtool.calibration.pooled import calibrate_recordings, predictor
-from icrtool.calibration.run_recording import turning_recording_of
+from icrtool.calibration.fit import fit
+from icrtool.calibration.held_out import HORIZONS_M, errors_without, plan_folds
+from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config, load_config
 from icrtool.errors import IcrToolError
-from icrtool.estimation.fit import fit
 from icrtool.fleet.recordings import find_recordings
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.read_log import read_log
-from icrtool.motion.fit import Pool
-from icrtool.motion.models import MODELS
-from icrtool.motion.recording import Recording, cut_windows
+from icrtool.motion.fit import Fold, Pool, PooledFit, Prediction
+from icrtool.motion.models import (
+    CONTROLLER,
+    FAMILY,
+    FIVE,
+    NO_SLIP,
+    RECOMMENDED,
+    TERMS,
+    Term,
+    controller_model,
+)  # fmt: skip
+from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_windows, totals_of
 from icrtool.motion.trials import cut_trials
 from icrtool.output.run_directory import RUN_FILE, is_run_directory
 from icrtool.output.stored_run import open_run
 
+SLIP_TERMS = ("vy_vw", "omega_sw", "omega_vw")
+WIDE, WIDTHS = 10.0, np.geomspace(0.003, 1.0, 60)
 
-def main() -> None:
-    """Print a table for each ground."""
-    ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    ask.add_argument("folder", type=Path)
-    ask.add_argument("--robot")
-    ask.add_argument("--config", type=Path)
-    ask.add_argument("--ground", action="append", default=[], metavar="PATTERN=NAME")
-    given = ask.parse_args()
-    grounds = dict(text.split("=", 1) for text in given.ground)
-    found: dict[str, list[Recording]] = {}
-    for path, recording in recordings_below(given.folder, load_config(given.config, given.robot)):
-        names = [name for pattern, name in grounds.items() if pattern in str(path)]
-        found.setdefault(names[0] if names else path.parent.name, []).append(recording)
-    for ground, recordings in found.items():
-        print("\n".join(format_ground(ground, recordings)), flush=True)
+
+class Row(NamedTuple):
+    """A model of the family, and the priors that are not those of `TERMS`."""
+
+    label: str
+    model: str
+    stds: Mapping[str, float] = {}
+    learned: bool = False
+
+
+def scaled(names: Sequence[str], factor: float) -> dict[str, float]:
+    """Return the priors of some terms, times a factor."""
+    return {name: factor * TERMS[name].std for name in names}
+
+
+NARROW = scaled(SLIP_TERMS, 1.0)
+ROWS = (
+    Row("no slip", NO_SLIP),
+    Row("one multiplier", "multiplier"),
+    Row("three ICRs", "icr"),
+    Row("`controller`", CONTROLLER),
+    Row("five", FIVE),
+    Row("six", "six"),
+    Row("eight, turn gains 0.3 and 0.2", RECOMMENDED, NARROW | {"omega_sw": 0.3, "omega_vw": 0.2}),
+    Row("narrow priors", RECOMMENDED, NARROW),
+    *(
+        Row(f"narrow, {name} {words}", RECOMMENDED, NARROW | scaled([name], factor))
+        for name in SLIP_TERMS
+        for words, factor in (("a third", 1 / 3), ("three times", 3))
+    ),
+    Row("narrow, a third of all priors", RECOMMENDED, scaled(list(TERMS), 1 / 3)),
+    Row("narrow, three times all priors", RECOMMENDED, scaled(list(TERMS), 3)),
+    Row("slip terms 0.05", RECOMMENDED, dict.fromkeys(SLIP_TERMS, 0.05)),
+    Row("slip terms learned from the other logs", RECOMMENDED, learned=True),
+    Row("**`recommended`**: wide where shown", RECOMMENDED),
+)
+
+
+def priors(stds: Mapping[str, float]) -> AbstractContextManager[object]:
+    """Return a context in which some terms have other priors, and no wider ones."""
+    changed: dict[str, Term] = {name: replace(TERMS[name], std=std, wide=0.0) for name, std in stds.items()}
+    return patch.dict(TERMS, changed)
+
+
+@dataclass(frozen=True)
+class Tested:
+    """Recordings that are fitted together, what each trial is predicted without, and the windows."""
+
+    name: str
+    recordings: Sequence[Recording]
+
+    def expected(self, row: Row, stds: Mapping[str, float]) -> Floats:
+        """Return the expected error (h,) of a row [m]."""
+        pooled = totals_of(*self.recordings)
+        windows = [cut_windows(one, pooled=pooled) for one in self.recordings]
+        pool, folds = Pool(windows, [one.width_m for one in self.recordings]), plan_folds(self.recordings)
+        with priors(stds):
+            found = pool.fit(FAMILY[FIVE if row.model == CONTROLLER else row.model])
+            errors = [
+                errors_without(one, cut_trials(one, HORIZONS_M, pooled), folds, i,
+                               lambda fold, one=one: predict(row.model, found, fold, one), windows[i].steps).position
+                for i, one in enumerate(self.recordings)
+            ]  # fmt: skip
+        return np.asarray(np.nanmean(np.concatenate(errors), axis=0))
+
+    def wide(self) -> tuple[Floats, Floats]:
+        """Return the slip terms (3,) as the data alone show them, and their standard deviations."""
+        pool = Pool([cut_windows(one) for one in self.recordings], [one.width_m for one in self.recordings])
+        with priors(scaled(SLIP_TERMS, WIDE)):
+            found = pool.fit(FAMILY[RECOMMENDED])
+        at = [found.model.terms.index(name) for name in SLIP_TERMS]
+        return found.parameters[at], found.std[at]
+
+
+def predict(name: str, found: PooledFit, fold: Fold, recording: Recording) -> Prediction | None:
+    """Return what a row predicts without a fold."""
+    if name == NO_SLIP:
+        return found.fitted, NO_CONSTANTS
+    without = found.without(fold)
+    if name != CONTROLLER or without is None:
+        return without
+    return controller_model(without[0], recording.lever, recording.width_m), without[1]
+
+
+def learn_priors(shown: Sequence[tuple[Floats, Floats]]) -> dict[str, float]:
+    """Return the priors of the slip terms that make the values of other logs likeliest (empirical Bayes).
+
+    Notes
+    -----
+    A value of standard deviation s that is drawn about zero with tau has variance tau^2 + s^2 (Morris 1983).
+    """
+    value, std = (np.array(one) for one in zip(*shown, strict=True))
+    variance = WIDTHS[:, None, None] ** 2 + std**2
+    likelihood = -(np.log(variance) + value**2 / variance).sum(axis=1)
+    return dict(zip(SLIP_TERMS, WIDTHS[likelihood.argmax(axis=0)].tolist(), strict=True))
+
+
+def format_table(title: str, tested: Sequence[Tested], *, others: Sequence[Tested]) -> Iterator[str]:
+    """Yield the lines of one table; priors are learned from `others` but those of the recordings tested."""
+    shown = {one.name: one.wide() for one in others}
+    errors = np.empty((len(ROWS), len(tested), len(HORIZONS_M)))
+    for r, row in enumerate(ROWS):
+        for i, one in enumerate(tested):
+            mine = {recording.name for recording in one.recordings}
+            apart = [value for name, value in shown.items() if name not in mine]
+            errors[r, i] = one.expected(row, learn_priors(apart) if row.learned else row.stds)
+    yield f"\n**{title}**\n\n| model | 5 m | 10 m | 20 m | worst ratio at 10 m |\n|---|---|---|---|---|"
+    mean, ratio = np.exp(np.nanmean(np.log(errors), axis=1)), errors[:, :, 1] / np.nanmin(errors[:, :, 1], axis=0)
+    for row, of_row, ratios in zip(ROWS, mean, ratio, strict=True):
+        worst = int(np.nanargmax(ratios))
+        cells = " | ".join(f"{value:.3f}" for value in of_row)
+        yield f"| {row.label} | {cells} | {ratios[worst]:.2f} ({tested[worst].name}) |"
 
 
 def recordings_below(folder: Path, config: Config) -> Iterator[tuple[Path, Recording]]:
     """Yield runs below a folder, or else recordings, fitted; one that cannot be used is named."""
-    # links to folders are not searched: they are named, two levels down
-    links = (one for pattern in ("*", "*/*") for one in folder.glob(pattern) if one.is_symlink() and one.is_dir())
-    places = [folder, *links]
-    runs = sorted({one.parent for place in places for one in place.rglob(RUN_FILE) if is_run_directory(one.parent)})
-    for path in runs or sorted(one.path for one in find_recordings(places)):
+    runs = sorted({one.parent for one in folder.rglob(RUN_FILE) if is_run_directory(one.parent)})
+    for path in runs or sorted(one.path for one in find_recordings([folder])):
         try:
             run = open_run(path) if runs else fit(read_log(path, config), config)
-            yield path, turning_recording_of(run)
+            recording = recording_of(run)
+            plan_folds([recording])
+            yield path, recording
         except IcrToolError as err:
             print(f"<!-- left out: {err} -->")
 
 
-def format_ground(ground: str, recordings: list[Recording]) -> Iterator[str]:
-    """Yield the lines of one ground's table."""
-    wheels, gyro = hold_out(recordings)
-    metres = sum(float(one.drive.distance[-1]) for one in recordings)
-    how = "each left out in turn" if wheels.folds[0].whole else f"{len(wheels.folds)} blocks, each trial left out"
-    yield f"\n**{ground}**: {len(recordings)} recorded, {metres:.0f} m; {how}\n"
-    horizons = [f"{horizon:g} m" for horizon in wheels.horizons_m]
-    yield "| model | " + " | ".join([*horizons, *(f"{one}, with gyro" for one in horizons)]) + " |"
-    yield "|---|" + "---|" * (2 * len(horizons))
-    for name in (*MODELS, "recommended"):
-        with_gyro = name if name == "recommended" else f"{name}_gyro"
-        row = [*cells(wheels, name), *cells(gyro, with_gyro)]
-        yield f"| `{name}` | " + " | ".join(row) + " |"
-    yield f"\nRecommended for all of it: `{wheels.recommended}`."
-    if wheels.folds[0].whole:
-        yield "\nShare of trials within the 95 % forecast of the calibration by the other logs:"
-        for words, share in forecast_shares(recordings).items():
-            yield f"{words} " + ", ".join(f"{one:.2f} after {h:g} m" for h, one in zip(HORIZONS_M, share, strict=True))
-        yield "\nShare of parameters of one log within the combined 2 sigma of those by the other logs:"
-        yield "wheels: {:.2f}, with gyro: {:.2f}".format(*parameter_shares(recordings))
+def drives_of(folder: Path, count: int) -> Iterator[Recording]:
+    """Yield simulated drives as sensors with troubles measure them; one that cannot be used is named."""
+    for number, drive in enumerate(load_drives(folder, count)):
+        try:
+            log = make_log(drive, draw_case(number, "ice" if is_on_ice(number) else "ground"))
+            run = fit(log, robot_config(drive))
+            if not run.usable:
+                print(f"<!-- left out: {run.name}: {run.summary['unusable_because']} -->")
+                continue
+            recording = recording_of(run)
+            plan_folds([recording])
+            yield recording
+        except IcrToolError as err:
+            print(f"<!-- left out: {err} -->")
 
 
-def forecast_shares(recordings: list[Recording]) -> dict[str, Floats]:
-    """Return the share of the trials of all left-out logs within their 95 % forecast, by wheels, and with the gyro."""
-    inside: dict[str, list[Floats]] = {}
-    for i, one in enumerate(recordings):
-        calibration = calibrate_recordings(recordings[:i] + recordings[i + 1 :]).calibration
-        trials = cut_trials(one, HORIZONS_M)
-        for with_gyro in (False, True)[: 1 + (calibration.gyro is not None and one.gyro_radps is not None)]:
-            errors = predictor(calibration, one, with_gyro=with_gyro)(trials)
-            _, p95 = forecast_trials(calibration, one, trials, with_gyro=with_gyro)
-            share = np.nanmean(np.where(np.isfinite(errors), errors <= p95, np.nan), axis=0)
-            inside.setdefault("with gyro:" if with_gyro else "wheels:", []).append(share)
-    return {words: np.mean(shares, axis=0) for words, shares in inside.items()}
-
-
-def parameter_shares(recordings: list[Recording]) -> list[float]:
-    """Return how many parameters of one log are within 2 sigma of those by the others: by wheels, and with the gyro."""
-    pool = Pool([cut_windows(one) for one in recordings], [one.width_m for one in recordings])
-    off: tuple[list[Floats], list[Floats]] = [], []
-    for i, recording in enumerate(recordings):
-        pools = Pool([pool.windows[i]], [recording.width_m]), pool.without(i)
-        for model in (model for model in MODELS.values() if model.terms):
-            wheels = [one.fit(model) for one in pools]
-            gyro = [one.fit(model.with_gyro(), of_wheels) for one, of_wheels in zip(pools, wheels, strict=True)]
-            for found, (alone, others) in zip(off, (wheels, gyro), strict=True):
-                robot = [term != "wheels_weight" for term in alone.model.terms]
-                found.append(((alone.parameters - others.parameters) / np.hypot(alone.std, others.std))[robot])
-    return [float(np.mean(np.abs(np.concatenate(found)) < 2.0)) for found in off]
-
-
-def cells(table: HeldOut | None, name: str) -> list[str]:
-    """Return p95 / expected error [m] at each horizon, median over what was left out."""
-    row = None if table is None else next((one for one in table.scores if one.name == name), None)
-    if row is None:
-        return ["", "", ""]
-    return [f"{row.median('p95', h):.2f} / {row.median('expected', h):.2f}" for h in range(len(row.folds[0].p95))]
+def main() -> None:
+    """Print a table for each folder, for the pool, and for the simulated drives."""
+    ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    ask.add_argument("folders", type=Path, nargs="*", metavar="FOLDER")
+    ask.add_argument("--robot")
+    ask.add_argument("--config", type=Path)
+    ask.add_argument("--pool", default="", metavar="TEXT")
+    ask.add_argument("--drives", type=Path)
+    ask.add_argument("--drive-count", type=int, default=20)
+    given = ask.parse_args()
+    config = load_config(given.config, given.robot)
+    sets = {one.name: [*recordings_below(one, config)] for one in given.folders}
+    alone = {name: [Tested(one.name, [one]) for _, one in found] for name, found in sets.items()}
+    if given.drives:
+        alone["simulated drives"] = [Tested(one.name, [one]) for one in drives_of(given.drives, given.drive_count)]
+    everything = [one for found in alone.values() for one in found]
+    for title, tested in alone.items():
+        print("\n".join(format_table(f"{title}: {len(tested)} alone", tested, others=everything)), flush=True)
+    together = [one for found in sets.values() for path, one in found if given.pool and given.pool in str(path)]
+    if len(together) > 1:
+        pool = [Tested("pool", together)]
+        title = f"{given.pool}: {len(together)} together, each left out whole"
+        print("\n".join(format_table(title, pool, others=everything)), flush=True)
 
 
 if __name__ == "__main__":

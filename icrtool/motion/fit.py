@@ -83,12 +83,14 @@ class PooledFit(FittedModel):
     ----------
     wheels : as in `FittedModel`, fitted to the same windows
     pool : the windows
+    wide : fit of the model with wide priors, which showed those of this one; None where no term has a wide prior
     solution : of all parameters, those of the model first, then the constants of each recording. Those of several
         recordings follow the model's; those of a single one are parameters like them.
     """
 
     wheels: PooledFit | None = None
     pool: Pool
+    wide: PooledFit | None = None
     solution: RobustFit
     _refits: dict[int, PooledFit] = field(default_factory=dict, repr=False, compare=False)
     _left_out: dict[Fold, Prediction | None] = field(default_factory=dict, repr=False, compare=False)
@@ -139,25 +141,31 @@ class PooledFit(FittedModel):
             fitted = FittedModel(self.model, self.parameters + steps, covariance, wheels)
             own = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
             return fitted, LogConstants(*own.tolist())
-        x, covariance = self._reweighted(clear)
-        return FittedModel(self.model, x[:k], covariance, wheels), LogConstants(*self._own(x, i).tolist())
+        shown = None if self.wide is None else self.wide.without(fold)
+        model = self.model if shown is None else replace(self.model, stds=()).as_shown(shown[0])
+        x, covariance = self._reweighted(clear, model)
+        return FittedModel(model, x[:k], covariance, wheels), LogConstants(*self._own(x, i).tolist())
 
     def refit_without(self, recording: int) -> PooledFit:
         """Return a fit of the model to the other recordings."""
         if recording not in self._refits:
             wheels = None if self.wheels is None else self.wheels.refit_without(recording)
-            self._refits[recording] = self.pool.without(recording).fit(self.model, wheels)
+            self._refits[recording] = self.pool.without(recording).fit(replace(self.model, stds=()), wheels)
         return self._refits[recording]
 
-    def _reweighted(self, clear: Bools) -> tuple[Floats, Floats]:
+    def _reweighted(self, clear: Bools, model: MotionModel) -> tuple[Floats, Floats]:
         """Return all parameters of a single recording as fitted to some residuals (m,), and the model's covariance.
+
+        Parameters
+        ----------
+        model : with its priors
 
         Notes
         -----
         A Newton step, then two of a new fit's reweighted steps, with residuals that follow the parameters to first
         order: over some metres they do so nearly exactly.
         """
-        at, (mean, std) = self.solution, self.pool.prior(self.model)
+        at, (mean, std) = self.solution, self.pool.prior(model)
         residuals, jacobian, pull = at.residuals[clear], at.jacobian[clear], std**-2.0
         x, information = at.x + self._steps(*self._derivatives(~clear)), at.information
         for _ in range(REWEIGHTS):
@@ -338,7 +346,15 @@ class Pool:
         Parameters
         ----------
         wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
+
+        Notes
+        -----
+        The priors of some terms are as wide as these windows show them (`MotionModel.as_shown`).
         """
+        widened, wide = model.widened(), None
+        if widened is not None:
+            wide = self.fit(widened, wheels)
+            model = model.as_shown(wide)
         residuals_of = [
             WindowResiduals(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)
         ]
@@ -357,4 +373,4 @@ class Pool:
         )  # fmt: skip
         levels = [self.group, *([self.recording] if count > 1 else [])]
         covariance = student_covariance(found, levels)[:k, :k]
-        return PooledFit(model, found.x[:k], covariance, wheels=wheels, pool=self, solution=found)
+        return PooledFit(model, found.x[:k], covariance, wheels=wheels, pool=self, wide=wide, solution=found)

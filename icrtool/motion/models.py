@@ -12,7 +12,7 @@ without free terms.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +60,7 @@ class Term:
     axis : which of v_x, v_y, omega it adds to
     column : its value per unit parameter, (n,); formula : the same in the symbols of `WheelMotion`, for other programs
     mean, std : prior of the parameter: how real robots differ
+    wide : standard deviation of that prior where the data look for a term that few drives show; 0: as `std`
     meaning : for a reader, with source
     nominal : the parameter without slip
     """
@@ -72,6 +73,7 @@ class Term:
     meaning: str
     mean: float = 0.0
     nominal: float = 0.0
+    wide: float = 0.0
 
 
 TERMS: dict[str, Term] = {
@@ -82,9 +84,12 @@ TERMS: dict[str, Term] = {
         Term("omega_w", OMEGA, lambda m: m.w, "w", 0.4, "b / W, 1 / multiplier (Mandow 2007)", mean=0.6, nominal=1.0),
         Term("omega_v", OMEGA, lambda m: m.v / m.b, "v / b", 0.02, "left/right asymmetry: turns while driving ahead"),
         Term("vy_w", VY, lambda m: m.w * m.b / 2, "w * b / 2", 0.3, "-2 x_icr / W (Martinez 2005)"),
-        Term("vy_vw", VY, lambda m: m.v * m.w, "v * w", 0.1, "side slip by centripetal acceleration (Seegmiller 2014)"),
-        Term("omega_sw", OMEGA, lambda m: m.spin * m.w, "spin * w", 0.03, "change of the turn gain with curvature"),
-        Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, "abs(v) * w", 0.02, "change of the turn gain with speed"),
+        Term("vy_vw", VY, lambda m: m.v * m.w, "v * w", 0.1, "side slip by centripetal acceleration (Seegmiller 2014)",
+             wide=1.0),
+        Term("omega_sw", OMEGA, lambda m: m.spin * m.w, "spin * w", 0.03, "change of the turn gain with curvature",
+             wide=0.3),
+        Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, "abs(v) * w", 0.02, "change of the turn gain with speed",
+             wide=0.2),
         Term("vy_v", VY, lambda m: m.v, "v", 0.02, "sideways while driving ahead (Anousaki 2004)"),
         Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, "abs(w) * b / 2", 0.1, "drag in turns (Seegmiller 2014)"),
         Term("gyro_scale", OMEGA, lambda m: m.gyro, "gyro", 0.02, "scale error of the gyro"),
@@ -105,12 +110,14 @@ class MotionModel:
     ----------
     label : for tables
     source : who proposed it
+    stds : priors of a fit, where they are not those of the terms
     """
 
     name: str
     label: str
     terms: tuple[str, ...]
     source: str
+    stds: tuple[float, ...] = ()
 
     @property
     def prior_mean(self) -> Floats:
@@ -120,7 +127,27 @@ class MotionModel:
     @property
     def prior_std(self) -> Floats:
         """Prior standard deviation of each term (k,)."""
-        return np.array([TERMS[name].std for name in self.terms])
+        return np.array(self.stds or [TERMS[name].std for name in self.terms])
+
+    def widened(self) -> MotionModel | None:
+        """Return the model with the wide prior of each term that has one; None where none has."""
+        if self.stds or not any(TERMS[name].wide for name in self.terms):
+            return None
+        return replace(self, stds=tuple(TERMS[name].wide or TERMS[name].std for name in self.terms))
+
+    def as_shown(self, widened: FittedModel) -> MotionModel:
+        """Return the model with the priors that a fit of `widened` gives.
+
+        Notes
+        -----
+        Few drives show how slip changes with curvature and speed: the priors are narrow. A drive that shows a term by
+        more than `SHOWN_SIGMAS` has a variance of its prior that exceeds the narrow one by what it shows beyond that
+        (empirical Bayes, positive part: Efron and Morris 1973).
+        """
+        beyond = widened.parameters**2 - (SHOWN_SIGMAS * widened.std) ** 2
+        wide = np.array([TERMS[name].wide > 0.0 for name in self.terms])
+        stds = np.sqrt(self.prior_std**2 + np.where(wide, np.maximum(beyond, 0.0), 0.0))
+        return replace(self, stds=tuple(stds.tolist()))
 
     @property
     def uses_gyro(self) -> bool:
@@ -281,8 +308,9 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
     return np.array([value[term] for term in terms]), np.array([by[term] for term in terms])
 
 
-NOT_SHOWN = 0.7
-"""A drive that leaves this share of a prior's standard deviation shows nothing of the parameter."""
+NOT_SHOWN, SHOWN_SIGMAS = 0.7, 3.0
+"""A drive that leaves this share of a prior's standard deviation shows nothing of the parameter, unless it lies two
+standard deviations from the prior's mean; so many of them widen the prior."""
 
 STEP = 1e-6
 
@@ -311,8 +339,9 @@ class FittedModel:
     @property
     def not_shown(self) -> tuple[str, ...]:
         """Names of the terms that the data did not show: they rest on the prior."""
-        share = self.std / self.model.prior_std
-        return tuple(name for name, left in zip(self.model.terms, share, strict=True) if left > NOT_SHOWN)
+        left = self.std / self.model.prior_std > NOT_SHOWN
+        near = np.abs(self.parameters - self.model.prior_mean) < 2.0 * self.std
+        return tuple(name for name, unseen in zip(self.model.terms, left & near, strict=True) if unseen)
 
     def complete(self, motion: WheelMotion) -> WheelMotion:
         """Return a motion with the turn rate of the wheels-only model, where the model has one."""

@@ -33,6 +33,21 @@ def fit_to(model: MotionModel, *recordings: Recording) -> PooledFit:
     return Pool([cut_windows(one) for one in recordings], [WIDTH_M] * len(recordings)).fit(model)
 
 
+@pytest.mark.parametrize(("gain", "widened"), [(0.0, False), (-0.25, True)])
+def test_a_prior_is_wide_where_the_drive_shows_more_than_it(gain: float, widened: bool) -> None:
+    """A narrow prior of 0.03 alone would pull a change of the turn gain of -0.25 to half of it."""
+    whole = FAMILY["recommended"]
+    place = whole.terms.index("omega_sw")
+    truth = whole.prior_mean
+    truth[place] = gain
+    found = fit_to(whole, make_recording(whole, truth, seconds=300.0))
+    assert (found.model.prior_std[place] > 3.0 * TERMS["omega_sw"].std) == widened
+    assert abs(found.parameters[place] - gain) < max(3.0 * found.std[place], 0.03)
+    assert not (widened and "omega_sw" in found.not_shown)
+    narrow = fit_to(replace(whole, stds=tuple(whole.prior_std)), make_recording(whole, truth, seconds=300.0))
+    assert (abs(narrow.parameters[place] - gain) > 2.0 * abs(found.parameters[place] - gain)) == widened
+
+
 @pytest.mark.parametrize("name", ["eight", "six_gyro"])
 def test_derivatives_are_those_of_differences(name: str) -> None:
     model = find_model(name)
