@@ -56,7 +56,17 @@ def test_a_dropout_report_writes_the_page_unless_it_is_not_wanted(icrtool: Comma
     assert icrtool("report", run_directory, "-o", "again.html", "-q") == (0, "", "")
     again = Path("again.html").read_bytes()
     assert "within 0.123 m" in spaced(again.decode())
-    assert again.count(b"data:image/png") == written.count(b"data:image/png") + 4
+    assert again.count(b"data:image/png") == written.count(b"data:image/png") + 3
+
+
+def test_figures_all_adds_those_of_the_paper(icrtool: Command, run_directory: Path) -> None:
+    drawn = {}
+    for figures in ("default", "all"):
+        command = ("dropout-report", run_directory, "--plots", "svg", "--figures", figures, "--no-page", "-q")
+        assert icrtool(*command) == (0, "", "")
+        drawn[figures] = {file.stem for file in (run_directory / "dropout" / "plots").iterdir()}
+    assert {"summary", "histogram", "worst"} <= drawn["default"]
+    assert drawn["all"] - drawn["default"] == {"histogram_05m", "histogram_10m", "histogram_20m", "examples_15m"}
 
 
 def test_a_report_that_was_edited_is_refused_in_one_line(icrtool: Command, run_directory: Path) -> None:
