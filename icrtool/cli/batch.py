@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import sys
 import time
@@ -20,7 +21,9 @@ from icrtool.cli.stages import signal_word
 from icrtool.records.text import LogText, counted, escaped, shortened
 
 if TYPE_CHECKING:
-    from icrtool.fleet.batch import BatchOptions
+    from distributed import Client
+
+    from icrtool.fleet.batch import BatchOptions, Lost
     from icrtool.fleet.fit_and_report import ReportOptions
     from icrtool.fleet.one_log import Request
     from icrtool.fleet.roll_up import PooledCalibration
@@ -37,6 +40,8 @@ LONGEST_STAGE, LEAST_NAME = 28, 12
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(min=1),
               help="Logs at the same time; default: one per core, fewer where memory is short.")  # fmt: skip
 @click.option("--scheduler", metavar="ADDRESS", help="Process on a Dask cluster, for example tcp://host:8786.")
+@click.option("--worker-timeout", "worker_timeout_s", metavar="SECONDS", type=options.POSITIVE, default=60.0,
+              show_default=True, help="Give up a cluster that has no scheduler or no worker for so long.")  # fmt: skip
 @click.option("--timeout", "timeout_s", metavar="SECONDS", type=options.POSITIVE, default=1800.0, show_default=True,
               help="Stop a log that takes longer.")  # fmt: skip
 @click.option("--redo", is_flag=True, help="Also process logs that are done.")
@@ -46,9 +51,9 @@ LONGEST_STAGE, LEAST_NAME = 28, 12
 @options.configuration
 @options.verbosity
 def command(
-    places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None, timeout_s: float,
-    redo: bool, overwrite: bool, asked: ReportOptions, baseline: Path | None, junit: Path | None,
-    markdown: Path | None, as_json: bool,
+    places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None,
+    worker_timeout_s: float, timeout_s: float, redo: bool, overwrite: bool,
+    asked: ReportOptions, baseline: Path | None, junit: Path | None, markdown: Path | None, as_json: bool,
     config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
@@ -73,7 +78,7 @@ def command(
     requests = plan(places, output, batch)
     output.mkdir(parents=True, exist_ok=True)
     view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
-    rows = run_all(requests, jobs, scheduler, batch, view)
+    rows = run_all(requests, jobs, scheduler, worker_timeout_s, batch, view)
     calibrations = list(pooled_calibrations(rows, output, allow_unusable=asked.allow_unusable)) if asked.ladder else []
     drawn = (output / PLOTS).is_dir() and not any(row.status == "done" for row in rows)
     write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
@@ -91,16 +96,17 @@ def command(
 
 
 def run_all(
-    requests: Sequence[Request], jobs: int | None, scheduler: str | None, batch: BatchOptions, view: View
-) -> list[Row]:
+    requests: Sequence[Request], jobs: int | None, scheduler: str | None, worker_timeout_s: float,
+    batch: BatchOptions, view: View,
+) -> list[Row]:  # fmt: skip
     """Process all logs, and return a row of each, in the order of the requests."""
     from icrtool.fleet.batch import run_batch
 
     rows: list[Row] = []
     with (
-        executor_of(requests, jobs, scheduler) as executor,
+        executor_of(requests, jobs, scheduler, worker_timeout_s) as (executor, lost),
         closing(view),
-        closing(run_batch(requests, executor, batch, view.stage)) as coming,
+        closing(run_batch(requests, executor, batch, view.stage, lost)) as coming,
     ):
         for row in coming:
             rows.append(row)
@@ -148,8 +154,10 @@ def print_results(
 
 
 @contextmanager
-def executor_of(requests: Sequence[Request], jobs: int | None, scheduler: str | None) -> Iterator[Executor]:
-    """Give what runs the logs: threads that own a process each, or a Dask cluster."""
+def executor_of(
+    requests: Sequence[Request], jobs: int | None, scheduler: str | None, worker_timeout_s: float
+) -> Iterator[tuple[Executor, Lost]]:
+    """Give what runs the logs (threads that own a process each, or a Dask cluster), and whether that is lost."""
     from icrtool.errors import ConfigError
     from icrtool.fleet.batch import local_executor
     from icrtool.fleet.worker import close_all
@@ -157,7 +165,7 @@ def executor_of(requests: Sequence[Request], jobs: int | None, scheduler: str | 
     if scheduler is None:
         try:
             with local_executor(requests, jobs) as executor:
-                yield executor
+                yield executor, str
         finally:
             close_all()
         return
@@ -165,12 +173,44 @@ def executor_of(requests: Sequence[Request], jobs: int | None, scheduler: str | 
         from distributed import Client
     except ImportError as err:
         raise ConfigError("--scheduler", "needs Dask", "pip install 'icrtool[cluster]'") from err
+    for name in ("distributed", "distributed.client", "distributed.utils", "tornado", "asyncio"):
+        # They log tracebacks where a scheduler is lost; the rows of the logs state it.
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError) as err:
         raise ConfigError(f"--scheduler {scheduler}", "no Dask scheduler answers there", str(err)) from err
-    with client, client.get_executor() as executor:
-        yield executor
+    with client:
+        # Its shutdown would wait for logs that a lost cluster never ends; all others are done by then.
+        yield client.get_executor(), _ClusterWatch(client, worker_timeout_s)
+
+
+class _ClusterWatch:
+    """Whether a cluster is lost: it has no scheduler, or no worker, for some time; then it is given up for good."""
+
+    def __init__(self, client: Client, worker_timeout_s: float) -> None:
+        self._client = client
+        self._timeout_s = worker_timeout_s
+        self._fine_s = time.monotonic()
+        self._lost = ""
+
+    def __call__(self) -> str:
+        """Return why it is lost; empty while it is not."""
+        why = self._lost or self._trouble()
+        if not why:
+            self._fine_s = time.monotonic()
+        elif not self._lost and (self._client.status == "closed" or time.monotonic() - self._fine_s > self._timeout_s):
+            self._lost = why
+        return self._lost
+
+    def _trouble(self) -> str:
+        if self._client.status != "running":
+            return "the scheduler of the cluster is gone"
+        try:
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        except (OSError, TimeoutError):
+            return "the scheduler of the cluster is gone"
+        return "" if workers else f"the cluster had no worker for {self._timeout_s:g} s"
 
 
 class View:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import blake2b, sha256
@@ -18,7 +18,7 @@ from icrtool.errors import ConfigError, OutputError
 from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.fleet_files import ROWS, check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
-from icrtool.fleet.one_log import Request, files_of, path_of
+from icrtool.fleet.one_log import Request, failed, files_of, path_of
 from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
 from icrtool.fleet.row import File, Row, as_text
 from icrtool.fleet.worker import close_all, process_apart
@@ -32,6 +32,12 @@ PROCESS_BYTES = 400 << 20
 
 LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
 """Memory of a log: so many times its size, at most that of 10 h at 100 Hz."""
+
+POLL_S = 1.0
+"""Time between two looks at a cluster."""
+
+Lost = Callable[[], str]
+"""Returns why no log can be processed any more (a scheduler that is gone); empty while they can."""
 
 Watch = Callable[[str, str], None]
 """Called with the name of a log and its stage."""
@@ -122,14 +128,16 @@ def finished(request: Request) -> Row | None:
 
 
 def run_batch(
-    requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None = None
-) -> Generator[Row, None, None]:
+    requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None = None,
+    lost: Lost = str,
+) -> Generator[Row, None, None]:  # fmt: skip
     """Yield the row of each log as it comes; what died or hung is tried once more when all others are done.
 
     Parameters
     ----------
     executor : runs `process_apart`; threads on this machine, or workers of a cluster
     watch : called when a log comes to its next stage, where the executor is on this machine
+    lost : of the executor
     """
     todo: list[Request] = []
     for request in requests:
@@ -139,7 +147,7 @@ def run_batch(
         else:
             todo.append(request)
     again: list[Request] = []
-    for request, row in _all_of(todo, executor, options, watch):
+    for request, row in _all_of(todo, executor, options, watch, lost):
         if row.status == "failed" and not row.repeatable:
             again.append(request)
             if watch is not None:
@@ -148,7 +156,7 @@ def run_batch(
             yield row
     for request in again:
         # One at a time: what wanted too much memory beside others may find enough alone.
-        for _, row in _all_of([request], executor, options, watch):
+        for _, row in _all_of([request], executor, options, watch, lost):
             yield replace(row, reason=f"{row.reason} (tried twice)") if row.status == "failed" else row
 
 
@@ -167,20 +175,39 @@ def default_jobs(requests: Sequence[Request]) -> int:
 
 
 def _all_of(
-    requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None
+    requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None, lost: Lost
 ) -> Generator[tuple[Request, Row], None, None]:
     pending: dict[Future[Row], Request] = {}
     try:
         for request in requests:
+            if why := lost():
+                yield request, failed(request, why, repeatable=False)
+                continue
             extra = (partial(watch, request.row.log),) if watch and isinstance(executor, ThreadPoolExecutor) else ()
             pending[executor.submit(process_apart, request.encode(), options.timeout_s, *extra)] = request
-        for future in as_completed(pending):
-            yield pending[future], future.result()
+        waiting = set(pending)
+        while waiting:
+            done, waiting = wait(waiting, POLL_S, FIRST_COMPLETED)
+            for future in done:
+                yield pending[future], _row_of(future, pending[future])
+            if waiting and (why := lost()):
+                for future in waiting:
+                    future.cancel()
+                    yield pending[future], failed(pending[future], why, repeatable=False)
+                return
     except BaseException:
         for future in pending:
             future.cancel()
         close_all()
         raise
+
+
+def _row_of(future: Future[Row], request: Request) -> Row:
+    """Return the row of a log, also where a cluster lost the work on it."""
+    try:
+        return future.result()
+    except (CancelledError, OSError) as err:
+        return failed(request, f"lost by the cluster ({str(err) or type(err).__name__})", repeatable=False)
 
 
 def _request(one: FoundRecording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:

@@ -21,6 +21,7 @@ from icrtool.fleet.row import HORIZONS_M, File, Row, as_text
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
+from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
@@ -88,6 +89,10 @@ def process(request: Request, stage: Stage) -> Row:
         path, directory = path_of(request.path), path_of(request.directory)
         reason = err.beside(str(path), str(directory), log_name(path))
         row = failed(request, reason, repeatable=not isinstance(err, OutputError))
+    except OSError as err:
+        # The log was removed meanwhile, or its disk fails.
+        place = escaped(str(err.filename or path_of(request.path)))
+        row = failed(request, f"{place}: {err.strerror or err}", repeatable=False)
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
     row_file, folder = path_of(request.row_file), path_of(request.folder)
     make_folders(row_file.parent, folder)

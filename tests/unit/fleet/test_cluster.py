@@ -62,3 +62,30 @@ def test_a_worker_killed_in_the_middle_loses_no_row_and_doubles_none(tmp_path: P
     assert batch.returncode == 0
     assert [row["log"] for row in document["logs"]] == [f"{number}.mcap" for number in range(LOGS)]
     assert document["counts"] == {"done": LOGS, "failed": 0, "skipped": 0}
+
+
+@pytest.mark.parametrize("lost", ["scheduler", "workers"])
+def test_a_cluster_that_is_lost_gives_a_row_for_each_log_and_all_tables(tmp_path: Path, cluster, lost: str) -> None:
+    address, processes = cluster
+    (tmp_path / "logs").mkdir()
+    for number in range(3):
+        drive = ("--duration", "40", "--seed", str(number), "-o", str(tmp_path / "logs" / f"{number}.mcap"), "-q")
+        assert start("-m", "icrtool", "simulate", *drive).wait(300) == 0
+    if lost == "workers":
+        for process in processes[1:]:
+            process.kill()
+    arguments = ("-m", "icrtool", "batch", str(tmp_path / "logs"), "-o", str(tmp_path / "out"), "--plots", "none",
+                 "--robot", "pentzer-tracked", "--no-ladder", "--worker-timeout", "3")  # fmt: skip
+    batch = start(*arguments, "--json", "--scheduler", address, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    if lost == "scheduler":
+        time.sleep(4)
+        processes[0].kill()
+    output, errors = batch.communicate(timeout=300)
+    assert b"Traceback" not in errors
+    assert batch.returncode == 1
+    document = json.loads(output)
+    assert [row["log"] for row in document["logs"]] == [f"{number}.mcap" for number in range(3)]
+    failures = [row for row in document["logs"] if row["status"] == "failed"]
+    assert failures
+    assert all("cluster" in row["reason"] for row in failures)
+    assert (tmp_path / "out" / "fleet.csv").is_file()
