@@ -50,7 +50,7 @@ class StateWindows(NamedTuple):
     residuals : (3 w,) forward, right [m] and turn [rad] of the wheels' motion less that of the states
     jacobian : (3 w, 6) by y_icr_right, y_icr_left, x_icr [m], heading offset [rad], scale of both wheels, difference
     length_m : (w,) distance of the wheels; turned_rad : (w,) turn by the wheels
-    end_s : (w,) time at the end; stretch : (w,) number of its stretch
+    end_s, end_m : (w,) time and distance of the wheels at the end; stretch : (w,) number of its stretch
     distance_m : of the wheels, whole drive
     place_std_m, heading_std_rad : median standard deviation of the states that the motion is compared with
     """
@@ -60,6 +60,7 @@ class StateWindows(NamedTuple):
     length_m: Floats
     turned_rad: Floats
     end_s: Floats
+    end_m: Floats
     stretch: Ints
     distance_m: float
     place_std_m: float
@@ -100,6 +101,7 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
         length_m=np.diff(distance),
         turned_rad=turned,
         end_s=table.t_s[rows[1:]],
+        end_m=distance[1:],
         stretch=(distance[:-1] // (STRETCH_IN_WINDOWS * window_m)).astype(np.int64),
         distance_m=whole_m,
         place_std_m=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
@@ -148,8 +150,8 @@ def final_covariance(
     1986) of a fit over the windows, clustered by stretches of `STRETCH_IN_WINDOWS`, heading offset and wheel scales
     marginalised, with one stretch's worth of what stretches are expected to differ by (`Y_OF_STRETCH`). Its residuals
     are those of the final ICRs, so that a fit that would end elsewhere counts too; their scale is no less than the
-    noise of the states, which follow poor fixes only slowly. A window weighs exp(-age / T): T = P / q is the memory of
-    a Kalman filter with variance P and process noise q.
+    noise of the states, which follow poor fixes only slowly. A window weighs exp(-distance since / D): D = P / q is the
+    memory of a Kalman filter with variance P and process noise q by distance.
 
     Coverage of 2 standard deviations, combined for pairs. Five recorded Warthog drives on grass and asphalt and one of
     a Husky, parts of one log: halves y 11 of 12, x 5 of 6; thirds y 27 of 28, x all of 14; quarters y 50 of 52, x all
@@ -162,8 +164,8 @@ def final_covariance(
     if len(windows.length_m) < 2:
         return filter_covariance + np.eye(3) * width_m**2
     forgets = process_icr_mps**2 * REFERENCE_STEP_S
-    memory_s = float(np.trace(filter_covariance)) / 3.0 / forgets if forgets > 0.0 else math.inf
-    weight = np.tile(np.exp((windows.end_s - windows.end_s[-1]) / memory_s), 3)
+    memory_m = float(np.trace(filter_covariance)) / 3.0 / forgets if forgets > 0.0 else math.inf
+    weight = np.tile(np.exp((windows.end_m - windows.end_m[-1]) / memory_m), 3)
     kind = np.repeat(np.arange(3), len(windows.length_m))
     scale = np.hypot(scale_by_kind(windows.residuals, kind), windows.noise[kind]) / np.sqrt(weight)
     prior = np.diag(prior_std(width_m) ** -2.0)

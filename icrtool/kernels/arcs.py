@@ -13,7 +13,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
-from icrtool.kernels.kinematics import body_velocity, euler_step
+from icrtool.kernels.kinematics import body_velocity, euler_step, wheel_speed
 
 SMALLEST_TURN_RAD = 1e-4
 """Below this sin(a)/a is taken from its series, which is then exact to the last bit."""
@@ -108,8 +108,9 @@ def model_states(
         N, E, psi, y_r, y_l, x_v = states[k]
         dt = wheel_t[k + 1] - wheel_t[k]
         N, E, psi = euler_step(N, E, psi, dt, v_left[k], v_right[k], y_r, y_l, x_v)
-        scale = math.sqrt(REFERENCE_STEP_S * dt) if rate_invariant else dt
+        of_pose = math.sqrt(REFERENCE_STEP_S * dt) if rate_invariant else dt
+        of_icrs = of_pose * (math.sqrt(wheel_speed(v_left[k], v_right[k])) if rate_invariant else 1.0)
         moved = (N, E, psi, y_r, y_l, x_v)
         for i in range(6):
-            states[k + 1, i] = moved[i] + scale * std[i] * noise[k, i]
+            states[k + 1, i] = moved[i] + (of_pose if i < 3 else of_icrs) * std[i] * noise[k, i]
     return states

@@ -69,6 +69,12 @@ def body_velocity(
 
 
 @njit
+def wheel_speed(v_left: float, v_right: float) -> float:
+    """Return the speed of the wheels (|V_l| + |V_r|) / 2 [m/s]: that of a spin on the spot is not zero."""
+    return 0.5 * (abs(v_left) + abs(v_right))
+
+
+@njit
 def euler_step(
     north: float, east: float, heading: float, dt: float,
     v_left: float, v_right: float, y_icr_right: float, y_icr_left: float, x_icr: float,

@@ -76,6 +76,8 @@ def run_ekf_plain(data: FilterInputs, t0: float, x0: Floats, P0: Floats, paramet
         slips = held < len(data.slipping) and data.slipping[held]
         if dt > 0:
             Q = np.diag(parameters.process_variance) * (REFERENCE_STEP_S * dt if parameters.rate_invariant else dt**2)
+            if parameters.rate_invariant:
+                Q[3:] *= (abs(data.v_left[held]) + abs(data.v_right[held])) / 2.0
             Q[2, 2] += dt * data.turn_variance[held] if held < len(data.turn_variance) else 0.0
             if in_gap or slips:
                 if slips and not in_gap:

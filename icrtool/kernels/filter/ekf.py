@@ -28,7 +28,7 @@ from icrtool.kernels.filter.ekf_step import (
 )
 from icrtool.kernels.filter.filter_records import FilterInputs, FilterOutput, FilterParameters, FilterState, Nodes
 from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
-from icrtool.kernels.kinematics import body_velocity
+from icrtool.kernels.kinematics import body_velocity, wheel_speed
 
 REFERENCE_STEP_S = 0.01
 """The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
@@ -138,7 +138,8 @@ def advance(
     """Propagate by dt [s] (Eqs. 14, 16) and add the process noise; return the path length by the wheels [m].
 
     Through a gap in the wheel data, and through slip, the pose is not dead-reckoned: only its uncertainty grows, and
-    the next measurement does not change the ICRs.
+    the next measurement does not change the ICRs. These wander with the wheels' travel, through
+    a gap as before it: a parked robot keeps what it has learned.
     """
     travelled = 0.0
     if in_gap or slips:
@@ -150,9 +151,12 @@ def advance(
         P[11] += parameters.gap_turn_variance * dt
     else:
         travelled = predict(x, P, v_left, v_right, dt, parameters.step_heading, parameters.guard)
-    scale = REFERENCE_STEP_S * dt if parameters.rate_invariant else dt * dt
+    of_pose = of_icrs = dt * dt
+    if parameters.rate_invariant:
+        of_pose = REFERENCE_STEP_S * dt
+        of_icrs = of_pose * wheel_speed(v_left, v_right)
     for i in range(6):
-        P[DIAGONAL[i]] += scale * parameters.process_variance[i]
+        P[DIAGONAL[i]] += (of_pose if i < 3 else of_icrs) * parameters.process_variance[i]
     P[11] += turn_variance * dt
     return travelled
 

@@ -20,7 +20,8 @@ class FilterParameters(NamedTuple):
     Attributes
     ----------
     process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
-    rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q
+    rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q, that of the ICRs by the wheels' travel: dt times
+        their speed over 1 m/s
     step_heading : the part of a step's turn after which its displacement is turned into the world: 0 at the start
         (Euler, Eq. 14), 0.5 in the middle, where the displacement of an arc points
     gnss_gate, heading_gate : largest NIS accepted; inf accepts all

@@ -91,3 +91,36 @@ def test_icrs_that_contradict_the_windows_are_not_usable_and_preset_paper_is_exe
     run = run_of(1, 660.0, "frames.heading_delay_s=0", "frames.reference_delay_s=0")
     assert "contradict" in str(run.summary["unusable_because"])
     assert "contradict" not in str(run_of(1, 660.0, "filter.preset=paper").summary["unusable_because"])
+
+
+def run_then_parked(hours: float) -> Run:
+    """Drive for 10 min at 10 Hz, then stand for some hours, with all streams as before."""
+    rng, rate_hz, driven = np.random.default_rng(1), 10.0, int(DRIVEN_S * 10.0)
+    t = np.arange(driven + round(3600.0 * hours * rate_hz)) / rate_hz
+    ramp = np.clip(np.minimum(t, DRIVEN_S - t) / 2.0, 0.0, 1.0)
+    v_left = ramp * (0.5 + 0.3 * np.sin(2 * np.pi * t / 13.0) + 0.2 * np.sin(2 * np.pi * t / 37.0))
+    v_right = ramp * (0.5 + 0.3 * np.sin(2 * np.pi * t / 17.0 + 1.0) - 0.15 * np.sin(2 * np.pi * t / 29.0))
+    states = [np.array([10.0, -5.0, 0.3, *TRUTH])]
+    for k in range(driven - 1):
+        states.append(step_state(states[-1], v_left[k], v_right[k], 1.0 / rate_hz, 0.5))
+    count, stamp_ns = len(t), EPOCH_NS + np.round(t * 1e9).astype(np.int64)
+    poses = np.array(states)[np.minimum(np.arange(count), driven - 1), :3]
+    # drawn row by row: the same noise on the same drive, whatever follows
+    poses = poses + rng.normal(size=(count, 3)) * [0.01, 0.01, math.radians(1.0)]
+    variance, of_heading = np.full(count, 0.01**2), np.full(count, math.radians(1.0) ** 2)
+    log = replace(
+        parked_log(0, 660.0),
+        wheels=WheelSamples(stamp_ns, v_left, v_right),
+        gnss=PositionFixes(stamp_ns, poses[:, 0], poses[:, 1], variance, variance.copy(), np.zeros(count)),
+        heading=HeadingSamples(stamp_ns, np.angle(np.exp(1j * poses[:, 2])), of_heading),
+    )
+    return fit(log, load_config(sets=[WIDTH]))
+
+
+def test_hours_of_parking_keep_the_result_and_its_sigma() -> None:
+    driven, parked = (run_then_parked(hours).summary["icr"] for hours in (0.0, 12.0))
+    for column, truth in zip(driven["final"], TRUTH, strict=True):
+        std = driven["final_std"][column]
+        assert abs(driven["final"][column] - truth) < 3.0 * std
+        assert parked["final"][column] == pytest.approx(driven["final"][column], abs=std / 2.0)
+        assert parked["final_std"][column] == pytest.approx(std, rel=0.1)

@@ -96,6 +96,7 @@ def test_smoothed_states_are_the_batch_solution() -> None:
             transition(nodes.x[i - 1], nodes.step[i], settings.step_heading, settings.guard, F)
             dt, gap = nodes.step[i, 0], nodes.step[i, 3]
             Q = np.diag(settings.process_variance) * REFERENCE_STEP_S * dt
+            Q[3:] *= np.abs(nodes.step[i, 1:3]).mean()
             Q += gap * dt * np.diag([4.0, 4.0, 1.0, 0.0, 0.0, 0.0])
             Q += 1e-14 * np.eye(6)  # nodes at one time differ by nothing: a batch wants that as a covariance
             assert np.allclose(F @ full(nodes.P[i - 1]) @ F.T + Q, P_predicted, atol=1e-12)
