@@ -59,6 +59,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         begin_ns=int(run.table.stamp_ns[0]),
         slipping=run.slipping if run.sensors.events else None,
         lever=Lever(*(place is not None for place in known_antenna_m(run))),
+        x_clock_std_m=run.summary["icr"].get("x_clock_std_m", 0.0),
     )
     return plain if heading is None else with_turn_rate(plain, heading)
 

@@ -70,7 +70,7 @@ def summarise(
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     end_errors = _end_errors(table, filtered.in_gap, width)
     convergence = converge(table, min(changes_s, default=None))
-    covariance, excitation = learned(filtered, config, measurements.clock_std_s)
+    covariance, excitation, x_clock_std_m = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
     field = config.filter.preset == "field"
     scale = measurements.findings["wheel_scale"] if field else None
@@ -104,6 +104,7 @@ def summarise(
                 "separation_multiplier": multiplier,
                 "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
                 "final_covariance_m2": filtered.covariance[3:, 3:],
+                "x_clock_std_m": x_clock_std_m,
             },
             "odometry": end_errors,
             "terrain": {"changes": [{"t_s": t} for t in changes_s]},
@@ -172,13 +173,12 @@ def filter_summary(measurements: Measurements, filtered: Filtered, config: Confi
     } | nis_summary(filtered.gnss, filtered.heading)
 
 
-def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, Excitation]:
-    """Return the covariance (3, 3) of the final ICRs [m^2], and which of them the drive showed.
+def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, Excitation, float]:
+    """Return the covariance (3, 3) of the final ICRs [m^2], what was shown, and the clocks' part of x_icr's std [m].
 
     Parameters
     ----------
-    clock_std_s : of the time between position and heading: at one speed, positions that lag look like an x_icr
-        further back
+    clock_std_s : of the time between position and heading: positions that lag look like an x_icr further back
 
     Preset ``paper``: the filter's own covariance, and what the drive could show.
     """
@@ -188,7 +188,7 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     windows, own = cut_drive(table, drive, p), filtered.covariance[3:, 3:]
     excitation = find_excitation(table, drive, width, windows)
     if config.filter.preset == "paper":
-        return own, excitation
+        return own, excitation, 0.0
     covariance = final_covariance(
         windows,
         own,
@@ -205,7 +205,8 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     )
     turning = drive.dt_s * (drive.v_left - drive.v_right) ** 2
     speed = float((turning * (drive.v_left + drive.v_right)).sum() / 2 / max(float(turning.sum()), 1e-12))
-    return covariance + np.diag([0.0, 0.0, (speed * clock_std_s) ** 2]), excitation
+    x_clock_std_m = abs(speed) * clock_std_s
+    return covariance + np.diag([0.0, 0.0, x_clock_std_m**2]), excitation, x_clock_std_m
 
 
 def without_unlearned(document: RunDocument) -> RunDocument:

@@ -101,6 +101,13 @@ class PooledFit(FittedModel):
         wheels = None if self.wheels is None else self.wheels.fitted
         return FittedModel(self.model, self.parameters, self.covariance, wheels)
 
+    def with_clock_error(self, x_std_m: float) -> PooledFit:
+        """Return the fit with a further standard deviation of its x_icr [m], -vy_w b / (2 omega_w)."""
+        of = dict(zip(self.model.terms, self.parameters.tolist(), strict=True))
+        place, covariance = self.model.terms.index("vy_w"), self.covariance.copy()
+        covariance[place, place] += (2.0 * of["omega_w"] / self.pool.widths_m[0] * x_std_m) ** 2
+        return replace(self, covariance=covariance)
+
     def constants(self, recording: int) -> LogConstants:
         """Return the constants of a recording."""
         return LogConstants(*self._own(self.solution.x, recording).tolist())

@@ -62,6 +62,7 @@ class Recording:
     begin_ns : stamp of the first state; 0 where it is not known
     slipping : (n,) whether the interval after a state lies in a slip event, which no window crosses; None without one
     lever : what is known of the place of the position on the robot
+    x_clock_std_m : what is not known of the time between position and heading looks like an x_icr so far off
     """
 
     name: str
@@ -75,6 +76,7 @@ class Recording:
     begin_ns: int = 0
     slipping: Bools | None = None
     lever: Lever = NO_LEVER
+    x_clock_std_m: float = 0.0
 
     @property
     def held_s(self) -> Floats:

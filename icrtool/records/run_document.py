@@ -76,6 +76,7 @@ class IcrDocument(TypedDict):
     separation_multiplier: float | None
     separation_multiplier_std: float | None
     final_covariance_m2: Matrix
+    x_clock_std_m: NotRequired[float]
 
 
 class EndErrorDocument(TypedDict):

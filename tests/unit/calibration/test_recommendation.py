@@ -63,6 +63,12 @@ def test_the_multiplier_belongs_to_the_icrs_beside_it(run: Run) -> None:
     assert geometry["y_icr_right_m_std"] == pytest.approx(np.sqrt(geometry["covariance_m2"][0][0]))
 
 
+def test_what_is_not_known_of_the_clocks_is_in_the_deviation_of_x(run: Run) -> None:
+    unknown = run.summary["icr"]["x_clock_std_m"]
+    assert 0.0 < unknown <= run.summary["geometry"]["x_icr_m_std"]
+    assert unknown <= run.summary["icr"]["final_std"]["x_icr_m"]
+
+
 def test_with_preset_paper_the_icrs_are_the_filters() -> None:
     config = parse_config({"robot": {"track_width_m": 0.6}, "filter": {"preset": "paper"}})
     summary = icrtool.fit(make_log(0, 180.0, rate=20.0), config).summary
