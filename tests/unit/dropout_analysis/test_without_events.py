@@ -62,7 +62,9 @@ def test_the_distance_within_a_budget_is_given_with_and_without_events_from_the_
         replace(run, sensors=replace(run.sensors, events=())), horizons_m=HORIZONS_M, comparison=False, budgets_m=(0.4,)
     )
     for one, free, unknown in zip(whole.budgets, without.budgets, quiet.budgets, strict=True):
-        assert (one.without_events_m, one.beyond_without_events) == (free.distance_m, free.beyond)
+        # blocks of other starts sum their steps in another order
+        assert one.without_events_m == pytest.approx(free.distance_m, abs=1e-9)
+        assert one.beyond_without_events == free.beyond
         assert one.distance_m == unknown.distance_m <= one.without_events_m
         assert np.isnan(unknown.without_events_m)
     icr = next(one for one in whole.budgets if one.model == "icr")
