@@ -18,7 +18,7 @@ from icrtool.estimation.fit import fit as fit_filter
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Floats
 from icrtool.motion.models import FIVE, ICRS, RECOMMENDED, TrackGeometry
-from icrtool.records.run import ICR_COLUMNS, Run, WarmStart, width_or_usual_m
+from icrtool.records.run import ICR_COLUMNS, Run, WarmStart, check_type, width_or_usual_m
 from icrtool.records.run_document import (
     ControllerDocument,
     GeometryDocument,
@@ -62,6 +62,7 @@ def fit(
     ConfigError
         A start that preset ``field`` does not take.
     """
+    check_type(log, RobotLog, "icrtool.read_log(path, config) reads one")
     # The callee alone holds the log, and frees what it needs no longer.
     logs = [log]
     del log

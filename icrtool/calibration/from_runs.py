@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from os import PathLike
 from typing import Any
 
 from icrtool.calibration.pooled import CalibrationResult, LeftOut, calibrate_recordings
@@ -11,7 +12,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.motion.recording import Recording, cut_windows
-from icrtool.records.run import Run
+from icrtool.records.run import MAKE_RUN, Run, check_type
 
 
 def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Calibration:
@@ -30,7 +31,9 @@ def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Cal
     DataError
         No run is left, or too short a drive.
     """
-    return calibrate_runs([runs] if isinstance(runs, Run) else runs, allow_unusable=allow_unusable).calibration
+    # A path is refused as what it is, not as a sequence of letters.
+    several = [runs] if isinstance(runs, (Run, str, PathLike)) else runs
+    return calibrate_runs(several, allow_unusable=allow_unusable).calibration
 
 
 def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> CalibrationResult:
@@ -40,6 +43,7 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
     alone: tuple[str, ...] = ()
     warnings: list[str] = []
     for run in runs:
+        check_type(run, Run, MAKE_RUN)
         recording = turning_recording_of(run)
         if why := _why_left_out(run, recording, recordings, allow_unusable=allow_unusable):
             left_out.append(LeftOut(run.name, why))

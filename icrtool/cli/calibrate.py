@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import check_run_config, runs_of
+from icrtool.cli.fit import check_run_config, runs_of, runs_or_logs
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @click.command("calibrate")
-@click.argument("sources", metavar="LOG|RUN...", nargs=-1, required=True, type=options.LOG)
+@click.argument("sources", metavar="LOG|RUN|FOLDER...", nargs=-1, required=True, type=options.LOG)
 @click.option("-o", "--output", metavar="FILE|DIR", type=options.FILE, help="Write the calibration file here.")
 @click.option("--x-icr", metavar="METRES", type=float,
               help="Forward position of the ICRs, where known: it gives that of the antenna. One log.")  # fmt: skip
@@ -41,19 +41,20 @@ def command(
 
     Several logs are fitted together, and each is left out in turn to test the model. With one log, each trial is
     predicted by a fit to the rest of the drive; position of the antenna, heading offset, delays and wheel scales are
-    estimated as well. A RUN keeps the configuration that it was fitted with. Logs that are not usable, too short, or
-    copies of another are left out.
+    estimated as well. A RUN keeps the configuration that it was fitted with. A FOLDER stands for
+    the runs in it, or else for its logs. Logs that are not usable, too short, copies or a part of another are left out.
 
     \b
     Example:
       icrtool calibrate field.mcap --robot husky-a200
       icrtool calibrate monday.mcap tuesday.mcap --robot warthog -o warthog.json
-      icrtool calibrate icrtool-runs/* -o calibration.json
+      icrtool calibrate icrtool-runs -o calibration.json
     """  # noqa: D301 - click reads the escape
     from icrtool.errors import IcrToolError
     from icrtool.output.files.calibration_file import calibration_file, write_calibration
 
     config = options.load(config_file, robot, sets)
+    sources = tuple(one for source in sources for one in runs_or_logs(source))
     if len(sources) > 1 and (plot is not None or x_icr is not None):
         raise click.UsageError("--plot and --x-icr are for one log")
     if output is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import runs_of
+from icrtool.cli.fit import runs_of, runs_or_logs
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 from icrtool.records.text import LogText
@@ -49,7 +49,7 @@ def command(
 
     config = options.load(config_file, robot, sets)
     places = _groups(sources)
-    found = [(name, one) for name, paths in places.items() for path in paths for one in _expand(path)]
+    found = [(name, one) for name, paths in places.items() for path in paths for one in runs_or_logs(path)]
     groups: dict[str, list[Run]] = {}
     runs = runs_of([path for _, path in found], config, quiet=quiet, verbose=verbose)
     for (name, _), run in zip(found, runs, strict=True):
@@ -100,17 +100,3 @@ def _named(source: str) -> tuple[LogText, Path]:
     if sign and name and place and not Path(source).exists():
         return LogText(name), Path(place)
     return LogText(Path(source).name or source), Path(source)
-
-
-def _expand(place: Path) -> list[Path]:
-    """Return the runs in a folder, or else its logs; a run or log is itself."""
-    from icrtool.fleet.recordings import find_recordings
-    from icrtool.fleet.roll_up import is_fleet, runs_of_fleet
-    from icrtool.output.run_directory import RUN_FILE, is_run_directory
-
-    if is_run_directory(place) or not place.is_dir():
-        return [place]
-    if is_fleet(place):
-        return [run for runs in runs_of_fleet(place).values() for run in runs]
-    runs = sorted(file.parent for file in place.rglob(RUN_FILE) if is_run_directory(file.parent))
-    return runs or [one.path for one in find_recordings([place])]

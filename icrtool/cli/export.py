@@ -136,16 +136,17 @@ def _calibration(source: Path | None, *, force: bool) -> Calibration:
     from icrtool.calibration.controller_numbers import unfit_reasons
     from icrtool.errors import DataError
 
-    name, found = _read_calibration(source, force=force)
+    name, found = read_calibration(source, force=force, advice=f"; {ALL_THE_SAME}")
     if (reasons := unfit_reasons(found)) and not force:
         raise DataError(name, f"not fit for use: {reasons[0]}", f"calibrate with other logs; {ALL_THE_SAME}")
     return found
 
 
-def _read_calibration(source: Path | None, *, force: bool) -> tuple[str, Calibration]:
+def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:
+    """Return a calibration and its name: of a calibration file, or of a run, which is calibrated."""
     from icrtool.output.stored_run import newest_run, open_run
 
-    if source is not None and source.is_file() and source.suffix == ".json":
+    if source is not None and source.is_file():
         from icrtool.output.files.calibration_file import open_calibration
 
         return source.name, open_calibration(source)
@@ -155,5 +156,5 @@ def _read_calibration(source: Path | None, *, force: bool) -> tuple[str, Calibra
     run = open_run(source or newest_run(RUNS))
     if not (run.usable or force):
         why = f"its ICRs are not usable: {run.summary['unusable_because']}"
-        raise DataError(run.name, why, f"drive again, with turns to both sides; {ALL_THE_SAME}")
+        raise DataError(run.name, why, f"drive again, with turns to both sides{advice}")
     return run.name, calibrate(run, allow_unusable=force)

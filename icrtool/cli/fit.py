@@ -204,6 +204,20 @@ def fit_log(
     return run
 
 
+def runs_or_logs(place: Path) -> list[Path]:
+    """Return the runs in a folder, or else its logs; a run or log is itself."""
+    from icrtool.fleet.recordings import find_recordings
+    from icrtool.fleet.roll_up import is_fleet, runs_of_fleet
+    from icrtool.output.run_directory import RUN_FILE, is_run_directory
+
+    if is_run_directory(place) or not place.is_dir():
+        return [place]
+    if is_fleet(place):
+        return [run for runs in runs_of_fleet(place).values() for run in runs]
+    runs = sorted(file.parent for file in place.rglob(RUN_FILE) if is_run_directory(file.parent))
+    return runs or [one.path for one in find_recordings([place])]
+
+
 def runs_of(paths: Sequence[Path], config: Config, *, quiet: bool, verbose: bool = False) -> list[Run]:
     """Read runs, and fit logs without a recommendation; nothing is written."""
     found = []

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
+from icrtool.cli.export import read_calibration
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 
 
 @click.command("forecast")
-@click.option("--calibration", "calibration_file", metavar="CAL.json", required=True, type=options.FILE,
-              help="File that icrtool calibrate -o wrote.")  # fmt: skip
+@click.option("--calibration", "calibration_file", metavar="CAL.json|RUN", required=True, type=options.FILE,
+              help="File that icrtool calibrate -o wrote, or a run, which is calibrated.")  # fmt: skip
 @click.option("--path", "path", metavar="PLAN.csv|RUN", required=True, type=options.FILE,
               help="Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven again.")  # fmt: skip
 @options.budgets
@@ -46,11 +47,10 @@ def command(
       icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
     """  # noqa: D301 - click reads the escape
     from icrtool.output.files.atomic_file import write_file
-    from icrtool.output.files.calibration_file import open_calibration
     from icrtool.output.files.picture_file import save_picture
     from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast, measured_to_m
 
-    calibration = open_calibration(calibration_file)
+    _, calibration = read_calibration(calibration_file)
     forecast, gyro = _forecasts(calibration, path)
     if output is not None:
         write_file(output, forecast_csv(forecast, gyro))

@@ -80,7 +80,7 @@ def command(
 
     \b
     Example:
-      icrtool simulate -o drive.mcap --robot husky-a200 --path lawnmower --gnss waas
+      icrtool simulate -o drive.mcap --robot husky-a200 --path figure-eight
       icrtool fit drive.mcap --robot husky-a200
     """  # noqa: D301 - click reads the escape
     config = simulated_robot(config_file, robot, sets)

@@ -26,7 +26,7 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration, Verdict
 from icrtool.records.memory import give_back_freed
-from icrtool.records.run import Run
+from icrtool.records.run import MAKE_RUN, Run, check_type
 
 
 def dropout_report(
@@ -82,6 +82,7 @@ def dropout_report(
     RunError
         `reference` is ``smoothed`` and the run has no smoothed states.
     """
+    check_type(run, Run, MAKE_RUN)
     if with_jumps:
         run = replace(run, sensors=replace(run.sensors, jumps=()))
     whole = run

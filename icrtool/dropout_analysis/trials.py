@@ -31,7 +31,7 @@ from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Intervals, Summa
 from icrtool.motion.trials import MOST_STARTS, ErrorsOf, Trials
 from icrtool.records.dropout import DEFAULT_SEED, HeadingErrors, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.memory import give_back_freed
-from icrtool.records.run import Run, drive_of, no_slip_icrs, straight_drive
+from icrtool.records.run import MAKE_RUN, Run, check_type, drive_of, no_slip_icrs, straight_drive
 
 LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
@@ -122,6 +122,7 @@ def dropout(
     and a parked robot would set the result. Overlapping trials are not independent: the
     intervals come from blocks of path of at least two horizons (`icrtool.kernels.open_loop.block_sums`).
     """
+    check_type(run, Run, MAKE_RUN)
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)

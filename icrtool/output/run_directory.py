@@ -54,8 +54,11 @@ def check_target(
     Raises
     ------
     OutputError
-        A file, a directory that is not a run of ours, or the run of another recording is there.
+        A file, a directory that is not a run of ours, or the run of another recording is there; or `log` is a run.
     """
+    if log is not None and is_run_directory(log):
+        path = next((one.get("path") for one in _inputs_of(log)), "data frames")
+        raise OutputError(log, "is a run, not a log", f"name its log ({path}), or: icrtool dropout-report {log}")
     check_directory(directory, is_run_directory, kind="run directory", inside=inside)
     if log is not None and not overwrite and is_run_directory(directory) and not _is_made_from(directory, log):
         other = next((one.get("path") for one in _inputs_of(directory)), "data frames")

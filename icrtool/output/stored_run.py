@@ -36,6 +36,9 @@ FIT_AGAIN = "fit the log again"
 LONGEST_STORED = 1000
 """Characters of a text of run.json that are used: a warning of ours has a few hundred."""
 
+ADDED_LISTS = ("reference_jumps",)
+"""Keys that run.json got while its schema stayed the same: empty in a run without them."""
+
 NAMES = ("topic", "message_type")
 """Keys of run.json whose texts stand there as in the log."""
 
@@ -186,7 +189,8 @@ def _read_document(directory: Path) -> dict[str, Any]:
             directory, f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}", FIT_AGAIN
         )
     # What a log wrote there is printed from here on.
-    return {escaped(key): value if key == "inputs" else _escaped(value) for key, value in document.items()}
+    read = {escaped(key): value if key == "inputs" else _escaped(value) for key, value in document.items()}
+    return {name: [] for name in ADDED_LISTS} | read
 
 
 def _escaped(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds

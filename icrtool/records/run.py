@@ -39,6 +39,22 @@ USUAL_WIDTH_M = 0.6
 """Track width of a small field robot [m], used where that of the robot is not known."""
 
 
+MAKE_RUN = "icrtool.fit(log) makes one, icrtool.open_run(directory) reads one"
+"""What to call for a run."""
+
+
+def check_type(value: object, kind: type, advice: str) -> None:
+    """Refuse an argument of another type, as the path of a file.
+
+    Raises
+    ------
+    TypeError
+        It is; `advice` names what to call.
+    """
+    if not isinstance(value, kind):
+        raise TypeError(f"a {kind.__name__} is needed, not {type(value).__name__}; {advice}")
+
+
 @dataclass(frozen=True, slots=True)
 class MeasurementOutcome:
     """How the filter used each fix or heading of a log.

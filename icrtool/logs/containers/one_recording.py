@@ -46,6 +46,9 @@ def storage_files(directory: Path) -> list[Path]:
         raise LogError(directory, why, "name one of them")
     if not found and (directory / "run.json").is_file():
         raise LogError(directory, "is a run, not a log", "icrtool dropout-report reads it; or name the log itself")
+    if not found and (directory / "fleet.json").is_file():
+        advice = f"icrtool dropout-report {directory}/runs/NAME reads one of its runs; icrtool report makes its page"
+        raise LogError(directory, "is the folder of a batch, not a log", advice)
     runs = sorted(entry.parent.name for entry in directory.glob("*/run.json")) if not found else []
     if runs:
         raise LogError(directory, f"holds runs, not a log: {some_of(runs)}", "icrtool dropout-report reads one of them")
