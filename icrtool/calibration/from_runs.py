@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from os import PathLike
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from icrtool.calibration.pooled import CalibrationResult, LeftOut, calibrate_recordings
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.arrays import Complexes
 from icrtool.motion.recording import Recording, cut_windows
 from icrtool.records.run import MAKE_RUN, Run, check_type
+
+SAME_SHARE, SAME_SPEED = 0.98, 1e-6
+"""A log is a part of another that has so much of its rows, with speeds that differ by no more than this share."""
 
 
 def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Calibration:
@@ -21,7 +27,7 @@ def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Cal
     Parameters
     ----------
     runs : of `icrtool.fit` or `icrtool.open_run`, of one robot; of many, those are left out that are not usable, too
-        short, or copies of another
+        short, copies of another, or a part of one
     allow_unusable : take runs that are not usable, too
 
     Raises
@@ -38,20 +44,20 @@ def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Cal
 
 def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> CalibrationResult:
     """Calibrate as `calibrate` does, with the table of the test; one run at a time is held."""
-    recordings: list[Recording] = []
-    robots, left_out = [], []
+    taken: list[_Taken] = []
+    left_out: list[LeftOut] = []
     alone: tuple[str, ...] = ()
-    warnings: list[str] = []
     for run in runs:
         check_type(run, Run, MAKE_RUN)
-        recording = turning_recording_of(run)
-        if why := _why_left_out(run, recording, recordings, allow_unusable=allow_unusable):
+        one = _Taken(turning_recording_of(run), _positions(run), robot_of(run), use_warnings(run, alone=False))
+        if why := _why_left_out(run, one, taken, allow_unusable=allow_unusable):
             left_out.append(LeftOut(run.name, why))
             continue
-        recordings.append(recording)
-        robots.append(robot_of(run))
+        parts = [_is_part(before, one) for before in taken]
+        left_out += [LeftOut(taken[i].recording.name, f"a part of {run.name}") for i in np.flatnonzero(parts)]
+        taken = [*(before for before, is_part in zip(taken, parts, strict=True) if not is_part), one]
         alone = use_warnings(run)
-        warnings += use_warnings(run, alone=False)
+    recordings, robots = [one.recording for one in taken], [one.robot for one in taken]
     if not recordings:
         if not left_out:
             raise ConfigError("runs", "no usable one is given", "name at least one run or log")
@@ -62,18 +68,58 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
         why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
     result = calibrate_recordings(recordings, robots[0])
-    known = alone if len(recordings) == 1 else tuple(dict.fromkeys(warnings))
+    known = alone if len(taken) == 1 else tuple(dict.fromkeys(text for one in taken for text in one.warnings))
     calibration = replace(result.calibration, warnings=known)
     return result._replace(calibration=calibration, left_out=tuple(left_out))
 
 
-def _why_left_out(run: Run, recording: Recording, before: Sequence[Recording], *, allow_unusable: bool) -> str:
+class _Taken(NamedTuple):
+    """A run that is calibrated.
+
+    Attributes
+    ----------
+    positions : complex (m,), of its fixes, north + i east [m]
+    warnings : of its use beside others
+    """
+
+    recording: Recording
+    positions: Complexes
+    robot: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def _positions(run: Run) -> Complexes:
+    found: Complexes = run.sensors.fixes.north_m + 1j * run.sensors.fixes.east_m
+    return found
+
+
+def _is_part(one: _Taken, of: _Taken) -> bool:
+    """Return whether a log, as one that was cut off, holds nothing but a part of a longer one.
+
+    It has the other's stamps, and where both have them the same wheel speeds and positions. At its ends speeds that
+    were made from positions of the wheels may differ.
+    """
+    part, whole = one.recording, of.recording
+    stamps, theirs = (np.rint(1e9 * log.t_s).astype(np.int64) + log.begin_ns for log in (part, whole))
+    if not (len(stamps) < len(theirs) and theirs[0] <= stamps[-1] and stamps[0] <= theirs[-1]):
+        return False
+    _, ours, others = np.intersect1d(stamps, theirs, assume_unique=True, return_indices=True)
+    same = np.isclose(part.drive.v_left[ours], whole.drive.v_left[others], rtol=SAME_SPEED)
+    same &= np.isclose(part.drive.v_right[ours], whole.drive.v_right[others], rtol=SAME_SPEED)
+    shared = np.count_nonzero(np.isin(one.positions, of.positions))
+    return bool(same.sum() >= SAME_SHARE * len(stamps) and shared >= SAME_SHARE * len(one.positions))
+
+
+def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unusable: bool) -> str:
     """Return why a run is not calibrated with those before it; empty where it is."""
     if not (run.usable or allow_unusable):
         return f"not usable: {run.summary['unusable_because']}"
-    same = next((one.name for one in before if recording.sha256 and one.sha256 == recording.sha256), None)
-    if same is not None:
-        return f"a copy of {same}"
+    recording = one.recording
+    for other in before:
+        if recording.sha256 and other.recording.sha256 == recording.sha256:
+            return f"a copy of {other.recording.name}"
+        if _is_part(one, other):
+            return f"a part of {other.recording.name}"
     try:
         cut_windows(recording)
     except DataError as err:

@@ -80,7 +80,7 @@ def command(
     view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
     rows = run_all(requests, jobs, scheduler, worker_timeout_s, batch, view)
     calibrations = list(pooled_calibrations(rows, output, allow_unusable=asked.allow_unusable)) if asked.ladder else []
-    drawn = (output / PLOTS).is_dir() and not any(row.status == "done" for row in rows)
+    drawn = (output / PLOTS).is_dir() and not any((row.status, row.this_time) == ("done", "processed") for row in rows)
     write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
     missing = compared.missing(row.log for row in rows) if compared is not None else []
     write_exports(rows, calibrations, missing, output if asked.page else None, junit=junit, markdown=markdown)
@@ -224,6 +224,7 @@ class View:
         self._live = not quiet and sys.stderr.isatty()
         self._begun = time.monotonic()
         self._counts: Counter[str] = Counter()
+        self._processed = 0
         self._stages: dict[str, str] = {}
 
     def stage(self, log: str, stage: str) -> None:
@@ -235,6 +236,7 @@ class View:
         """Show the result of a log."""
         self._stages.pop(row.log, None)
         self._counts[row.status] += 1
+        self._processed += row.this_time == "processed"
         self.close()
         if row.status == "failed":
             if self._reports:
@@ -251,7 +253,7 @@ class View:
     def _show(self) -> None:
         if not self._live:
             return
-        done, worked = self._counts.total(), self._counts["done"] + self._counts["failed"]
+        done, worked = self._counts.total(), self._processed
         parts = [f"{done}/{self._logs} done"]
         if self._counts["failed"]:
             parts.append(f"{self._counts['failed']} failed")
@@ -274,7 +276,7 @@ class View:
 
 def line_of(row: Row) -> str:
     """Return a line about a log that could be used."""
-    parts = [f"{row.status:7}", str(LogText(row.log))]
+    parts = [f"{row.status if row.this_time == 'processed' else row.this_time:7}", str(LogText(row.log))]
     if row.distance_m is not None:
         parts.append(f"{row.distance_m:.0f} m")
     if not row.usable:
@@ -283,13 +285,16 @@ def line_of(row: Row) -> str:
         parts.append(f"multiplier {row.multiplier:.3f} ± {row.multiplier_std or 0.0:.3f}")
     if (p95 := row.shown_error()) is not None:
         parts.append(f"95 % within {p95:.3g} m after 10 m")
+    if row.reason:
+        parts.append(escaped(row.reason.partition(":")[0]))
     return "  ".join(parts)
 
 
 def summary_of(rows: Sequence[Row], output: Path) -> str:
     """Return the last line: how many logs were done or failed, and where the tables are."""
-    counts = Counter(row.status for row in rows)
-    parts = [f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]]
+    from icrtool.fleet.row import counts_text
+
+    parts = [counts_text(rows)]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
     files = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from icrtool.fleet.row import Row
+from icrtool.fleet.row import Row, counts_text
 
 if TYPE_CHECKING:
     from icrtool.output.exports.acceptance import Suite
@@ -29,9 +28,8 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     """
     from icrtool.output.exports.acceptance import escaped_markdown, markdown_table
 
-    counts = Counter(row.status for row in rows)
     lines = [f"## {len(rows)} logs", ""]
-    lines += [", ".join(f"{counts[status]} {status}" for status in ("done", "skipped", "failed") if counts[status]), ""]
+    lines += [counts_text(rows), ""]
     if verdicts := sorted((one for row in rows for one in row.verdicts), key=lambda one: one.passed):
         missed = sum(not one.passed for one in verdicts)
         lines += [f"**Acceptance limits not met: {missed}.**" if missed else "All acceptance limits are met.", ""]

@@ -117,14 +117,11 @@ def finished(request: Request) -> Row | None:
         return None
     if row.key != request.row.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
         return None
-    if row.status == "failed":
-        return replace(row, log=request.row.log, group=request.row.group, tags=request.row.tags)
-    needed = ["run.json", "dropout", *([PAGE_FILE] if request.report.page else [])]
-    if not all((path_of(request.directory) / name).exists() for name in needed):
-        return None
-    why = "; ".join(filter(None, ["done before: same input, configuration and version", row.reason]))
-    return replace(row, status="skipped", reason=why, log=request.row.log, group=request.row.group,
-                   tags=request.row.tags)  # fmt: skip
+    if row.status != "failed":
+        needed = ["run.json", "dropout", *([PAGE_FILE] if request.report.page else [])]
+        if not all((path_of(request.directory) / name).exists() for name in needed):
+            return None
+    return replace(row, this_time="skipped", log=request.row.log, group=request.row.group, tags=request.row.tags)
 
 
 def run_batch(

@@ -65,7 +65,7 @@ def check_tables(folder: Path, *, page: bool) -> None:
 
 def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration] = ()) -> dict[str, Any]:
     """Return what fleet.json holds: how many logs were done or failed, all of each, and the pooled calibrations."""
-    counts = Counter(row.status for row in rows)
+    counts = Counter(row.status for row in rows) + Counter(row.this_time for row in rows)
     return {
         "schema": FLEET_SCHEMA,
         "tool_version": __version__,
@@ -174,7 +174,7 @@ def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file:
     import pyarrow.json as pj
     import pyarrow.parquet as pq
 
-    texts = {"log", "status", "reason", "robot", "group", "start_utc", "tool_version", "run", "tags"}
+    texts = {"log", "status", "this_time", "reason", "robot", "group", "start_utc", "tool_version", "run", "tags"}
     counts = {"events", "outages", "warnings", "gates_failed"}
     kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in columns}
     # Names of files need not be text. As JSON, since to convert lists pyarrow would load pandas.

@@ -18,6 +18,7 @@ from icrtool.config import Config
 from icrtool.errors import IcrToolError, OutputError
 from icrtool.fleet.fit_and_report import ReportOptions, Stage, fit_and_write, report_and_write
 from icrtool.fleet.row import HORIZONS_M, File, Row, as_text
+from icrtool.logs.containers.channel import truncation
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
@@ -146,10 +147,12 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
     controller: Mapping[str, Any] = summary.get("controller") or {}
     if not controller and report.calibration is not None:
         controller = report.calibration.controller_numbers()._asdict()
+    unusable = f"not usable: {summary['unusable_because']}" if not summary["usable"] else ""
+    cut = truncation(summary["warnings"])
     return replace(
         request.row,
         status="done",
-        reason=f"not usable: {summary['unusable_because']}" if not summary["usable"] else "",
+        reason="; ".join(filter(None, [unusable, f"truncated: {cut}" if cut else ""])),
         usable=summary["usable"],
         robot=_robot(request),
         start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),

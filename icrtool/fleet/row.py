@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -14,11 +15,12 @@ HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 SHOWN_ERROR, SHOWN_WITHOUT = "recommended_p95_10m_m", "icr_p95_10m_m"
 """The error of each log that is printed, drawn, and compared with the baseline; without a held-out one the second."""
 
-BEFORE_ICRS = ("log", "status", "reason", "robot", "group", "start_utc", "duration_s", "distance_m")
+BEFORE_ICRS = ("log", "status", "this_time", "reason", "robot", "group", "start_utc", "duration_s", "distance_m")
 AFTER_ERRORS = ("events", "outages", "warnings", "tool_version", "run")
 """Columns of fleet.csv that a row holds as they are."""
 
-Status = Literal["done", "failed", "skipped"]
+Status = Literal["done", "failed"]
+ThisTime = Literal["processed", "skipped"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +41,9 @@ class Row:
     ----------
     log : path below the common parent
     run : directory of the run below that of the batch
-    status : ``skipped``: done by an earlier batch from the same input, configuration and version
-    reason : why it failed, was skipped, or its ICRs are not usable; `usable` : whether they are
+    status : of the result
+    this_time : ``skipped``: the result is that of an earlier batch from the same input, configuration and version
+    reason : why it failed, its ICRs are not usable, or that the log is truncated; `usable` : whether they are
     details : last lines of the process that failed
     repeatable : whether the same input, configuration and version give this result again
     icr : final ICRs [m] and, as ``std_…``, their standard deviations
@@ -79,6 +82,7 @@ class Row:
     key: str = ""
     tool_version: str = ""
     took_s: float = 0.0
+    this_time: ThisTime = "processed"
 
     def shown_error(self, *, baseline: bool = False) -> float | None:
         """Return the error [m] that stands for the log, or for its baseline."""
@@ -104,6 +108,14 @@ class Row:
             "gates_failed": self.gates_failed if self.status != "failed" else None,
             "took_s": self.took_s,
         }
+
+
+def counts_text(rows: Sequence[Row]) -> str:
+    """Return how many logs were done and failed, and how many of them by an earlier batch."""
+    counts = Counter(row.status for row in rows)
+    text = ", ".join(f"{counts[status]} {status}" for status in ("done", "failed") if counts[status])
+    skipped = sum(row.this_time == "skipped" for row in rows)
+    return f"{text} ({skipped} of them before, skipped this time)" if skipped else text
 
 
 def as_text(path: object) -> str:

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -70,7 +71,8 @@ class Worker:
         """Process a log; one that hangs or kills the process gives a row with the reason."""
         process, errors = self._started()
         begin_of_errors = errors.seek(0, os.SEEK_END)
-        end = time.monotonic() + timeout_s
+        begun = time.monotonic()
+        end = begun + timeout_s
         try:
             assert process.stdin is not None  # noqa: S101 - for the type checker
             process.stdin.write(request.encode() + b"\n")
@@ -82,7 +84,7 @@ class Worker:
                 stage(line.stage)
         except queue.Empty:
             self.close()
-            return failed(request, f"took longer than {timeout_s:g} s and was ended", repeatable=False)
+            return _after(begun, failed(request, f"took longer than {timeout_s:g} s and was ended", repeatable=False))
         except (OSError, ValueError):
             pass  # it died, or what it wrote was cut off when it did
         why = _how_it_ended(process)
@@ -92,7 +94,7 @@ class Worker:
             details = errors.read().decode(errors="replace").strip()[-LONGEST_DETAILS:]
         self.close()
         last = f": {details.splitlines()[-1]}" if details else ""
-        return failed(request, f"{why}{last}", details=details, repeatable=False)
+        return _after(begun, failed(request, f"{why}{last}", details=details, repeatable=False))
 
     def ask_to_end(self) -> None:
         """Close its input: it removes what it is writing, and ends."""
@@ -131,6 +133,11 @@ class Worker:
         self._process, self._errors, self._lines = process, errors, queue.SimpleQueue()
         threading.Thread(target=_forward, args=(process.stdout, self._lines), daemon=True).start()
         return process, errors
+
+
+def _after(begun: float, row: Row) -> Row:
+    """Return a row with the time [s] since a reading of the monotonic clock."""
+    return replace(row, took_s=round(time.monotonic() - begun, 3))
 
 
 def _how_it_ended(process: subprocess.Popen[bytes]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems, some_of
+from icrtool.logs.containers.channel import CUT_OFF, WHOLE, Block, Channel, Container, Cut, Problems, some_of
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATIO
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.containers.one_recording import Span, check_spans, storage_files
@@ -189,7 +189,7 @@ class BagDirectory:
         except zstandard.ZstdError as err:
             if not target.stat().st_size:
                 raise LogError(file, "does not decompress", str(err)) from err
-            self.own_problems.add(f"{file.name}: cut off or damaged ({err}); what could be decompressed was read")
+            self.own_problems.add(f"{file.name}: {CUT_OFF} or damaged ({err}); what could be decompressed was read")
         except OSError as err:
             free = shutil.disk_usage(self._scratch.name).free
             raise LogError(file, f"cannot be decompressed: {err.strerror}", f"{free} bytes are free for it") from err

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -155,6 +155,15 @@ def made_ahead(blocks: Iterator[Block], stop: Callable[[], object] | None = None
             if stop is not None:
                 stop()
             raise
+
+
+CUT_OFF = "cut off"
+"""Stands in the sentence about a file whose end is missing."""
+
+
+def truncation(warnings: Iterable[str]) -> str:
+    """Return the warning that the end of a log is missing; empty where it is there."""
+    return next((one for one in warnings if CUT_OFF in one), "")
 
 
 class Problems(list[str]):

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, ros_type_name
+from icrtool.logs.containers.channel import CUT_OFF, WHOLE, Block, Channel, Cut, ros_type_name
 from icrtool.logs.containers.chunked_file import Chunk, ChunkedFile, Spaces
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
@@ -270,7 +270,7 @@ class McapFile(ChunkedFile):
             if opcode == 0 or length > left:
                 break
             at += _HEAD_BYTES + length
-        self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
+        self.problems.add(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_loose(self, at: int, length: int, *, learn: bool) -> tuple[Block | None, int]:
         """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""

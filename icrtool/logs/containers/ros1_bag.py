@@ -11,7 +11,7 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import Block, Channel, ros_type_name
+from icrtool.logs.containers.channel import CUT_OFF, Block, Channel, ros_type_name
 from icrtool.logs.containers.chunked_file import Chunk, ChunkedFile, Spaces
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Packed, Space
 from icrtool.logs.containers.record_table import BAG_CONNECTION, Records, scan_bag
@@ -63,7 +63,7 @@ class Ros1Bag(ChunkedFile):
             self._check_start()
             self._chunks: list[Chunk] | None = self._read_index()
             if self._chunks is None:
-                self.problems.add("has no index (not closed, or cut off); read from start to end")
+                self.problems.add(f"has no index (not closed, or {CUT_OFF}); read from start to end")
                 self._learn_all()
         except BaseException:
             self.close()
@@ -150,7 +150,7 @@ class Ros1Bag(ChunkedFile):
                 self._connect(record.number(b"conn"), record.text(b"topic"), content)
             at = record.at + record.length
         if at < self._size:
-            self.problems.add(f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
+            self.problems.add(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_chunk(self, chunk: Chunk, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         if chunk.size < 0:

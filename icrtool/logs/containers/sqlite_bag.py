@@ -15,6 +15,7 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.channel import (
+    CUT_OFF,
     WHOLE,
     Block,
     Channel,
@@ -298,7 +299,7 @@ class SqliteBag:
                 return frozenset()
             stream.seek(size - size % page_bytes)
             page = stream.read()
-        self.problems.add("cut off; what could be read of it was read")
+        self.problems.add(f"{CUT_OFF}; what could be read of it was read")
         return frozenset(row for row, end in _table_rows(page) if end > len(page))
 
     def _batch_query(self, wanted: frozenset[int], cut: Cut) -> Callable[[int, int], tuple[Block | None, int | None]]:

@@ -111,31 +111,34 @@ def test_a_log_that_hangs_is_ended(season: Path) -> None:
     assert time.monotonic() - begun < 40
     assert {row.log: row.status for row in rows} == {"hang.mcap": "failed", "a.mcap": "done"}
     assert {row.log: row.usable for row in rows} == {"hang.mcap": False, "a.mcap": True}
+    assert all(row.took_s >= 4.0 for row in rows if "longer than 4 s" in row.reason)
     assert any("longer than 4 s" in row.reason for row in rows)
 
 
 def test_what_is_done_is_skipped_until_input_configuration_or_request_change(season: Path) -> None:
     add(season, "a", "b", "bad")
-    assert {row.status for row in run(season).values()} == {"done", "failed"}
+    first = {name: row.status for name, row in run(season).items()}
+    assert first == {"a": "done", "b": "done", "bad": "failed"}
     again = run(season)
-    assert {name: row.status for name, row in again.items()} == {"a": "skipped", "b": "skipped", "bad": "failed"}
+    assert {name: row.status for name, row in again.items()} == first, "the status is about the result"
+    assert {row.this_time for row in again.values()} == {"skipped"}
     assert again["a"].distance_m == 7.0
     assert len((season / "order.txt").read_text().split()) == 3, "the log's own error is kept, nothing ran again"
     (season / "a.mcap").touch()  # another time, the same content
-    assert run(season)["a"].status == "skipped"
+    assert run(season)["a"].this_time == "skipped"
     (season / "a.mcap").write_bytes(b"\x89MCAP0\r\nA")  # the same size and another content
-    assert {name: row.status for name, row in run(season).items()}["a"] == "done"
-    assert run(season, sets=("filter.preset=paper",))["b"].status == "done"
-    assert run(season, sets=("filter.preset=paper",), redo=True)["b"].status == "done"
+    assert run(season)["a"].this_time == "processed"
+    assert run(season, sets=("filter.preset=paper",))["b"].this_time == "processed"
+    assert run(season, sets=("filter.preset=paper",), redo=True)["b"].this_time == "processed"
     (season.parent / "out" / "runs" / "b" / "run.json").unlink()
-    assert run(season, sets=("filter.preset=paper",))["b"].status == "done"
+    assert run(season, sets=("filter.preset=paper",))["b"].this_time == "processed"
 
 
 def test_another_version_processes_all_again(season: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     add(season, "a")
     run(season)
     monkeypatch.setattr("icrtool.fleet.batch.__version__", "99")
-    assert run(season)["a"].status == "done"
+    assert run(season)["a"].this_time == "processed"
 
 
 def test_a_row_file_that_is_damaged_is_not_trusted(season: Path) -> None:
@@ -144,15 +147,15 @@ def test_a_row_file_that_is_damaged_is_not_trusted(season: Path) -> None:
     (file,) = (season.parent / "out" / ".rows").iterdir()
     for content in (b"", b"{}", b"[", file.read_bytes()[:-20]):
         file.write_bytes(content)
-        assert run(season)["a"].status == "done"
+        assert run(season)["a"].this_time == "processed"
 
 
 def test_a_finished_log_without_a_page_is_processed_again_where_one_is_asked_for(season: Path) -> None:
     add(season, "a")
-    assert run(season, page=False)["a"].status == "done"
-    assert run(season, page=False)["a"].status == "skipped"
-    assert run(season)["a"].status == "done"
-    assert run(season)["a"].status == "skipped"
+    assert run(season, page=False)["a"].this_time == "processed"
+    assert run(season, page=False)["a"].this_time == "skipped"
+    assert run(season)["a"].this_time == "processed"
+    assert run(season)["a"].this_time == "skipped"
 
 
 def test_an_interrupted_batch_ends_its_processes_and_is_continued(season: Path) -> None:
@@ -169,7 +172,7 @@ def test_an_interrupted_batch_ends_its_processes_and_is_continued(season: Path) 
     for name in ("hang1", "hang2", "hang3"):
         (season / f"{name}.mcap").unlink()
     add(season, "b")
-    assert {name: row.status for name, row in run(season).items()} == {"a": "skipped", "b": "done"}
+    assert {name: row.this_time for name, row in run(season).items()} == {"a": "skipped", "b": "processed"}
 
 
 def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
@@ -261,7 +264,8 @@ def test_tables_hold_a_row_per_log_and_null_where_nothing_is_known(season: Path,
     assert frame["distance_m"].isna().tolist() == [False, True]
     document = json.loads((tmp_path / "fleet.json").read_text())
     assert document["counts"] == {"done": 1, "failed": 1, "skipped": 0}
-    contract = ("log", "status", "reason", "robot", "group", "start_utc", "duration_s", "distance_m", "y_icr_right_m",
+    contract = ("log", "status", "this_time", "reason",
+                "robot", "group", "start_utc", "duration_s", "distance_m", "y_icr_right_m",
                 "y_icr_left_m", "x_icr_m", "std_y_icr_right_m", "std_y_icr_left_m", "std_x_icr_m", "multiplier",
                 "multiplier_std", "events", "outages", "warnings", "tool_version")  # fmt: skip
     assert set(contract) <= set(rows[0])

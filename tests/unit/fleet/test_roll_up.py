@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from icrtool.cli.batch import line_of, summary_of
-from icrtool.cli.compare import _expand, _groups
+from icrtool.cli.compare import _groups
+from icrtool.cli.fit import runs_or_logs
 from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, write_fleet
 from icrtool.fleet.roll_up import PooledCalibration, pooled_calibrations, runs_of_fleet
@@ -80,7 +81,7 @@ def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     assert runs_of_fleet(place) == _groups((str(place),)) == groups
     write_fleet([*logs, *rows("a", multiplier=1.5)], place)
     assert runs_of_fleet(place) == groups, "a copy in the same group would be tested on itself"
-    assert _expand(place) == [run for runs in groups.values() for run in runs]
+    assert runs_or_logs(place) == [run for runs in groups.values() for run in runs]
     write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice", multiplier=1.5)], place)
     assert list(runs_of_fleet(place)) == ["barn grass", "barn ice", "other ice"]
     with pytest.raises(RunError):

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import icrtool as library
+from icrtool.calibration.from_runs import calibrate_runs
 from icrtool.output.files.states_file import file_b2sum
 from icrtool.output.run_directory import CHECKSUM_FILE, RUN_FILE
 
@@ -90,3 +91,26 @@ def test_a_run_from_before_jumps_were_listed_is_read_without_any(run: Path) -> N
     opened = library.open_run(run)
     assert opened.summary["reference_jumps"] == []
     assert library.dropout(opened).counts.crosses_jump.sum() == 0
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_log_that_was_cut_off_is_left_out_beside_the_whole_one(tmp_path: Path, order: tuple[int, ...]) -> None:
+    content = (LOGS / "wheeled_lawnmower.mcap").read_bytes()
+    config = library.load_config(robot="segway-rmp400")
+    runs = []
+    for name, size in (("whole", len(content)), ("short", 6 * len(content) // 10)):
+        (tmp_path / f"{name}.mcap").write_bytes(content[:size])
+        runs.append(library.fit(library.read_log(tmp_path / f"{name}.mcap", config), config))
+    result = calibrate_runs(runs[i] for i in order)
+    assert [str(one) for one in result.left_out] == ["short: left out: a part of whole"]
+    assert [log.name for log in result.calibration.logs] == ["whole"]
+    alone = library.calibrate(runs[0])
+    assert result.calibration.geometry()[0] == alone.geometry()[0]
+
+
+def test_drives_of_the_same_wheels_with_other_fixes_are_both_calibrated(tmp_path: Path, icrtool) -> None:
+    for seed in (1, 2):
+        options = ("--path", "figure-eight", "--duration", str(60 + 10 * seed), "--seed", str(seed), "-q")
+        assert icrtool("simulate", "-o", f"{seed}.mcap", "--robot", "husky-a200", *options)[0] == 0
+    assert icrtool("calibrate", "1.mcap", "2.mcap", "--robot", "husky-a200", "-o", "both.json")[0] == 0
+    assert [log["name"] for log in json.loads((tmp_path / "both.json").read_text())["logs"]] == ["1", "2"]
