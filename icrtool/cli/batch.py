@@ -67,7 +67,7 @@ def command(
     \b
     Example:
       icrtool batch season/ -o results --robot husky-a200
-      icrtool batch logs.csv -o results -j 4 --gate "icr.p95@10m <= 1.5"
+      icrtool batch logs.csv -o results -j 4 --gate "recommended.p95@10m <= 1.5"
     """  # noqa: D301 - click reads the escape
     from icrtool.fleet.batch import BatchOptions, plan
     from icrtool.fleet.fleet_files import PLOTS, write_fleet

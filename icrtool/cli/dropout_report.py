@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from icrtool.records.run import Run
 
 EPILOG_GATE = (
-    'A limit of --gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "icr.p95@10m <= 3.8".'
+    'A limit of --gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "recommended.p95@10m <= 1.2"'
+    ', or "MODEL.within@ERRORm >= METRES", for example "recommended.within@0.5m >= 10".'
 )
 
 
@@ -105,7 +106,7 @@ def command(
       icrtool dropout-report
       icrtool dropout-report icrtool-runs/field --budget 0.5 --outage 20
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
-      icrtool dropout-report log.bag --robot jackal --gate "icr.p95@10m <= 1.5" --junit gates.xml
+      icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
     from icrtool.output.files.calibration_file import open_calibration
 

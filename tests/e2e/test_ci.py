@@ -17,7 +17,7 @@ from icrtool.fleet.row import Row
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^\s+(?:- )?(?:run: )?icrtool (.*)$", PAGE, re.MULTILINE)
-RATES = ("--duration", "40", "--wheel-rate", "20", "--gnss-rate", "5", "--heading-rate", "20", "--gnss", "0.002")
+RATES = ("--duration", "80", "--wheel-rate", "20", "--gnss-rate", "5", "--heading-rate", "20", "--gnss", "0.002")
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
