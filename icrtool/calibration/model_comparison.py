@@ -109,7 +109,7 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
         fits={name: fit.fitted for name, fit in found.fits.items()},
         width_m=recording.width_m,
         heading=heading,
-        notes=notes,
+        notes=(*notes, *_lever_notes(recording)),
         calibration=_calibration(run, found),
     )
     drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
@@ -153,6 +153,15 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
         for name, label in FILTER_LABELS.items():
             errors_of = partial(_errors_along, path, recording.drive, _icrs_of(run, name))
             yield ComparedRow(f"{name}_{kind}", f"{label} + {kind}", errors_of)
+
+
+def _lever_notes(recording: Recording) -> list[str]:
+    """Return which part of the position's place on the robot is not known, and what the row ``controller`` does."""
+    parts = {"ahead of": recording.lever.ahead, "to the right of": recording.lever.aside}
+    unknown = " and ".join(word for word, known in parts.items() if not known)
+    what = f"how far {unknown} the body's origin the position is measured is not known"
+    lever = "in the row of the controller numbers it is a constant of this log"
+    return [f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it"] if unknown else []
 
 
 def _icrs_of(run: Run, name: str) -> FrozenIcrs:
