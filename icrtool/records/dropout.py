@@ -222,6 +222,15 @@ class BudgetDistance(NamedTuple):
         return f"about {self.distance_m:.0f} m" if self._far else f"{self.distance_m:.1f} m"
 
     @property
+    def without_events_text(self) -> str:
+        """As `short_text`, of the trials that touch no slip event; empty where there is none."""
+        if not math.isfinite(self.without_events_m):
+            return ""
+        return (
+            f"more than {self.without_events_m:g} m" if self.beyond_without_events else f"{self.without_events_m:.1f} m"
+        )
+
+    @property
     def reach_text(self) -> str:
         """As `short_text`, with the horizons that it was interpolated between where they are far."""
         low, high = self.between_m

@@ -10,6 +10,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import controller_rows, format_export
+from icrtool.output.tables.brief import reach_rows
 from icrtool.output.text_format import controller_error_text, error_text, event_kinds, excitation_text, jump_count
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.text import counted
@@ -34,7 +35,7 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str
     -------
     dict
         ``grade`` and ``verdict``: may the numbers be used, in one word and in one sentence; ``checks``: why;
-        ``reaches``: how far each model stays within a budget, a list a budget, the recommended model first;
+        ``reaches``: budget [m], and label, distance and note of each model as `icrtool dropout-report` prints them;
         ``numbers``: name and value of what a controller is given, ``with_numbers``: the error with these alone,
         ``export``: configuration of a diff_drive_controller, ``model``: the recommended one; empty where there is none.
     """
@@ -45,7 +46,7 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str
         "grade": grade,
         "verdict": verdict,
         "checks": _checks(summary, report),
-        "reaches": _reaches(report),
+        "reaches": _reaches(summary, report),
         "numbers": _numbers(calibration),
         "with_numbers": controller_error_text(calibration.controller) if calibration is not None else "",
         "export": _export(calibration),
@@ -63,13 +64,15 @@ def _verdict(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Check:
     return "good", "Yes."
 
 
-def _reaches(report: Mapping[str, Any]) -> list[list[BudgetDistance]]:
-    found: dict[float, list[BudgetDistance]] = {}
-    for row in sorted(report["budgets"], key=lambda one: one["model"] != "recommended"):
+def _reaches(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[tuple[float, list[tuple[str, str, str]]]]:
+    budgets = []
+    for row in report["budgets"]:
         known: dict[str, Any] = {key: math.nan if value is None else value for key, value in row.items()}
-        one = BudgetDistance(**known)
-        found.setdefault(one.budget_m, []).append(one)
-    return list(found.values())
+        budgets.append(BudgetDistance(**known))
+    given = [(one["name"], one["label"], one["fitted"]) for one in report["calibrations"]]
+    events = len(summary["events"])
+    sizes = dict.fromkeys(one.budget_m for one in budgets)
+    return [(size, rows) for size in sizes if (rows := reach_rows(budgets, given, size, events))]
 
 
 def _numbers(calibration: Calibration | None) -> list[tuple[str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -214,28 +214,41 @@ REACH_ROWS = ("controller", "recommended", "recommended_gyro", "recommended_head
 REACH_LABELS = {"recommended_gyro": "with the gyro", "recommended_heading": "with the heading"}
 
 
-def reach_rows(report: DropoutReport, budget_m: float) -> list[tuple[str, BudgetDistance, str]]:
-    """Return label, distance and note of each model whose distance within a budget is stated, in their order."""
-    by_model = {one.model: one for one in report.budgets if one.budget_m == budget_m}
+def reach_rows(
+    budgets: Sequence[BudgetDistance], calibrations: Sequence[tuple[str, str, str]], budget_m: float, events: int
+) -> list[tuple[str, str, str]]:
+    """Return label, distance and note of each model whose distance within a budget is stated, in their order.
+
+    Parameters
+    ----------
+    calibrations : name, label, and what it was fitted to, of each that was given
+    events : slip events of the run; the last row is the distance without them, where that is known
+    """
+    by_model = {one.model: one for one in budgets if one.budget_m == budget_m}
     rows = [
-        (f"calibration {one.label}" if one.label != "calibration" else one.label, by_model[one.name],
-         "fitted to this log" if one.fitted_to_this else "fitted to other logs")
-        for one in report.calibrations if one.name in by_model
+        (f"calibration {label}" if label != "calibration" else label, by_model[name], note)
+        for name, label, note in calibrations if name in by_model
     ]  # fmt: skip
     for name in REACH_ROWS:
         if name in by_model and not (name == "icr" and "recommended" in by_model):
             label = REACH_LABELS.get(name, by_model[name].label)
             note = NOTES.get(name, by_model[name].interval_text if name.startswith("recommended") else "")
             rows.append((label, by_model[name], note))
-    return rows
+    found = [(label, one.short_text, note) for label, one, note in rows]
+    best = by_model.get("recommended") or by_model.get("icr")
+    if events and best is not None and (quiet := best.without_events_text):
+        found.append((f"without its {counted(events, 'slip event')}", quiet, best.label))
+    return found
 
 
 def _reach_blocks(report: DropoutReport) -> list[Block]:
     """Return how far the robot stays within each budget."""
     blocks: list[Block] = []
+    given = [(one.name, one.label, one.fitted_text) for one in report.calibrations]
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows = [
-            (f"   {shortened(label, 28)}", one.short_text, note) for label, one, note in reach_rows(report, budget_m)
+            (f"   {shortened(label, 28)}", text, note)
+            for label, text, note in reach_rows(report.budgets, given, budget_m, len(report.run_summary["events"]))
         ]
         blocks += [Line(f"How far within {budget_m:g} m (95 %)?", "title"), Table("lrl", rows)]
     return blocks or ["How far?  No trial is as long as the shortest horizon."]

@@ -19,9 +19,11 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.output.dropout_directory import report_document
+from icrtool.output.page.answer import answer_of
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
+from icrtool.output.tables.brief import brief_dropout
 from icrtool.records.events import ReferenceJump
 from icrtool.records.run import Run
 from support.barn import configured, simulate
@@ -81,6 +83,23 @@ def test_the_answer_is_that_of_the_report(page: str, run: Run, report: DropoutRe
     assert f"{report.calibration.controller_numbers().multiplier:.3f}" in text
     assert "No: an acceptance limit" in text
     assert f"{report.worst[0].errors_m['recommended']:.3f} m" in text
+
+
+def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutReport) -> None:
+    budgets = [one._replace(without_events_m=20.0, beyond_without_events=True) for one in report.budgets]
+    event = {"kind": "skid", "begin_s": 1.0, "end_s": 2.0, "severity": 0.5, "north_m": 0.0, "east_m": 0.0,
+             "distance_m": 0.1}  # fmt: skip
+    summary = {**run.summary, "events": [event, event]}
+    slipped = replace(report, budgets=budgets, run_summary=summary)
+    printed = str(brief_dropout(slipped, "report.html"))
+    ((budget_m, rows),) = answer_of(summary, report_document(slipped))["reaches"]
+    assert budget_m == report.budgets[0].budget_m
+    assert rows[-1][:2] == ("without its 2 slip events", "more than 20 m")
+    lines = printed[printed.index("How far") :].splitlines()[1 : 1 + len(rows)]
+    assert [[word for word in row if word] for row in rows] == [
+        [word for word in re.split("  +", line.strip()) if word] for line in lines
+    ]
+    assert "without its" not in str(brief_dropout(report, "report.html"))
 
 
 def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> None:
