@@ -83,6 +83,8 @@ def _environment() -> Environment:
         "distance": lambda value: _with_units(text_format.distance_text(value)),
         "duration": lambda value: _with_units(text_format.duration_text(value)),
         "signed": text_format.signed,
+        "digits": text_format.digits_of,
+        "with_std": lambda *numbers: text_format.with_std(*numbers).replace("-", "−"),
         "units": _with_units,
         "breakable": _breakable,
         "minus": _minus,

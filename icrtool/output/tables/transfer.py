@@ -8,6 +8,7 @@ from typing import Any
 from icrtool.calibration.transfer import Cell, Pair, Transfer
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.text_blocks import Block, Table, Text
+from icrtool.output.text_format import digits_of, with_std
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
 TRANSFER_SCHEMA = "icrtool/compare/1"
@@ -61,7 +62,7 @@ def format_transfer(transfer: Transfer) -> Text:
     blocks: list[Block] = []
     for pair in transfer.pairs:
         rows = [
-            (one.quantity, f"{one.first:+.3f}", f"{one.second:+.3f}", f"{one.difference:+.3f} ± {one.std:.3f}")
+            (one.quantity, f"{one.first:+.3f}", f"{one.second:+.3f}", with_std(one.difference, one.std, 3))
             for one in pair.parameters
         ]
         table = Table("lr", rows, ("", pair.first, pair.second, "difference ± std"))
@@ -90,7 +91,7 @@ def _errors(cell: Cell) -> str:
 def verdict(transfer: Transfer, pair: Pair) -> str:
     """Return one sentence: how the multiplier differs, and what the calibration of the first costs on the second."""
     one = next(one for one in pair.parameters if one.quantity == "multiplier")
-    change = f"by {one.difference:+.2f} ± {one.std:.2f}"
+    change = f"by {with_std(one.difference, one.std)}"
     if not one.significant:
         change += ", which may be chance"
     cost = transfer.cell(pair.first, pair.second, CHOICE_HORIZON_M).cost
@@ -109,4 +110,5 @@ def _change(values: tuple[float, ...]) -> str:
     value, low, high = values
     if not math.isfinite(low + high):
         return f"{value:+.2f} m (too short for an interval)"
-    return f"{value:+.2f} m ({low:+.2f} to {high:+.2f})"
+    digits = digits_of((high - low) / 4)
+    return f"{value:+.{digits}f} m ({low:+.{digits}f} to {high:+.{digits}f})"

@@ -1,0 +1,24 @@
+"""Differences print with as many digits as their standard deviation needs."""
+
+import pytest
+
+from icrtool.output.text_format import digits_of, with_std
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (0.0044, 0.0072, "+0.004 ± 0.007"),
+        (0.0044, 0.0132, "+0.004 ± 0.013"),
+        (-0.25, 0.31, "-0.25 ± 0.31"),
+        (12.0, 3.0, "+12.00 ± 3.00"),
+        (0.0, 1e-9, "+0.00000 ± 0.00000"),
+    ],
+)
+def test_a_spread_is_never_rounded_to_one_digit_less_than_it_needs(value: float, std: float, text: str) -> None:
+    assert with_std(value, std) == text
+
+
+@pytest.mark.parametrize("std", [0.0, float("nan"), float("inf")])
+def test_without_a_spread_the_least_digits_are_printed(std: float) -> None:
+    assert digits_of(std, 3) == 3
