@@ -39,6 +39,7 @@ from support.browser import Browser, Page, browser, chromium
 from support.recordings import table_errors
 
 HOSTILE = "</script><script>window.hostile=1</script><img src=x onerror='window.hostile=1'>\"'"
+DRAWN_AT_FIRST = ["whole model", "no slip", "controller numbers"]
 LENGTHS_M = (5.0, 10.0, 20.0)
 AXE = Path(sys.prefix) / "axe-core" / "axe.min.js"
 
@@ -146,7 +147,7 @@ def test_pointing_at_the_map_marks_the_moment_in_the_charts(page: Page) -> None:
     assert place == pytest.approx(page.evaluate(f"icrtoolPage.map().pixelsOf({row})"), abs=3.0)
 
 
-def test_a_click_on_the_map_draws_the_paths_of_all_models(chrome: Browser, file: Path) -> None:
+def test_a_click_on_the_map_draws_three_paths_and_lists_all_errors(chrome: Browser, file: Path) -> None:
     page = chrome.page()
     page.open(file)
     centre(page, "#map")
@@ -158,6 +159,8 @@ def test_a_click_on_the_map_draws_the_paths_of_all_models(chrome: Browser, file:
     rows = page.evaluate("[...document.querySelectorAll('#loop tbody tr')].map((row) => row.textContent)")
     assert len(rows) == page.evaluate("icrtoolPage.data.models.length") > 4
     assert all(re.search(r"\d m", row) for row in rows)
+    boxes = "[...document.querySelectorAll('#loop tbody tr')].filter((row) => row.querySelector('input').checked)"
+    assert page.evaluate(f"{boxes}.map((row) => row.textContent.trim().split(/ ?[\\d]/)[0])") == DRAWN_AT_FIRST
     assert page.complaints() == []
 
 
@@ -396,6 +399,20 @@ def test_the_chart_of_a_comparison_follows_the_group_and_the_measure(chrome: Bro
     bare = chrome.page(scripts=False)
     bare.open(file)
     assert bare.evaluate("document.querySelector('.picture img').getClientRects().length") == 1
+
+
+def test_a_failed_log_is_a_line_on_a_phone(chrome: Browser, tmp_path: Path) -> None:
+    file, reason = tmp_path / "report.html", "not a log; a log is an .mcap file, a ROS 1 .bag or a ROS 2 bag directory"
+    failed = {**FLEET["logs"][2], "log": "c.bag", "reason": reason}
+    file.write_text(fleet_page({**FLEET, "logs": [*FLEET["logs"][:2], failed]}, tmp_path), encoding="utf-8")
+    page = chrome.page(width=390, height=844)
+    page.open(file)
+    good, bad = page.evaluate(
+        "['tr:not(.bad)', 'tr.bad'].map((one) => document.querySelector(`#table tbody ${one}`).offsetHeight)"
+    )
+    assert bad <= 1.2 * good
+    assert page.evaluate("document.querySelector('#table .reason').getBoundingClientRect().left") < 390
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
 def test_the_table_of_a_fleet_sorts_and_filters(chrome: Browser, tmp_path: Path) -> None:

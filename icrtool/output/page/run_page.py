@@ -40,6 +40,8 @@ SCRIPTS = (
     "run.js",
 )
 
+MAIN_ROWS = ("recommended", "controller", "recommended_gyro", "recommended_heading", "no_slip")
+
 TWINS = ("trajectory", "icr_estimates", "gnss_difference", "summary")
 """Pictures that a browser with scripts draws itself; they are for printing, and for readers without scripts."""
 
@@ -95,6 +97,7 @@ def run_page(
         begun=_utc(int(run.table.stamp_ns[0])),
         errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
         coordinates=coordinates, samples=len(run.table), worst_label=_worst_label(document),
+        main_rows=_main_rows(document),
     )  # fmt: skip
 
 
@@ -154,9 +157,16 @@ def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _main_rows(report: Mapping[str, Any]) -> set[str]:
+    """Return the models whose errors are not folded: those of `MAIN_ROWS`; without a whole model, all."""
+    names = {one["name"] for one in report["models"]}
+    given = {one["name"] for one in report["calibrations"]}
+    return given.union(MAIN_ROWS) & names if MAIN_ROWS[0] in names else names
+
+
 def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the worst trials, each with what happened meanwhile: jumps of the position, outages, slip."""
-    found = []
+    found: list[dict[str, Any]] = []
     for one in report["worst"]:
         speed = one["speed_mean_mps"]
         end_s = one["t_s"] + (one["horizon_m"] / speed if speed else 0.0)
@@ -172,7 +182,7 @@ def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[d
         notes = [f"the position steps by {error_text(max(sizes))}"] if sizes else []
         notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]
         notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
-        found.append({**one, "note": ", ".join(notes)})
+        found.append({**one, "rank": len(found) + 1, "note": ", ".join(notes)})
     return found
 
 

@@ -13,7 +13,9 @@ const icrtoolMap = (() => {
     const north = steps.north.map((value) => value + steps.first_north), east = steps.east.map((value) => value + steps.first_east);
     const rowNorth = Float64Array.from(s.step, (step) => north[step]), rowEast = Float64Array.from(s.step, (step) => east[step]);
     const tree = d3.quadtree(d3.range(s.step.length), (row) => rowEast[row], (row) => rowNorth[row]);
-    const hidden = new Set();
+    // At first: what answers a question. The rest is a click away.
+    const SHOWN = ["recommended", "controller", "no_slip"], known = data.models.some((model) => model.name === SHOWN[0]);
+    const hidden = new Set(["rejected", ...data.models.filter((model) => known && !SHOWN.includes(model.name)).map((model) => `loop ${model.name}`)]);
     let loop = null, span = [-Infinity, Infinity], moment = 0, transform = d3.zoomIdentity, width = 0, height = 0;
 
     const svg = d3.select(element).html("").append("svg").attr("role", "img")
@@ -224,7 +226,7 @@ const icrtoolMap = (() => {
       ];
       document.getElementById("layers").replaceChildren(...entries.map((one) => {
         const item = document.createElement("li");
-        item.append(toggle(one, true, (shown) => hide(one.name, !shown)));
+        item.append(toggle(one, !hidden.has(one.name), (shown) => hide(one.name, !shown)));
         return item;
       }));
     }
@@ -251,7 +253,8 @@ const icrtoolMap = (() => {
       drawLoop(result) {
         loop = result;
         const norths = [], easts = [];
-        for (const { path } of result.models) {
+        for (const { name, path } of result.models) {
+          if (hidden.has(`loop ${name}`)) continue;
           norths.push(...d3.extent(path.north).map((v) => v + north[result.start]));
           easts.push(...d3.extent(path.east).map((v) => v + east[result.start]));
         }
