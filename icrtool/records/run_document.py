@@ -179,7 +179,7 @@ class HeadingDocument(TypedDict):
     """The heading.
 
     `source`: orientation, dual_antenna_message, antenna_pair, gyro_course, wheels_course or fused; `parts`: of an
-    estimated one, with its standard deviation `std_deg` (null for a stated one).
+    estimated one; `std_deg`: its median standard deviation as the filter is given it (null for a stated one).
     """
 
     source: str

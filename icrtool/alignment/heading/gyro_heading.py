@@ -41,6 +41,9 @@ STANDING_RATE_STD = math.radians(0.05)
 FEWEST_COURSES = 8
 PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1])
 ABSOLUTE_PRIOR_STD = np.array([math.pi, math.radians(1.0), 0.05])
+ANY_DIRECTION_STD = math.pi / math.sqrt(3.0)
+"""Standard deviation [rad] of a direction that may be any, as before the robot drives."""
+
 LONGEST_STEP_S = 1.0
 """A gap between events is cut into steps of at most this, so that the uncertainty grows within it."""
 
@@ -112,8 +115,14 @@ class HeadingEstimate:
 
     @property
     def median_std(self) -> float:
-        """Median standard deviation of the smoothed heading [rad]."""
+        """Median standard deviation of the smoothed heading [rad]: how good its sources are."""
         return float(np.median(self.smoothed_std))
+
+    @property
+    def median_causal_std(self) -> float:
+        """Median standard deviation of the causal heading once it is known [rad]: of what the filter is given."""
+        known = self.causal_std <= max(ANY_DIRECTION_STD, float(self.causal_std.min()))
+        return float(np.median(self.causal_std[known]))
 
 
 def estimate_heading(

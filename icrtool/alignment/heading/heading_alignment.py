@@ -116,7 +116,7 @@ class HeadingAlignment:
     applied_mirror : the heading is turned over; applied_offset_rad : what is subtracted from it, after that
     name : what a significant offset may come from
     applied_std_rad, applied_correlation_s : the least noise, and how long it is correlated, that the filter uses
-    std_rad : median standard deviation of an estimated heading; NaN for a stated one
+    std_rad : median standard deviation of an estimated heading, as the filter is given it; NaN for a stated one
     """
 
     source: str
@@ -220,7 +220,7 @@ def align_estimated_heading(
     log: RobotLog, derived: DerivedHeading, stated: HeadingAlignment | None
 ) -> HeadingAlignment:
     """Return what is known of an estimated heading, and of the stated one that it was made of (None: without one)."""
-    std = derived.estimate.median_std
+    std = derived.estimate.median_causal_std
     estimated = f"{log.name}: the heading is estimated: {derived.why}"
     own = HeadingAlignment(derived.source, derived.why, std_rad=std, warnings=(estimated,))
     if stated is None or derived.attitude_offset is None:

@@ -229,7 +229,7 @@ def _derived(
         attitude_offset = offset, float(estimate.constants_std[OFFSET])
         lag = round(float(estimate.constants[LAG]) * 1e9)
         attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - attitude_offset[0], thin(stated.var_rad2))
-    std = math.degrees(estimate.median_std)
+    std = math.degrees(estimate.median_causal_std)
     causal, smoothed = _samples(estimate, turn, epoch)
     gyro = GyroSamples(gyro_topic, epoch + np.round(turn.t * 1e9).astype(np.int64), turn.rate) if gyro_topic else None
     return DerivedHeading(

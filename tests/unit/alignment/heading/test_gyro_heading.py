@@ -95,6 +95,52 @@ def test_the_standard_deviation_covers_the_error_over_many_drives() -> None:
     assert 0.5 < np.mean(square) < 1.5
 
 
+def with_second_antenna(log: RobotLog, truth: Truth, seed: int) -> RobotLog:
+    """Return the log with another antenna 0.9 m away, of 1 cm."""
+    gnss, rng = log.gnss, np.random.default_rng(seed)
+    psi = np.interp(gnss.stamp_ns - truth[0][0], truth[0] - truth[0][0], truth[1])
+    away = 0.9 * np.exp(1j * (psi + math.radians(130.0))) + rng.normal(0, 0.01, (2, len(psi))).T @ [1, 1j]
+    other = replace(gnss, north_m=gnss.north_m + away.real, east_m=gnss.east_m + away.imag)
+    return replace(log, other_receivers=(OtherReceiver("/rear", other),))
+
+
+def with_mean_rates(log: RobotLog, truth: Truth, seed: int) -> RobotLog:
+    """Return the log with a gyro that gives means over the interval before its stamps, or after them."""
+    gyro, (stamps, psi) = log.gyros[0], truth
+    turned = np.diff(psi) / (np.diff(stamps) / 1e9)
+    means = np.concatenate([turned[:1], turned] if seed % 2 else [turned, turned[-1:]])
+    rates = gyro.rates_radps.copy()
+    rates[:, 2] += np.gradient(psi, (stamps - stamps[0]) / 1e9) - means
+    return replace(log, gyros=(replace(gyro, rates_radps=rates),))
+
+
+@pytest.mark.parametrize("source", ["gyro_course", "fused", "antenna_pair"])
+def test_the_stated_deviation_is_that_of_the_heading_that_the_filter_is_given(source: str) -> None:
+    square, stated = [], []
+    for seed in range(8):
+        log, truth = without_heading(seed)
+        log = with_mean_rates(log, truth, seed)
+        if source == "fused":
+            log = with_attitude(log, truth, seed)
+        elif source == "antenna_pair":
+            log = with_second_antenna(log, truth, seed)
+        found = align_streams(log, CONFIG)
+        assert found.heading.source == source
+        later = found.log.heading.stamp_ns - truth[0][0] >= FIRST_S * 1e9
+        square.append((error_deg(found.log.heading, truth)[later] ** 2).mean())
+        stated.append(math.degrees(found.heading.std_rad) ** 2)
+    assert 0.8 < math.sqrt(np.mean(square) / np.mean(stated)) < 1.25
+
+
+def test_the_stated_deviation_is_no_worse_for_a_robot_that_stands_at_first() -> None:
+    """Until it drives, no direction is known: neither is any trial begun there."""
+    log, _ = without_heading(1)
+    found = derive_heading(log, WIDTH_M).estimate
+    unknown = np.full(2 * len(found.t), math.pi)
+    stood = replace(found, causal_std=np.concatenate([unknown, found.causal_std]))
+    assert stood.median_causal_std == pytest.approx(found.median_causal_std, rel=0.02)
+
+
 @pytest.mark.parametrize(("offset_deg", "lag_s"), [(0.0, 0.0), (12.0, 0.0), (0.0, 0.1)])
 def test_the_fused_heading_is_better_than_the_attitude_sensor(offset_deg: float, lag_s: float) -> None:
     inside = []
@@ -171,11 +217,7 @@ def test_few_noisy_fixes_and_a_wandering_bias_still_give_a_heading() -> None:
 
 def test_two_antennas_point_wherever_they_are_mounted() -> None:
     log, truth = without_heading(3)
-    psi = np.interp(log.gnss.stamp_ns - truth[0][0], truth[0] - truth[0][0], truth[1])
-    rng = np.random.default_rng(3)
-    away = 0.9 * np.exp(1j * (psi + math.radians(130.0))) + rng.normal(0, 0.01, (2, len(psi))).T @ [1, 1j]
-    other = replace(log.gnss, north_m=log.gnss.north_m + away.real, east_m=log.gnss.east_m + away.imag)
-    found = derive_heading(replace(log, other_receivers=(OtherReceiver("/rear", other),)), WIDTH_M)
+    found = derive_heading(with_second_antenna(log, truth, 3), WIDTH_M)
     assert found.source == "antenna_pair"
     assert math.sqrt((error_deg(found.smoothed, truth) ** 2).mean()) < LARGEST_RMS_DEG
 
