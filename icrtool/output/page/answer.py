@@ -10,9 +10,10 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import controller_rows, format_export
-from icrtool.output.tables.brief import reach_rows
+from icrtool.output.tables.brief import reach_rows, trust
 from icrtool.output.text_format import controller_error_text, error_text, event_kinds, excitation_text, jump_count
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
+from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted
 
 Grade = Literal["good", "care", "bad", "fact"]
@@ -23,7 +24,7 @@ SMALLEST_SHOWN = 0.0005
 """A standard deviation below this would be printed as zero."""
 
 
-def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str, Any]:
+def answer_of(summary: RunDocument, report: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the page of a run states first.
 
     Parameters
@@ -41,10 +42,12 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str
     """
     found = report["recommended"]
     calibration = calibration_of({**found, "created": ""}) if found is not None else None
-    grade, verdict = _verdict(summary, report)
+    grade, sentence = trust(
+        summary, passed=report["passed"], events_left_out=report["without_events"] is not None
+    )  # fmt: skip
     return {
         "grade": grade,
-        "verdict": verdict,
+        "verdict": f"{sentence[:1].upper()}{sentence[1:]}.",
         "checks": _checks(summary, report),
         "reaches": _reaches(summary, report),
         "numbers": _numbers(calibration),
@@ -52,16 +55,6 @@ def answer_of(summary: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str
         "export": _export(calibration),
         "model": calibration.fitted.model.label if calibration is not None else "",
     }
-
-
-def _verdict(summary: Mapping[str, Any], report: Mapping[str, Any]) -> Check:
-    if not summary["usable"]:
-        return "bad", f"No: {summary['unusable_because']}."
-    if not report["passed"]:
-        return "bad", "No: an acceptance limit is not met."
-    if warnings := len(summary["warnings"]):
-        return "care", f"Yes, after reading {'the warning' if warnings == 1 else f'the {warnings} warnings'}."
-    return "good", "Yes."
 
 
 def _reaches(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[tuple[float, list[tuple[str, str, str]]]]:

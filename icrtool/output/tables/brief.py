@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -86,7 +86,8 @@ def brief_dropout(report: DropoutReport, place: str) -> Text:
     blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary), "title")]
     if report.usable:
         blocks += _reach_blocks(report)
-        blocks.append(_row("Trust?", _trust(report)))
+        _, sentence = trust(summary, passed=report.passed, events_left_out=report.event_cost is not None)
+        blocks.append(_row("Trust?", sentence))
     if report.usable and report.worst:
         one = report.worst[0]
         turn, speed = turn_text(one.heading_change_rad), one.speed_mean_mps
@@ -226,7 +227,7 @@ def reach_rows(
     """
     by_model = {one.model: one for one in budgets if one.budget_m == budget_m}
     rows = [
-        (f"calibration {label}" if label != "calibration" else label, by_model[name], note)
+        (label if label.startswith("calibration") else f"calibration {label}", by_model[name], note)
         for name, label, note in calibrations if name in by_model
     ]  # fmt: skip
     for name in REACH_ROWS:
@@ -254,16 +255,26 @@ def _reach_blocks(report: DropoutReport) -> list[Block]:
     return blocks or ["How far?  No trial is as long as the shortest horizon."]
 
 
-def _trust(report: DropoutReport) -> str:
-    """Return whether the distances can be trusted, and the reasons for care."""
-    summary = report.run_summary
+Trust = Literal["good", "care", "bad"]
+
+
+def trust(summary: RunDocument, *, passed: bool, events_left_out: bool) -> tuple[Trust, str]:
+    """Return whether the numbers of a report can be trusted, and the reasons for care, one sentence.
+
+    Parameters
+    ----------
+    passed : every acceptance limit is met
+    events_left_out : no trial crosses a slip event
+    """
+    if not summary["usable"]:
+        return "bad", f"no: {summary['unusable_because']}"
+    if not passed:
+        return "bad", "no: an acceptance limit is not met"
     reasons = [f"{what} {text}" for good, what, text in run_checks(summary) if not good and what != "slip events"]
     if events := summary["events"]:
-        crossed = "left out" if report.event_cost is not None else "trials across them count"
+        crossed = "left out" if events_left_out else "trials across them count"
         reasons.append(f"{counted(len(events), 'slip event')}, {crossed}")
-    if not report.passed:
-        return "no: an acceptance limit is not met"
-    return f"yes, with care: {'; '.join(reasons)}" if reasons else "yes"
+    return ("care", f"yes, with care: {'; '.join(reasons)}") if reasons else ("good", "yes")
 
 
 def _outages(report: DropoutReport) -> list[str]:
