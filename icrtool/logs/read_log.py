@@ -203,8 +203,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         )
     chosen: tuple[tuple[Role, WheelMotion | PositionSource | HeadingSource | None], ...]
     chosen = (("wheels", motion), ("gnss", position), ("heading", source))
-    notes = [note for role, one in chosen if one is not None for note in clock_notes(one.stamps, name, role)]
-    warnings += list(dict.fromkeys(notes))
+    warnings += clock_notes([(role, one.stamps) for role, one in chosen if one is not None], name)
     gnss, datum, rejected = _fixes(position, config, clock, name)
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock, name)
     samples, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)

@@ -29,10 +29,12 @@ class SetBack(NamedTuple):
     step_ns : the largest step back
     pieces : into how many a stretch between such steps is cut by sorting, in the mean: 1 where the stretches only
         change places, about 2 where single messages are out of place, many where times come again
+    before_ns : log time of the last message before the largest step
     """
 
     step_ns: int
     pieces: float
+    before_ns: int = 0
 
 
 NOT_SET_BACK = SetBack(0, 0.0)
@@ -208,7 +210,7 @@ def time_order(times: Ints) -> tuple[SetBack, Ints | None]:
     step_ns = int(-steps.min())
     stretch = np.concatenate([[0], np.cumsum(steps < -(NEAR_NS if step_ns > NEAR_NS else OUT_OF_ORDER_NS))])
     pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
-    return SetBack(step_ns, float(pieces / (stretch[-1] + 1))), order
+    return SetBack(step_ns, float(pieces / (stretch[-1] + 1)), int(times[np.argmin(steps)])), order
 
 
 def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -72,33 +72,49 @@ def _usable(table: TopicTable, path: str) -> StampedRows:
     return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)))
 
 
-def clock_notes(rows: StampedRows, name: str, role: Role) -> Iterator[str]:
-    """Yield sentences about clocks that cannot be used, or that were set.
+def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
+    """Yield sentences about clocks of streams that were set back, one for all, and that cannot be used, one for each.
 
     Raises
     ------
     DataError
         The clock was set back, and times came again: nothing shows which of two samples came first.
     """
-    again, far = rows.set_back.pieces > MOST_PIECES, rows.set_back.step_ns > NEAR_NS
-    why = f"log time goes back by {rows.set_back.step_ns / 1e9:.1f} s"
-    if again and far:
+    yield from _set_back_note(streams, name)
+    for role, rows in streams:
+        if rows.note and rows.note != "no header":
+            yield f"{name}: {role}: {rows.note}; log time is used"
+        if rows.replaced > 1:
+            counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
+            yield f"{name}: {role}: {counted}; log time is used for them"
+
+
+def _set_back_note(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
+    """Yield the sentence on the log's clock, with the largest step of the streams that show one."""
+    back = [
+        (rows.set_back, role)
+        for role, rows in streams
+        if rows.set_back.pieces > MOST_PIECES or rows.set_back.step_ns > NEAR_NS
+    ]
+    if not back:
+        return
+    # Of streams in which times come again, the largest step: they decide what can be done.
+    largest = max(back, key=lambda one: (one[0].pieces > MOST_PIECES, one[0].step_ns))[0]
+    moment = f"{np.datetime64(largest.before_ns // 1_000_000_000, 's')}Z"
+    why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment} ({', '.join(role for _, role in back)})"
+    far = largest.step_ns > NEAR_NS
+    if largest.pieces > MOST_PIECES and far:
         raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
-    if again:
+    if largest.pieces > MOST_PIECES:
         yield (
-            f"{name}: {why}: the clock was set while recording, and samples of that time are mixed, which makes errors "
-            "there too large; fit each part alone (--from, --to)"
+            f"{name}: {why}: the clock was set back while recording, and samples of that time are mixed, which makes "
+            "errors there too large; fit each part alone (--from, --to)"
         )
-    elif far:
+    else:
         yield (
-            f"{name}: log time goes back by {rows.set_back.step_ns / 1e9:.0f} s; messages are sorted; if the clock was "
-            "set while recording, fit each part alone (--from, --to)"
+            f"{name}: {why}: the clock was set back, or messages are stored out of order; all are used, sorted by "
+            "time; if it was set back, fit each part alone (--from, --to)"
         )
-    if rows.note and rows.note != "no header":
-        yield f"{name}: {role}: {rows.note}; log time is used"
-    if rows.replaced > 1:
-        counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
-        yield f"{name}: {role}: {counted}; log time is used for them"
 
 
 def usable_rows(stamps: Ints, usable: Bools) -> Ints | slice:

@@ -16,7 +16,8 @@ TIMES = np.arange(0, 100_000_000_000, 20_000_000)
 def notes_of(times: Ints) -> list[str]:
     set_back, order = time_order(times)
     stamps = times if order is None else times[order]
-    return list(clock_notes(StampedRows(None, stamps, "no header", 0, set_back=set_back), "drive", "wheels"))
+    rows = StampedRows(None, stamps, "no header", 0, set_back=set_back)
+    return list(clock_notes([("wheels", rows), ("gnss", rows)], "drive"))
 
 
 def set_back(seconds: float) -> Ints:
@@ -26,7 +27,13 @@ def set_back(seconds: float) -> Ints:
 @pytest.mark.parametrize("seconds", [0.3, 1.4])
 def test_a_clock_set_back_by_little_is_reported_with_its_step(seconds: float) -> None:
     (note,) = notes_of(set_back(seconds))
-    assert f"goes back by {seconds - 0.02:.1f} s: the clock was set" in note
+    assert f"goes back by {seconds - 0.02:.1f} s after 1970-01-01T00:00:50Z (wheels, gnss): the clock was set" in note
+
+
+def test_parts_of_a_drive_that_a_clock_set_back_exchanges_are_one_warning_with_time_and_step() -> None:
+    (note,) = notes_of(TIMES + np.where(TIMES > 50_000_000_000, -60_000_000_000, 100_000_000_000))
+    assert "goes back by 160.0 s after 1970-01-01T00:02:30Z (wheels, gnss)" in note
+    assert "all are used, sorted by time" in note
 
 
 def test_a_clock_set_back_by_more_is_refused() -> None:
