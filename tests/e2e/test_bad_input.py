@@ -22,6 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
 from icrtool.config import load_config
+from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
 from icrtool.logs.read_log import read_log
@@ -508,6 +509,28 @@ def test_an_interrupted_run_leaves_a_whole_directory_or_nothing(tmp_path, option
         assert after or process.returncode != 0
         stopped += not after
     assert stopped > 0
+
+
+@pytest.mark.parametrize("value", [np.inf, 1.7e308, 9e29, 5e-324])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("wheel_position_left_m", "wheel_position_right_m"), ("wheel_v_left_mps",), ("latitude_deg",), ("height_m",),
+        ("gnss_std_m",), ("heading_rad",), ("yaw_rate_radps",),
+    ],
+)  # fmt: skip
+def test_a_log_with_extreme_values_is_read_and_fitted_without_a_warning(
+    tmp_path: Path, names: tuple[str, ...], value: float
+) -> None:
+    usual = drive(60.0)
+    changed = {name: getattr(usual, name).copy() for name in names}
+    for column in changed.values():
+        column[5::14], column[12::14] = value, -value
+    with np.errstate(all="ignore"):  # of the writer: turns and squares of them
+        path = log(tmp_path, replace(usual, **changed))
+    run = fit(read_log(path, CONFIG), CONFIG)
+    assert np.isfinite(run.table.std_north_m).all()
+    dropout(run)
 
 
 HOUR_NS, YEAR_NS = 3_600_000_000_000, 31_557_600_000_000_000

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 _MOST_EXPECTED = 1 << 22
 """Numbers of a column that memory is set aside for on the log's word alone."""
 
+LARGEST = 1e30
+"""No quantity of a robot is larger, in any unit: what is counts as infinite, so that no power of numbers overflows."""
+
 
 class GrowingColumn:
     """A column that grows in place, so that all rows are never copied; a single row while all rows are the same.
@@ -64,9 +67,11 @@ def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _copy(source: NDArray[Any], target: NDArray[Any]) -> None:
-    """Copy numbers; a signalling NaN, with which any arithmetic would warn, becomes a NaN."""
+    """Copy numbers, which any arithmetic may then use: a signalling NaN becomes a NaN, what is too large infinite."""
     if target.dtype.kind != "f":
         target[...] = source
         return
     with np.errstate(invalid="ignore"):
         np.multiply(source, 1.0, out=target)
+    if target.size and not (target.min() >= -LARGEST and target.max() <= LARGEST):  # NaN compares false
+        np.copyto(target, np.copysign(np.inf, target), where=np.abs(target) > LARGEST)

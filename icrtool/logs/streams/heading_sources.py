@@ -44,6 +44,9 @@ _REFERENCES = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
 UNKNOWN_RAD2 = (2 * np.pi) ** 2
 """A heading with a standard deviation of a turn is not known yet: drivers of moving bases write 1000."""
 
+LEAST_BASELINE_CM = 0.005
+"""Half of what the fields of a baseline resolve: a shorter one has no direction."""
+
 LARGEST_DEG = 720.0
 """A heading beyond this stands for "unknown": Septentrio writes -2e10."""
 
@@ -152,6 +155,8 @@ def _stated(
     table: TopicTable, heading: Floats, variance: Floats, usable: Bools, score: float, what: str, convention_why: str
 ) -> HeadingSource:
     """Return headings clockwise from north (n,), with the variances (n,) that the messages state, NaN for unknown."""
+    finite = np.isfinite(heading)
+    heading, usable = np.where(finite, heading, np.nan), usable & finite
     return HeadingSource(
         **of_topic(table), yaw_rad=heading, variance=variance, usable=usable, convention="ned",
         convention_why=convention_why, score=score, why=what, problem="" if usable.any() else "no valid heading",
@@ -170,7 +175,7 @@ def _azimuth(table: TopicTable) -> HeadingSource:
     reference = _REFERENCES.get(float(np.median(codes)), "unknown") if len(codes) else "unknown"
     variance, what = table.floats("variance") * factor**2, f"azimuth, {reference} north"
     variance = np.where(variance > 0, variance, np.nan)
-    source = _stated(table, yaw, variance, np.isfinite(yaw), 95.0, what, "stated in the message")
+    source = _stated(table, yaw, variance, np.ones(len(yaw), np.bool_), 95.0, what, "stated in the message")
     return source if ned else replace(source, convention="enu")
 
 
@@ -187,10 +192,11 @@ def _relposned(table: TopicTable) -> HeadingSource:
     else:
         north, east = (table.column(*names) + 0.01 * np.nan_to_num(table.floats(*fine)) for names, fine in _BASELINE)
         heading, length = np.arctan2(east, north), np.hypot(north, east)
+        measured = (length > LEAST_BASELINE_CM) & np.isfinite(length)
         # The baseline in cm, its accuracy in 0.1 mm.
         acc = np.maximum(table.floats("accN", "acc_n"), table.floats("accE", "acc_e")) * 0.01
-        std = np.divide(acc, length, out=np.full(len(table), np.nan), where=length > 0)
-        usable = ((flags & _RELPOS_VALID) != 0) & (length > 0)
+        std = np.divide(acc, length, out=np.full(len(table), np.nan), where=measured)
+        usable = ((flags & _RELPOS_VALID) != 0) & measured
     what = "u-blox moving base: bearing of the antenna baseline"
     variance = np.where(std > 0, std**2, np.nan)
     return _stated(table, heading, variance, usable, 90.0, what, "u-blox: clockwise from north")

@@ -112,8 +112,12 @@ def _side_means(values: NDArray[Any], left: list[int], right: list[int]) -> tupl
         finite = [place for place in places if place not in dead and np.isfinite(values[:, place]).any()]
         if len(finite) == 1:
             means.append(values[:, finite[0]].astype(np.float64, copy=False))
+        elif finite:
+            of_side = values.T[finite].astype(np.float64, copy=False)
+            of_side[np.isinf(of_side)] = np.nan  # infinity less infinity would warn
+            means.append(of_side.mean(axis=0))
         else:
-            means.append(values.T[finite].astype(np.float64, copy=False).mean(axis=0) if finite else None)
+            means.append(None)
     return (means[0], means[1]), dead
 
 
