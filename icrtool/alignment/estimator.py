@@ -303,7 +303,11 @@ class _Model:
         self.drive, self.windows, self.b = drive, windows, width_m
         self.v, self.u = drive.mean_speed, drive.half_difference
         self.middle_t = drive.wheel_t + drive.wheel_dt / 2
+        # places are needed where a window begins or ends: at few of the fixes of a long drive
+        edges = np.stack([windows.begin, windows.end])
+        self.edge_t = drive.fix_t[edges]
         self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
+        self.level = np.exp(-0.5j * np.interp(self.edge_t, drive.heading_t, drive.heading).sum(axis=0))
         self.smooth_heading = _smooth(drive.heading_t, drive.heading)
         self.turn_v, self.turn_w = drive.cumulate(self.v).real, drive.cumulate(2 * self.u / width_m).real
         self.turned = _turned(drive, windows)
@@ -362,29 +366,33 @@ class _Model:
 
     def _displacements(self, x: Floats) -> tuple[Complexes, Complexes]:
         """Return predicted minus seen displacements in the frame of the heading (w,), and their Jacobian (w, k)."""
-        drive, windows = self.drive, self.windows
+        drive = self.drive
         nose, rate = self._directions(x)
-        body = self._velocity(x, rate)
-        t = drive.fix_t - x[TP] - x[TH]
-        begin, end = windows.begin, windows.end
+        v, u, drag = self.v, self.u, np.abs(self.u)
+        t = self.edge_t - x[TP] - x[TH]
+        step = nose * drive.wheel_dt
+        integral = np.zeros(len(nose), np.complex128)
 
-        def between(velocity: Complexes) -> Complexes:
-            at = np.interp(t, drive.wheel_t, drive.cumulate(velocity))
-            return np.asarray(at[end] - at[begin], np.complex128)
+        def laid(speed: Floats) -> Complexes:
+            np.cumsum((speed * step)[:-1], out=integral[1:])
+            return np.asarray(np.interp(t, drive.wheel_t, integral), np.complex128)
 
-        path = drive.cumulate(body * nose)
-        at = np.interp(t, drive.wheel_t, path)
-        predicted = at[end] - at[begin]
-        speed = (np.interp(t + STEP_S, drive.wheel_t, path) - np.interp(t - STEP_S, drive.wheel_t, path)) / (2 * STEP_S)
-        jacobian = np.zeros((len(begin), len(x)), np.complex128)
-        jacobian[:, A], jacobian[:, M] = between(self.v * nose), between(self.u * nose)
-        jacobian[:, C], jacobian[:, L] = between(1j * rate * nose), between(1j * self.v * rate * nose)
-        jacobian[:, D], jacobian[:, N] = 1j * predicted, between(np.abs(self.u) * nose)
-        jacobian[:, TP] = -(speed[end] - speed[begin])
-        sideways = np.interp(t, self.middle_t, x[C] + x[L] * self.v) * self._smooth_turn(t, x)
-        jacobian[:, TH] = jacobian[:, TP] + between(1j * rate * body.real * nose) + sideways[end] - sideways[begin]
-        psi = np.interp(drive.fix_t, drive.heading_t, drive.heading) + x[D]
-        level = np.exp(-0.5j * (psi[begin] + psi[end]))
+        def between(at: Complexes) -> Complexes:
+            return np.asarray(at[1] - at[0], np.complex128)
+
+        jacobian = np.zeros((len(self.seen), len(x)), np.complex128)
+        for name, speed in ((A, v), (M, u), (N, drag), (C, rate), (L, v * rate)):
+            jacobian[:, name] = between(laid(speed))
+        jacobian[:, [C, L]] *= 1j
+        predicted = sum((x[name] * jacobian[:, name] for name in (A, M, C, L, N)), np.zeros(1))
+        jacobian[:, D] = 1j * predicted
+        np.cumsum((self._velocity(x, rate) * step)[:-1], out=integral[1:])
+        after, before = (np.interp(t + shift, drive.wheel_t, integral) for shift in (STEP_S, -STEP_S))
+        jacobian[:, TP] = -between((after - before) / (2 * STEP_S))
+        sideways = np.interp(t, self.middle_t, x[C] + x[L] * v) * self._smooth_turn(t, x)
+        turning = 1j * laid(rate * (x[A] * v + x[M] * u + x[N] * drag))
+        jacobian[:, TH] = jacobian[:, TP] + between(turning + sideways)
+        level = self.level * np.exp(-1j * x[D])
         return (predicted - self.seen) * level, jacobian * level[:, None]
 
     def _turns(self, x: Floats) -> tuple[Floats, Floats]:
