@@ -13,6 +13,9 @@ from random import Random
 from support.edits import edited
 
 SECRET = b"-----BEGIN PRIVATE KEY----- of the user, never to leave his machine"
+MOST_FORGED_BYTES = 1 << 24
+"""Of a file that is forged by its content; a run's own are smaller."""
+
 PNG = b"\x89PNG\r\n\x1a\n"
 
 HIDDEN = (
@@ -77,12 +80,19 @@ def base64_of(content: bytes) -> bytes:
     return b64encode(content)
 
 
+def is_small(path: Path) -> bool:
+    """Return whether a path is a file that a forger may read: an earlier forgery may be a pipe, or of 64 GB."""
+    return path.is_file() and path.stat().st_size <= MOST_FORGED_BYTES
+
+
 def sums(place: Path) -> None:
     """Write checksums that fit the files, as whoever forges a run can."""
     file = place / "B2SUMS"
     try:
+        if not is_small(file):
+            return
         names = [line.partition("  ")[2] for line in file.read_text().splitlines()]
-        regular = [name for name in names if (place / name).is_file() and (place / name).stat().st_size < 1 << 28]
+        regular = [name for name in names if is_small(place / name)]
         lines = [f"{hashlib.blake2b((place / name).read_bytes()).hexdigest()}  {name}\n" for name in regular]
         if not file.is_symlink():
             file.write_text("".join(lines))
@@ -150,8 +160,7 @@ def special(place: Path, home: Home, random: Random) -> str:
 def content(place: Path, home: Home, random: Random) -> str:
     """Replace the content of a file, with checksums that fit."""
     path = files_of(place, random)
-    readable = path.is_file() and not path.is_symlink() and path.stat().st_size < 1 << 28
-    old = path.read_bytes() if readable else b""
+    old = path.read_bytes() if is_small(path) and not path.is_symlink() else b""
     at = random.randrange(len(old) + 1)
     new = random.choice([
         b"", PNG, PNG + SECRET[:5] * 1000, b"[" * 100_000, old[:at], old + old, b"\xff" * 50,
@@ -189,7 +198,7 @@ def document(place: Path, home: Home, random: Random) -> str:
     """Edit one place of a JSON document, with checksums that fit."""
     path = random.choice([place / "run.json", place / "dropout" / "report.json"])
     try:
-        if not path.is_file() or path.stat().st_size > 1 << 28:
+        if not is_small(path):
             return f"{path.name}: forged already"
         plain = json.loads(path.read_bytes())
     except (OSError, ValueError):
@@ -215,7 +224,7 @@ def names(place: Path, home: Home, random: Random) -> str:
         own.write_text(json.dumps({"schema": "icrtool/files/1", "kind": kind, "files": listed, "made_from": listed}))
         return "names in .icrtool-files"
     lists = place / "B2SUMS"
-    if lists.is_file() and not lists.is_symlink():
+    if is_small(lists) and not lists.is_symlink():
         line = f"{hashlib.blake2b(SECRET).hexdigest()}  {outside}\n"
         lists.write_text(lists.read_text(errors="replace").replace("states.csv", outside) + line)
     return "names in B2SUMS"
