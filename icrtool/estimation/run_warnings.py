@@ -56,6 +56,8 @@ def unusable_reasons(
     twist_separation: float | None = None,
     contradiction: str = "",
     filtered: str = "",
+    *,
+    inverted: bool = False,
 ) -> list[str]:
     """Return why the ICRs of a run must not be used; empty where they can be.
 
@@ -64,11 +66,13 @@ def unusable_reasons(
     contradiction : of `contradicts_windows`
     filtered : how the wheels show that a filter made them; nothing else is then worth a reason
     twist_separation : (y_r - y_l) / b by a body twist that was converted with b, None for other wheels
+    inverted : the right ICR ended left of the left one
     """
     if filtered:
         return [f"filtered or fused odometry ({filtered}); wheel speeds are needed: topics.wheels names their topic"]
     hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
     reasons = [f"{', '.join(hidden)} not shown by this drive"] if hidden else []
+    reasons += ["the ICRs ended inverted: check sides and signs of the wheels"] if inverted and not hidden else []
     for word, outcome in (("fixes", gnss), ("headings", heading)):
         share = rejected_share(outcome)
         if share > UNUSABLE_SHARE:

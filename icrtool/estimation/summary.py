@@ -76,14 +76,11 @@ def summarise(
     scale = measurements.findings["wheel_scale"] if field else None
     of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
     unusable = unusable_reasons(
-        excitation,
-        *filtered.in_use,
-        filtered.noise,
-        scale,
-        multiplier if of_twist else None,
+        excitation, *filtered.in_use, filtered.noise, scale, multiplier if of_twist else None,
         contradicts_windows(table, covariance, measurements.findings) if field and not changes_s else "",
         str(measurements.sections["wheels"]["filtered"] or "") if field else "",
-    )
+        inverted=bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]),
+    )  # fmt: skip
     document: RunDocument = plain(
         {
             "schema": RUN_SCHEMA,

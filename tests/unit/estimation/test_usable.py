@@ -99,3 +99,11 @@ def test_the_rejected_share_counts_what_the_filter_saw() -> None:
     none = np.zeros(4)
     assert rejected_share(MeasurementOutcome(np.arange(4), none, none, code, none)) == 0.5
     assert rejected_share(MeasurementOutcome(np.arange(4), none, none, 0 * code, none)) == 0.0
+
+
+def test_icrs_that_ended_inverted_are_not_usable() -> None:
+    """Preset ``paper`` from a certain start on the wrong sides."""
+    start = ("initial_y_icr_right_m=-0.5", "initial_y_icr_left_m=0.5", "initial_icr_std_m=0.001", "preset=paper")
+    run = fit(make_log(0, 10.0), load_config(sets=[WIDTH, *(f"filter.{one}" for one in start)]))
+    assert run.table.y_icr_right_m[-1] < run.table.y_icr_left_m[-1]
+    assert not run.usable
