@@ -59,8 +59,9 @@ def align(log: RobotLog, config: Config) -> Measurements:
 def _align_once(log: RobotLog, config: Config) -> Measurements:
     found = align_streams(log, config)
     heading = found.heading
-    quality = grade_fixes(found.log, config, found.fix_steps)
-    noise = reference_noise(found.log, config.filter, found.fix_steps, found.heading_steps)
+    fix_steps = found.fix_steps
+    quality = grade_fixes(found.log, config, fix_steps)
+    noise = reference_noise(found.log, config.filter, fix_steps, found.heading_steps)
     sensors = sensors_as_sent(quality.log, config, noise)
     findings = alignment_findings(found, sensors.antenna_m)
     return Measurements(

@@ -127,10 +127,12 @@ def _found(sensors: SensorData, width_m: float) -> Disagreements:
     if knots is None:
         return Disagreements()
     knots, steps = without_jumps(knots, width_m)
-    quiet = np.ones(len(knots.t), np.bool_)
+    quiet = fitted = np.ones(len(knots.t), np.bool_)
+    model = fit_motion(knots, width_m, quiet)
     found = Disagreements()
     for quantile in (FIRST_QUANTILE, LATER_QUANTILE):
-        model = fit_motion(knots, width_m, quiet)
+        if not np.array_equal(quiet, fitted):
+            model, fitted = fit_motion(knots, width_m, quiet), quiet
         if model is None:
             return Disagreements()
         evidence, error = _weigh(knots, model, quiet, quantile)
