@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import sys
+import textwrap
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -276,7 +277,9 @@ class View:
 
 def line_of(row: Row) -> str:
     """Return a line about a log that could be used."""
-    parts = [f"{row.status if row.this_time == 'processed' else row.this_time:7}", str(LogText(row.log))]
+    # Of a log that can be used, the only reason is that its end is missing.
+    word = "skipped" if row.this_time == "skipped" else "cut off" if row.usable and row.reason else row.status
+    parts = [f"{word:7}", str(LogText(row.log))]
     if row.distance_m is not None:
         parts.append(f"{row.distance_m:.0f} m")
     if not row.usable:
@@ -284,9 +287,7 @@ def line_of(row: Row) -> str:
     if row.multiplier is not None:
         parts.append(f"multiplier {row.multiplier:.3f} ± {row.multiplier_std or 0.0:.3f}")
     if (p95 := row.shown_error()) is not None:
-        parts.append(f"95 % within {p95:.3g} m after 10 m")
-    if row.reason:
-        parts.append(escaped(row.reason.partition(":")[0]))
+        parts.append(f"95 %: {p95:.3g} m after 10 m")
     return "  ".join(parts)
 
 
@@ -299,4 +300,6 @@ def summary_of(rows: Sequence[Row], output: Path) -> str:
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
     files = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")
     written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
-    return f"\n{counted(len(rows), 'log')}: {', '.join(parts)}\nwritten to {LogText(str(output))}: {written}"
+    place = f"written to {LogText(str(output))}: {written}"
+    lines = textwrap.wrap(place, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    return "\n".join(["", f"{counted(len(rows), 'log')}: {', '.join(parts)}", *lines])

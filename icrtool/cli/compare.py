@@ -45,7 +45,7 @@ def command(
     from icrtool.output.files.atomic_file import write_file
     from icrtool.output.files.json_file import json_bytes
     from icrtool.output.files.picture_file import save_picture
-    from icrtool.output.tables.transfer import format_transfer, transfer_csv, transfer_document
+    from icrtool.output.tables.transfer import brief_transfer, format_transfer, transfer_csv, transfer_document
 
     config = options.load(config_file, robot, sets)
     places = _groups(sources)
@@ -66,7 +66,7 @@ def command(
     if as_json:
         print_json("compare", document)
     elif not quiet:
-        show(format_transfer(transfer))
+        show(format_transfer(transfer) if verbose else brief_transfer(transfer))
 
 
 def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:

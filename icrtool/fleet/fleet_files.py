@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -127,12 +128,14 @@ def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool
         name = ", ".join(str(LogText(part)) for part in (one.robot, one.group) if part) or "all logs"
         head = f"{name}: {counted(len(one.logs), 'log')}"
         if one.left_out:
-            head += f", {len(one.left_out)} not used (not usable, copies, or beyond {MOST_POOLED_S / 3600:.0f} h)"
+            why = f" (not usable, copies, parts of another, or beyond {MOST_POOLED_S / 3600:.0f} h)"
+            head += f", {len(one.left_out)} not used{why if tables else ''}"
         if one.reason:
-            parts.append(f"{head}: no calibration: {escaped(one.reason)}")
-            continue
-        head += f": multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}{one.within_text}, in {one.file}"
-        parts.append(f"{head}\n{one.table}" if tables else head)
+            head += f": no calibration: {escaped(one.reason)}"
+        else:
+            head += f": multiplier {one.multiplier:.4f} ± {one.multiplier_std:.4f}{one.within_text}, in {one.file}"
+        lines = textwrap.wrap(head, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+        parts.append("\n".join(lines) if not tables else head if one.reason else f"{head}\n{one.table}")
     return ("\n\n" if tables else "\n").join(parts) + "\n"
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import fcntl
+import json
 import os
 import pty
 import re
@@ -110,3 +112,39 @@ def test_a_narrow_terminal_loses_no_column_without_notice(screen: Screen) -> Non
     text = " ".join(" ".join(lines).split())
     assert "left out: the terminal has 60 columns" in text
     assert "…" not in "".join(line for line in lines if "%" in line)
+
+
+def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Screen) -> None:
+    logs = [ROOT / "sample_logs" / name for name in ("wheeled_lawnmower.mcap", "wheeled_figure_eight")]
+    status, lines = screen("calibrate", *logs, *ROBOT)
+    check_fits(lines)
+    assert status == 0
+    assert "wheel_separation_multiplier" in "\n".join(lines)
+    assert "How far within 0.5 m (95 %), each log left out in turn?" in lines
+    assert "omega_sw" not in "\n".join(lines)
+    status, brief = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *ROBOT)
+    check_fits(brief)
+    text = " ".join("\n".join(brief).split())
+    assert (status, brief[0].split()[:5]) == (0, ["The", "multiplier", "of", "b", "differs"])
+    assert "error [m] after 10 m, calibrated on row, tested on column" in text
+    full = screen("compare", *(f"{name}={log}" for name, log in zip("ab", logs, strict=True)), *ROBOT, "-v")[1]
+    assert len(full) > len(brief) + 8
+
+
+def test_a_batch_has_a_line_a_log_and_says_which_one_is_cut_off(screen: Screen, tmp_path: Path) -> None:
+    (tmp_path / "season").mkdir()
+    content = (ROOT / "sample_logs" / "wheeled_lawnmower.mcap").read_bytes()
+    (tmp_path / "season" / "whole.mcap").write_bytes(content)
+    (tmp_path / "season" / "short.mcap").write_bytes(content[: 6 * len(content) // 10])
+    (tmp_path / "season" / "broken.mcap").write_bytes(content[:100])
+    status, lines = screen("batch", "season", "-o", "fleet", *ROBOT, "--plots", "none", "--no-page", "-j", "1")
+    check_fits([line for line in lines if not line.startswith("Error: ")])
+    assert status == 1
+    assert any(line.startswith("cut off  short.mcap") for line in lines)
+    with (tmp_path / "fleet" / "fleet.csv").open() as file:
+        rows = {row["log"]: row for row in csv.DictReader(file)}
+    assert rows["short.mcap"]["status"] == "done"
+    assert rows["short.mcap"]["reason"].startswith("truncated: ")
+    assert {row["this_time"] for row in rows.values()} == {"processed"}
+    (calibration,) = json.loads((tmp_path / "fleet" / "fleet.json").read_text())["calibrations"]
+    assert (calibration["logs"], calibration["left_out"]) == (["whole.mcap"], ["short.mcap"])

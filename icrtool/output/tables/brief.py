@@ -12,6 +12,7 @@ from icrtool.calibration.one_log import LogCalibration
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.observability import lacking_turns
+from icrtool.motion.models import TERMS
 from icrtool.output.tables.calibration import setting_blocks
 from icrtool.output.tables.dropout import shown_horizons
 from icrtool.output.text_blocks import Block, Line, Table, Text
@@ -349,7 +350,8 @@ def brief_calibration(result: CalibrationResult | None, sensors: LogCalibration 
         what = "log" if table.folds[0].whole else "block of distance"
         blocks += [Line(f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?", "title")]
         blocks += [Table("lrl", rows)]
-        blocks += [_row("not shown", ", ".join(calibration.fitted.not_shown))] if calibration.fitted.not_shown else []
+        if unknown := [TERMS[name].meaning for name in calibration.fitted.not_shown]:
+            blocks.append(_row("not found", f"{'; '.join(unknown)}: too small, or not driven; taken as usual"))
     if sensors is not None:
         blocks += setting_blocks(sensors)
     return Text(blocks)

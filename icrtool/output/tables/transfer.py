@@ -13,6 +13,9 @@ from icrtool.records.dropout import CHOICE_HORIZON_M
 
 TRANSFER_SCHEMA = "icrtool/compare/1"
 
+MOST_VERDICTS = 4
+"""Sentences that are printed unless -v is given."""
+
 
 def transfer_document(transfer: Transfer) -> dict[str, Any]:
     """Return plain data."""
@@ -70,18 +73,29 @@ def format_transfer(transfer: Transfer) -> Text:
         for horizon, change in pair.errors.items():
             if math.isfinite(change.p95_m):
                 route = ", the same route" if pair.paired else ""
-                blocks.append(f"held-out error after {horizon:g} m{route}: 95 % {_change(change[:3])}; "
+                blocks.append(f"error of a fit to other trials after {horizon:g} m{route}: 95 % {_change(change[:3])}; "
                               f"expected {_change(change[3:])}")  # fmt: skip
         blocks.append("")
+    return Text([*blocks, *_matrix_blocks(transfer)])
+
+
+def brief_transfer(transfer: Transfer) -> Text:
+    """Return the verdicts, a sentence each, and the transfer matrix, no line end."""
+    sentences = [verdict(transfer, pair) for pair in transfer.pairs]
+    more = [f"and {len(sentences) - MOST_VERDICTS} more: -v"] if len(sentences) > MOST_VERDICTS else []
+    return Text([*sentences[:MOST_VERDICTS], *more, "", *_matrix_blocks(transfer)])
+
+
+def _matrix_blocks(transfer: Transfer) -> list[Block]:
+    """Return the errors of each calibration in each group."""
     names = list(transfer.calibrations)
     cells = [[transfer.cell(row, column, CHOICE_HORIZON_M) for column in names] for row in names]
     matrix = [(row[0].calibrated_on, *(_errors(cell) for cell in row)) for row in cells]
-    blocks += [
+    return [
         f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column",
         Table("lr", matrix, ("", *names)),
         "on the diagonal each trial is predicted by a fit that does not contain it",
     ]
-    return Text(blocks)
 
 
 def _errors(cell: Cell) -> str:

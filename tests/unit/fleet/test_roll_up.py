@@ -57,7 +57,9 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
     assert (ice.file, ice.logs) == ("", ("c",))
     assert "usable" in ice.reason
     assert grass.table in calibrations_text(found)
-    assert len(calibrations_text(found, tables=False).splitlines()) == len(found)
+    lines = calibrations_text(found, tables=False).splitlines()
+    assert sum(not line.startswith("  ") for line in lines) == len(found)
+    assert max(map(len, lines)) <= 80
     numbers = f"multiplier {grass.multiplier:.4f} ± {grass.multiplier_std:.4f}, within 0.5 m (95 %) for"
     assert numbers in calibrations_text(found)
     write_fleet(logs, place, found)
