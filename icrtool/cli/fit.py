@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -80,14 +81,15 @@ def command(
         place = escaped(str(directory))
         documents.append({"log": escaped(str(log)), "status": "done", "directory": place, "run": run.summary})
         if not (quiet or as_json):
-            _print(run, place, verbose=verbose)
+            again = ["icrtool", "info", escaped(str(log)), "-v", *options.given(config_file, robot, sets, start, end)]
+            _print(run, place, shlex.join(again), verbose=verbose)
     if as_json:
         print_json("fit", {"logs": documents})
     options.leave(failed, len(logs), "logs")
 
 
-def _print(run: Run, place: str, *, verbose: bool) -> None:
-    """Print the answer, with -v all that was found."""
+def _print(run: Run, place: str, examine: str, *, verbose: bool) -> None:
+    """Print the answer, with -v all that was found; `examine`: command that names what is wrong in the log."""
     from icrtool.output.tables.brief import brief_run
     from icrtool.output.tables.run import format_run
 
@@ -95,7 +97,7 @@ def _print(run: Run, place: str, *, verbose: bool) -> None:
         show(format_run(run))
         click.echo(f"\nwritten to {place}")
     else:
-        show(brief_run(run, place))
+        show(brief_run(run, place, examine))
 
 
 def check_times(times: tuple[float, ...]) -> None:

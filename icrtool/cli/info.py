@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,19 +50,22 @@ def command(
     logs = logs_of(logs, quiet=quiet)
     for log in logs:
         found = Found(log)
+        given = options.given(config_file, robot, sets, start, end)
         try:
             with Stages(LogText(log.name), quiet=quiet, verbose=verbose) as stages:
                 _examine(found, config, (start, end), stages)
         except IcrToolError as err:
             found.problem = err
         if not (quiet or as_json):
-            _print(found, config, _options(config_file, robot, sets, start, end), everything=verbose)
-        options.warn(found.warnings, quiet=quiet)
+            _print(found, config, given, everything=verbose)
+        # On a terminal the answer names the gravest one.
+        if verbose or as_json or not sys.stderr.isatty():
+            options.warn(found.warnings, quiet=quiet)
         if found.problem is not None:
             failed.append(log)
             options.report_error(found.problem, log)
         if as_json:
-            documents.append(_document(found, _options(config_file, robot, sets, start, end)))
+            documents.append(_document(found, given))
     if as_json:
         print_json("info", {"logs": documents})
     options.leave(failed, len(logs), "logs")
@@ -112,29 +116,25 @@ def _examine(found: Found, config: Config, part: tuple[str | None, str | None], 
 
 
 def _print(found: Found, config: Config, given: Sequence[str], *, everything: bool) -> None:
-    """Print what a log holds, whether it can be fitted, and the command to run next."""
+    """Print whether a log can be fitted, what it holds, and the command to run next; with -v all that was found."""
     from icrtool.logs.describe import describe_log, describe_survey
-    from icrtool.output.tables.overview import next_command, overview_rows, verdict_rows
+    from icrtool.output.tables.overview import brief_info, next_command, overview_rows, verdict_rows
+    from icrtool.output.tables.run import excitation_row
     from icrtool.output.text_blocks import Line, Text, labelled
 
+    command = next_command(escaped(str(found.log)), given, found.run)
+    if not everything:
+        show(brief_info(found.survey, found.measured, found.run, found.problem, config, command))
+        return
     if found.survey is not None:
-        click.echo(describe_survey(found.survey, found.measured, everything=everything))
+        click.echo(describe_survey(found.survey, found.measured))
     elif found.measured is not None:
         click.echo(describe_log(found.measured))
     rows = overview_rows(found.measured, found.run) if found.measured is not None else []
+    rows += [excitation_row(found.run)] if found.run is not None else []
     rows += verdict_rows(found.run, found.problem, config)
-    command = next_command(escaped(str(found.log)), given, found.run)
     last = [Line(f"{'next':<12}{command}", "as is")] if command is not None else []
     show(Text(["", *labelled(rows), *last]))
-
-
-def _options(
-    config_file: Path | None, robot: str | None, sets: tuple[str, ...], start: str | None, end: str | None
-) -> list[str]:
-    """Return the options of this call that the next command takes too."""
-    pairs = [("--config", config_file), ("--robot", robot), *(("--set", one) for one in sets)]
-    pairs += [("--from", start), ("--to", end)]
-    return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]
 
 
 def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:

@@ -244,6 +244,15 @@ def load(config_file: Path | None, robot: str | None, sets: tuple[str, ...]) -> 
     return load_config(config_file, robot, sets)
 
 
+def given(
+    config_file: Path | None, robot: str | None, sets: tuple[str, ...], start: str | None, end: str | None
+) -> list[str]:
+    """Return the options of a call that the next command takes too."""
+    pairs = [("--config", config_file), ("--robot", robot), *(("--set", one) for one in sets)]
+    pairs += [("--from", start), ("--to", end)]
+    return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]
+
+
 def write_or_print(text: str, output: Path | None) -> None:
     """Write a text to its file, or print it where none is named."""
     if output is None:

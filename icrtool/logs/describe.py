@@ -1,4 +1,4 @@
-"""The text of ``icrtool info``."""
+"""The text of ``icrtool info -v``."""
 
 from __future__ import annotations
 
@@ -20,18 +20,17 @@ Sources = Sequence[WheelMotion | PositionSource | HeadingSource]
 GAP_IN_INTERVALS = 5.0
 
 
-def describe_survey(survey: Survey, measured: RobotLog | None, *, everything: bool) -> str:
-    """Return the text of ``icrtool info``: topics, rates, gaps, stamps, candidates by role, the choice.
+def describe_survey(survey: Survey, measured: RobotLog | None) -> str:
+    """Return the text of ``icrtool info -v``: topics, rates, gaps, stamps, candidates by role, the choice.
 
     Parameters
     ----------
     measured : the assembled log, None when it cannot be used
-    everything : also list the topics whose types no role can use
     """
     size = sum(file.bytes for file in survey.inputs)
     topics, files = counted(len(survey.channels), "topic"), counted(len(survey.inputs), "file")
     lines = [f"{survey.path}: {topics}, {size / 1e6:.3g} MB in {files}"]
-    lines += _topics(survey, everything=everything)
+    lines += _topics(survey)
     chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
     candidates: tuple[tuple[Role, Sources], ...] = (
         ("wheels", survey.candidates.wheels),
@@ -67,15 +66,11 @@ def describe_log(log: RobotLog) -> str:
     return "\n".join(lines)
 
 
-def _topics(survey: Survey, *, everything: bool) -> list[str]:
+def _topics(survey: Survey) -> list[str]:
     tables = {table.topic: table for table in survey.tables}
     lines, width = [], max((len(str(channel.topic)) for channel in survey.channels), default=0)
-    unused = 0
     for topic, channel in {channel.topic: channel for channel in survey.channels}.items():
         table = tables.get(topic)
-        if table is None and not everything and topic not in survey.candidates.unread:
-            unused += 1
-            continue
         text = f"  {topic:<{width}}  {channel.message_type}"
         if table is not None:
             rate, _ = rate_and_jitter(table.log_time_ns)
@@ -91,8 +86,6 @@ def _topics(survey: Survey, *, everything: bool) -> list[str]:
         else:
             text += "  no role"
         lines.append(text)
-    if unused:
-        lines.append(f"  and {unused} of types that no role can use (-v lists them)")
     return lines
 
 

@@ -8,6 +8,7 @@ import json
 import os
 import pty
 import re
+import shlex
 import struct
 import subprocess
 import sys
@@ -112,6 +113,37 @@ def test_a_narrow_terminal_loses_no_column_without_notice(screen: Screen) -> Non
     text = " ".join(" ".join(lines).split())
     assert "left out: the terminal has 60 columns" in text
     assert "…" not in "".join(line for line in lines if "%" in line)
+
+
+def test_a_log_is_described_on_one_screen(screen: Screen, tmp_path: Path) -> None:
+    log = Path("drive.mcap")
+    (tmp_path / log).symlink_to(ROOT / "sample_logs" / "wheeled_lawnmower.mcap")
+    status, lines = screen("info", log, *ROBOT)
+    check_fits(lines)
+    assert (status, lines[0]) == (0, "verdict     can be fitted, all ICRs are shown")
+    text = "\n".join(lines)
+    for topic in ("/joint_states", "/gps/fix", "/imu/data"):
+        assert text.count(topic) == 1
+    assert text.endswith("icrtool dropout-report drive.mcap --robot segway-rmp400")
+    assert len(screen("info", log, *ROBOT, "-v")[1]) > MOST_LINES
+
+
+def test_a_log_that_cannot_be_fitted_says_so_first(screen: Screen) -> None:
+    status, lines = screen("info", ROOT / "sample_logs" / "wheeled_figure_eight")
+    check_fits([line for line in lines if not line.startswith("Error: ")])
+    assert status == 1
+    assert lines[0].startswith("verdict     cannot be fitted: robot.track_width_m")
+
+
+def test_the_next_command_of_an_unusable_run_names_the_log_and_the_options(screen: Screen, tmp_path: Path) -> None:
+    (tmp_path / "two words.mcap").symlink_to(ROOT / "sample_logs" / "wheeled_lawnmower.mcap")
+    given = (*ROBOT, "--set", "frames.heading_offset_deg=40")
+    status, lines = screen("fit", "two words.mcap", *given, "--plots", "none")
+    check_fits([line for line in lines if not line.startswith("next ")])
+    assert status == 0
+    assert lines[0].startswith("Do not use: ")
+    command = shlex.split(lines[-1].removeprefix("next"))
+    assert command == ["icrtool", "info", "two words.mcap", "-v", *given]
 
 
 def test_a_calibration_and_a_comparison_are_answered_on_one_screen(screen: Screen) -> None:

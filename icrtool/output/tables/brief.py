@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
@@ -15,7 +16,7 @@ from icrtool.estimation.observability import lacking_turns
 from icrtool.motion.models import TERMS
 from icrtool.output.tables.calibration import setting_blocks
 from icrtool.output.tables.dropout import shown_horizons
-from icrtool.output.text_blocks import Block, Line, Table, Text
+from icrtool.output.text_blocks import Block, Line, Look, Table, Text
 from icrtool.output.text_format import (
     distance_text,
     duration_text,
@@ -52,12 +53,13 @@ Check = tuple[bool, str, str]
 """Whether it is in order, what was checked, and the finding."""
 
 
-def brief_run(run: Run, directory: str) -> Text:
+def brief_run(run: Run, directory: str, examine: str) -> Text:
     """Return what `icrtool fit` prints: usable or not, the numbers, why to trust them, what is next.
 
     Parameters
     ----------
     directory : of the run
+    examine : command that names what is wrong in the log
     """
     summary = run.summary
     blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary), "title"), *_state_lines(summary)]
@@ -69,10 +71,15 @@ def brief_run(run: Run, directory: str) -> Text:
         label = "checks" if not number else ""
         blocks.append(Line(_cut(f"{label:{LABEL}}{'ok' if good else '!':4}{what:12}{text}"), "as is"))
     if corrected := corrections(summary):
-        blocks.append(_row("corrected", "; ".join(corrected)))
-    blocks.append(_row("inputs", "; ".join(_inputs(summary))))
-    blocks.append(_row("written to", directory))
-    blocks.append(_row("next", f"icrtool dropout-report {directory}" if summary["usable"] else _advice(summary)))
+        blocks.append(labelled_line("corrected", "; ".join(corrected)))
+    blocks.append(labelled_line("inputs", "; ".join(_inputs(summary))))
+    blocks.append(labelled_line("written to", directory))
+    if summary["usable"]:
+        blocks.append(copied("next", shlex.join(["icrtool", "dropout-report", directory])))
+    elif lacks := _lacking_turns(summary):
+        blocks.append(labelled_line("next", lacks))
+    else:
+        blocks.append(copied("next", examine))
     return Text(blocks)
 
 
@@ -88,16 +95,16 @@ def brief_dropout(report: DropoutReport, place: str) -> Text:
     if report.usable:
         blocks += _reach_blocks(report)
         _, sentence = trust(summary, passed=report.passed, events_left_out=report.event_cost is not None)
-        blocks.append(_row("Trust?", sentence))
+        blocks.append(labelled_line("Trust?", sentence))
     if report.usable and report.worst:
         one = report.worst[0]
         turn, speed = turn_text(one.heading_change_rad), one.speed_mean_mps
         text = f"{error_text(one.errors_m[one.model])} after {one.horizon_m:g} m, turning {turn} at {speed:.2f} m/s"
-        blocks.append(_row("Worst", f"at {duration_text(one.t_s)}: {text}"))
-    blocks += [_row("Outages", text) for text in _outages(report)]
+        blocks.append(labelled_line("Worst", f"at {duration_text(one.t_s)}: {text}"))
+    blocks += [labelled_line("Outages", text) for text in _outages(report)]
     blocks += [_error_table(report)]
     blocks += [Line(one.line(), "good" if one.passed else "bad") for one in report.verdicts]
-    blocks.append(_row("page" if place.endswith(".html") else "written to", place))
+    blocks.append(labelled_line("page" if place.endswith(".html") else "written to", place))
     return Text(blocks)
 
 
@@ -110,13 +117,18 @@ def _title(summary: RunDocument) -> str:
 
 
 def _state_lines(summary: RunDocument) -> list[Line]:
-    """Return that a run can be used, and its gravest warning: the first that the alignment did not mend."""
-    warnings = [one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]]
-    first = next((one for one in warnings if ": corrected" not in one), next(iter(warnings), ""))
-    head = f"{counted(len(warnings), 'warning')} (-v), first: {first}" if len(warnings) > 1 else first
+    """Return that a run can be used, and its gravest warning."""
+    head = gravest(summary["warnings"], summary["log"])
     if summary["usable"]:
         return [Line(_cut(f"{'USABLE':{LABEL}}{head}"), "good")]
-    return [Line(_cut(f"{'':{LABEL}}{head}"), "as is")] if warnings else []
+    return [Line(_cut(f"{'':{LABEL}}{head}"), "as is")] if head else []
+
+
+def gravest(warnings: Sequence[str], log: str) -> str:
+    """Return how many warnings there are and the gravest: the first that nothing was done about; none: empty."""
+    plain = [one.removeprefix(f"{log}: ") for one in warnings]
+    first = min(plain, key=lambda one: ("is not given" in one) + 2 * (": corrected" in one), default="")
+    return f"{counted(len(plain), 'warning')} (-v), first: {first}" if len(plain) > 1 else first
 
 
 def _controller_lines(run: Run) -> Iterator[str]:
@@ -154,7 +166,7 @@ def run_checks(summary: RunDocument) -> list[Check]:
         found.append((agreement.endswith("agrees"), "EKF", agreement))
     excitation, gnss, heading = summary["excitation"], summary["gnss"], summary["heading"]
     verdicts: Mapping[Any, Any] = excitation["verdict"]
-    lacks = lacking_turns(*np.radians([excitation["turned_right_deg"], excitation["turned_left_deg"]]).tolist())
+    lacks = _lacking_turns(summary)
     if set(verdicts.values()) == {"shown"}:
         found.append((not lacks, "excitation", f"all three ICRs shown{f'; {lacks}' if lacks else ''}"))
     else:
@@ -201,10 +213,10 @@ def _inputs(summary: RunDocument) -> list[str]:
     return [f"{topic} ({', '.join(taken)})" for topic, taken in roles.items()]
 
 
-def _advice(summary: RunDocument) -> str:
+def _lacking_turns(summary: RunDocument) -> str:
     excitation = summary["excitation"]
     right, left = np.radians([excitation["turned_right_deg"], excitation["turned_left_deg"]]).tolist()
-    return lacking_turns(right, left) or "icrtool info LOG -v names what is wrong in the log"
+    return lacking_turns(right, left)
 
 
 NOTES = {"controller": "in any diff_drive_controller"}
@@ -310,17 +322,18 @@ def _metres(error_m: float) -> str:
     return f"{error_m:7.2f}" if np.isfinite(error_m) else "-"
 
 
-def _row(label: str, text: str) -> Line:
-    return Line(_wrapped(label, text), "as is")
-
-
-def _wrapped(label: str, text: str) -> str:
-    """Return a label and a text in lines of at most `WIDTH`; a path is not broken."""
+def labelled_line(label: str, text: str, look: Look = "as is") -> Line:
+    """Return a label and a text in two lines of at most `WIDTH`; a path is not broken."""
     lines = textwrap.wrap(
         text, WIDTH, initial_indent=f"{label:{LABEL}}", subsequent_indent=" " * LABEL, break_long_words=False,
         break_on_hyphens=False, max_lines=2, placeholder=" …",
     )  # fmt: skip
-    return "\n".join(lines) or label
+    return Line("\n".join(lines) or label, look)
+
+
+def copied(label: str, command: str) -> Line:
+    """Return a command on one line, however long: it is copied."""
+    return Line(f"{label:{LABEL}}{command}", "as is")
 
 
 def _cut(line: str) -> str:
@@ -351,7 +364,7 @@ def brief_calibration(result: CalibrationResult | None, sensors: LogCalibration 
         blocks += [Line(f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?", "title")]
         blocks += [Table("lrl", rows)]
         if unknown := [TERMS[name].meaning for name in calibration.fitted.not_shown]:
-            blocks.append(_row("not found", f"{'; '.join(unknown)}: too small, or not driven; taken as usual"))
+            blocks.append(labelled_line("not found", f"{'; '.join(unknown)}: too small, or not driven; taken as usual"))
     if sensors is not None:
         blocks += setting_blocks(sensors)
     return Text(blocks)

@@ -1,19 +1,24 @@
-"""What a log is at a glance, and what to do with it: the first and the last lines of `icrtool info`."""
+"""What a log is at a glance, and what to do with it: what `icrtool info` prints, with -v its last lines."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 
 import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
+from icrtool.logs.read_log import Survey
+from icrtool.output.tables.brief import copied, gravest, labelled_line
 from icrtool.output.tables.run import Row, excitation_row
+from icrtool.output.text_blocks import Block, Text
 from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
+from icrtool.records.samples import ROLE_WORDS
 from icrtool.records.tables import RobotLog
+from icrtool.records.text import counted
 
 OLDEST_DATE_NS = 946_684_800_000_000_000
 """1 January 2000: stamps before it count from the start of a computer or a simulation."""
@@ -37,16 +42,76 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
 
 
 def verdict_rows(run: Run | None, problem: IcrToolError | None, config: Config) -> list[Row]:
-    """Return whether a log can be fitted, what it shows, and what is missing."""
-    rows = [excitation_row(run)] if run is not None else []
-    rows.append(("verdict", verdict(run, problem)))
+    """Return whether a log can be fitted, and what is missing."""
+    rows = [("verdict", verdict(run, problem))]
     if run is not None and config.robot.track_width_m is None:
         missing = (
-            "robot.track_width_m: without it, no-slip odometry and the multiplier are left out; --robot NAME "
-            "(icrtool robots lists them) or --set robot.track_width_m=… gives it"
+            "robot.track_width_m (no multiplier, no no-slip odometry): --robot NAME (icrtool robots lists them), or "
+            "--set robot.track_width_m=…"
         )
         rows.append(("missing", missing))
     return rows
+
+
+def brief_info(
+    survey: Survey | None, log: RobotLog | None, run: Run | None, problem: IcrToolError | None, config: Config,
+    command: str | None,
+) -> Text:  # fmt: skip
+    """Return what `icrtool info` prints: the verdict, what was driven, each topic once, what is missing and next.
+
+    Parameters
+    ----------
+    survey, log, run : as far as reading and fitting came
+    problem : why the log cannot be fitted
+    command : to run next
+    """
+    name = survey.name if survey is not None else log.name if log is not None else ""
+    (_, decision), *missing = verdict_rows(run, problem, config)
+    blocks: list[Block] = [labelled_line("verdict", decision, "good" if run is not None and run.usable else "bad")]
+    rows = [*_holds_rows(survey, log), *(overview_rows(log, run) if log is not None else [])]
+    rows += [excitation_row(run)] if run is not None else []
+    rows += _topic_rows(survey, log)
+    warnings = run.warnings if run is not None else log.warnings if log is not None else ()
+    rows += [("warnings", gravest(warnings, name))] if warnings else []
+    blocks += [labelled_line(label, text) for label, text in (*rows, *missing)]
+    return Text([*blocks, *([copied("next", command)] if command is not None else [])])
+
+
+def _holds_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
+    if survey is not None:
+        size = sum(file.bytes for file in survey.inputs)
+        holds = (
+            f"{counted(len(survey.channels), 'topic')}, {size / 1e6:.3g} MB in {counted(len(survey.inputs), 'file')}"
+        )
+        yield "log", f"{survey.name}: {holds}"
+    elif log is not None:
+        yield "log", f"{log.name}: table"
+
+
+def _topic_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
+    """Yield each topic that is used, or those that come nearest to it, and how many others there are."""
+    used: set[str] = set()
+    if log is not None:
+        uses = [(stream.topic, ROLE_WORDS[stream.role]) for stream in log.streams]
+        uses += [(log.gyro.topic, "gyro")] if log.gyro is not None else []
+        for stream in log.streams:
+            if stream.topic not in used:
+                used.add(stream.topic)
+                first, *more = [word for topic, word in uses if topic == stream.topic]
+                also = f" ({', '.join(more)} too)" if more else ""
+                yield first, f"{stream.topic}{also}: {stream.rate_hz:.4g} Hz; {stream.why}"
+        if log.gyro is not None and log.gyro.topic not in used:
+            used.add(log.gyro.topic)
+            yield "gyro", f"{log.gyro.topic}: turn rates; not used by the filter"
+    elif survey is not None:
+        for role, sources in survey.candidates.by_role().items():
+            used |= {sources[0].topic} if sources else set()
+            text = next((f"{one.topic}: {one.problem or one.why}" for one in sources), "no topic could be used")
+            yield ROLE_WORDS[role], text
+    if survey is not None:
+        others = {channel.topic for channel in survey.channels} - {one for name in used for one in name.split(" + ")}
+        if others:
+            yield "others", f"{counted(len(others), 'topic')} (-v names them, and why they are not used)"
 
 
 def verdict(run: Run | None, problem: IcrToolError | None) -> str:
