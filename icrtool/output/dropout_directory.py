@@ -18,9 +18,12 @@ from icrtool.kernels.open_loop.block_sums import FEWEST_BLOCKS, HORIZONS_A_BLOCK
 from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 from icrtool.kernels.open_loop.trials import Summary
 from icrtool.output.files.atomic_directory import atomic_directory
+from icrtool.output.files.checksums import list_anew
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.output.files.own_files import files_in
 from icrtool.output.files.trials_file import trials_file
+from icrtool.output.run_directory import is_run_directory
 from icrtool.output.tables.dropout import no_trial, why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.records.dropout import ExampleTrial, ModelResult, error_columns
@@ -53,7 +56,7 @@ def write_report(
     stamp_ns: Ints | None = None,
     inside: Path | None = None,
 ) -> DropoutReport:
-    """Write a report, whole or not at all; an old one in its place is replaced.
+    """Write a report, whole or not at all; an old one in its place is replaced. The list of its run names its files.
 
     Parameters
     ----------
@@ -76,6 +79,11 @@ def write_report(
 
             draw_figures("report", report, partial / "plots", plots, figures)
         write_tables(report, partial)
+        names = [name.as_posix() for name in files_in(partial)]
+        if in_run := is_run_directory(directory.parent):
+            list_anew(directory.parent, directory.name)
+    if in_run:
+        list_anew(directory.parent, directory.name, names)
     return report
 
 

@@ -12,11 +12,12 @@ from typing import Any
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import file_sha256, files_of_log
 from icrtool.output.files.atomic_directory import atomic_directory, check_directory
+from icrtool.output.files.checksums import file_b2sum, write_sums
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.files.own_files import made_from
-from icrtool.output.files.states_file import StatesFormat, file_b2sum, write_states
+from icrtool.output.files.states_file import StatesFormat, write_states
 from icrtool.records.late_output import FigureSet
 from icrtool.records.regular_file import read_regular
 from icrtool.records.run import Run
@@ -25,8 +26,6 @@ from icrtool.records.run_document import EVENT_COLUMNS
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
 PAGE_FILE = "report.html"
-CHECKSUM_FILE = "B2SUMS"
-"""Sums of all files, as ``b2sum -c`` reads them: an edited run is recognised."""
 
 STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": "parquet"}
 
@@ -142,7 +141,7 @@ def write_run(
         pictures = [f"plots/{file.name}" for file in sorted((partial / "plots").glob("*"))]
         sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE, *pictures)}
         sums[states_name] = states_sum.result()
-        (partial / CHECKSUM_FILE).write_bytes("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()).encode())
+        write_sums(partial, sums)
         if then is not None:
             then(partial)
 

@@ -14,10 +14,10 @@ import numpy as np
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, RunError
 from icrtool.logs.containers.split_files import numbered_file, split_path
+from icrtool.output.files.checksums import CHECKSUM_FILE, file_b2sum, read_sums
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
-from icrtool.output.files.states_file import StatesFileError, StatesFormat, file_b2sum, read_states
+from icrtool.output.files.states_file import StatesFileError, StatesFormat, read_states
 from icrtool.output.run_directory import (
-    CHECKSUM_FILE,
     RUN_FILE,
     SCHEMA_FAMILY,
     SMOOTHED_FILES,
@@ -67,7 +67,7 @@ def open_run(path: str | Path) -> Run:
     directory = Path(path)
     document = _read_document(directory)
     sums = read_sums(directory)
-    _check_sum(directory, RUN_FILE, sums)
+    check_sum(directory, RUN_FILE, sums)
     if MEASUREMENTS_FILE not in sums:
         raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
     try:
@@ -80,7 +80,7 @@ def open_run(path: str | Path) -> Run:
             raise RunError(directory, f"{CHECKSUM_FILE} names no states", FIT_AGAIN)
         if table.fault:
             raise ValueError(table.fault)
-        _check_sum(directory, MEASUREMENTS_FILE, sums)
+        check_sum(directory, MEASUREMENTS_FILE, sums)
         table, sensors, gnss, heading = read_measurements(directory, table, run_document)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
@@ -212,29 +212,21 @@ def _read_states(directory: Path, names: Mapping[str, StatesFormat], sums: Mappi
         return None
     with ThreadPoolExecutor(1) as pool:
         # Both read the file from end to end; hashing leaves the interpreter to the other.
-        checked = pool.submit(_check_sum, directory, name, sums)
+        checked = pool.submit(check_sum, directory, name, sums)
         try:
             return read_states(directory / name, names[name], directory)
         finally:
             checked.result()
 
 
-def read_sums(directory: Path) -> dict[str, str]:
-    """Return the BLAKE2b sums (hex) of the files of a run, by their path below it.
+def check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
+    """Refuse a file of a run whose sum is not that of the list.
 
     Raises
     ------
     RunError
-        Its list of them cannot be read.
+        It is not, or the file cannot be read.
     """
-    try:
-        lines = read_regular(directory / CHECKSUM_FILE, directory).decode().splitlines()
-    except (OSError, UnicodeDecodeError) as err:
-        raise RunError(directory, f"no readable {CHECKSUM_FILE}", FIT_AGAIN) from err
-    return {name: sum_ for sum_, _, name in (line.partition("  ") for line in lines)}
-
-
-def _check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
     try:
         found = file_b2sum(directory / name, directory)
     except OSError as err:

@@ -121,13 +121,17 @@ def test_a_picture_that_is_a_link_is_not_shown(icrtool: Command, place: Path, ho
         assert name in errors
 
 
-def test_a_picture_is_shown_only_as_it_was_written(icrtool: Command, place: Path, home: Home) -> None:
-    picture = place / "plots" / "trajectory.png"
-    for content in (b"no picture", picture.read_bytes() + b"more"):
-        picture.write_bytes(content)
+@pytest.mark.parametrize("name", ["plots/trajectory.png", "dropout/plots/summary.png", "dropout/report.json"])
+def test_what_a_page_shows_is_as_it_was_written(icrtool: Command, place: Path, home: Home, name: str) -> None:
+    file = place / name
+    for content in (b"something else", file.read_bytes() + b" "):
+        file.write_bytes(content)
         status, errors = use(icrtool, place, home, ("report", "RUN"))
         assert status == 1
-        assert "plots/trajectory.png" in errors
+        assert name in errors
+    if name.startswith("dropout"):
+        assert use(icrtool, place, home, ("dropout-report", "RUN", "--plots", "none", "--no-ladder"))[0] == 0
+        assert use(icrtool, place, home, ("report", "RUN"))[0] == 0
 
 
 @pytest.mark.parametrize(

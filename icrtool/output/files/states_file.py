@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 from collections import deque
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.decompress import LARGEST_RATIO
+from icrtool.output.files.checksums import file_b2sum
 from icrtool.records.regular_file import open_regular
 from icrtool.records.tables import States
 
@@ -42,9 +42,6 @@ PARQUET_ROWS = 1 << 17
 
 FREE_BYTES = 1 << 29
 """States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
-
-LARGEST_RUN_FILE_BYTES = 1 << 33
-"""Of a file of a run: 70 h at 100 Hz. A file may be far larger than what is on the disk, and take hours to read."""
 
 PIECES_AHEAD = 4
 """Pieces of text that wait to be written at most."""
@@ -156,24 +153,6 @@ def _array(column: pa.ChunkedArray) -> NDArray[Any]:
     if column.null_count:
         raise StatesFileError("a cell is empty")
     return np.concatenate([np.from_dlpack(chunk) for chunk in column.chunks])
-
-
-def file_b2sum(path: Path, inside: Path | None = None) -> str:
-    """Return the BLAKE2b sum (hex) of a file: as safe as SHA-256, at twice its speed on most machines.
-
-    Parameters
-    ----------
-    inside : as in `open_regular`
-
-    Raises
-    ------
-    OSError
-        The file cannot be read, or is larger than `LARGEST_RUN_FILE_BYTES`.
-    """
-    with open_regular(path, inside) as file:
-        if os.fstat(file.fileno()).st_size > LARGEST_RUN_FILE_BYTES:
-            raise OSError(errno.EFBIG, f"larger than {LARGEST_RUN_FILE_BYTES} bytes", str(path))
-        return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
 
 
 def _csv_pieces(table: States) -> Iterator[bytes]:

@@ -16,14 +16,14 @@ from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
 from icrtool.output.files.atomic_file import is_page, write_file
+from icrtool.output.files.checksums import CHECKSUM_FILE, read_sums
 from icrtool.output.files.json_file import schema_of
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
-from icrtool.output.run_directory import CHECKSUM_FILE
-from icrtool.output.stored_run import read_sums
+from icrtool.output.stored_run import check_sum
 from icrtool.output.tables.dropout import shown_horizons
 from icrtool.output.text_format import duration_text, error_text, position_word, role_word
 from icrtool.records.plain_data import plain
@@ -107,11 +107,14 @@ def read_report(directory: Path) -> dict[str, Any] | None:
     Raises
     ------
     RunError
-        It is not a report of this version.
+        It is not a report of this version, or was edited.
     """
-    file = directory / DROPOUT_DIRECTORY / REPORT_FILE
+    name = f"{DROPOUT_DIRECTORY}/{REPORT_FILE}"
+    file = directory / name
     if not os.path.lexists(file):
         return None
+    if name in (sums := _listed(directory)):
+        check_sum(directory, name, sums)
     if schema_of(file, directory) != DROPOUT_SCHEMA:
         raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
     return dict(json.loads(read_regular(file, directory)))
@@ -121,9 +124,14 @@ def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
     """Return the pictures in a run's directory and in that of its dropout report."""
     if directory is None:
         return {}
-    sums = read_sums(directory) if os.path.lexists(directory / CHECKSUM_FILE) else {}
+    sums = _listed(directory)
     found = pictures_in(directory / "plots", directory, sums)
-    return found | pictures_in(directory / DROPOUT_DIRECTORY / "plots", directory)
+    return found | pictures_in(directory / DROPOUT_DIRECTORY / "plots", directory, sums)
+
+
+def _listed(directory: Path) -> dict[str, str]:
+    """Return the sums of the files of a run; none where it has no list of them."""
+    return read_sums(directory) if os.path.lexists(directory / CHECKSUM_FILE) else {}
 
 
 def draw_pictures(run: Run) -> dict[str, Picture]:

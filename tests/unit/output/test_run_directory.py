@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import icrtool
 from icrtool.errors import OutputError
 from icrtool.output import figure_catalogue as catalogue
 from icrtool.output import run_directory
+from icrtool.output.dropout_directory import write_report
 from icrtool.output.files.atomic_directory import atomic_directory
+from icrtool.output.files.checksums import file_b2sum, read_sums
 from icrtool.output.files.json_file import json_bytes
 from icrtool.output.run_directory import check_target, write_run
 from icrtool.output.stored_run import open_run
@@ -86,6 +89,41 @@ def test_states_may_be_parquet(tmp_path: Path, run: Run) -> None:
 @pytest.mark.skipif(shutil.which("b2sum") is None, reason="needs b2sum")
 def test_the_sums_are_those_of_b2sum(written: Path) -> None:
     subprocess.run(["b2sum", "--check", "--strict", "--quiet", "B2SUMS"], cwd=written, check=True)
+
+
+def listed(directory: Path) -> set[str]:
+    """Return the files that the list of a run names, each with its sum."""
+    sums = read_sums(directory)
+    assert {name: file_b2sum(directory / name) for name in sums} == sums
+    return set(sums)
+
+
+def test_the_list_of_a_run_names_its_report_too_and_is_true_at_every_moment(written: Path, run: Run) -> None:
+    files = set(names_in(written)) - {"B2SUMS"}
+    assert listed(written) == files
+    report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0])
+    report.write(written / "dropout", plots=("png",))
+    (written / "dropout" / "mine.txt").write_text("not of icrtool")
+    first = listed(written)
+    assert first == set(names_in(written)) - {"B2SUMS", "dropout/mine.txt"}
+    assert {"dropout/report.json", "dropout/plots/summary.png"} < first
+
+    def fail(_: object) -> None:
+        assert listed(written) == first
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OutputError):
+        write_report(fail, written / "dropout")
+    report.write(written / "dropout", plots=())
+    assert listed(written) == {name for name in first if "/plots/" not in name}
+    write_run(run, written, plots=())
+    assert listed(written) == files
+
+
+def test_a_list_beside_a_report_that_is_no_run_is_left_alone(tmp_path: Path, run: Run) -> None:
+    (tmp_path / "B2SUMS").write_text("my own list of dropout/report.json\n")
+    icrtool.dropout_report(run, horizons_m=[1.0]).write(tmp_path / "dropout", plots=())
+    assert (tmp_path / "B2SUMS").read_text() == "my own list of dropout/report.json\n"
 
 
 def test_the_same_run_makes_the_same_bytes(tmp_path: Path, run: Run) -> None:

@@ -16,10 +16,10 @@ import icrtool
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import RunError
 from icrtool.estimation.fit import fit
-from icrtool.output import run_directory
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.style import picture_bytes
+from icrtool.output.files.checksums import file_b2sum
 from icrtool.output.files.json_file import json_bytes
 from icrtool.output.run_directory import write_run
 from icrtool.output.stored_run import log_of, newest_run, open_run
@@ -220,7 +220,7 @@ def forge(directory: Path, document: Any) -> None:
 
 def sign(directory: Path) -> None:
     names = [path.name for path in directory.iterdir() if path.is_file() and path.name != "B2SUMS"]
-    sums = {name: run_directory.file_b2sum(directory / name) for name in names}
+    sums = {name: file_b2sum(directory / name) for name in names}
     (directory / "B2SUMS").write_text("".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()))
 
 
