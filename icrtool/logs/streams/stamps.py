@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Ints
-from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, SetBack, TopicTable
+from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, SetBack, TopicTable
 from icrtool.records.samples import Role
 
 MOST_PIECES = 10.0
@@ -18,6 +18,9 @@ MOST_PIECES = 10.0
 
 LARGEST_SHARE_BACKWARDS = 0.01
 LARGEST_SHARE_ZERO = 0.01
+
+AROUND = 25
+"""Messages before and after a step of a clock whose median delay to log time decides whether it lasts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +35,7 @@ class StampedRows:
     delay_ns : median of log time minus header stamp, 0 without header stamps
     replaced : header stamps of another clock that log times stand for
     set_back : as `TopicTable.set_back`
+    header_back : the largest step by which the clock of the headers was set back, and its last stamp before
     """
 
     header_ns: Ints | None
@@ -40,6 +44,7 @@ class StampedRows:
     delay_ns: int
     replaced: int = 0
     set_back: SetBack = NOT_SET_BACK
+    header_back: SetBack = NOT_SET_BACK
 
     def on(self, clock: Literal["header", "log"]) -> Ints:
         """Return the stamps on a clock; the log's where the header's cannot be used."""
@@ -60,6 +65,34 @@ def _usable(table: TopicTable, path: str) -> StampedRows:
     zeros = np.count_nonzero(header == 0)
     if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
         return StampedRows(None, log_ns, f"{100 * zeros / len(header):.0f} % of the header stamps are 0", 0)
+    header, back = _without_steps_back(header, log_ns)
+    return replace(_near_log_time(header, log_ns), header_back=back)
+
+
+def _without_steps_back(header: Ints, log_ns: Ints) -> tuple[Ints, SetBack]:
+    """Return header stamps (n,) of a clock that was set back as if it had not been, and the largest step.
+
+    Log time goes on, so the delay to it grows by the step and stays there; after a message out of place it does not.
+    """
+    steps = np.flatnonzero(np.diff(header) < 0)
+    if not len(steps) or len(steps) > LARGEST_SHARE_BACKWARDS * len(header) + 1:
+        return header, NOT_SET_BACK
+    delay = log_ns - header
+    rows = np.arange(AROUND)
+    before = np.median(delay[np.maximum(steps[:, None] - rows, 0)], axis=1)
+    after = np.median(delay[np.minimum(steps[:, None] + 1 + rows, len(delay) - 1)], axis=1)
+    grown = (after - before).astype(np.int64)
+    lasting = grown > OUT_OF_ORDER_NS
+    if not lasting.any():
+        return header, NOT_SET_BACK
+    largest = int(np.argmax(np.where(lasting, grown, 0)))
+    moved = np.zeros(len(header), np.int64)
+    moved[steps[lasting] + 1] = grown[lasting]
+    return header + np.cumsum(moved), SetBack(int(grown[largest]), 0.0, int(header[steps[largest]]))
+
+
+def _near_log_time(header: Ints, log_ns: Ints) -> StampedRows:
+    """Return header stamps that are near log time and increasing, log times in place of a few others, or why not."""
     delay = int(np.median(log_ns - header))
     if abs(delay) > NEAR_NS:
         return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
@@ -81,6 +114,13 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         The clock was set back, and times came again: nothing shows which of two samples came first.
     """
     yield from _set_back_note(streams, name)
+    if back := [(rows.header_back, role) for role, rows in streams if rows.header_back.step_ns]:
+        step_ns, _, before_ns = max(back)[0]
+        yield (
+            f"{name}: header stamps go back by {step_ns / 1e9:.1f} s after {_time_of_day(before_ns)} "
+            f"({', '.join(role for _, role in back)}): their clock was set back while recording; the later ones are "
+            "moved by as much, which log time shows"
+        )
     for role, rows in streams:
         if rows.note and rows.note != "no header":
             yield f"{name}: {role}: {rows.note}; log time is used"
@@ -100,7 +140,7 @@ def _set_back_note(streams: Sequence[tuple[Role, StampedRows]], name: str) -> It
         return
     # Of streams in which times come again, the largest step: they decide what can be done.
     largest = max(back, key=lambda one: (one[0].pieces > MOST_PIECES, one[0].step_ns))[0]
-    moment = f"{np.datetime64(largest.before_ns // 1_000_000_000, 's')}Z"
+    moment = _time_of_day(largest.before_ns)
     why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment} ({', '.join(role for _, role in back)})"
     far = largest.step_ns > NEAR_NS
     if largest.pieces > MOST_PIECES and far:
@@ -115,6 +155,10 @@ def _set_back_note(streams: Sequence[tuple[Role, StampedRows]], name: str) -> It
             f"{name}: {why}: the clock was set back, or messages are stored out of order; all are used, sorted by "
             "time; if it was set back, fit each part alone (--from, --to)"
         )
+
+
+def _time_of_day(stamp_ns: int) -> str:
+    return f"{np.datetime64(stamp_ns // 1_000_000_000, 's')}Z"
 
 
 def usable_rows(stamps: Ints, usable: Bools) -> Ints | slice:

@@ -243,11 +243,12 @@ def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, In
     """Return the stamps of the left side, and the times of both sides: of headers where both have them, else logged."""
     rows = stamp_rows(left), stamp_rows(right)
     headers = [one.header_ns for one in rows if one.header_ns is not None and (np.diff(one.header_ns) >= 0).all()]
-    stamps = replace(rows[0], set_back=max(one.set_back for one in rows))
+    back = max(one.header_back for one in rows)
+    stamps = replace(rows[0], set_back=max(one.set_back for one in rows), header_back=back)
     if len(headers) == 2:
         return stamps, headers[0], headers[1]
     note = rows[0].note or rows[1].note or "the header stamps of a side go back"
-    return StampedRows(None, stamps.log_ns, note, 0, set_back=stamps.set_back), rows[0].log_ns, rows[1].log_ns
+    return replace(stamps, header_ns=None, note=note, delay_ns=0, replaced=0), rows[0].log_ns, rows[1].log_ns
 
 
 def _half_interval(times: Ints) -> int:
