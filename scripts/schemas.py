@@ -134,6 +134,10 @@ RunOfReport = plain("RunOfReport", {
     "config": dict[str, Any], "drive": DriveDocument, "icr": IcrDocument,
 })  # fmt: skip
 Bootstrap = plain("Bootstrap", {"method": str, "block": str, "resamples": int, "level": float, "seed": int})
+Bootstrap.__doc__ = (
+    "How the intervals of the errors were found: by `method` over `block`, at `level`. The key keeps the name of "
+    "earlier versions; `resamples` is 0 where nothing was resampled. `seed` is that of the reference's own error."
+)
 DropoutDocument = plain("DropoutDocument", {
     "schema": Literal["icrtool/dropout/1"], "tool_version": str, "run": RunOfReport, "usable": bool,
     "unusable_because": str | None, "reference": str, "smoothed": bool, "starts": int,

@@ -20,6 +20,8 @@ CONTROLLERS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json",
 TRAJECTORIES = ("evo", "kitti")
 TARGETS = (*CONTROLLERS, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
 
+TEXT_SUFFIXES = (".txt", ".csv")
+"""Of a file for one trajectory, beside those of the formats; what else a name has after a dot is part of the name."""
 
 ALL_THE_SAME = "--force exports it all the same"
 
@@ -28,7 +30,8 @@ ALL_THE_SAME = "--force exports it all the same"
 @click.argument("source", metavar="[RUN|CAL.json]", required=False, type=options.FILE)
 @click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the result is for.")
 @click.option("-o", "--output", metavar="FILE", type=options.FILE,
-              help="File to write; for evo and kitti also a directory: a file for each path of the run.")  # fmt: skip
+              help="File to write; for evo and kitti a directory with a file for each path of the run, "
+              "or a file with the suffix .tum, .kitti, .txt or .csv.")  # fmt: skip
 @click.option("--force", is_flag=True, help="Also export what is not fit for use.")
 def command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
     """Print a calibration for a robot's controller, or a run for other programs.
@@ -53,7 +56,7 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
     """  # noqa: D301 - click reads the escape
     from icrtool.output.files.atomic_file import check_place
 
-    if target in TRAJECTORIES and output is not None and (output.is_dir() or not output.suffix):
+    if target in TRAJECTORIES and output is not None and not _is_one_file(output):
         _write_trajectories(_run(source), cast("TrajectoryFormat", target), output)
         return
     if target == "foxglove" and output is None:
@@ -69,6 +72,13 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
         options.write_or_print(f"{format_export(_calibration(source, force=force), cast('Target', target))}\n", output)
     else:
         options.write_or_print(_path_text(_run(source, output), target), output)
+
+
+def _is_one_file(output: Path) -> bool:
+    """Return whether a place for trajectories is a file: by what is there, else by a suffix that such files have."""
+    from icrtool.output.exports.trajectories import SUFFIXES
+
+    return output.is_file() or (output.suffix.lower() in (*SUFFIXES.values(), *TEXT_SUFFIXES) and not output.is_dir())
 
 
 def _path_text(run: Run, target: str) -> str:

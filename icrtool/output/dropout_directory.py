@@ -128,7 +128,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "with_jumps": report.with_jumps,
         "without_events": _event_document(report),
         "tolerance_m": TOLERANCE_M,
-        # the key and its parts keep their names; nothing is resampled
+        # how the intervals were found: the key and its parts keep their names; nothing is resampled
         "bootstrap": {
             "method": "Student's t over blocks of path",
             "block": f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",

@@ -215,11 +215,13 @@ class BudgetDistance(NamedTuple):
 
     @property
     def short_text(self) -> str:
-        """``14.1 m``, ``about 14 m`` between far horizons, or ``more than 20 m``."""
+        """``14.1 m``, ``about 14 m`` or ``less than 1 m`` between far horizons, or ``more than 20 m``."""
         if self.beyond:
             return f"more than {self.distance_m:g} m"
+        if not self._far:
+            return f"{self.distance_m:.1f} m"
         # The error grows faster than the distance: on a straight line between far horizons it comes out too long.
-        return f"about {self.distance_m:.0f} m" if self._far else f"{self.distance_m:.1f} m"
+        return f"about {self.distance_m:.0f} m" if self.distance_m >= 1.0 else "less than 1 m"
 
     @property
     def without_events_text(self) -> str:

@@ -88,6 +88,9 @@ def test_trajectories_into_a_directory_are_a_file_a_path(icrtool, tmp_path: Path
     assert status == 0
     assert {file.name for file in (tmp_path / "evo").iterdir()} == {"filter.tum", "icr.tum", "no_slip.tum"}
     assert out.count("written to") == 3
+    for name in ("2024.05.01-field", "field.bag"):
+        assert icrtool("export", "--for", "kitti", "-o", tmp_path / name)[0] == 0
+        assert {file.suffix for file in (tmp_path / name).iterdir()} == {".kitti"}
 
 
 def test_foxglove_needs_a_file_and_gets_a_layout_beside_it(icrtool, tmp_path: Path) -> None:

@@ -264,6 +264,22 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     assert page.complaints() == []
 
 
+def test_the_chart_of_errors_draws_the_main_models_and_folds_the_others(chrome: Browser, file: Path) -> None:
+    page = chrome.page()
+    page.open(file)
+    names = "[...document.querySelectorAll('#{} input:checked')].map((one) => one.closest('li').textContent.trim())"
+    drawn = page.evaluate(names.format("error-keys"))
+    assert {*DRAWN_AT_FIRST} <= {*drawn} <= {*DRAWN_AT_FIRST, "whole model + gyro", "whole model + heading"}
+    assert page.evaluate(names.format("error-others")) == []
+    folded = page.evaluate("icrtoolPage.data.errors.models.filter((one) => !one.main).map((one) => one.label)")
+    others = "[...document.querySelectorAll('#error-others li')].map((one) => one.textContent.trim())"
+    assert page.evaluate(others) == folded != []
+    assert page.evaluate("document.getElementById('error-others').closest('details').open") is False
+    page.evaluate("document.querySelector('#error-others input').click()")
+    assert page.evaluate(names.format("error-others")) == folded[:1]
+    assert page.complaints() == []
+
+
 @pytest.mark.parametrize("scale", [0.0, 3.7e-4, 0.0954, 0.3, 1.0, 13.0, 950.0])
 def test_the_chart_of_errors_takes_numbers_of_any_size(chrome: Browser, file: Path, scale: float) -> None:
     page = chrome.page()

@@ -43,6 +43,9 @@ PATH_CELLS = 4000.0
 ERROR_KEYS = {"p95": "p95_m", "p95_low": "p95_low_m", "p95_high": "p95_high_m", "expected": "expected_error_m",
               "expected_low": "expected_low_m", "expected_high": "expected_high_m"}  # fmt: skip
 
+MAIN_ROWS = ("recommended", "controller", "recommended_gyro", "recommended_heading", "no_slip")
+"""Models whose errors are not folded, beside calibrations."""
+
 
 class PageSteps(NamedTuple):
     """Which states a page has, all of them or every `joined`-th.
@@ -89,14 +92,21 @@ def drive_data(run: Run, report: Mapping[str, Any], *, coordinates: bool) -> dic
     }
 
 
+def main_rows(report: Mapping[str, Any]) -> set[str]:
+    """Return the models whose errors are not folded: those of `MAIN_ROWS`; without a whole model, all."""
+    names = {one["name"] for one in report["models"]}
+    given = {one["name"] for one in report["calibrations"]}
+    return given.union(MAIN_ROWS) & names if MAIN_ROWS[0] in names else names
+
+
 def errors_data(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return the errors over distance by model, and those of the reference alone."""
-    models = report["models"]
+    models, main = report["models"], main_rows(report)
     reference = report["reference_error"]
     return {
         "horizons_m": [row["horizon_m"] for row in models[0]["by_horizon"]] if models else [],
         "models": [
-            {"name": one["name"], "label": one["label"]}
+            {"name": one["name"], "label": one["label"], "main": one["name"] in main}
             | {key: [row[column] for row in one["by_horizon"]] for key, column in ERROR_KEYS.items()}
             for one in models
         ],

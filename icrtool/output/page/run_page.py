@@ -19,7 +19,7 @@ from icrtool.output.files.atomic_file import is_page, write_file
 from icrtool.output.files.checksums import CHECKSUM_FILE, read_sums
 from icrtool.output.files.json_file import schema_of
 from icrtool.output.page.answer import answer_of
-from icrtool.output.page.drive_data import drive_data
+from icrtool.output.page.drive_data import drive_data, main_rows
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
@@ -39,8 +39,6 @@ SCRIPTS = (
     "map.js",
     "run.js",
 )
-
-MAIN_ROWS = ("recommended", "controller", "recommended_gyro", "recommended_heading", "no_slip")
 
 TWINS = ("trajectory", "icr_estimates", "gnss_difference", "summary")
 """Pictures that a browser with scripts draws itself; they are for printing, and for readers without scripts."""
@@ -97,7 +95,7 @@ def run_page(
         begun=_utc(int(run.table.stamp_ns[0])),
         errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
         coordinates=coordinates, samples=len(run.table), worst_label=_worst_label(document),
-        main_rows=_main_rows(document),
+        main_rows=main_rows(document),
     )  # fmt: skip
 
 
@@ -163,13 +161,6 @@ def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
         "models": [{**one, "rows": [one["by_horizon"][h] for h in shown]} for one in models],
         "reference": [report["reference_error"][h] for h in shown] if report["reference_error"] else [],
     }
-
-
-def _main_rows(report: Mapping[str, Any]) -> set[str]:
-    """Return the models whose errors are not folded: those of `MAIN_ROWS`; without a whole model, all."""
-    names = {one["name"] for one in report["models"]}
-    given = {one["name"] for one in report["calibrations"]}
-    return given.union(MAIN_ROWS) & names if MAIN_ROWS[0] in names else names
 
 
 def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -294,11 +294,11 @@ const icrtoolCharts = (() => {
 
   /** Make the chart of errors over distance; gives a function that destroys it. */
   function errorChart(data) {
-    const element = document.getElementById("error-chart"), list = document.getElementById("error-keys");
+    const element = document.getElementById("error-chart");
     const { horizons_m: horizons, models, reference } = data.errors;
     if (!element || !horizons.length) return () => {};
     let chart = null;
-    const hidden = new Set();
+    const folded = models.filter((model) => model.main === false), hidden = new Set(folded.map((model) => model.name));
 
     function draw() {
       const measure = document.querySelector("input[name=measure]:checked").value, log = document.getElementById("log").checked;
@@ -334,14 +334,17 @@ const icrtoolCharts = (() => {
       }, columns, element);
     }
 
-    const entries = [...models.map((model) => ({ ...lookOf(model.name), label: model.label, name: model.name })),
+    const modelKeys = (of) => of.map((model) => ({ ...lookOf(model.name), label: model.label, name: model.name }));
+    const entries = [...modelKeys(models.filter((model) => !folded.includes(model))),
       ...(reference.p95.length ? [{ color: "reference", dash: "dotted", label: "position reference alone" }] : []),
       ...data.budgets_m.map((budget) => ({ color: "budget", dash: "dashed", label: `budget ${budget} m` }))];
-    list.replaceChildren(...entries.map((one) => {
+    const boxes = (id, of) => document.getElementById(id).replaceChildren(...of.map((one) => {
       const item = document.createElement("li");
-      item.append(toggle(one, true, one.name && ((shown) => { hidden[shown ? "delete" : "add"](one.name); draw(); })));
+      item.append(toggle(one, !hidden.has(one.name), one.name && ((shown) => { hidden[shown ? "delete" : "add"](one.name); draw(); })));
       return item;
     }));
+    boxes("error-keys", entries);
+    if (folded.length) boxes("error-others", modelKeys(folded));
     const inputs = [...document.querySelectorAll("input[name=measure], #log")];
     for (const input of inputs) input.addEventListener("change", draw);
     draw();
