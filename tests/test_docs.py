@@ -18,6 +18,10 @@ from click.testing import CliRunner
 import icrtool
 from icrtool.cli.commands import icrtool as command_line
 from icrtool.config import Config, builtin_robots
+from icrtool.logs.streams.heading_sources import HEADING_TYPES
+from icrtool.logs.streams.position_sources import POSITION_TYPES
+from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
+from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
 from icrtool.output.tables.configuration import format_configuration
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,6 +57,17 @@ def test_every_command_has_help_and_stands_in_the_documentation(command: str) ->
 def test_the_readme_names_every_built_in_robot() -> None:
     for robot in builtin_robots():
         assert f"`{robot}`" in README
+
+
+@pytest.mark.parametrize(
+    ("role", "types"),
+    [("Wheels", {*WHEEL_TYPES, *PAIR_TYPES}), ("Position", {*POSITION_TYPES}), ("Heading", {*HEADING_TYPES})],
+)
+def test_the_page_of_message_types_names_those_that_are_read_and_no_other(role: str, types: set[str]) -> None:
+    page = (ROOT / "docs" / "reference" / "message-types.md").read_text(encoding="utf-8")
+    section = page.split(f"## {role}\n")[1].split("\n## ")[0]
+    named = {name for row in re.findall(r"^\| (.*?) \|", section, re.MULTILINE) for name in re.findall(r"`(.*?)`", row)}
+    assert {name for name in named if "/" in name and name != "/tf"} - {"tf2_msgs/TFMessage"} == types
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -9,7 +9,7 @@ import numpy as np
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.read_log import Survey
 from icrtool.logs.streams.heading_sources import HeadingSource
-from icrtool.logs.streams.position_sources import PositionSource
+from icrtool.logs.streams.source import PositionSource
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.records.samples import ROLE_WORDS, Role, rate_and_jitter
 from icrtool.records.tables import RobotLog

@@ -19,12 +19,11 @@ from icrtool.logs.containers.channel import WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.split_files import file_sha256, log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
-from icrtool.logs.messages.dynamic_joints import Collector, collector_for
+from icrtool.logs.messages.collectors import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
 from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE, find_gyro, find_gyros
 from icrtool.logs.streams.heading_sources import Convention, HeadingSource
 from icrtool.logs.streams.joint_names import ignored_joints
-from icrtool.logs.streams.position_sources import PositionSource
 from icrtool.logs.streams.select import (
     Candidates,
     Choice,
@@ -34,6 +33,7 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
+from icrtool.logs.streams.source import PositionSource
 from icrtool.logs.streams.stamps import StampedRows, clock_notes, usable_rows
 from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
 from icrtool.logs.streams.transform_pose import transform_channels, transform_pose

@@ -11,17 +11,29 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from struct import Struct
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
-from icrtool.logs.containers.channel import Block
-from icrtool.logs.messages.schema import COUNTED, NUMBERS, SIZES, TEXT, Layout, Operation
+from icrtool.logs.containers.channel import Block, Channel
+from icrtool.logs.messages.definitions import definitions_of
+from icrtool.logs.messages.schema import (
+    COUNTED,
+    MOST_ELEMENTS,
+    NUMBERS,
+    SIZES,
+    TEXT,
+    Definitions,
+    Layout,
+    Operation,
+    Slot,
+    compile_layout,
+)
 from icrtool.records.text import LONGEST_TEXT
 
-_MESSAGES_AT_ONCE = 1 << 14
+MESSAGES_AT_ONCE = 1 << 14
 _SHAPES_AT_ONCE, _COMPARED_SHAPES, _TRIED_SHAPES = 1 << 10, 1 << 8, 1 << 4
 """Shapes that messages decoded at once may have; those of them that messages are compared with; and the least."""
 
@@ -174,11 +186,16 @@ class Decoder:
     layout: Layout
     _known: list[Shape] = field(default_factory=list)
 
+    @property
+    def slots(self) -> dict[str, Slot]:
+        """The wanted fields that the messages have, by path."""
+        return self.layout.slots
+
     def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, Decoded]]:
         """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
         rows = np.flatnonzero(block.channel == number)
         while len(rows):
-            some = rows[:_MESSAGES_AT_ONCE]
+            some = rows[:MESSAGES_AT_ONCE]
             decoded = self._decode(block.data, block.start[some], block.end[some])
             done = len(decoded.readable)
             yield rows[:done], decoded
@@ -300,6 +317,15 @@ class Decoded:
                 numbers[rows, place] = one
         return numbers if "[*]" in path else numbers[:, 0]
 
+    def texts(self, path: str) -> list[bytes]:
+        """Return a text field's text of each message (n,)."""
+        number, found = self.layout.slots[path].number, np.full(len(self.start), b"", object)
+        for shape, rows in self._by_shape():
+            at, length = shape.taken[number][0]
+            if length:
+                found[rows] = _unaligned(self.data, np.dtype((np.void, length)))[self.start[rows] + at].tolist()
+        return list(found)
+
     def _codes(self, at: int, length: int, rows: Ints | slice, known: dict[bytes, int]) -> list[int]:
         """Return the numbers of the texts at an offset in messages of one shape; of only one where all are the same."""
         kind = np.dtype((np.void, length))
@@ -308,7 +334,7 @@ class Decoded:
         else:
             texts = _unaligned(self.data, kind)[self.start[rows] + at]
         is_one = length == 0 or bool((texts == texts[0]).all())
-        return _text_numbers(texts[: 1 if is_one else None].tolist(), known)
+        return text_numbers(texts[: 1 if is_one else None].tolist(), known)
 
     def _by_shape(self) -> Iterator[tuple[Shape, Ints | slice]]:
         """Yield each shape with the rows that have it."""
@@ -322,7 +348,7 @@ class Decoded:
                 yield shape, rows
 
 
-def _text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
+def text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
     """Return the numbers of texts; new ones become known, those beyond `MOST_TEXTS` as one."""
     if len(known) + len(texts) <= MOST_TEXTS:
         return [known.setdefault(text, len(known)) for text in texts]
@@ -343,3 +369,23 @@ def _types(kind: str) -> tuple[np.dtype[Any], np.dtype[Any]]:
     """Return the type of a slot's numbers in little-endian messages, and in columns."""
     letter = kind[0] if kind.startswith(("int", "float")) else "u"
     return np.dtype(f"<{letter}{SIZES[kind]}"), np.dtype(np.float64 if letter == "f" else np.int64)
+
+
+def ros_decoder(
+    channel: Channel, wanted: Sequence[str], definitions: Definitions | None = None, most: int = MOST_ELEMENTS
+) -> Decoder:
+    """Return the decoder of a channel of ROS messages.
+
+    Parameters
+    ----------
+    definitions : in place of the channel's own
+    most : elements taken of a sequence
+
+    Raises
+    ------
+    DefinitionError
+        The layout of the channel's type is not known.
+    """
+    encoding: Literal["cdr", "ros1"] = "cdr" if channel.encoding == "cdr" else "ros1"
+    known = definitions if definitions is not None else definitions_of(channel)
+    return Decoder(compile_layout(known, channel.message_type, wanted, encoding, most))

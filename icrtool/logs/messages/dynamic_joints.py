@@ -8,7 +8,7 @@ So the messages are grouped by their number of joints, and each group is decoded
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.decoder import Decoder
+from icrtool.logs.messages.decoder import Decoder, ros_decoder
 from icrtool.logs.messages.definitions import definitions_of, full_name
-from icrtool.logs.messages.schema import BASE, NAME, SEQUENCE, Definitions, compile_layout
+from icrtool.logs.messages.schema import BASE, MOST_ELEMENTS, NAME, SEQUENCE, Definitions
 from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable, merge_tables, time_order
 from icrtool.records.text import LogText
 
@@ -45,13 +45,11 @@ class DynamicJointCollector:
         self._tables: list[TopicTable] = []
         self._times: list[Ints] = []
         self._unreadable = 0
-        layout = self._collector(1).layout
-        kinds = {path: slot.kind for path, slot in layout.slots.items()}
+        kinds = {path: slot.kind for path, slot in self._collector(1).decoder.slots.items()}
         texts = (_NAMES, "joint 0.interface_names[*]")
         if "joint 0.values[*]" not in kinds or any(kinds.get(path) != "string" for path in texts):
             raise DefinitionError(channel.message_type, "its definition in the log lacks names or values of the joints")
-        encoding: Literal["cdr", "ros1"] = "cdr" if layout.cdr else "ros1"
-        self._counter = Decoder(compile_layout(self._unrolled(0), channel.message_type, (_JOINTS,), encoding))
+        self._counter = self._decoder(0, (_JOINTS,))
 
     def feed(self, block: Block, number: int) -> None:
         """Add the messages of a block whose channel is `number`."""
@@ -81,9 +79,14 @@ class DynamicJointCollector:
         if joints not in self._collectors:
             lists = [f"joint {j}.{what}[*]" for j in range(joints) for what in ("interface_names", "values")]
             self._collectors[joints] = TopicCollector(
-                self._channel, (*HEADER, _NAMES, *lists), self._unrolled(joints), MOST_INTERFACES
+                self._channel, self._decoder(joints, (*HEADER, _NAMES, *lists), MOST_INTERFACES)
             )
         return self._collectors[joints]
+
+    def _decoder(self, joints: int, wanted: tuple[str, ...], most: int = MOST_ELEMENTS) -> Decoder:
+        if (encoding := self._channel.encoding) not in ("cdr", "ros1"):
+            raise DefinitionError(self._channel.topic, f"its lists within lists are not read in {str(encoding)!r}")
+        return ros_decoder(self._channel, wanted, self._unrolled(joints), most)
 
     def _unrolled(self, joints: int) -> Definitions:
         """Return the definitions with the list of lists as a number and so many fields."""
@@ -101,23 +104,6 @@ class DynamicJointCollector:
                 flat.append((_JOINTS, (BASE, ("uint32", 0))))
                 flat += [(f"joint {j}", (NAME, detail[0][1])) for j in range(joints)]
         return {**self._definitions, name: (constants, flat)}
-
-
-Collector = TopicCollector | DynamicJointCollector
-"""Gathers the columns of one topic while blocks go by."""
-
-
-def collector_for(channel: Channel, wanted: tuple[str, ...]) -> Collector:
-    """Return what gathers the wanted columns of a channel.
-
-    Raises
-    ------
-    DefinitionError
-        The layout of the channel's type is not known.
-    """
-    if channel.message_type == DYNAMIC_JOINT_STATE:
-        return DynamicJointCollector(channel)
-    return TopicCollector(channel, wanted)
 
 
 def _as_joint_state(table: TopicTable, joints: int) -> TopicTable:

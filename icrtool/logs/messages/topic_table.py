@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,9 @@ from numpy.typing import NDArray
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.decoder import Decoded, Decoder
-from icrtool.logs.messages.definitions import definitions_of
+from icrtool.logs.messages.decoded_values import MessageColumns, MessageDecoder
 from icrtool.logs.messages.growing_column import GrowingColumn
-from icrtool.logs.messages.schema import MOST_ELEMENTS, Definitions, Layout, compile_layout
 from icrtool.records.text import LogText
-
-READ_ENCODINGS = ("cdr", "ros1")
-"""Serializations of messages that are read: of ROS 2 and of ROS 1."""
 
 
 class SetBack(NamedTuple):
@@ -126,47 +121,27 @@ class TopicTable:
 
 @dataclass(slots=True)
 class TopicCollector:
-    """Gathers the columns of one topic while blocks go by.
-
-    Attributes
-    ----------
-    definitions : in place of the channel's own, None where those are used
-    most : elements taken of a sequence at most
-    """
+    """Gathers the columns of one topic while blocks go by."""
 
     channel: Channel
-    wanted: tuple[str, ...]
-    definitions: Definitions | None = None
-    most: int = MOST_ELEMENTS
-    layout: Layout = field(init=False)
-    _decoder: Decoder = field(init=False)
+    decoder: MessageDecoder
     _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
     _columns: dict[str, GrowingColumn] = field(default_factory=dict)
     _texts: dict[str, dict[bytes, int]] = field(default_factory=dict)
     _unreadable: int = 0
 
-    def __post_init__(self) -> None:
-        definitions = self.definitions if self.definitions is not None else definitions_of(self.channel)
-        encoding = self.channel.encoding
-        if encoding not in READ_ENCODINGS:
-            raise DefinitionError(self.channel.topic, f"serialization {encoding!r} is not read")
-        self.layout = compile_layout(
-            definitions, self.channel.message_type, self.wanted, cast(Literal["cdr", "ros1"], encoding), self.most
-        )
-        self._decoder = Decoder(self.layout)
-
     def feed(self, block: Block, number: int) -> None:
         """Add the messages of a block whose channel is `number`."""
-        for rows, decoded in self._decoder.decode(block, number):
+        for rows, decoded in self.decoder.decode(block, number):
             readable = rows[decoded.readable]
             self._unreadable += len(rows) - len(readable)
             if len(readable):
                 self._add(decoded, block.log_time_ns[readable])
 
-    def _add(self, decoded: Decoded, times: Ints) -> None:
+    def _add(self, decoded: MessageColumns, times: Ints) -> None:
         expected = self.channel.count or 0
         self._times.add(times, expected)
-        for path, slot in self.layout.slots.items():
+        for path, slot in self.decoder.slots.items():
             if slot.kind != "string":
                 values = decoded.numbers(path)
             else:

@@ -19,7 +19,16 @@ GPSFIX_STATUS = {
 """GPSStatus of gps_msgs: 18 DGPS, 19 and 20 RTK, 33 WAAS."""
 
 UBLOX_CARRIER = {0: OTHER_FIX, 1: FLOAT_FIX, 2: FIXED_FIX}
-"""carrSoln, bits 6 and 7 of NavPVT.flags."""
+"""carrSoln of u-blox, bits 6 and 7 of NavPVT.flags."""
+
+NMEA_QUALITY = {1: OTHER_FIX, 2: OTHER_FIX, 3: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 8: OTHER_FIX, 9: OTHER_FIX}
+"""Quality of GGA: single, differential, PPS, RTK fixed and float, simulated, SBAS of NovAtel.
+
+The others are no fixes: 0 none, 6 dead reckoning, 7 typed in.
+"""
+
+XBOT_FLAGS = {0: OTHER_FIX, 1: OTHER_FIX, 2: FIXED_FIX, 3: FIXED_FIX, 4: FLOAT_FIX, 5: FLOAT_FIX}
+"""Low bits of the flags of xbot_msgs/AbsolutePose: 1 corrections, 2 RTK fixed, 4 RTK float."""
 
 SEPTENTRIO_MODE = {1: OTHER_FIX, 2: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 6: OTHER_FIX, 7: FIXED_FIX, 8: FLOAT_FIX}
 """Low bits of the mode: stand-alone, DGPS, RTK fixed and float, SBAS, moving-base fixed and float."""
@@ -48,7 +57,12 @@ def class_by_status(table: TopicTable, codes: Mapping[int, int] | None = None) -
 
 def class_by_carrier(flags: Ints | None) -> Bytes | None:
     """Return the class (n,) by the carrier solution in u-blox flags (n,)."""
-    return None if flags is None else _looked_up((flags >> 6) & 3, UBLOX_CARRIER, NOT_STATED)
+    return None if flags is None else class_by_code((flags >> 6) & 3, UBLOX_CARRIER)
+
+
+def class_by_code(values: Ints | None, codes: Mapping[int, int]) -> Bytes | None:
+    """Return the class (n,) by codes (n,); those that are not known state none."""
+    return None if values is None else _looked_up(values, codes, NOT_STATED)
 
 
 def class_by_mode(modes: Ints | None) -> Bytes | None:

@@ -12,10 +12,11 @@ import numpy as np
 
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats
+from icrtool.logs.messages.nmea import HDT, NMEA_SENTENCE
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
+from icrtool.logs.streams.metric_positions import GOAL_WORDS, XBOT_FUSED
 from icrtool.logs.streams.orientation import nose_yaw
 from icrtool.logs.streams.position_sources import (
-    GOAL_WORDS,
     INS_SOLVED,
     INS_SOLVED_CODES,
     SOLVED,
@@ -237,6 +238,29 @@ def _septentrio(deviation: str, mode: str, score: float, what: str) -> Entry:
     return (*fields, "error", *(name for name in (mode,) if name)), read
 
 
+def _nmea(table: TopicTable) -> HeadingSource:
+    """Return the true headings of HDT."""
+    headings = table.rows(table.column("sentence_kind") == HDT)
+    if not len(headings):
+        raise DefinitionError(table.topic, "none of its sentences is HDT")
+    heading = np.radians(headings.column("heading"))
+    unknown = np.full(len(headings), np.nan)
+    all_of_them = np.ones(len(headings), np.bool_)
+    what = "NMEA: clockwise from true north"
+    return _stated(headings, heading, unknown, all_of_them, 88.0, "heading of the GNSS receiver (HDT)", what)
+
+
+def _absolute_pose(table: TopicTable) -> HeadingSource:
+    """Return the headings of OpenMower, counter-clockwise from east, where its receiver has two antennas."""
+    std = table.floats("orientation_accuracy")
+    variance = np.where(std > 0, std**2, np.nan)
+    valid = table.floats("orientation_valid") != 0
+    source = table.floats("source")
+    score = 30.0 if len(source) and np.median(source) == XBOT_FUSED else 90.0
+    stated = _stated(table, table.floats("vehicle_heading"), variance, valid, score, "OpenMower's heading", "REP-103")
+    return replace(stated, convention="enu")
+
+
 _AZIMUTH = ((*HEADER, "azimuth", "variance", "unit", "orientation", "reference"), _azimuth)
 _DUAL = _degrees("heading", "heading_sigma", 90.0, "NovAtel dual antenna heading", "solution_status", SOLVED)
 _INS = "NovAtel INS azimuth"
@@ -253,6 +277,11 @@ HEADING_TYPES: dict[str, Entry] = {
     "nav_msgs/Odometry": (_POSE[0], _odometry),
     "geometry_msgs/QuaternionStamped": _orientation(
         "quaternion", "", 0, 80.0, "heading of the GNSS receiver (nmea_navsat_driver)", stuffed=True
+    ),
+    NMEA_SENTENCE: ((*HEADER, "sentence"), _nmea),
+    "xbot_msgs/AbsolutePose": (
+        (*HEADER, "vehicle_heading", "orientation_valid", "orientation_accuracy", "source"),
+        _absolute_pose,
     ),
     "compass_msgs/Azimuth": _AZIMUTH,
     "compass_interfaces/Azimuth": _AZIMUTH,

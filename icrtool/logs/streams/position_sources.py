@@ -1,36 +1,27 @@
-"""Messages that hold the robot's position: geodetic fixes, or positions that are metric already."""
+"""Messages that hold the robot's position: geodetic fixes, and the table of all message types that hold one."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 
+from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Floats
+from icrtool.logs.messages.nmea import GGA, GST, NMEA_SENTENCE, RMC
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.fix_class import (
     GPSFIX_STATUS,
+    NMEA_QUALITY,
+    UBLOX_CARRIER,
     class_by_carrier,
+    class_by_code,
     class_by_mode,
     class_by_status,
     class_by_type,
 )
-from icrtool.logs.streams.source import NEVER_MOVES, NO_ROWS, Source, of_topic
-
-REFERENCE_WORDS = re.compile(
-    r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"
-    r"prism|leica|utm|global|navsat|\bins\b|vectornav|novatel|sbg|ublox",
-    re.IGNORECASE,
-)
-"""In names of odometry and pose topics, or of their frames: a reference, not the robot's own dead reckoning."""
-
-REFERENCE_FRAMES = {"world", "earth", "ecef", "local_enu", "enu", "camera_init"}
-"""Names of frames that are no such words; FAST-LIO and LOAM call their map ``camera_init``."""
-
-GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
+from icrtool.logs.streams.metric_positions import ABSOLUTE_POSE, metric
+from icrtool.logs.streams.source import NEVER_MOVES, PositionEntry, PositionSource, of_topic
 
 RADIUS_95_IN_STD = 2.45
 """err_horz is a 95 % radius: this many standard deviations of a circular normal distribution."""
@@ -54,51 +45,18 @@ H_ACC, LAT_HP, LON_HP, HEIGHT_HP = (
 )
 """u-blox fields as ROS 1 and as ROS 2 spell them."""
 
-LEAST_AREA_M, FLAT, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
-"""A drive this wide (standard deviation) shows its plane where it is no thicker than a tenth of that."""
-
-LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
-"""Of the earth; UTM coordinates far from the equator may be as large, but have a height near 0."""
-
 FARTHEST_M = 200_000.0
 """No robot drives further from the middle of its fixes."""
+
+UBX_FLAGS = ("gnss_fix_ok", "invalid_llh", "gps_fix.fix_type", "carr_soln.status")
+UBX_NO_FIX = (0, 1, 5)
+"""GpsFix of u-blox: none, dead reckoning only, time only."""
 
 STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
 """A receiver whose fixes stay within this is that of a base station, or of a robot that stands."""
 
 GOOD_STD_M = 0.3
 """A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PositionSource(Source):
-    """Positions of one topic.
-
-    Attributes
-    ----------
-    geodetic : (n, 3) latitude, longitude [deg], ellipsoidal height [m]; None where metric
-    metric : (n, 2) north, east [m] in the topic's own frame; None where geodetic
-    variance : (n, 3) north, east, covariance of both [m^2]; NaN where not stated
-    usable : (n,) rows to use; `rejected` counts the others by reason
-    stated_class : uint8 (n,) how the position was solved, None where no message states it
-    """
-
-    geodetic: Floats | None = None
-    metric: Floats | None = None
-    variance: Floats = field(default_factory=lambda: np.empty((0, 3)))
-    usable: Bools = field(default_factory=lambda: NO_ROWS)
-    rejected: dict[str, int] = field(default_factory=dict)
-    stated_class: Bytes | None = None
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no row can be used, even where the topic is configured."""
-        return not self.usable.any()
-
-
-Reader = Callable[[TopicTable], PositionSource]
-Entry = tuple[tuple[str, ...], Reader]
-"""The fields of a message type to take, and how to read them."""
 
 
 def _geodetic(
@@ -236,6 +194,36 @@ def _navpvt(table: TopicTable) -> PositionSource:
     return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", fix_class)
 
 
+def _ubx_navpvt(table: TopicTable) -> PositionSource:
+    """Return the positions of ublox_dgnss, which spreads the flags over fields."""
+    geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
+    no_fix = (table.floats("gnss_fix_ok") == 0) | (table.floats("invalid_llh") == 1)
+    no_fix |= np.isin(table.floats("gps_fix.fix_type"), UBX_NO_FIX)
+    variance = _accuracy(table.floats("h_acc") * 1e-3)
+    fix_class = class_by_code(table.integers("carr_soln.status"), UBLOX_CARRIER)
+    return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", fix_class)
+
+
+def _nmea(table: TopicTable) -> PositionSource:
+    """Return the fixes of GGA, with the deviations that GST states for the same time; of RMC where there is no GGA."""
+    kinds = table.column("sentence_kind")
+    kind, name = (GGA, "GGA") if (kinds == GGA).any() else (RMC, "RMC")
+    fixes, deviations = table.rows(kinds == kind), table.rows(kinds == GST)
+    if not len(fixes):
+        raise DefinitionError(table.topic, "none of its sentences is GGA or RMC")
+    std = np.full((len(fixes), 2), np.nan)
+    if len(deviations):
+        times_ns = deviations.log_time_ns
+        after = np.searchsorted(times_ns[:-1] + np.diff(times_ns) // 2, fixes.log_time_ns)
+        same = deviations.column("utc_s")[after] == fixes.column("utc_s")
+        std[same] = np.column_stack([deviations.column("north_std"), deviations.column("east_std")])[after[same]]
+    quality = fixes.column("quality")
+    fix_class = class_by_code(quality, NMEA_QUALITY)
+    no_fix = np.isin(quality, [*NMEA_QUALITY], invert=True)
+    geodetic = _place(fixes, "latitude", "longitude", "altitude")
+    return _geodetic(fixes, geodetic, _deviations(*std.T), no_fix, 84.0, f"GNSS fix ({name})", fix_class)
+
+
 def _navhpposllh(table: TopicTable) -> PositionSource:
     geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
     for column, (names, unit) in enumerate(((LAT_HP, 1e-9), (LON_HP, 1e-9), (HEIGHT_HP, 1e-4))):
@@ -246,7 +234,7 @@ def _navhpposllh(table: TopicTable) -> PositionSource:
     return _geodetic(table, geodetic, variance, invalid, 86.0, "u-blox high precision position")
 
 
-def _septentrio(mode: str, what: str, score: float, *accuracies: str) -> Entry:
+def _septentrio(mode: str, what: str, score: float, *accuracies: str) -> PositionEntry:
     """Return the entry of a Septentrio block: angles in rad; low bits of the mode 0: no solution."""
 
     def read(table: TopicTable) -> PositionSource:
@@ -278,7 +266,7 @@ def solved(table: TopicTable, path: str, accepted: frozenset[str] | frozenset[in
 def _novatel(
     place: tuple[str, str, str], deviations: tuple[str, str], status: str, accepted: frozenset[str] | frozenset[int],
     kind: str, what: str, score: float,
-) -> Entry:  # fmt: skip
+) -> PositionEntry:  # fmt: skip
     """Return the entry of a NovAtel log; a height above mean sea level comes with the undulation of the geoid."""
 
     def read(table: TopicTable) -> PositionSource:
@@ -291,55 +279,6 @@ def _novatel(
     return (*HEADER, status, kind, *place, "undulation", *deviations), read
 
 
-def _metric(pose: str, covariance: str, score: float, what: str, *, odometry: bool = False) -> Entry:
-    """Return the entry of a pose: x is taken as east and y as north, in the topic's own frame."""
-
-    def read(table: TopicTable) -> PositionSource:
-        x, y = (table.column(f"{pose}position.{axis}").astype(np.float64) for axis in "xy")
-        variance = np.full((len(table), 3), np.nan)
-        if covariance:
-            var_x, var_y, cov = (table.floats(f"{covariance}[{i}]") for i in (0, 7, 1))
-            positive = (var_x > 0) & (var_y > 0)
-            variance[positive] = np.column_stack([var_y, var_x, cov])[positive]
-        usable = np.isfinite(x) & np.isfinite(y)
-        frame = table.text("header.frame_id").lstrip("/")
-        named = bool(REFERENCE_WORDS.search(f"{table.topic} {frame}")) or frame in REFERENCE_FRAMES
-        problem = "" if usable.any() else "no finite position"
-        places = np.column_stack([x, y, table.floats(f"{pose}position.z")])[usable]
-        if len(places) and LEAST_RADIUS_M < np.linalg.norm(np.median(places, axis=0)) < LARGEST_RADIUS_M:
-            problem = "its positions are counted from the centre of the earth (ECEF), which is not read"
-        elif not _is_level(places):
-            problem = "its positions lie in a plane that stands upright: z is not up, as in a camera's optical frame"
-        if GOAL_WORDS.search(table.topic):
-            problem = problem or "its name is that of a goal, not of a measurement"
-        elif not named and (odometry or "odom" in table.topic.lower()):
-            problem = (
-                problem
-                or "its name and frame do not show a position reference: it may be the wheels' dead reckoning; "
-                "topics.gnss names it if it is a reference"
-            )
-        count = int(np.count_nonzero(~usable))
-        return PositionSource(
-            **of_topic(table), metric=np.column_stack([y, x]), variance=variance, usable=usable,
-            rejected={"not finite": count} if count else {}, score=score, why=what, problem=problem,
-        )  # fmt: skip
-
-    variances = tuple(f"{covariance}[{i}]" for i in (0, 1, 7) if covariance)
-    return (*HEADER, *(f"{pose}position.{axis}" for axis in "xyz"), *variances), read
-
-
-def _is_level(places_m: Floats) -> bool:
-    """Return whether a drive (n, 3) that has an area lies in a plane whose normal is within 45 deg of z."""
-    some = places_m[:: max(1, len(places_m) // MOST_PLACES)]
-    if len(some) < 3 or not (np.abs(some) < LARGEST_PLACE_M).all():
-        return True
-    # single jumps are no place
-    kept = np.clip(some, *np.percentile(some, [2.5, 97.5], axis=0))
-    _, size, axes = np.linalg.svd(kept - kept.mean(axis=0), full_matrices=False)
-    _, across_m, off_m = size / math.sqrt(len(some))
-    return bool(across_m < LEAST_AREA_M or off_m > FLAT * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
-
-
 _COVARIANCE = tuple(f"position_covariance[{i}]" for i in (0, 1, 4))
 _FIX = (*HEADER, "status.status", "latitude", "longitude", "altitude", *_COVARIANCE, "position_covariance_type")
 _GEO = "pose.position."
@@ -349,11 +288,16 @@ _OEM7_BESTPOS = _novatel(
     "NovAtel position", 85.0,
 )  # fmt: skip
 
-POSITION_TYPES: dict[str, Entry] = {
+POSITION_TYPES: dict[str, PositionEntry] = {
     "sensor_msgs/NavSatFix": (_FIX, _navsatfix),
     "gps_common/GPSFix": ((*_FIX, "err_horz"), _gpsfix),
     "gps_msgs/GPSFix": ((*_FIX, "err_horz"), _gpsfix),
     "ublox_msgs/NavPVT": (("lat", "lon", "height", *H_ACC, "flags"), _navpvt),
+    "ublox_ubx_msgs/UBXNavPVT": (
+        (*HEADER, "lat", "lon", "height", "h_acc", *UBX_FLAGS),
+        _ubx_navpvt,
+    ),
+    NMEA_SENTENCE: ((*HEADER, "sentence"), _nmea),
     "ublox_msgs/NavHPPOSLLH": (
         ("lat", "lon", "height", *LAT_HP, *LON_HP, *HEIGHT_HP, *H_ACC, "invalid_llh", "invalidLlh", "flags"),
         _navhpposllh,
@@ -379,9 +323,10 @@ POSITION_TYPES: dict[str, Entry] = {
     "geographic_msgs/GeoPoseStamped": (
         (*HEADER, *(f"{_GEO}{name}" for name in ("latitude", "longitude", "altitude"))), _geopose
     ),
-    "geometry_msgs/PoseStamped": _metric("pose.", "", 70.0, "metric pose"),
-    "geometry_msgs/PoseWithCovarianceStamped": _metric("pose.pose.", "pose.covariance", 70.0, "metric pose"),
-    "nav_msgs/Odometry": _metric(
+    "geometry_msgs/PoseStamped": metric("pose.", "", 70.0, "metric pose"),
+    "geometry_msgs/PoseWithCovarianceStamped": metric("pose.pose.", "pose.covariance", 70.0, "metric pose"),
+    "xbot_msgs/AbsolutePose": ABSOLUTE_POSE,
+    "nav_msgs/Odometry": metric(
         "pose.pose.", "pose.covariance", 60.0, "metric position of an odometry message", odometry=True
     ),
 }  # fmt: skip

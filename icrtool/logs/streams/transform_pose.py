@@ -13,7 +13,8 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
-from icrtool.logs.streams.position_sources import POSITION_TYPES, REFERENCE_FRAMES, REFERENCE_WORDS
+from icrtool.logs.streams.metric_positions import REFERENCE_FRAMES, REFERENCE_WORDS
+from icrtool.logs.streams.position_sources import POSITION_TYPES
 from icrtool.logs.streams.static_transforms import BASE_FRAMES, FIELDS, TYPES, is_static
 from icrtool.records.text import LogText
 

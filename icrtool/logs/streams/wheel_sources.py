@@ -16,7 +16,7 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.containers.channel import some_of
 from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
-from icrtool.logs.streams.position_sources import REFERENCE_WORDS
+from icrtool.logs.streams.metric_positions import REFERENCE_WORDS
 from icrtool.logs.streams.source import NEVER_MOVES, Source, of_topic
 from icrtool.logs.streams.wheel_names import wheel_joints
 
@@ -35,6 +35,9 @@ ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
 
 MOST_WHEELS = 32
 """Of a side. A message that lists more is not of wheels, or was made to take time."""
+
+_HALF_COUNTER = 1 << 31
+_RPM = 2 * np.pi / 60
 
 SIDEWAYS_SHARE = 0.2
 """A twist with more than this sideways, and no turn, is a velocity in east and north, not in the body frame."""
@@ -270,6 +273,48 @@ def _segway(prefix: str, *header: str) -> Entry:
     return (*header, *fields), read
 
 
+def _wheel_ticks(table: TopicTable, _: Config) -> WheelMotion:
+    """Return the motion in xbot_msgs/WheelTick: counters that count up, with the direction of each wheel beside them.
+
+    A step counts with the direction stated behind it, as in OpenMower's own xbot_positioning. Its driver leaves
+    `valid_wheels` at 0, and the rear wheels are meant.
+    """
+    valid = table.integers("valid_wheels")
+    bits = int(np.bitwise_or.reduce(valid)) if valid is not None else 0
+    axles = [place for place, both in (("f", 3), ("r", 12)) if bits & both == both] or ["r"]
+
+    def travelled(place: str) -> Floats:
+        ticks, direction = table.integers(f"wheel_ticks_{place}"), table.column(f"wheel_direction_{place}")
+        if ticks is None:
+            raise DefinitionError(table.topic, f"its {table.message_type} has no whole numbers wheel_ticks_{place}")
+        steps = np.abs(np.mod(np.diff(ticks) + _HALF_COUNTER, 2 * _HALF_COUNTER) - _HALF_COUNTER)
+        return np.concatenate([[0.0], np.cumsum(np.where(direction[1:] != 0, -steps, steps))])
+
+    per_metre = float(np.median(table.floats("wheel_tick_factor")))
+    known = per_metre > 0
+    sides = [sum(travelled(f"{axle}{side}") for axle in axles) / len(axles) for side in "lr"]
+    left, right = (np.asarray(side) / (per_metre if known else 1.0) for side in sides)
+    unit: Unit = "m" if known else "counts"
+    why = f"ticks of the {' and '.join({'f': 'front', 'r': 'rear'}[axle] for axle in axles)} wheels"
+    return motion_of(WheelMotion(**of_topic(table, "stamp"), unit=unit, score=90.0, why=why), (left, right))
+
+
+def _autopilot_wheels(table: TopicTable, _: Config) -> WheelMotion:
+    """Return the motion in mavros_msgs/WheelOdomStamped: travelled metres or rpm of each wheel, as its topic states.
+
+    Wheel 0 is the left one in the configuration that comes with MAVROS.
+    """
+    values = table.column("data[*]").astype(np.float64)
+    if values.shape[1] < 2:
+        raise DefinitionError(table.topic, "its messages hold fewer than two wheels")
+    sides = values[:, 0], values[:, 1]
+    if "rpm" in table.topic.lower():
+        rpm = WheelMotion(**of_topic(table), score=80.0, why="wheel speeds [rpm] of the autopilot: 0 left, 1 right")
+        return motion_of(rpm, speed=(sides[0] * _RPM, sides[1] * _RPM))
+    why = "wheel distances [m] of the autopilot: 0 left, 1 right"
+    return motion_of(WheelMotion(**of_topic(table), unit="m", score=90.0, why=why), sides)
+
+
 def _twist_motion(table: TopicTable, speed: str, sideways: str, turn: str, score: float, why: str) -> WheelMotion:
     twist = np.column_stack([table.column(speed), table.column(turn)]).astype(np.float64)
     note = ""
@@ -332,6 +377,12 @@ WHEEL_TYPES: dict[str, Entry] = {
         ("position[*]", "velocity[*]"), [0, 1], [2, 3],
         "four wheels: front left, rear left, front right, rear right", "stamp",
     ),
+    "xbot_msgs/WheelTick": (
+        ("stamp.sec", "stamp.nanosec", "wheel_tick_factor", "valid_wheels",
+         *(f"wheel_{what}_{place}" for what in ("ticks", "direction") for place in ("fl", "fr", "rl", "rr"))),
+        _wheel_ticks,
+    ),
+    "mavros_msgs/WheelOdomStamped": ((*HEADER, "data[*]"), _autopilot_wheels),
     "scout_msgs/ScoutStatus": ((*HEADER, *_SCOUT), _scout),
     **dict.fromkeys(("segway_rmp/SegwayStatusStamped", "segway_rmp_ros2/SegwayStatusStamped"), _SEGWAY_STAMPED),
     "segway_interfaces/Stamped": _SEGWAY_STAMPED,

@@ -143,7 +143,7 @@ def test_messages_without_a_like_are_decoded_one_by_one(monkeypatch):
     """Texts of every length before the number: more shapes than are compared, and than are decoded at once."""
     monkeypatch.setattr(decoder, "_COMPARED_SHAPES", 40)
     monkeypatch.setattr(decoder, "_SHAPES_AT_ONCE", 100)
-    monkeypatch.setattr(decoder, "_MESSAGES_AT_ONCE", 300)
+    monkeypatch.setattr(decoder, "MESSAGES_AT_ONCE", 300)
     kind = "sensor_msgs/msg/Temperature"
     layout = compile_layout(STORE.fielddefs, "sensor_msgs/Temperature", ("header.frame_id", "temperature"), "cdr")
     rng = np.random.default_rng(1)

@@ -28,8 +28,8 @@ from icrtool.logs.containers.decompress import (
 )
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
 from icrtool.logs.cut import moment
+from icrtool.logs.messages.collectors import collector_for
 from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
-from icrtool.logs.messages.dynamic_joints import collector_for
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import read_log, survey_log

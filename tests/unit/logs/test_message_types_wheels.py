@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from icrtool.config import load_config
-from icrtool.errors import ConfigError
+from icrtool.errors import ConfigError, DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.wheel_pairs import Side, pair_motion
@@ -393,3 +393,46 @@ def test_a_configured_topic_that_tells_nothing_is_an_error(tmp_path: Path) -> No
     path = write_mcap(tmp_path / "log.mcap", [("/joint_states", messages)], "sensor_msgs/msg/JointState")
     with pytest.raises(ConfigError, match=r"topics\.wheels: /joint_states: no left and right wheel"):
         read_log(path, load_config(sets=["topics.wheels=/joint_states"]))
+
+
+def ticks(**columns: Any) -> TopicTable:
+    zeros = [0] * 4
+    known = {"wheel_tick_factor": [200] * 4, "valid_wheels": zeros}
+    known |= {f"wheel_{what}_{place}": zeros for what in ("ticks", "direction") for place in ("fl", "fr", "rl", "rr")}
+    return column_table("xbot_msgs/WheelTick", **{**known, **columns})
+
+
+@pytest.mark.parametrize("valid", [0, 12, 4 | 8 | 1], ids=["not stated", "rear", "rear and one in front"])
+def test_ticks_count_up_and_the_direction_beside_them_gives_the_sign(valid: int) -> None:
+    columns = {"wheel_ticks_rl": [0, 100, 150, 170], "wheel_direction_rl": [0, 0, 1, 0]}
+    motion = read(ticks(**columns, wheel_ticks_rr=[2**32 - 50, 50, 250, 250], valid_wheels=[valid] * 4))
+    assert motion.position is not None
+    assert motion.unit == "m"
+    np.testing.assert_allclose(motion.position[0], [0.0, 0.5, 0.25, 0.35])
+    np.testing.assert_allclose(motion.position[1], [0.0, 0.5, 1.5, 1.5])
+
+
+def test_ticks_of_four_wheels_are_the_mean_of_each_side() -> None:
+    columns = {
+        "wheel_ticks_rl": [0, 100, 200, 300],
+        "wheel_ticks_fl": [7, 127, 247, 367],
+        "wheel_ticks_rr": [0, 1, 2, 3],
+    }
+    motion = read(ticks(**columns, valid_wheels=[15] * 4, wheel_tick_factor=[0] * 4))
+    assert motion.position is not None
+    assert motion.unit == "counts"
+    np.testing.assert_allclose(motion.position[0], [0.0, 110.0, 220.0, 330.0])
+    np.testing.assert_allclose(motion.position[1], [0.0, 0.5, 1.0, 1.5])
+
+
+def test_an_autopilot_s_wheels_are_metres_or_rpm_as_the_topic_states() -> None:
+    kind, values = "mavros_msgs/WheelOdomStamped", {"data[*]": [[0.0, 30.0], [1.0, 60.0], [2.0, 60.0]]}
+    distance = read(column_table(kind, "/mavros/wheel_odometry/distance", **values))
+    rpm = read(column_table(kind, "/mavros/wheel_odometry/rpm", **values))
+    assert (distance.unit, rpm.unit) == ("m", "rad")
+    assert distance.position is not None
+    assert rpm.speed is not None
+    assert distance.position[1].tolist() == [30.0, 60.0, 60.0]
+    np.testing.assert_allclose(rpm.speed[1], [np.pi, 2 * np.pi, 2 * np.pi])
+    with pytest.raises(DefinitionError, match="fewer than two wheels"):
+        read(column_table(kind, **{"data[*]": [[1.0]]}))

@@ -1,0 +1,168 @@
+"""Messages that are decoded one by one: the values at the wanted paths of each, as columns."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.arrays import Bools, Ints
+from icrtool.logs.containers.channel import Block
+from icrtool.logs.messages.decoder import MESSAGES_AT_ONCE, text_numbers
+from icrtool.logs.messages.schema import MOST_ELEMENTS, Slot
+from icrtool.records.text import LONGEST_TEXT
+
+LONGEST_MESSAGE_BYTES = 1 << 20
+"""Of a message that is decoded by itself; those that icrtool uses have some hundred bytes."""
+
+_STEP = re.compile(r"([^.\[\]]+)|\[(\d+|\*)\]")
+_LARGEST_INTEGER = 1 << 62
+
+Step = str | int | None
+"""A field's name, an element's place, or None for all elements of a sequence."""
+
+
+class MessageColumns(Protocol):
+    """Some decoded messages of one topic."""
+
+    @property
+    def readable(self) -> Bools:
+        """Which of the messages given (m,) are readable; what follows holds those alone."""
+        ...
+
+    def numbers(self, path: str) -> NDArray[Any]:
+        """Return a field of numbers as float64 or int64: (n,) or, of a sequence, (n, longest)."""
+        ...
+
+    def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
+        """Return the numbers of a text field's texts (n,) or (n, longest), -1 for none; new texts become known."""
+        ...
+
+
+class MessageDecoder(Protocol):
+    """Decodes the messages of one topic."""
+
+    @property
+    def slots(self) -> Mapping[str, Slot]:
+        """The wanted fields that the messages have, by path."""
+        ...
+
+    def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, MessageColumns]]:
+        """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedValues:
+    """Messages as nested values: mappings by field name, sequences, numbers, texts.
+
+    Attributes
+    ----------
+    messages : the readable ones (n,)
+    """
+
+    slots: Mapping[str, Slot]
+    messages: Sequence[object]
+    readable: Bools
+
+    def numbers(self, path: str) -> NDArray[Any]:
+        """Return a field of numbers; what a message lacks is NaN or 0."""
+        whole = self.slots[path].kind not in ("float32", "float64")
+        take, result = (_integer, np.int64) if whole else (_float, np.float64)
+        found = self._at(path)
+        if "[*]" not in path:
+            return np.array([take(value) for value in found], result)
+        return _padded([[take(value) for value in _listed(values)] for values in found], 0 if whole else np.nan, result)
+
+    def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
+        """Return the numbers of a text field's texts, -1 for none; new texts become known."""
+        found = self._at(path)
+        if "[*]" not in path:
+            return np.array(text_numbers([_text(value) for value in found], known), np.int64)
+        return _padded([text_numbers([_text(one) for one in _listed(values)], known) for values in found], -1, np.int64)
+
+    def _at(self, path: str) -> list[object]:
+        steps = steps_of(path)
+        return [value_at(message, steps) for message in self.messages]
+
+
+@dataclass(slots=True)
+class ValueDecoder:
+    """Decodes messages one by one.
+
+    Attributes
+    ----------
+    parse : returns a message's nested values, None where it is not readable
+    """
+
+    slots: Mapping[str, Slot]
+    parse: Callable[[bytes], object] = field(repr=False)
+
+    def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, DecodedValues]]:
+        """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
+        rows = np.flatnonzero(block.channel == number)
+        for begin in range(0, len(rows), MESSAGES_AT_ONCE):
+            some = rows[begin : begin + MESSAGES_AT_ONCE]
+            ends = zip(block.start[some].tolist(), block.end[some].tolist(), strict=True)
+            found = [
+                self.parse(block.data[start:end].tobytes()) if end - start <= LONGEST_MESSAGE_BYTES else None
+                for start, end in ends
+            ]
+            readable = np.array([one is not None for one in found], np.bool_)
+            yield some, DecodedValues(self.slots, [one for one in found if one is not None], readable)
+
+
+def steps_of(path: str) -> tuple[Step, ...]:
+    """Return the steps of a path such as ``joints[*].name`` or ``position_covariance[4]``."""
+    found = (match.groups() for match in _STEP.finditer(path))
+    return tuple(name or (None if place == "*" else int(place)) for name, place in found)
+
+
+def value_at(value: object, steps: Sequence[Step]) -> object:
+    """Return what a message holds at some steps, a list behind a step to all elements; None for nothing."""
+    for done, step in enumerate(steps):
+        if isinstance(step, str):
+            value = value.get(step) if isinstance(value, dict) else None
+        elif not isinstance(value, list):
+            return None
+        elif step is None:
+            return [value_at(one, steps[done + 1 :]) for one in value[:MOST_ELEMENTS]]
+        else:
+            value = value[step] if step < len(value) else None
+    return value
+
+
+def _listed(values: object) -> list[Any]:
+    return values if isinstance(values, list) else []
+
+
+def _float(value: object) -> float:
+    if not isinstance(value, (int, float)):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.copysign(math.inf, value)
+
+
+def _integer(value: object) -> int:
+    if isinstance(value, float):
+        value = int(value) if math.isfinite(value) else 0
+    return value if isinstance(value, int) and abs(value) < _LARGEST_INTEGER else 0
+
+
+def _text(value: object) -> bytes:
+    return value.encode("utf-8", "replace")[:LONGEST_TEXT] if isinstance(value, str) else b""
+
+
+def _padded(rows: list[list[Any]], lacking: float, result: type[np.float64 | np.int64]) -> NDArray[Any]:
+    """Return rows of different lengths (n, longest)."""
+    padded = np.full((len(rows), max(map(len, rows), default=0)), lacking, result)
+    for row, values in zip(padded, rows, strict=True):
+        row[: len(values)] = values
+    return padded

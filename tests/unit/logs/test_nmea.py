@@ -1,0 +1,163 @@
+"""NMEA sentences: what pynmea2 reads in them is read; what has no right checksum, or makes no sense, is left out."""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+
+import numpy as np
+import pynmea2
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from icrtool.logs.containers.channel import Block, Channel
+from icrtool.logs.messages.collectors import collector_for
+from icrtool.logs.messages.nmea import GGA, GST, HDT, NMEA_SENTENCE, RMC, parse_sentence
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.heading_sources import HEADING_TYPES
+from icrtool.logs.streams.position_sources import POSITION_TYPES
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
+from icrtool.records.text import LogText
+
+ROUNDING_DEG = 1e-12
+STEP_NS = 100_000_000
+PATIENT = settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
+"""On a busy machine the first drawing takes seconds."""
+
+FIXES = st.tuples(
+    st.floats(0.0, 8999.999), st.sampled_from("NS"), st.floats(0.0, 17959.999), st.sampled_from("EW"),
+    st.integers(0, 9), st.floats(-400.0, 8000.0), st.floats(-100.0, 80.0),
+)  # fmt: skip
+
+
+def sentence(body: str) -> bytes:
+    """Return a sentence with its checksum."""
+    checksum = 0
+    for byte in body.encode():
+        checksum ^= byte
+    return f"${body}*{checksum:02X}\r\n".encode()
+
+
+def gga(quality: int, utc: str = "101500.00", north: str = "4806.000") -> bytes:
+    return sentence(f"GNGGA,{utc},{north},N,01136.000,E,{quality},12,0.8,500.0,M,47.0,M,,")
+
+
+def table_of(texts: list[bytes]) -> TopicTable:
+    """Return the messages of a topic, as ROS 2 serializes them."""
+    messages = []
+    for text in texts:
+        head = b"\0\1\0\0" + struct.pack("<iII", 0, 0, 1) + b"\0\0\0\0"
+        messages.append(head + struct.pack("<I", len(text) + 1) + text + b"\0")
+    end = np.cumsum([len(message) for message in messages])
+    zeros, stamps = np.zeros(len(texts), np.int64), STEP_NS * np.arange(1, len(texts) + 1)
+    data = np.frombuffer(b"".join(messages), np.uint8)
+    collector = collector_for(Channel(0, LogText("/nmea"), LogText(NMEA_SENTENCE), LogText("cdr")), ("sentence",))
+    collector.feed(Block(data, zeros, stamps, np.append(0, end[:-1]), end), 0)
+    return collector.table()
+
+
+@PATIENT
+@given(FIXES)
+def test_a_fix_is_where_another_library_reads_it(fix: tuple[float, str, float, str, int, float, float]) -> None:
+    north, side, east, hemisphere, quality, height, undulation = fix
+    fields = (
+        "101500.25", f"{north:012.6f}", side, f"{east:013.6f}", hemisphere, str(quality), "12", "0.8",
+        f"{height:.3f}", "M", f"{undulation:.3f}", "M", "", "",
+    )  # fmt: skip
+    text = str(pynmea2.GGA("GN", "GGA", fields))
+    read, expected = parse_sentence(text.encode()), pynmea2.parse(text, check=True)
+    assert read is not None
+    assert read["sentence_kind"] == GGA
+    assert read["latitude"] == pytest.approx(expected.latitude, abs=ROUNDING_DEG)
+    assert read["longitude"] == pytest.approx(expected.longitude, abs=ROUNDING_DEG)
+    assert read["altitude"] == pytest.approx(expected.altitude + float(expected.geo_sep), abs=1e-9)
+    assert (read["quality"], read["utc_s"]) == (quality, 10 * 3600 + 15 * 60 + 0.25)
+
+
+@PATIENT
+@given(st.binary(max_size=200) | st.text("$!*,.GNAPRMCSTHD0123456789-+eEnaif\r\n", max_size=120).map(str.encode))
+def test_bytes_of_any_kind_are_a_sentence_or_none(text: bytes) -> None:
+    read = parse_sentence(text)
+    assert read is None or all(isinstance(value, (int, float)) for value in read.values())
+
+
+@PATIENT
+@given(st.data())
+def test_a_sentence_with_a_changed_byte_is_none(data: st.DataObject) -> None:
+    text = bytearray(gga(4).strip())
+    place, byte = data.draw(st.integers(1, len(text) - 1)), data.draw(st.integers(0, 255))
+    same = text[place] == byte or (text[place : place + 1].lower() == bytes([byte]).lower() and place > len(text) - 3)
+    text[place] = byte
+    assert (parse_sentence(bytes(text)) is None) is not same
+
+
+@pytest.mark.parametrize("text", [b"", b"$", b"$GNGGA*", gga(4)[:-5], gga(4).replace(b"*", b""), gga(4) * 2])
+def test_a_sentence_without_its_checksum_is_none(text: bytes) -> None:
+    assert parse_sentence(text) is None
+
+
+@pytest.mark.parametrize(
+    "field", ["nan", "inf", "1e5", "1_0", "", " 4806.0", "9" * 40, "٤٨٠٦.٠", "4806.0.0", "0x10", "-", "."]
+)
+def test_a_field_that_is_no_number_of_nmea_is_none(field: str) -> None:
+    read = parse_sentence(gga(4, north=field))
+    assert read is None or math.isnan(read["latitude"])
+
+
+def test_a_sentence_that_ends_early_has_what_it_has() -> None:
+    assert math.isnan(parse_sentence(sentence("GNGGA"))["latitude"])
+    assert parse_sentence(sentence("GNRMC,,A"))["quality"] == 1
+    assert parse_sentence(sentence("GPGSV,1,1,00")) == {}
+
+
+def test_the_quality_states_how_the_position_was_solved() -> None:
+    source = POSITION_TYPES[NMEA_SENTENCE][1](table_of([gga(quality) for quality in range(10)]))
+    assert source.usable.tolist() == [quality not in (0, 6, 7) for quality in range(10)]
+    stated = dict(enumerate(source.stated_class.tolist()))
+    assert (stated[4], stated[5]) == (FIXED_FIX, FLOAT_FIX)
+    assert {stated[quality] for quality in (1, 2, 3, 8, 9)} == {OTHER_FIX}
+    assert source.rejected == {"no fix": 3}
+
+
+def test_the_mode_of_rmc_states_it_too_and_a_void_one_is_no_fix() -> None:
+    body = "GPRMC,101500.00,{},4806.000,N,01136.000,E,0.1,,231126,,,{}"
+    modes = [("A", "R"), ("A", "F"), ("A", "D"), ("V", "A"), ("A", "N"), ("A", "")]
+    source = POSITION_TYPES[NMEA_SENTENCE][1](table_of([sentence(body.format(*mode)) for mode in modes]))
+    assert source.usable.tolist() == [True, True, True, False, False, True]
+    assert source.stated_class.tolist()[:3] == [FIXED_FIX, FLOAT_FIX, OTHER_FIX]
+
+
+def test_deviations_are_those_of_the_same_time() -> None:
+    gst = "GNGST,{},5,0.02,0.01,12,{},0.5,0.02"
+    texts = [gga(4, "101500.00"), sentence(gst.format("101500.00", 0.3)), gga(4, "101500.10"), gga(4, "101500.20"),
+             sentence(gst.format("101500.20", 0.4)), sentence(gst.format("101500.30", 0.6))]  # fmt: skip
+    source = POSITION_TYPES[NMEA_SENTENCE][1](table_of(texts))
+    assert source.variance[:, 0].tolist() == pytest.approx([0.09, math.nan, 0.16], nan_ok=True)
+    assert source.variance[0, 1] == pytest.approx(0.25)
+
+
+def test_a_heading_is_clockwise_from_true_north() -> None:
+    texts = [sentence("GPHDT,90.0,T"), gga(4), sentence("GPHDT,,T"), sentence("GPHDT,359.5,T")]
+    source = HEADING_TYPES[NMEA_SENTENCE][1](table_of(texts))
+    assert source.convention == "ned"
+    assert source.usable.tolist() == [True, False, True]
+    np.testing.assert_allclose(np.degrees(source.heading_rad("ned")[source.usable]), [90.0, -0.5])
+
+
+def test_sentences_are_counted_and_those_damaged_are_not_read() -> None:
+    bad = bytearray(gga(4))
+    bad[10] ^= 1
+    table = table_of(
+        [gga(4), bytes(bad), sentence("GPRMC,,V"), sentence("GPGST,"), sentence("GPHDT,1,T"), b"\xff" * 99]
+    )
+    assert table.unreadable == 2
+    assert table.column("sentence_kind").tolist() == [GGA, RMC, GST, HDT]
+
+
+def test_sentences_of_megabytes_cost_no_time() -> None:
+    begin = time.process_time()
+    table = table_of([b"$" + b"," * 1_000_000 + b"*00"] * 20)
+    assert table.unreadable == 20
+    assert time.process_time() - begin < 2.0
