@@ -181,8 +181,10 @@ def _joined(t: Floats, dt: Floats, left: Floats, right: Floats, turns: Bools) ->
     """
     if len(t) <= MOST_WHEEL_SAMPLES:
         return t, dt, left, right
-    gaps = np.flatnonzero(dt[:-1] == 0.0)
-    first = np.unique(np.concatenate([_thinned(turns), gaps, gaps + 1, [len(t) - 1]]))
+    gap = dt == 0.0
+    begins = gap | np.append(True, gap[:-1])
+    begins[_thinned(turns)] = begins[-1] = True
+    first = np.flatnonzero(begins)
     joined = np.add.reduceat(dt, first)
     speeds = []
     for speed in (left, right):

@@ -159,8 +159,8 @@ def without_frozen(log: RobotLog) -> RobotLog:
     speed = np.abs(wheels.v_left_mps + wheels.v_right_mps)[:-1] / 2
     gone = np.concatenate([[0.0], np.cumsum(speed * unbroken(np.diff(wheels.stamp_ns) / 1e9))])
     travel = np.interp(gnss.stamp_ns, wheels.stamp_ns, gone)
-    first = np.flatnonzero(np.diff(gnss.north_m, prepend=np.nan) != 0.0)
-    first = np.union1d(first, np.flatnonzero(np.diff(gnss.east_m, prepend=np.nan) != 0.0))
+    moves = (np.diff(axis, prepend=np.nan) != 0.0 for axis in (gnss.north_m, gnss.east_m))
+    first = np.flatnonzero(np.logical_or(*moves))
     count = np.diff(first, append=len(travel))
     length = travel[first + count - 1] - travel[first]
     old = length > FROZEN_M
