@@ -121,7 +121,8 @@ def write_exports(
     junit: Path | None, markdown: Path | None,
 ) -> None:  # fmt: skip
     """Write the page of the fleet, and what machines that watch pull requests read, where they are asked for."""
-    from icrtool.output.files.atomic_file import is_page, write_file
+    from icrtool.output.files.atomic import write_file
+    from icrtool.output.files.own_files import is_page
 
     if junit is not None:
         from icrtool.fleet.acceptance import suites_of

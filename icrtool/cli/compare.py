@@ -42,7 +42,7 @@ def command(
       icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
-    from icrtool.output.files.atomic_file import write_file
+    from icrtool.output.files.atomic import write_file
     from icrtool.output.files.json_file import json_bytes
     from icrtool.output.files.picture_file import save_picture
     from icrtool.output.tables.transfer import brief_transfer, format_transfer, transfer_csv, transfer_document

@@ -46,7 +46,7 @@ def command(
       icrtool forecast --calibration warthog.json --path plan.csv --budget 0.5
       icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.files.atomic_file import write_file
+    from icrtool.output.files.atomic import write_file
     from icrtool.output.files.picture_file import save_picture
     from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast, measured_to_m
 

@@ -53,7 +53,7 @@ class _NewFile(click.Path):
 
             check_picture(path)
         else:
-            from icrtool.output.files.atomic_file import check_place
+            from icrtool.output.files.own_files import check_place
 
             check_place(path)
         return path
@@ -258,7 +258,7 @@ def write_or_print(text: str, output: Path | None) -> None:
     if output is None:
         click.echo(text, nl=False)
         return
-    from icrtool.output.files.atomic_file import write_file
+    from icrtool.output.files.atomic import write_file
 
     write_file(output, text)
 

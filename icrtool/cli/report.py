@@ -32,7 +32,8 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
       icrtool report results/
     """  # noqa: D301 - click reads the escape
     from icrtool.errors import ConfigError
-    from icrtool.output.files.atomic_file import check_place, is_page, write_file
+    from icrtool.output.files.atomic import write_file
+    from icrtool.output.files.own_files import check_place, is_page
     from icrtool.output.run_directory import PAGE_FILE
     from icrtool.output.stored_run import newest_run
 

@@ -17,9 +17,10 @@ from icrtool.fleet.roll_up import MOST_POOLED_S, PooledCalibration
 from icrtool.fleet.row import SHOWN_ERROR, SHOWN_WITHOUT, Row, as_text, columns_of
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import disk
-from icrtool.output.files.atomic_file import atomic_file, check_place, is_page, make_folders, write_file
+from icrtool.output.files.atomic import atomic_file, make_folders, write_file
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, json_bytes, schema_of
+from icrtool.output.files.own_files import check_place, is_page
 from icrtool.output.run_directory import PAGE_FILE, PLOT_FORMATS
 from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records.dropout import Verdict

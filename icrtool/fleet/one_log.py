@@ -80,7 +80,7 @@ def process(request: Request, stage: Stage) -> Row:
     ----------
     stage : called with what is done next
     """
-    from icrtool.output.files.atomic_file import make_folders, write_file
+    from icrtool.output.files.atomic import make_folders, write_file
 
     begun = time.monotonic()
     try:

@@ -17,7 +17,7 @@ from icrtool import __version__
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import unique_name
 from icrtool.fleet.row import File, Row
-from icrtool.output.files.atomic_file import make_folders
+from icrtool.output.files.atomic import make_folders
 from icrtool.output.files.calibration_file import write_calibration
 from icrtool.output.files.json_file import FLEET_FILE, InputFile, logs_of_fleet
 from icrtool.records.regular_file import is_regular, read_regular

@@ -17,7 +17,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.kernels.open_loop.block_sums import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
 from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 from icrtool.kernels.open_loop.trials import Summary
-from icrtool.output.files.atomic_directory import atomic_directory
+from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.checksums import list_anew
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
@@ -64,7 +64,7 @@ def write_report(
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     figures : ``all``: those of the paper too
     stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: they are not written
-    inside : as in `icrtool.output.files.atomic_directory.check_directory`
+    inside : as in `icrtool.output.files.own_files.check_directory`
 
     Raises
     ------

@@ -11,12 +11,12 @@ from typing import Any
 
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import file_sha256, files_of_log
-from icrtool.output.files.atomic_directory import atomic_directory, check_directory
+from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.checksums import file_b2sum, write_sums
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_measurements
-from icrtool.output.files.own_files import made_from
+from icrtool.output.files.own_files import check_directory, own_files
 from icrtool.output.files.states_file import StatesFormat, write_states
 from icrtool.records.late_output import FigureSet
 from icrtool.records.regular_file import read_regular
@@ -68,7 +68,7 @@ def check_target(
 def _is_made_from(directory: Path, log: Path) -> bool:
     """Return whether a run was made from a log: from a file in the same place, or from files of the same content."""
     files = [file for file in files_of_log(log) if file.is_file()]
-    inputs, sources = _inputs_of(directory), made_from(directory)
+    inputs, sources = _inputs_of(directory), own_files(directory).made_from
     if any(os.path.realpath(file) in sources for file in files):
         return True
     return bool(inputs) and all(

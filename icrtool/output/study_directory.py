@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from icrtool import __version__
-from icrtool.output.files.atomic_directory import atomic_directory, check_directory
+from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.output.files.own_files import check_directory
 from icrtool.simulation.studies import KINDS, Column, StudyResult
 
 STUDY_SCHEMA = "icrtool/study/1"

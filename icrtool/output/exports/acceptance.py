@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_width
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
-from icrtool.output.files.atomic_file import write_file
+from icrtool.output.files.atomic import write_file
 from icrtool.output.tables.dropout import format_dropout, shown_horizons
 from icrtool.output.text_blocks import Line, Table
 from icrtool.output.text_format import error_text, run_title, xml_text

@@ -38,7 +38,7 @@ from icrtool.output.exports.paths import (
     paths_of,
     rows_apart,
 )
-from icrtool.output.files.atomic_file import EXPORTED_MCAP
+from icrtool.output.files.own_files import EXPORTED_MCAP
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.samples import FIXED_FIX
 

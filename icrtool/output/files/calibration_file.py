@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from icrtool.errors import OutputError, RunError
-from icrtool.output.files.atomic_file import write_file
+from icrtool.output.files.atomic import write_file
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.records.regular_file import read_regular
 from icrtool.records.run import CALIBRATION_SCHEMA
@@ -49,7 +49,7 @@ def write_calibration(document: Mapping[str, Any], place: Path, inside: Path | N
 
     Parameters
     ----------
-    inside : as in `icrtool.output.files.atomic_file.atomic_file`
+    inside : as in `icrtool.output.files.atomic.atomic_file`
 
     Returns
     -------

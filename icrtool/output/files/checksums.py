@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from icrtool.errors import RunError
-from icrtool.output.files.atomic_file import write_file
+from icrtool.output.files.atomic import write_file
 from icrtool.records.regular_file import open_regular, read_regular
 
 CHECKSUM_FILE = "B2SUMS"

@@ -1,14 +1,11 @@
-"""The calls that change directories on the disk, in one place: rename, exchange, link, sync, lock.
-
-`atomic_directory` and `atomic_file` use nothing else, so that a test can let each of them fail.
-"""
+"""The calls that change names on the disk: hidden names beside a place, and their locks; exchange, link, sync."""
 
 from __future__ import annotations
 
 import ctypes
 import errno
+import glob
 import os
-import re
 import secrets
 import shutil
 import sys
@@ -22,14 +19,14 @@ from pathlib import Path
 if sys.platform != "win32":
     import fcntl
 
-AT_FDCWD = -100
-RENAME_EXCHANGE = 2
-"""Linux <linux/fs.h> and macOS <sys/stdio.h> (RENAME_SWAP) have the same number."""
-
 NO_EXCHANGE = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
 """What a kernel or a file system answers that cannot exchange; network file systems are among them."""
 
 NO_LINK = {errno.EPERM, errno.EXDEV, errno.EMLINK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EACCES}
+
+AT_FDCWD = -100
+RENAME_EXCHANGE = 2
+"""Linux <linux/fs.h> and macOS <sys/stdio.h> (RENAME_SWAP) have the same number."""
 
 LONGEST_NAME_BYTES = 200
 """A hidden name is that of the place and some letters; a longer one is shortened to its hash."""
@@ -42,26 +39,20 @@ LONGEST_WRITE_S = 86400.0
 SYNC_THREADS = 8
 """A journal commits what is asked for together: eight threads sync 16 files in a fifth of the time of one."""
 
-
 _LOOK = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
-def hidden_name(place: Path, end: str) -> Path:
+def hidden_name(place: Path, end: str = ".partial") -> Path:
     """Return a new hidden name beside a place, for what shall get its name."""
     return place.with_name(f"{_hidden_begin(place)}{secrets.token_hex(TOKEN_BYTES)}{end}")
 
 
-def hidden(place: Path, *ends: str) -> list[Path]:
-    """Return what has a name that `hidden_name` made of a place and one of these ends."""
-    begin = _hidden_begin(place)
+def hidden(place: Path, end: str) -> list[Path]:
+    """Return what has a name that `hidden_name` made of a place."""
     # Of exactly this length: the directories a and a.b may be beside one another.
-    sought = [re.compile(f"{re.escape(begin)}[0-9a-f]{{{2 * TOKEN_BYTES}}}{re.escape(end)}") for end in ends]
-    try:
-        beside = list(place.parent.iterdir())
-    except (FileNotFoundError, NotADirectoryError):
-        return []
+    found = place.parent.glob(glob.escape(_hidden_begin(place)) + 2 * TOKEN_BYTES * "[0-9a-f]" + end)
     # A link is not ours: it would lead the cleaning elsewhere.
-    return [path for path in beside if any(one.fullmatch(path.name) for one in sought) and not path.is_symlink()]
+    return [path for path in found if not path.is_symlink()]
 
 
 def _hidden_begin(place: Path) -> str:
@@ -69,14 +60,40 @@ def _hidden_begin(place: Path) -> str:
     return f".{blake2b(name, digest_size=16).hexdigest() if len(name) > LONGEST_NAME_BYTES else place.name}."
 
 
-def rename(source: Path, target: Path) -> None:
-    """Rename a file or a directory."""
-    source.rename(target)
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Lock a file or directory, where that is possible, until the block or the process ends."""
+    handle = None
+    with suppress(OSError):
+        handle = _lock(path)
+    try:
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
 
 
-def replace(source: Path, target: Path) -> None:
-    """Rename a file, over one that is there."""
-    source.replace(target)
+def is_abandoned(path: Path) -> bool:
+    """Return whether no living process writes what `locked` locked."""
+    try:
+        os.close(_lock(path))
+    except BlockingIOError:
+        return False
+    except OSError:  # no locks here, or not ours to open: its age decides
+        return path.exists() and time.time() - path.stat().st_mtime > LONGEST_WRITE_S
+    return True
+
+
+def _lock(path: Path) -> int:
+    if sys.platform == "win32":
+        raise OSError(errno.ENOSYS, "no locks", str(path))
+    handle = os.open(path, _LOOK)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
 
 
 def exchange(one: Path, other: Path) -> bool:
@@ -115,8 +132,6 @@ def link(source: Path, target: Path) -> None:
         if isinstance(err, OSError) and err.errno not in NO_LINK:
             raise
         shutil.copy2(source, target, follow_symlinks=False)
-        if not target.is_symlink():
-            sync(target)
 
 
 def sync(path: Path) -> None:
@@ -154,38 +169,3 @@ def remove(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink(missing_ok=True)
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Lock a file or directory, where that is possible, until the block or the process ends."""
-    handle = None
-    if sys.platform != "win32":
-        with suppress(OSError):
-            handle = os.open(path, _LOOK)
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    try:
-        yield
-    finally:
-        if handle is not None:
-            os.close(handle)
-
-
-def is_abandoned(path: Path) -> bool:
-    """Return whether no living process writes what `locked` locked."""
-    try:
-        if sys.platform != "win32":
-            handle = os.open(path, _LOOK)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            finally:
-                os.close(handle)
-            return True
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass  # no locks here, or not ours to open: its age decides
-    try:
-        return time.time() - path.stat().st_mtime > LONGEST_WRITE_S
-    except OSError:
-        return False

@@ -1,113 +1,252 @@
-"""Which files of a directory icrtool wrote, so that a replacement keeps those that somebody else put there."""
+"""What icrtool may replace: files and directories of its own, and nothing that somebody else put there.
+
+``.icrtool-files`` in a directory lists what was written there with it: all else is kept where that is replaced.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
+from icrtool.errors import OutputError
 from icrtool.output.files import disk
-from icrtool.records.regular_file import read_regular
+from icrtool.records.regular_file import check_folders, open_regular, read_regular
+from icrtool.records.text import escaped, listed
+
+IsOurs = Callable[[Path], bool]
+"""Whether a directory is one that we wrote and may replace."""
+
+IsOurFile = Callable[[bytes], bool]
+"""Whether a file, of which the first bytes are given, is one that we wrote and may replace."""
 
 OWN_FILES = ".icrtool-files"
-"""List of the files that were written with a directory: JSON with `schema`, `kind`, `files` and `made_from`."""
+"""List of the files that were written with a directory: JSON with the keys of `OwnFiles`, and `schema`."""
 
 SCHEMA = "icrtool/files/1"
 
+EXPORTED_MCAP = b"icrtool export"
+"""Library in the header of an MCAP file that `icrtool export` wrote: it is no log of somebody's."""
 
-def write_own_files(directory: Path, kind: str, made_from: Sequence[str] = ()) -> None:
-    """Write the list of all files in a directory that is about to be put in place.
+PACKED = (b"\x28\xb5\x2f\xfd", b"\x1f\x8b", b"BZh", b"\x04\x22\x4d\x18")
+"""How files packed with zstd, gzip, bzip2 and lz4 begin: nothing that icrtool writes, and perhaps a log."""
 
-    Parameters
-    ----------
-    made_from : absolute paths of the files that its content was made from
-    """
-    files = sorted(path.as_posix() for path in files_in(directory))
-    _write(directory / OWN_FILES, kind, files, made_from)
+FIRST_BYTES = 4096
 
 
-def kind_of(directory: Path) -> str | None:
-    """Return the kind of directory that icrtool wrote here; None where no list of its files states one."""
-    document = _read(directory)
-    return document[0] if document is not None else None
+@contextmanager
+def reported(path: Path) -> Iterator[None]:
+    """Raise an OSError of the block as an OutputError of a place."""
+    try:
+        yield
+    except OSError as err:
+        raise OutputError(path, "cannot be written", err.strerror or str(err)) from err
 
 
-def made_from(directory: Path) -> frozenset[str]:
-    """Return the absolute paths of the files that a directory of ours was made from; empty where no list has them."""
-    document = _read(directory)
-    return document[2] if document is not None else frozenset()
-
-
-def files_by_owner(directory: Path, names: Collection[str]) -> tuple[list[PurePosixPath], list[PurePosixPath]]:
-    """Return the files below a directory that icrtool wrote, and all others, relative to it.
+def check_place(path: Path, inside: Path | None = None, ours: IsOurFile | None = None) -> None:
+    """Refuse a place where a file cannot be put, before any work is done for it.
 
     Parameters
     ----------
-    names : files at the top that are icrtool's though no list has them: they are written later than the directory
+    inside, ours : as in `atomic_file`
+
+    Raises
+    ------
+    OutputError
+        The directory is missing, or a link below `inside`; a log, a directory, a device or a pipe is there, or another
+        file than one of ours.
     """
-    files = list(files_in(directory))
-    lists: dict[PurePosixPath, frozenset[str]] = {}
-    for parent in {parent for path in files for parent in path.parents}:
-        document = _read(directory / parent)
-        lists[parent] = document[1] if document is not None else frozenset()
-
-    def is_own(path: PurePosixPath) -> bool:
-        listed = any(str(path.relative_to(parent)) in lists[parent] for parent in path.parents)
-        return listed or path.name == OWN_FILES or str(path) in names
-
-    own = [path for path in files if is_own(path)]
-    return own, sorted(set(files) - set(own))
+    with reported(path):
+        if not place_of_file(path, inside, ours).parent.is_dir():
+            raise OutputError(path, "its directory does not exist", "make it first, or name another file")
 
 
-def carry(source: Path, target: Path, files: list[PurePosixPath]) -> list[PurePosixPath]:
-    """Give files of one directory a second name in another, where that has none of the same name.
+def place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> Path:
+    """Return the place of a file without links; parameters and errors as of `check_place`."""
+    place = Path(os.path.realpath(path if inside is None else path.parent))
+    if inside is not None:
+        check_folders(path, inside)
+        place /= path.name
+        if place.is_symlink():
+            return place
+    if place.is_dir():
+        raise OutputError(path, "is a directory", "name a file")
+    if place.exists():
+        if not place.is_file():
+            raise OutputError(path, "is a device or pipe, which would be replaced", "name a file")
+        _check_content(path, place, ours)
+    return place
 
-    A directory of ours below `source` that some of them lie in stays one in `target`: its next content replaces it.
 
-    Returns
-    -------
-    list of PurePosixPath
-        Those that are in both directories now.
+def _check_content(path: Path, place: Path, ours: IsOurFile | None) -> None:
+    """Refuse to replace a log, or what is not ours."""
+    from icrtool.logs.containers.open_log import container_of
+
+    try:
+        with open_regular(place) as stream:
+            first = stream.read(FIRST_BYTES)
+            is_log = container_of(stream) is not None and EXPORTED_MCAP not in first[:64]
+    except PermissionError:
+        return  # it may be replaced without being read
+    if is_log or first.startswith(PACKED):
+        raise OutputError(path, "a log is there", "it is left alone; name another file")
+    if ours is not None and first and not ours(first):
+        raise OutputError(path, "a file that icrtool did not write is there", "it is left alone; name another place")
+
+
+def is_page(first: bytes) -> bool:
+    """Return whether a file is a page of ours, by its first bytes."""
+    return b"icrtool</title>" in first
+
+
+def check_directory(directory: Path, ours: IsOurs, *, kind: str, inside: Path | None = None) -> None:
+    """Refuse a place where a directory of ours cannot be put; restore what a killed process renamed aside.
+
+    Parameters
+    ----------
+    directory : where it shall appear; nothing, an empty directory and one of ours may be there
+    ours : whether a directory may be replaced
+    kind : what is being written, for the message ("run directory")
+    inside : a directory above it; below that no link is followed. None: the user named `directory`, and links are
+
+    Raises
+    ------
+    OutputError
+        A file or a foreign directory is there; the place is inside a directory of this kind, holds one, or is a mount
+        point; or nothing can be known about the place.
+    """
+    why, advice = "", "it is left alone; name another place"
+    with reported(directory):
+        if inside is not None:
+            check_folders(directory, inside)
+        place = real_place(directory)
+        restore(place, ours)
+        if outer := next((parent for parent in place.parents if ours(parent)), None):
+            why, advice = f"lies inside the {kind} {outer}", "name a place outside it"
+        elif file := next((one for one in (place, *place.parents) if one.exists() and not one.is_dir()), None):
+            why = "a file is there" if file == place else f"{file} is a file"
+            advice = f"name another place for the {kind}"
+        elif not place.exists():
+            return
+        elif not ours(place) and own_files(place).kind != kind and any(place.iterdir()):
+            why = f"holds something that is not a {kind}"
+        elif inner := next((one for one in place.glob("**/*/") if ours(one)), None):
+            why = f"holds another {kind} ({inner.relative_to(place)})"
+        elif place.is_mount():
+            why, advice = "is a mount point, which cannot be replaced", "name a directory in it"
+    if why:
+        raise OutputError(directory, why, advice)
+
+
+def real_place(directory: Path) -> Path:
+    """Return a place without links; unlike `Path.resolve` it takes a link that leads to itself as it is."""
+    return Path(os.path.realpath(directory))
+
+
+def restore(directory: Path, ours: IsOurs) -> None:
+    """Rename an old directory back to its place, where a killed process left it aside and put nothing there.
 
     Raises
     ------
     OSError
-        One cannot be linked or copied.
+        It cannot be renamed.
     """
-    carried = []
-    for file in files:
-        if not os.path.lexists(target / file):
-            for parent in list(file.parents)[:-1]:
-                kind = kind_of(source / parent)
-                if kind is not None and not (target / parent / OWN_FILES).exists():
-                    (target / parent).mkdir(parents=True, exist_ok=True)
-                    _write(target / parent / OWN_FILES, kind, [])
-            disk.link(source / file, target / file)
-            carried.append(file)
-    return carried
+    place = real_place(directory)
+    if not os.path.lexists(place):
+        aside = [path for path in disk.hidden(place, ".old") if ours(path) or own_files(path).kind]
+        if aside:
+            max(aside, key=lambda path: path.stat().st_mtime_ns).rename(place)
 
 
-def files_in(directory: Path) -> Iterator[PurePosixPath]:
-    """Yield all that is no directory, links to directories included, relative to `directory`."""
-    for folder, folders, names in os.walk(directory):
-        here = Path(folder)
-        links = [name for name in folders if (here / name).is_symlink()]
-        for name in (*links, *names):
-            yield PurePosixPath((here / name).relative_to(directory).as_posix())
+class OwnFiles(NamedTuple):
+    """What icrtool wrote in a directory.
+
+    Attributes
+    ----------
+    kind : of directory; empty where no list states one
+    files : relative to the directory
+    made_from : absolute paths of the files that the directory was made from
+    """
+
+    kind: str = ""
+    files: frozenset[str] = frozenset()
+    made_from: frozenset[str] = frozenset()
 
 
-def _write(file: Path, kind: str, files: list[str], made_from: Sequence[str] = ()) -> None:
-    document = {"schema": SCHEMA, "kind": kind, "files": files, "made_from": list(made_from)}
-    file.write_text(json.dumps(document, indent=0) + "\n", encoding="utf-8")
-
-
-def _read(directory: Path) -> tuple[str, frozenset[str], frozenset[str]] | None:
+def own_files(directory: Path) -> OwnFiles:
+    """Return what the list of a directory states; nothing where it has none."""
     try:
         document = json.loads(read_regular(directory / OWN_FILES, directory))
         if document["schema"] == SCHEMA:
             files, sources = (frozenset(map(str, document.get(key, ()))) for key in ("files", "made_from"))
-            return str(document["kind"]), files, sources
+            return OwnFiles(str(document["kind"]), files, sources)
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         pass
-    return None
+    return OwnFiles()
+
+
+def files_in(directory: Path) -> list[PurePosixPath]:
+    """Return all that is no directory, links to directories included, relative to `directory`."""
+    found = (path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(PurePosixPath(path.relative_to(directory).as_posix()) for path in found)
+
+
+def write_own_files(directory: Path, own: OwnFiles) -> None:
+    """Write the list of a directory that is about to be put in place."""
+    document = {"schema": SCHEMA, "kind": own.kind, "files": sorted(own.files), "made_from": sorted(own.made_from)}
+    (directory / OWN_FILES).write_text(json.dumps(document, indent=0) + "\n", encoding="utf-8")
+
+
+def keep_foreign(place: Path, partial: Path, names: Collection[str]) -> str:
+    """Give the files that icrtool did not write a second name in the directory that replaces theirs.
+
+    Parameters
+    ----------
+    partial : the new directory, in which its list is not yet written
+    names : as in `icrtool.output.files.atomic.atomic_directory`
+
+    Returns
+    -------
+    str
+        A line about what the replacement removes and keeps; empty where that is nothing.
+
+    Raises
+    ------
+    OutputError
+        One has the name of a directory of ours, or ours of one of its directories.
+    """
+    new, there = files_in(partial), files_in(place)
+    lists = {parent: own_files(place / parent).files for path in there for parent in path.parents}
+    own = {
+        path
+        for path in there
+        if path.name == OWN_FILES
+        or str(path) in names
+        or any(str(path.relative_to(parent)) in lists[parent] for parent in path.parents)
+    }
+    removed = [path for path in there if path in own and path not in new and path.name != OWN_FILES]
+    foreign = [path for path in there if path not in own]
+    kept = [path for path in foreign if not os.path.lexists(partial / path)]
+    if lost := [path for path in foreign if path not in kept and path not in new]:
+        raise OutputError(place, f"holds {_names(lost, ())}, which icrtool did not write", "move it elsewhere first")
+    for path in kept:
+        disk.link(place / path, partial / path)
+        # A directory of ours that it lies in stays one: its next content replaces it.
+        for parent in list(path.parents)[:-1]:
+            if kind := own_files(place / parent).kind:
+                write_own_files(partial / parent, OwnFiles(kind))
+    tops = {path.parts[0] for path in new}
+    parts = [f"removed {_names(removed, tops)}"] if removed else []
+    parts += [f"kept {_names(kept, tops)}, not written by icrtool"] if kept else []
+    return f"replaced: {'; '.join(parts)}" if parts else ""
+
+
+def _names(paths: Collection[PurePosixPath], tops: Collection[str]) -> str:
+    """Return names in a line; a directory at the top stands for its files unless it is one of `tops`."""
+    names = dict.fromkeys(
+        f"{path.parts[0]}/" if len(path.parts) > 1 and path.parts[0] not in tops else str(path) for path in paths
+    )
+    return escaped(listed(list(names)))

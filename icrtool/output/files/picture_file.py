@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from icrtool.errors import OutputError
-from icrtool.output.files.atomic_file import check_place, write_file
+from icrtool.output.files.atomic import write_file
+from icrtool.output.files.own_files import check_place
 from icrtool.output.run_directory import PLOT_FORMATS
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def save_picture(figure: Figure, file: Path, inside: Path | None = None) -> None
 
     Parameters
     ----------
-    inside : as in `icrtool.output.files.atomic_file.atomic_file`
+    inside : as in `icrtool.output.files.atomic.atomic_file`
 
     Raises
     ------

@@ -10,8 +10,9 @@ import numpy as np
 
 from icrtool.errors import DataError, OutputError
 from icrtool.output.files import disk
-from icrtool.output.files.atomic_directory import exchange, hidden_directory, restore
+from icrtool.output.files.atomic import hidden_directory, put
 from icrtool.output.files.csv_file import read_numbers
+from icrtool.output.files.own_files import reported, restore
 from icrtool.simulation.drives import TrackSpeeds
 from icrtool.simulation.record import TruthTable
 
@@ -38,7 +39,7 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
         Something is there, or the place cannot be written. It then stays as it was.
     """
     truth = truth_path(log)
-    try:
+    with reported(log):
         restore(log, _is_bag)
         for place in (log, truth):
             if place.exists() and not force:
@@ -51,13 +52,11 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
             # Killed from here on, it leaves a log without its truth, never with that of another log.
             disk.remove(truth)
             if log.is_dir():
-                disk.remove(exchange(fresh / log.name, log, fresh.with_suffix(".old")))
+                put(fresh / log.name, log, fresh)
             else:
-                disk.replace(fresh / log.name, log)
-            disk.replace(fresh / truth.name, truth)
+                (fresh / log.name).replace(log)
+            (fresh / truth.name).replace(truth)
             disk.sync(log.absolute().parent)
-    except OSError as err:
-        raise OutputError(log, "cannot be written", err.strerror or str(err)) from err
 
 
 def _is_bag(place: Path) -> bool:

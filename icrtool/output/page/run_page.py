@@ -15,9 +15,10 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
-from icrtool.output.files.atomic_file import is_page, write_file
+from icrtool.output.files.atomic import write_file
 from icrtool.output.files.checksums import CHECKSUM_FILE, read_sums
 from icrtool.output.files.json_file import schema_of
+from icrtool.output.files.own_files import is_page
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data, main_rows
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
@@ -57,7 +58,7 @@ def write_page(
     path : the file
     plots : directory of the run, whose PNG pictures the page shows where no script draws; default: that of `run`
     coordinates : False leaves out where on the globe the robot was
-    inside : as in `icrtool.output.files.atomic_file.atomic_file`
+    inside : as in `icrtool.output.files.atomic.atomic_file`
 
     Raises
     ------

@@ -16,7 +16,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
 from icrtool.output.exports.acceptance import format_markdown, suite_of, write_junit, write_markdown
-from icrtool.output.files.atomic_file import check_place
+from icrtool.output.files.own_files import check_place
 from icrtool.output.tables.dropout import (
     budget_lines,
     error_text,

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import builtins
+import ctypes
 import errno
 import hashlib
 import io
 import os
 import resource
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -24,8 +26,7 @@ from icrtool.fleet.fleet_files import write_fleet
 from icrtool.fleet.row import Row
 from icrtool.output.exports.foxglove import write_foxglove
 from icrtool.output.figures.style import new_figure
-from icrtool.output.files import disk
-from icrtool.output.files.atomic_file import atomic_file, write_file
+from icrtool.output.files.atomic import atomic_file, write_file
 from icrtool.output.files.calibration_file import write_calibration
 from icrtool.output.files.picture_file import save_picture
 from icrtool.output.files.truth_file import log_and_truth
@@ -128,16 +129,16 @@ class Fault:
     def __init__(self, patched: pytest.MonkeyPatch, folder: Path, number: int, *, exchanges: bool) -> None:
         self.left, self.folder, self.failed = number, str(folder), ""
         for module, name in ((os, "rename"), (os, "replace"), (os, "link"), (os, "mkdir"), (os, "fsync"), (os, "open"),
-                             (io, "open"), (builtins, "open"), (disk, "exchange")):  # fmt: skip
+                             (io, "open"), (builtins, "open"), (ctypes, "CDLL")):  # fmt: skip
             patched.setattr(module, name, self.wrapped(name, getattr(module, name)))
         if not exchanges:
-            patched.setattr(disk, "exchange", lambda *_: False)
+            patched.setattr(sys, "platform", "other")
 
     def wrapped(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any, **options: Any) -> Any:
             mode = str(args[1]) if len(args) > 1 and isinstance(args[1], str) else options.get("mode", "r")
             reads = real is io.open and not set(mode) & set("wxa+")
-            ours = isinstance(args[0], int) if name == "fsync" else str(args[0]).startswith(self.folder)
+            ours = name in ("fsync", "CDLL") or str(args[0]).startswith(self.folder)
             if ours and not reads:
                 self.left -= 1
                 if self.left == 0:

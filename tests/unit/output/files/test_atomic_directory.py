@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import subprocess
@@ -13,8 +14,8 @@ from random import Random
 import pytest
 
 from icrtool.errors import OutputError
-from icrtool.output.files import disk
-from icrtool.output.files.atomic_directory import atomic_directory, check_directory
+from icrtool.output.files.atomic import atomic_directory
+from icrtool.output.files.own_files import check_directory
 
 
 def marked(directory: Path) -> bool:
@@ -139,16 +140,16 @@ def write_generation(directory: Path, text: str) -> None:
 
 
 class Fault:
-    """Lets the n-th call of the disk layer, or of a write, fail."""
+    """Lets the n-th call of the system that changes the disk, or of a write, fail."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, number: int, failure: BaseException, *, exchanges: bool):
         self.left, self.failure, self.name = number, failure, ""
-        for name in ("rename", "exchange", "link", "sync"):
-            call = getattr(disk, name)
-            if name == "exchange" and not exchanges:
-                monkeypatch.setattr(disk, "exchange", lambda *_: False)
-            else:
-                monkeypatch.setattr(disk, name, partial(self.call, name, call))
+        for name in ("rename", "link", "fsync"):
+            monkeypatch.setattr(os, name, partial(self.call, name, getattr(os, name)))
+        if exchanges:
+            monkeypatch.setattr(ctypes, "CDLL", partial(self.call, "exchange", ctypes.CDLL))
+        else:
+            monkeypatch.setattr(sys, "platform", "other")
         monkeypatch.setattr(Path, "mkdir", partialmethod_of(self, "mkdir", Path.mkdir))
         monkeypatch.setattr(Path, "write_text", partialmethod_of(self, "write", Path.write_text))
 
@@ -187,17 +188,16 @@ def test_whatever_call_fails_the_old_or_the_new_one_is_there(tmp_path: Path, mon
         assert (place / "mine.txt").read_text() == "years of work"
     write_generation(place, "last")
     assert [path.name for path in tmp_path.iterdir()] == ["a"], "leftovers are removed by the next one"
-    assert failed == {"rename" if not exchanges else "exchange", "link", "sync", "write", "mkdir"}
+    assert failed == {"rename" if not exchanges else "exchange", "link", "fsync", "write", "mkdir"}
 
 
 KILLED = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[4])
-from icrtool.output.files import disk
-from icrtool.output.files.atomic_directory import atomic_directory
+from icrtool.output.files.atomic import atomic_directory
 if sys.argv[3] == "renames":
-    disk.exchange = lambda *_: False
+    sys.platform = "other"
 for number in range(int(sys.argv[2]), 1_000_000):
     with atomic_directory(Path(sys.argv[1]), lambda place: (place / "mark").exists(), kind="report") as fresh:
         for name in ("mark", "0.gen", "1.gen", "2.gen", "3.gen"):

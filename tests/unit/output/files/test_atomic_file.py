@@ -8,8 +8,8 @@ import pytest
 
 from icrtool.errors import OutputError
 from icrtool.output.exports.acceptance import write_junit, write_markdown
-from icrtool.output.files import disk
-from icrtool.output.files.atomic_file import atomic_file, check_place, write_file
+from icrtool.output.files.atomic import atomic_file, write_file
+from icrtool.output.files.own_files import check_place
 
 
 def test_nothing_is_seen_at_the_place_before_all_is_written(tmp_path: Path) -> None:
@@ -45,14 +45,14 @@ def test_a_file_system_that_only_reads_is_one_error(tmp_path: Path, monkeypatch,
         write(tmp_path / "a", [])
 
 
-@pytest.mark.parametrize("call", ["sync", "replace"])
+@pytest.mark.parametrize("call", ["fsync", "replace"])
 def test_a_disk_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch, call: str) -> None:
     (tmp_path / "a.txt").write_text("old")
 
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(disk, call, fail)
+    monkeypatch.setattr(os, call, fail)
     with pytest.raises(OutputError, match="Input/output error"), atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "old")]
@@ -71,7 +71,7 @@ def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
 def test_a_link_stays_a_link_and_leftovers_of_the_dead_are_removed(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "a.txt").symlink_to("real/b.txt")
-    (tmp_path / "real" / ".b.txt.12345678.partial.txt").write_text("of a killed process")
+    (tmp_path / "real" / ".b.txt.12345678.partial").write_text("of a killed process")
     with atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
     assert (tmp_path / "a.txt").is_symlink()
