@@ -10,7 +10,8 @@ from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
 from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
+from icrtool.kernels.open_loop.trials import FrozenIcrs
+from icrtool.kernels.track import Track
 
 RATE_HZ = 100
 HORIZONS_M = np.arange(1.0, 21.0)
@@ -19,7 +20,7 @@ LARGEST_DIFFERENCE_M = 1e-6
 """Both add up a hundred thousand steps, in another order."""
 
 
-def drive_around(hours: float) -> tuple[Drive, FrozenIcrs]:
+def drive_around(hours: float) -> tuple[Track, FrozenIcrs]:
     """Return a winding drive at 1 m/s whose ICRs converge in the first seconds and then change slowly."""
     rng = np.random.default_rng(0)
     n = int(hours * 3600 * RATE_HZ)
@@ -39,10 +40,8 @@ def drive_around(hours: float) -> tuple[Drive, FrozenIcrs]:
     north = integral(speed * np.cos(heading) + turn * x * np.sin(heading))
     east = integral(speed * np.sin(heading) - turn * x * np.cos(heading))
     distance = integral(np.hypot(speed, turn * x))
-    none = np.zeros(n, dtype=bool)
-    dt_s = np.full(n, 1.0 / RATE_HZ)
-    drive = Drive(dt_s, speed - turn * y_left, speed - turn * y_right, north, east, heading, distance, none, none, none)
-    return drive, FrozenIcrs(y_right, y_left, x)
+    left, right, held = speed - turn * y_left, speed - turn * y_right, np.full(n, 1.0 / RATE_HZ)
+    return Track.of_states(t, held, left, right, north, east, heading, distance), FrozenIcrs(y_right, y_left, x)
 
 
 def open_loop_rows(table: Table, hours: float, repeats: int) -> None:

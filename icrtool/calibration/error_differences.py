@@ -9,7 +9,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.block_sums import LEVEL
 from icrtool.kernels.open_loop.error_statistics import error_summary
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.track import Track
 from icrtool.records.dropout import DEFAULT_SEED
 
 RESAMPLES = 300
@@ -77,7 +77,7 @@ def blocks_of(path_m: Floats, horizon_m: float) -> Ints:
     return np.floor(path_m / max(horizon_m, SHORTEST_BLOCK_M)).astype(np.int64)
 
 
-def same_route(first: Drive, second: Drive) -> bool:
+def same_route(first: Track, second: Track) -> bool:
     """Return whether two drives took the same route at the same distance."""
     ends = [float(one.distance[-1]) for one in (first, second)]
     if abs(ends[1] - ends[0]) > 0.05 * min(ends):

@@ -21,9 +21,10 @@ from icrtool.calibration.held_out import HeldOut, left_out
 from icrtool.calibration.record import ErrorSources
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import OMEGA, displacements, path_at
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
-from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Steps, Windows, cut_windows, totals_of
+from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Windows, cut_windows, totals_of
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
 TWIST_OVER_M = 1.0
@@ -84,7 +85,7 @@ class PathErrors(NamedTuple):
 
 
 def path_errors(
-    steps: Steps, begin_s: Floats, end_s: Floats, fitted: FittedModel, width_m: float, own: LogConstants = NO_CONSTANTS
+    steps: Track, begin_s: Floats, end_s: Floats, fitted: FittedModel, width_m: float, own: LogConstants = NO_CONSTANTS
 ) -> PathErrors:
     """Return displacement and turn of windows by a model, and how errors of its parameters and of each source spread.
 
@@ -93,16 +94,14 @@ def path_errors(
     begin_s, end_s : (w,) times of the windows' starts and ends
     own : constants of the recording
     """
-    gyro = steps.gyro + own.gyro_later_s * steps.gyro_change()
+    gyro = None if steps.gyro is None else steps.gyro + own.gyro_later_s * steps.gyro_change()
     motion = wheel_motion(steps.v_left, steps.v_right, width_m, gyro)
     fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
     fixed[OMEGA] += own.gyro_bias_radps
     # the sources act all along the path, not at the ends of windows alone
     of_start, of_end = begin_s + own.wheels_later_s, end_s + own.wheels_later_s
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
-    path = path_at(
-        steps.t, steps.held, steps.into, lambda some: (fixed[:, some], axes, columns[:, some]), fitted.parameters, at
-    )
+    path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), fitted.parameters, at)
     s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)
     moved, by = displacements(path, s, e)
     moved_by, turned_by = by[:-1], path.heading_by[:, e] - path.heading_by[:, s]

@@ -10,9 +10,10 @@ from icrtool.calibration.error_growth import SOURCES, PathErrors, Spread, mean_e
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints
+from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import OMEGA, VX
 from icrtool.motion.models import FittedModel, wheel_motion
-from icrtool.motion.recording import Recording, Steps, joined_steps, samples_a_step
+from icrtool.motion.recording import Recording, steps_of
 from icrtool.motion.trials import Trials
 
 STEP_M = 0.1
@@ -83,27 +84,25 @@ def forecast_plan(
     held = np.abs(step / speed)
     turn = np.append(np.diff(direction), 0.0) / held
     left, right = wheel_speeds(calibration.fitted, calibration.width_m, speed, turn)
-    t = np.concatenate([[0.0], np.cumsum(held)])
-    steps = Steps(t[:-1], held, left, right, turn, held / 2.0)
-    length = np.concatenate([[0.0], np.cumsum(np.abs(step))])
-    return _along(calibration, steps, t, path, length, float(direction[0]), with_gyro=with_gyro)
+    t, length = (np.concatenate([[0.0], np.cumsum(one)]) for one in (held, np.abs(step)))
+    left, right, turn, direction = (np.append(one, one[-1:]) for one in (left, right, turn, direction))
+    planned = Track.of_states(
+        t, np.append(held, 0.0), left, right, path.real, path.imag, direction, length
+    )._replace(gyro=turn, into=0.5)  # fmt: skip
+    return _along(calibration, planned, planned, with_gyro=with_gyro)
 
 
 def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Forecast:
     """Return the errors of driving the path of a recording again, with its wheel speeds (and gyro)."""
-    drive = recording.drive
-    steps = joined_steps(recording, samples_a_step(recording))
-    place = drive.north + 1j * drive.east
-    heading = float(drive.heading[0])
-    return _along(calibration, steps, recording.t_s, place, drive.distance, heading, with_gyro=with_gyro)
+    return _along(calibration, recording.track, steps_of(recording), with_gyro=with_gyro)
 
 
 def forecast_trials(
     calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
 ) -> tuple[Floats, Floats]:
     """Return expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
-    steps = joined_steps(recording, samples_a_step(recording))
-    some, t = trials.ends >= 0, recording.t_s
+    steps = steps_of(recording)
+    some, t = trials.ends >= 0, recording.track.t
     begin = np.broadcast_to(t[trials.starts][:, None], some.shape)[some]
     _, expected, p95 = _errors(calibration, steps, begin, t[trials.ends[some]], with_gyro=with_gyro)
     found = np.full((2, *trials.ends.shape), np.nan)
@@ -152,28 +151,25 @@ def _smoothed(values: Floats, width: int) -> Floats:
     return np.asarray(np.convolve(padded, np.full(width, 1.0 / width), mode="valid"))
 
 
-def _along(
-    calibration: Calibration, steps: Steps, t: Floats, place: Complexes, length: Floats, heading: float, *,
-    with_gyro: bool,
-) -> Forecast:  # fmt: skip
-    """Return the forecast after each metre of a path; `t`, `place`, `length` (n,) at its points."""
-    metres = np.arange(1.0, np.floor(length[-1]) + 1.0)
+def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: bool) -> Forecast:
+    """Return the forecast after each metre of a track, and of its wheel samples as they are integrated."""
+    t, metres = track.t, np.arange(1.0, np.floor(track.distance[-1]) + 1.0)
     if not len(metres):
-        raise DataError("path", f"{length[-1]:.2f} m long", "a forecast needs a metre at least")
-    rows = np.searchsorted(length, metres)
+        raise DataError("path", f"{track.distance[-1]:.2f} m long", "a forecast needs a metre at least")
+    rows = np.searchsorted(track.distance, metres)
     spread, expected, p95 = _errors(calibration, steps, np.full(len(rows), t[0]), t[rows], with_gyro=with_gyro)
-    c, s = np.cos(heading), np.sin(heading)
+    c, s = np.cos(track.heading[0]), np.sin(track.heading[0])
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
     east = np.sqrt(np.maximum(s * s * xx + 2 * c * s * xy + c * c * yy, 0.0))
     return Forecast(
-        metres, place[rows].imag, place[rows].real, expected, p95, east, north,
+        metres, track.east[rows], track.north[rows], expected, p95, east, north,
         np.degrees(np.sqrt(spread.heading[:, 0])),
     )  # fmt: skip
 
 
 def _errors(
-    calibration: Calibration, steps: Steps, begin_s: Floats, end_s: Floats, *, with_gyro: bool
+    calibration: Calibration, steps: Track, begin_s: Floats, end_s: Floats, *, with_gyro: bool
 ) -> tuple[Spread, Floats, Floats]:
     """Return moments, expected and 95 % error of windows from and to times (w,)."""
     fitted, sources = calibration.fitted, calibration.sources

@@ -100,12 +100,12 @@ def _is_part(one: _Taken, of: _Taken) -> bool:
     were made from positions of the wheels may differ.
     """
     part, whole = one.recording, of.recording
-    stamps, theirs = (np.rint(1e9 * log.t_s).astype(np.int64) + log.begin_ns for log in (part, whole))
+    stamps, theirs = (np.rint(1e9 * log.track.t).astype(np.int64) + log.begin_ns for log in (part, whole))
     if not (len(stamps) < len(theirs) and theirs[0] <= stamps[-1] and stamps[0] <= theirs[-1]):
         return False
     _, ours, others = np.intersect1d(stamps, theirs, assume_unique=True, return_indices=True)
-    same = np.isclose(part.drive.v_left[ours], whole.drive.v_left[others], rtol=SAME_SPEED)
-    same &= np.isclose(part.drive.v_right[ours], whole.drive.v_right[others], rtol=SAME_SPEED)
+    same = np.isclose(part.track.v_left[ours], whole.track.v_left[others], rtol=SAME_SPEED)
+    same &= np.isclose(part.track.v_right[ours], whole.track.v_right[others], rtol=SAME_SPEED)
     shared = np.count_nonzero(np.isin(one.positions, of.positions))
     return bool(same.sum() >= SAME_SHARE * len(stamps) and shared >= SAME_SHARE * len(one.positions))
 

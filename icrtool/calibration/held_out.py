@@ -17,10 +17,11 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.error_statistics import error_summary
 from icrtool.kernels.open_loop.trials import OpenLoopPath, Summary
+from icrtool.kernels.track import Track
 from icrtool.kernels.within_budget import within_budget
 from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, FittedModel, controller_model
-from icrtool.motion.recording import NO_CONSTANTS, Recording, Steps, cut_windows, totals_of
+from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_windows, totals_of
 from icrtool.motion.trials import TrialErrors, Trials, cut_trials, predicted_path, trial_errors
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 
@@ -79,7 +80,7 @@ class HeldOut:
     folds: tuple[Fold, ...]
     trials: tuple[Trials, ...]
     fits: dict[str, PooledFit]
-    steps: tuple[Steps, ...]
+    steps: tuple[Track, ...]
     scores: tuple[HeldOutRow, ...] = ()
 
     @property
@@ -127,15 +128,15 @@ class HeldOut:
     def path(self, name: str, i: int, start: int, end: int) -> OpenLoopPath | None:
         """Return the path of a row from one state of recording i to another, predicted without what it touches."""
         recording, rows = self.recordings[i], np.arange(start, end + 1)
-        drive, t = recording.drive, recording.t_s
-        ends = (np.array([drive.distance[row]]) for row in (start, end))
+        track, t = recording.track, recording.track.t
+        ends = (np.array([track.distance[row]]) for row in (start, end))
         ((fold, _),) = left_out(self.folds, i, *ends)
         if (found := self.without(name, fold)) is None:
             return None
         turned, place = predicted_path(recording, *found, self.steps[i].around(t[start], t[end]))(t[rows])
-        turn = drive.heading[start] - turned[0]
+        turn = track.heading[start] - turned[0]
         moved = np.exp(1j * turn) * (place - place[0])
-        return OpenLoopPath(drive.north[start] + moved.real, drive.east[start] + moved.imag, turned + turn)
+        return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, turned + turn)
 
 
 def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
@@ -148,7 +149,7 @@ def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
     """
     if len(recordings) > 1:
         return tuple(Fold(one.name, i, i, -np.inf, np.inf) for i, one in enumerate(recordings))
-    total = float(recordings[0].drive.distance[-1])
+    total = float(recordings[0].track.distance[-1])
     if total < 2.0 * CHOICE_HORIZON_M:
         why = f"{total:.1f} m of driven distance"
         raise DataError(recordings[0].name, why, "too short to fit on one part and test on another")
@@ -186,7 +187,7 @@ def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floa
 
 def errors_without(
     recording: Recording, trials: Trials, folds: Sequence[Fold], i: int, without: Callable[[Fold], Prediction | None],
-    steps: Steps | None = None,
+    steps: Track | None = None,
 ) -> TrialErrors:  # fmt: skip
     """Return the errors of trials of recording i, each predicted without its fold; NaN where that is none.
 
@@ -195,16 +196,16 @@ def errors_without(
     without : gives the model for a fold, None where too little is left to fit it
     steps : the wheel samples joined; default single samples
     """
-    distance = recording.drive.distance
+    distance = recording.track.distance
     errors = TrialErrors.none(trials.ends.shape)
     # a horizon after the other, as the ends lie in memory
     column, row = np.nonzero(trials.ends.T >= 0)
     start, end = trials.starts[row], trials.ends[row, column]
-    t = recording.t_s
+    t = recording.track.t
     for fold, some in left_out(folds, i, distance[start], distance[end]):
         if (found := without(fold)) is not None:
             s, e = start[some], end[some]
-            near = (steps if steps is not None else recording).around(t[s.min()], t[e.max()])
+            near = (steps if steps is not None else recording.track).around(t[s.min()], t[e.max()])
             missed = trial_errors(recording, s, e, predicted_path(recording, *found, near))
             for all_errors, of_fold in zip(errors, missed, strict=True):
                 all_errors[row[some], column[some]] = of_fold
@@ -215,7 +216,7 @@ class Fits(NamedTuple):
     """The motion models fitted to recordings; `steps` are the wheel samples joined, by recording."""
 
     fits: dict[str, PooledFit]
-    steps: tuple[Steps, ...]
+    steps: tuple[Track, ...]
     pool: Pool
 
 
@@ -235,7 +236,7 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
         # the clocks are those of one robot: many logs show them no better than one
         off = float(np.sqrt(np.mean([one.x_clock_std_m**2 for one in recordings])))
         fits[FIVE] = fits[FIVE].with_clock_error(off)
-    if all(one.gyro_radps is not None for one in recordings):
+    if all(one.track.gyro is not None for one in recordings):
         fits |= {f"{name}{GYRO}": pool.fit(MODELS[name].with_gyro(), fits[name]) for name in names}
     return Fits(fits, tuple(one.steps for one in windows), pool)
 
@@ -285,4 +286,4 @@ def _fold_of(folds: Sequence[Fold], i: int, trials: Trials, recording: Recording
     """Return the number of the fold (k,) in which trials of recording i start."""
     mine = [fold for fold in folds if fold.recording == i]
     edges = [fold.end_m for fold in mine[:-1]]
-    return mine[0].number + np.searchsorted(edges, recording.drive.distance[trials.starts], side="right")
+    return mine[0].number + np.searchsorted(edges, recording.track.distance[trials.starts], side="right")

@@ -20,7 +20,8 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import recording_of, scaled_gyro, with_turn_rate
 from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE
-from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, OpenLoopPath
+from icrtool.kernels.open_loop.trials import FrozenIcrs, OpenLoopPath
+from icrtool.kernels.track import Track
 from icrtool.motion.models import NO_SLIP, FittedModel
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import ErrorsOf, TrialErrors, Trials
@@ -78,7 +79,7 @@ class ComparedModels(NamedTuple):
     table: ModelComparison
     rows: tuple[ComparedRow, ...]
     trials: Trials
-    drive: Drive
+    track: Track
 
 
 def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> ComparedModels:
@@ -112,9 +113,9 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
         notes=(*notes, *_lever_notes(recording)),
         calibration=_calibration(run, found),
     )
-    drive = recording.drive._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
+    track = recording.track._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
     rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
-    return ComparedModels(table, tuple(rows), trials, drive)
+    return ComparedModels(table, tuple(rows), trials, track)
 
 
 def _calibration(run: Run, found: HeldOut) -> Calibration | None:
@@ -130,7 +131,7 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
     plain = recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     for one in headings:
         found = with_turn_rate(plain, one)
-        if found.gyro_radps is not None:
+        if found.track.gyro is not None:
             if found.gyro_reversed:
                 notes.append(f"the {one.kind} counts turns in the other direction: its sign was changed")
             return found, one.kind, tuple(notes)
@@ -151,7 +152,7 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
         (recording,) = found.recordings
         path = turned_path(run, recording)
         for name, label in FILTER_LABELS.items():
-            errors_of = partial(_errors_along, path, recording.drive, _icrs_of(run, name))
+            errors_of = partial(_errors_along, path, recording.track, _icrs_of(run, name))
             yield ComparedRow(f"{name}_{kind}", f"{label} + {kind}", errors_of)
 
 
@@ -173,9 +174,9 @@ def _icrs_of(run: Run, name: str) -> FrozenIcrs:
 
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
-    psi, last = recording.cumulate(scaled_gyro(recording)), len(recording.t_s) - 1
+    psi, last = recording.track.cumulate(scaled_gyro(recording)), len(recording.track.t) - 1
     give_back_freed()
-    held, place = recording.held_s, np.zeros(last + 1, np.complex128)
+    held, place = recording.track.held, np.zeros(last + 1, np.complex128)
     for lo in range(0, last, ROWS_AT_ONCE):
         hi = min(lo + ROWS_AT_ONCE, last)
         moved = held[lo:hi] * (run.table.v_left_mps[lo:hi] + run.table.v_right_mps[lo:hi]) / 2.0
@@ -183,7 +184,7 @@ def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     return psi, np.cumsum(place, out=place)
 
 
-def _errors_along(path: tuple[Floats, Complexes], drive: Drive, icrs: FrozenIcrs, trials: Trials) -> TrialErrors:
+def _errors_along(path: tuple[Floats, Complexes], track: Track, icrs: FrozenIcrs, trials: Trials) -> TrialErrors:
     """Return the errors (k, h) of ICRs (n,) or (1,) along the path of `turned_path`.
 
     Notes
@@ -199,7 +200,7 @@ def _errors_along(path: tuple[Floats, Complexes], drive: Drive, icrs: FrozenIcrs
         right, left, x = (column if len(column) == 1 else column[s] for column in icrs)
         arm = (right + left) / 2.0 - 1j * x
         moved = place[e] - place[s] - 1j * arm * (np.exp(1j * psi[e]) - np.exp(1j * psi[s]))
-        driven = drive.north[e] - drive.north[s] + 1j * (drive.east[e] - drive.east[s])
-        errors.position[some, h] = np.abs(np.exp(1j * (drive.heading[s] - psi[s])) * moved - driven)
-        errors.heading[some, h] = np.abs(psi[e] - psi[s] - drive.heading[e] + drive.heading[s])
+        driven = track.north[e] - track.north[s] + 1j * (track.east[e] - track.east[s])
+        errors.position[some, h] = np.abs(np.exp(1j * (track.heading[s] - psi[s])) * moved - driven)
+        errors.heading[some, h] = np.abs(psi[e] - psi[s] - track.heading[e] + track.heading[s])
     return errors

@@ -72,7 +72,7 @@ def calibration_from(table: HeldOut, robot: Mapping[str, Any] | None = None) -> 
     constants = [best.constants(i) for i in range(len(recordings))]
     logs = tuple(
         CalibrationLog(
-            one.name, one.path, one.sha256, float(one.drive.distance[-1]), math.degrees(own.heading_offset_rad),
+            one.name, one.path, one.sha256, float(one.track.distance[-1]), math.degrees(own.heading_offset_rad),
             -own.wheels_later_s, one.begin_ns,
         )
         for one, own in zip(recordings, constants, strict=True)
@@ -96,7 +96,7 @@ def calibration_from(table: HeldOut, robot: Mapping[str, Any] | None = None) -> 
 
 
 def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    without = [one.name for one in recordings if one.gyro_radps is None]
+    without = [one.name for one in recordings if one.track.gyro is None]
     return () if not without else (f"no gyro that turns with the robot in {', '.join(without)}: wheels alone",)
 
 
@@ -145,7 +145,7 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
     if abs(recording.width_m - calibration.width_m) > 1e-3 * calibration.width_m:
         why = f"{recording.width_m:g} m, the calibration is of a robot of {calibration.width_m:g} m"
         raise ConfigError("robot.track_width_m", why, "use a calibration of this robot")
-    if with_gyro and (calibration.gyro is None or recording.gyro_radps is None):
+    if with_gyro and (calibration.gyro is None or recording.track.gyro is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
     return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)

@@ -15,7 +15,7 @@ from icrtool.motion.models import Lever
 from icrtool.motion.recording import Recording
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.memory import give_back_freed
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 
 GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
 """Turns over this time are compared, at least so many."""
@@ -44,20 +44,17 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
     width = width_m if width_m is not None else run.track_width_m
     if width is None:
         raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
-    drive, inputs = drive_of(run), run.summary.get("inputs", [])
+    track, inputs = track_of(run), run.summary.get("inputs", [])
     left_scale, right_scale = run.wheel_scales
     if (left_scale, right_scale) != (1.0, 1.0):
-        drive = drive._replace(v_left=drive.v_left / left_scale, v_right=drive.v_right / right_scale)
+        track = track._replace(v_left=track.v_left / left_scale, v_right=track.v_right / right_scale)
     plain = Recording(
         name=run.name,
-        t_s=run.table.t_s,
-        drive=drive,
-        gyro_radps=None,
+        track=track,
         width_m=width,
         path=inputs[0]["path"] if inputs else "",
         sha256=inputs[0]["sha256"] if inputs else "",
         begin_ns=int(run.table.stamp_ns[0]),
-        slipping=run.slipping if run.sensors.events else None,
         lever=Lever(*(place is not None for place in known_antenna_m(run))),
         x_clock_std_m=run.summary["icr"].get("x_clock_std_m", 0.0),
     )
@@ -78,17 +75,18 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
     """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it."""
     if not np.isfinite(heading.angle_rad).all():
         return plain
-    t, dt = plain.t_s, plain.drive.dt_s
+    t = plain.track.t
 
     def rate(later_s: float) -> Floats:
-        turned = np.diff(np.interp(np.append(t, t[-1] + dt[-1]) + later_s, t, heading.angle_rad))
+        turned, dt = (np.diff(one, append=one[-1:]) for one in (np.interp(t + later_s, t, heading.angle_rad), t))
         return np.divide(turned, dt, out=np.zeros(len(t)), where=dt > 0.0)
 
     slope, _, later_s = _gyro_line(plain, rate(0.0))
     give_back_freed()
     if not abs(abs(slope) - 1.0) < GYRO_SCALE_RANGE:
         return plain
-    return replace(plain, gyro_radps=np.sign(slope) * rate(later_s), gyro_reversed=slope < 0.0)
+    track = plain.track._replace(gyro=np.sign(slope) * rate(later_s))
+    return replace(plain, track=track, gyro_reversed=slope < 0.0)
 
 
 def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
@@ -98,22 +96,22 @@ def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None 
 
 def scaled_gyro(recording: Recording) -> Floats:
     """Return the turn rate of a recording's gyro (n,) [rad/s] with scale and bias that fit its reference."""
-    if recording.gyro_radps is None:
-        return np.zeros(len(recording.t_s))
-    slope, bias, _ = _gyro_line(recording, recording.gyro_radps)
-    rate: Floats = slope * recording.gyro_radps
+    if recording.track.gyro is None:
+        return np.zeros(len(recording.track.t))
+    slope, bias, _ = _gyro_line(recording, recording.track.gyro)
+    rate: Floats = slope * recording.track.gyro
     rate += bias
     return rate
 
 
 def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]:
     """Return scale, bias [rad/s] and lead [s] with which a turn rate (n,) makes the reference's turns over seconds."""
-    t = recording.t_s
+    t = recording.track.t
     every = rows_at_steps(t - t[0], GYRO_STEP_S)
     if len(every) < FEWEST_GYRO_STEPS:
         return float("nan"), float("nan"), 0.0
-    sums = recording.cumulate(rate)
-    turned, lasting = np.diff(recording.drive.heading[every]), np.diff(t[every])
+    sums = recording.track.cumulate(rate)
+    turned, lasting = np.diff(recording.track.heading[every]), np.diff(t[every])
 
     def evaluate(x: Floats) -> tuple[Floats, Floats]:
         at = t[every] + x[2]

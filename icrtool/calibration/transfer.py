@@ -147,7 +147,7 @@ def compare_calibrations(
     pairs = []
     for other in others:
         (one, *_), (two, *_) = groups = recordings[first], recordings[other]
-        paired = len(groups[0]) == len(groups[1]) == 1 and same_route(one.drive, two.drive)
+        paired = len(groups[0]) == len(groups[1]) == 1 and same_route(one.track, two.track)
         parameters = _parameter_differences(results[first].calibration, results[other].calibration)
         errors = _differences(tested[first, first], tested[other, other], paired=paired)
         pairs.append(Pair(first, other, parameters, dict(zip(HORIZONS_M, errors, strict=True)), paired))
@@ -174,7 +174,7 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
         trials = cut_trials(one, HORIZONS_M)
         found = result.table.errors(RECOMMENDED, i, trials) if own else predictor(result.calibration, one)(trials)
         errors.append(found.position)
-        path.append(before + one.drive.distance[trials.starts])
+        path.append(before + one.track.distance[trials.starts])
         before = path[-1][-1]
     return _Tested(np.concatenate(errors), np.concatenate(path))
 

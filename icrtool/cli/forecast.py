@@ -76,7 +76,7 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
         from icrtool.output.stored_run import open_run
 
         recording = turning_recording_of(open_run(path))
-        with_gyro = with_gyro and recording.gyro_radps is not None
+        with_gyro = with_gyro and recording.track.gyro is not None
         forecast = partial(forecast_drive, calibration, recording)
     else:
         from icrtool.output.files.csv_file import read_numbers

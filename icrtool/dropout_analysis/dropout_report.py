@@ -99,7 +99,7 @@ def dropout_report(
     horizons = _horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m, limits)
     report = dropout(
         compared, horizons, further=further, starts=starts, seed=seed, sink=sink,
-        starts_of_further=None if found is None else found.trials.starts, drive=None if found is None else found.drive,
+        starts_of_further=None if found is None else found.trials.starts, track=None if found is None else found.track,
     )  # fmt: skip
     give_back_freed()
     if without_events:
@@ -165,7 +165,7 @@ def _calibration_rows(
             continue
         kept, seen = one.summary() | {"models": {}, "held_out": []}, one.fitted_to(recording.sha256)
         rows = [(name, label, one.recommended, False)]
-        if one.gyro is not None and recording.gyro_radps is not None:
+        if one.gyro is not None and recording.track.gyro is not None:
             rows.append((f"{name}_gyro", f"{label} + gyro", one.gyro.model.name, True))
         for name, label, model, with_gyro in rows:
             models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=with_gyro)))

@@ -12,11 +12,12 @@ from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.direct import open_loop_path, trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import Drive, OpenLoopPath
+from icrtool.kernels.open_loop.trials import OpenLoopPath
+from icrtool.kernels.track import Track
 from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.trials import Trials
 from icrtool.records.dropout import ExampleTrial
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 
 WORST_COUNT = 10
 WORST_HORIZON_M = 10.0
@@ -38,15 +39,15 @@ def worst_trials(
     ----------
     compared : held-out models, of which ``recommended`` is evaluated; without them the momentary ICRs
     """
-    drive, models = drive_of(run), models_of(run)
-    ends, rows = counted_ends(drive, horizon_m, starts), compared.rows if compared is not None else ()
+    track, models = track_of(run), models_of(run)
+    ends, rows = counted_ends(track, horizon_m, starts), compared.rows if compared is not None else ()
     held_out = next((row for row in rows if row.name == RECOMMENDED), None)
     if compared is not None and held_out is not None:
         some = compared.trials.starts
         errors = np.full(len(ends), np.nan)
         errors[some] = held_out.errors_of(Trials(some, ends[some])).position[:, 0]
     else:
-        errors = open_loop_errors(drive, models[0].icrs, ends)[:, 0]
+        errors = open_loop_errors(track, models[0].icrs, ends)[:, 0]
     ends, left = ends[:, 0], np.nan_to_num(errors, copy=False, nan=-1.0)
     chosen: list[int] = []
     while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
@@ -54,7 +55,7 @@ def worst_trials(
         before_its_end = slice(ends[worst] + 1)
         left[before_its_end][ends[before_its_end] >= worst] = -1.0
     name = held_out.name if held_out is not None else models[0].name
-    return tuple(_example(run, drive, models, rows, name, start, int(ends[start]), horizon_m) for start in chosen)
+    return tuple(_example(run, track, models, rows, name, start, int(ends[start]), horizon_m) for start in chosen)
 
 
 def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[ExampleTrial, ...]:
@@ -66,23 +67,23 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     twentieth part of the trials that end furthest from their start. Typical: of those, the one with the median error
     of the momentary ICRs.
     """
-    drive, models = drive_of(run), models_of(run)
-    ends = trial_ends(drive, np.array([horizon_m]))[:, 0]
+    track, models = track_of(run), models_of(run)
+    ends = trial_ends(track, np.array([horizon_m]))[:, 0]
     # A parked start repeats the same path many times: the last state of each stop stands for it.
-    moving = np.flatnonzero((ends >= 0) & ~standing_states(drive))
+    moving = np.flatnonzero((ends >= 0) & ~standing_states(track))
     if not len(moving):
         return ()
     last = ends[moving]
-    chord = np.hypot(*(_change(column, moving, last) for column in (drive.north, drive.east)))
+    chord = np.hypot(*(_change(column, moving, last) for column in (track.north, track.east)))
     # Further than its wheels rolled: the reference jumped.
     chord[chord > LONGEST_CHORD * horizon_m] = 0.0
-    off = np.abs(_change(drive.heading, moving, last))
+    off = np.abs(_change(track.heading, moving, last))
     off -= np.pi
     np.abs(off, out=off)
     groups = (moving[off <= off.min() + ALIKE_RAD], moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)])
-    chosen = (_typical(drive, models[0], ends, group) for group in groups)
+    chosen = (_typical(track, models[0], ends, group) for group in groups)
     return tuple(
-        _example(run, drive, models, (), models[0].name, start, int(ends[start]), horizon_m) for start in chosen
+        _example(run, track, models, (), models[0].name, start, int(ends[start]), horizon_m) for start in chosen
     )
 
 
@@ -93,15 +94,15 @@ def _change(column: Floats, starts: Ints, ends: Ints) -> Floats:
     return change
 
 
-def _typical(drive: Drive, model: Model, ends: Ints, group: Ints) -> int:
+def _typical(track: Track, model: Model, ends: Ints, group: Ints) -> int:
     """Return the start with the median error of a group, or of evenly spaced ones where it is large."""
     sample = group[:: -(-len(group) // TYPICAL_OF)]
-    errors = [open_loop_errors(drive, model.icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
+    errors = [open_loop_errors(track, model.icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
     return int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
 
 
 def _example(
-    run: Run, drive: Drive, models: tuple[Model, ...], rows: Sequence[ComparedRow], by: str, start: int, end: int,
+    run: Run, track: Track, models: tuple[Model, ...], rows: Sequence[ComparedRow], by: str, start: int, end: int,
     horizon_m: float,
 ) -> ExampleTrial:  # fmt: skip
     paths: dict[str, OpenLoopPath] = {}
@@ -109,12 +110,12 @@ def _example(
     for model in models:
         if model.name in PICTURED:
             right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
-            paths[model.name] = open_loop_path(drive, right, left, x, start, end)
+            paths[model.name] = open_loop_path(track, right, left, x, start, end)
     for row in rows:
         if row.name in PICTURED and row.path is not None and (path := row.path(start, end)) is not None:
             paths[row.name] = path
     for name, path in paths.items():
-        errors[name] = float(np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end]))
+        errors[name] = float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end]))
     table = run.table
     duration = float(table.t_s[end] - table.t_s[start])
     return ExampleTrial(

@@ -13,7 +13,7 @@ from icrtool.estimation.run_filter import set_up_again
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.filter.ekf import run_ekf
 from icrtool.records.dropout import Outage
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 
 LONGEST_SHARE = 0.5
 """Spaced outages leave at least this share of the time between them to learn."""
@@ -128,7 +128,7 @@ def _spaced(run: Run, length_s: float) -> list[float]:
     is not one to begin in.
     """
     t, last = run.table.t_s, float(run.table.t_s[-1])
-    moves = ~standing_states(drive_of(run))[:-1]
+    moves = ~standing_states(track_of(run))[:-1]
     moves &= ~_in_real_outage(run, t[:-1], length_s)
     gaps = np.flatnonzero(run.in_gap | run.jumping)
     moves &= ~_meets(t[:-1], length_s, t[gaps], t[gaps + 1])

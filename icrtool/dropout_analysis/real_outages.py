@@ -8,7 +8,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.kernels.open_loop.direct import open_loop_path
 from icrtool.kernels.open_loop.trials import OpenLoopPath
 from icrtool.records.dropout import Outage
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 
 COMPARED_S = 1.0
 """Fixes of this time after an outage are compared with the open-loop path, which is driven on for as long."""
@@ -21,7 +21,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
     wheels is as wrong as the open-loop path. An outage that never ends, and one with a gap in the wheel data, has no
     end error and is left out; so is one that the drive begins with: neither position nor ICRs were known before it.
     """
-    drive, table = drive_of(run), run.table
+    track, table = track_of(run), run.table
     origin = int(table.stamp_ns[0])
     outages = []
     for begin, end in run.outages_ns:
@@ -31,7 +31,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         after = int(np.searchsorted(table.stamp_ns, end + round(COMPARED_S * 1e9)))
         gaps = np.flatnonzero(run.in_gap[last:after])
         after = last + int(gaps[0]) if len(gaps) else min(after, len(table) - 1)
-        path = open_loop_path(drive, *table.icrs_at(first), first, after)
+        path = open_loop_path(track, *table.icrs_at(first), first, after)
         error = _end_error_m(run, path, table.stamp_ns[first : after + 1], int(end))
         inside = slice(last - first + 1)
         outages.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.track import Track
 from icrtool.records.dropout import ReferenceErrors
 from icrtool.records.run import Run
 
@@ -16,13 +16,13 @@ GNSS_NIS, HEADING_NIS = 2.0, 1.0
 """Mean normalised innovation squared where the noise is right: the number of measured components."""
 
 
-def reference_error(run: Run, drive: Drive, ends: NDArray[np.int32], seed: int) -> ReferenceErrors:
+def reference_error(run: Run, track: Track, ends: NDArray[np.int32], seed: int) -> ReferenceErrors:
     """Return the error that the reference puts into the trials of each horizon.
 
     Parameters
     ----------
     run : its standard deviations are those of the reference
-    drive : the same for the kernels
+    track : its states
     ends : (h, n), the state at which the trial from each start ends, negative where there is none
     seed : of the draws
 
@@ -50,7 +50,7 @@ def reference_error(run: Run, drive: Drive, ends: NDArray[np.int32], seed: int) 
             continue
         start = start[np.linspace(0, len(start) - 1, DRAWS).astype(np.int64)]
         end = column[start]
-        north, east = drive.north[end] - drive.north[start], drive.east[end] - drive.east[start]
+        north, east = track.north[end] - track.north[start], track.east[end] - track.east[start]
         north_std = [np.sqrt(position) * table.std_north_m[rows] for rows in (start, end)]
         east_std = [np.sqrt(position) * table.std_east_m[rows] for rows in (start, end)]
         std_heading = np.sqrt(heading) * table.std_heading_rad[start]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.open_loop.direct import STANDING, trial_ends
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.open_loop.direct import trial_ends
+from icrtool.kernels.track import STANDING, Track
 from icrtool.records.run import ICR_COLUMNS, Run
 
 Starts = Literal["moving", "all"]
@@ -26,9 +26,9 @@ LEAST_FALL = 0.5
 """A standard deviation that loses less than this part of itself shows that the drive added nothing to the start."""
 
 
-def standing_states(drive: Drive) -> Bools:
+def standing_states(track: Track) -> Bools:
     """Return the states (n,) after which the robot stands; the last state, which has no interval, is none of them."""
-    standing: Bools = (np.abs(drive.v_left) < STANDING_MPS) & (np.abs(drive.v_right) < STANDING_MPS)
+    standing: Bools = (np.abs(track.v_left) < STANDING_MPS) & (np.abs(track.v_right) < STANDING_MPS)
     standing[-1:] = False
     return standing
 
@@ -38,11 +38,11 @@ def leave_out_standing(ends: NDArray[np.signedinteger], standing: Bools) -> None
     ends[standing[:, None] & (ends >= 0)] = STANDING
 
 
-def counted_ends(drive: Drive, horizon_m: float, starts: Starts) -> Ints:
+def counted_ends(track: Track, horizon_m: float, starts: Starts) -> Ints:
     """Return `trial_ends` (n, 1) of one horizon, without the starts that do not count."""
-    ends = trial_ends(drive, np.array([horizon_m]))
+    ends = trial_ends(track, np.array([horizon_m]))
     if starts == "moving":
-        leave_out_standing(ends, standing_states(drive))
+        leave_out_standing(ends, standing_states(track))
     return ends
 
 

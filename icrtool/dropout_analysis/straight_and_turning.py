@@ -12,9 +12,9 @@ from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_of_cells
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.track import Track
 from icrtool.records.dropout import TurningSplit
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 
 SPLIT_HORIZON_M = 5.0
 STRAIGHT_RAD = math.radians(10.0)
@@ -29,14 +29,14 @@ def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
 
     What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
     """
-    drive = drive_of(run)
-    ends = counted_ends(drive, SPLIT_HORIZON_M, starts)
+    track = track_of(run)
+    ends = counted_ends(track, SPLIT_HORIZON_M, starts)
     tried = np.flatnonzero(ends[:, 0] >= 0)
-    straight = heading_range(drive, SPLIT_HORIZON_M)[tried] < STRAIGHT_RAD
+    straight = heading_range(track, SPLIT_HORIZON_M)[tried] < STRAIGHT_RAD
     parts = {kind: part for kind, part in ((True, straight), (False, ~straight)) if part.any()}
 
     def mean_errors(model: Model) -> dict[bool, float]:
-        errors = open_loop_errors(drive, model.icrs, ends)[tried, 0]
+        errors = open_loop_errors(track, model.icrs, ends)[tried, 0]
         return {kind: float(errors[part].mean()) for kind, part in parts.items()}
 
     of_model = {model.name: mean_errors(model) for model in models_of(run) if model.name in SPLIT_MODELS}
@@ -48,11 +48,11 @@ def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
     )
 
 
-def heading_range(drive: Drive, horizon_m: float) -> Floats:
+def heading_range(track: Track, horizon_m: float) -> Floats:
     """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of path."""
     size = horizon_m / CELLS
     # A step longer than a horizon counts as a little more than one: a damaged speed fills no memory.
-    distance = drive.distance
+    distance = track.distance
 
     def cells_of(part: Floats) -> Floats:
         return np.asarray(np.floor((part - distance[0]) / size))
@@ -63,7 +63,7 @@ def heading_range(drive: Drive, horizon_m: float) -> Floats:
     cells = np.arange(cell[-1] + CELLS + 1)
     # In a cell without a state the heading lies between those around it.
     highest, lowest = (
-        sliding_window_view(np.interp(cells, cell, extreme.reduceat(drive.heading, first)), CELLS + 1)
+        sliding_window_view(np.interp(cells, cell, extreme.reduceat(track.heading, first)), CELLS + 1)
         for extreme in (np.maximum, np.minimum)
     )
     return np.repeat((highest.max(axis=1) - lowest.min(axis=1))[cell], np.diff(first, append=len(distance)))

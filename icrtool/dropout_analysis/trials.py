@@ -27,11 +27,12 @@ from icrtool.kernels.open_loop.error_statistics import (
     summary_of_sorted,
 )
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, Intervals, Summary, TrialCounts
+from icrtool.kernels.open_loop.trials import FrozenIcrs, Intervals, Summary, TrialCounts
+from icrtool.kernels.track import Track
 from icrtool.motion.trials import MOST_STARTS, ErrorsOf, Trials
 from icrtool.records.dropout import DEFAULT_SEED, HeadingErrors, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.memory import give_back_freed
-from icrtool.records.run import MAKE_RUN, Run, check_type, drive_of, no_slip_icrs, straight_drive
+from icrtool.records.run import MAKE_RUN, Run, check_type, no_slip_icrs, track_of
 
 LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
@@ -83,7 +84,7 @@ def dropout(
     starts_of_further: Ints | None = None,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
-    drive: Drive | None = None,
+    track: Track | None = None,
 ) -> DropoutReport:
     """Return how far the predicted position is off after distances without GNSS (Pentzer 2014, Section 6.4).
 
@@ -97,7 +98,7 @@ def dropout(
     starts_of_further : states from which theirs, and all heading errors, are measured: nearer ones are copies
     seed : of what the reference's own error is drawn from
     sink : receives every single error (for ``--trials``)
-    drive : `icrtool.records.run.drive_of` the run, where it is at hand: of a long log it is large
+    track : `icrtool.records.run.track_of` the run, where it is at hand: of a long log it is large
 
     Returns
     -------
@@ -126,14 +127,14 @@ def dropout(
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
-    drive = drive if drive is not None else drive_of(run)
+    track = track if track is not None else track_of(run)
     predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
-    standing, learned = standing_states(drive), first_learned(run)
+    standing, learned = standing_states(track), first_learned(run)
     left_out = standing if starts == "moving" else np.zeros_like(standing)
     if len({model.name for model in predictors}) < len(predictors):
         raise ValueError("two models have the same name")
-    sparse = starts_of_further if starts_of_further is not None else sparse_starts(drive)
-    asked = _Asked(run, drive, predictors, left_out, learned, seed, sink, sparse)
+    sparse = starts_of_further if starts_of_further is not None else sparse_starts(track)
+    asked = _Asked(run, track, predictors, left_out, learned, seed, sink, sparse)
     with ThreadPoolExecutor(THREADS) as pool:
         parts = [_part(asked, horizons[group], pool) for group in _groups(len(horizons), len(run.table))]
     splits = [part.by_learning for part in parts if part.by_learning is not None]
@@ -165,7 +166,7 @@ class _Asked(NamedTuple):
     """
 
     run: Run
-    drive: Drive
+    track: Track
     predictors: Sequence[Model | ConstantModel]
     left_out: Bools
     learned: int | None
@@ -185,9 +186,9 @@ class _Part(NamedTuple):
 
 def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
     """Return the errors of all models at some horizons."""
-    drive, learned, by_learning = asked.drive, asked.learned, None
-    ends, counts = _ends(drive, horizons, asked.left_out, pool)
-    blocks = _blocks(drive.distance, horizons, ends, pool)
+    track, learned, by_learning = asked.track, asked.learned, None
+    ends, counts = _ends(track, horizons, asked.left_out, pool)
+    blocks = _blocks(track.distance, horizons, ends, pool)
     sparse = Trials(asked.sparse, ends[:, asked.sparse].T.astype(np.int64))
     slipping = _slipping_trials(asked.run, ends)
     results = []
@@ -195,19 +196,19 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
         give_back_freed()
         if isinstance(model, ConstantModel):
             errors, turned = model.errors_of(sparse)
-            tested = _blocks(drive.distance[sparse.starts], horizons, np.isfinite(errors.T) - 1, pool)
+            tested = _blocks(track.distance[sparse.starts], horizons, np.isfinite(errors.T) - 1, pool)
         else:
-            errors, turned = _errors(drive, model, ends, pool), _turn_errors(drive, model.icrs, sparse)
+            errors, turned = _errors(track, model, ends, pool), _turn_errors(track, model.icrs, sparse)
             tested = blocks
         if asked.sink is not None:
-            asked.sink(model.name, horizons, errors if len(errors) == len(drive.distance) else _spread(errors, asked))
+            asked.sink(model.name, horizons, errors if len(errors) == len(track.distance) else _spread(errors, asked))
         touching = slipping if slipping is None or len(errors) == len(slipping) else slipping[asked.sparse]
         results.append(_result_of(model, errors, turned, tested, touching, pool))
         if model.name == "icr":
             first = len(errors) if learned is None else learned
             by_learning = error_summary(errors[:first]), error_summary(errors[first:])
         del errors  # before those of the next model are made
-    return _Part(counts, reference_error(asked.run, drive, ends, asked.seed), results, by_learning)
+    return _Part(counts, reference_error(asked.run, track, ends, asked.seed), results, by_learning)
 
 
 def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> Bools | None:
@@ -220,17 +221,17 @@ def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> Bools | None:
 
 def _spread(errors: Floats, asked: _Asked) -> Floats:
     """Return errors (n, h) of all starts from those of some."""
-    all_errors: Floats = np.full((len(asked.drive.distance), errors.shape[1]), np.nan)
+    all_errors: Floats = np.full((len(asked.track.distance), errors.shape[1]), np.nan)
     all_errors[asked.sparse] = errors
     return all_errors
 
 
-def _turn_errors(drive: Drive, icrs: FrozenIcrs, trials: Trials) -> Floats:
+def _turn_errors(track: Track, icrs: FrozenIcrs, trials: Trials) -> Floats:
     """Return the errors (k, h) [rad] of the turns that ICRs make, NaN where there is no trial."""
-    turn = np.concatenate([[0.0], np.cumsum(np.where(drive.gap, 0.0, drive.dt_s) * (drive.v_left - drive.v_right))])
+    turn = np.concatenate([[0.0], np.cumsum(track.held * (track.v_left - track.v_right))])
     at = trials.starts if len(icrs.y_icr_right) > 1 else np.zeros(1, np.int64)
     width = np.maximum(np.abs(icrs.y_icr_right[at] - icrs.y_icr_left[at]), MIN_ICR_SEPARATION_M)
-    made, driven = (column[trials.ends] - column[trials.starts][:, None] for column in (turn, drive.heading))
+    made, driven = (column[trials.ends] - column[trials.starts][:, None] for column in (turn, track.heading))
     errors: Floats = np.abs(made / width[:, None] - driven)
     errors[trials.ends < 0] = np.nan
     return errors
@@ -249,9 +250,9 @@ def errors_from_states(run: Run, horizon_m: float) -> dict[str, Floats]:
     dict
         By model name, float64 (n,) [m]; NaN where there is no trial (`dropout` lists the reasons).
     """
-    drive = drive_of(run)
-    ends = trial_ends(drive, np.array([horizon_m]))
-    return {model.name: open_loop_errors(drive, model.icrs, ends)[:, 0] for model in models_of(run)}
+    track = track_of(run)
+    ends = trial_ends(track, np.array([horizon_m]))
+    return {model.name: open_loop_errors(track, model.icrs, ends)[:, 0] for model in models_of(run)}
 
 
 def check_horizons(horizons_m: Iterable[float]) -> Floats:
@@ -273,10 +274,11 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
 
 def load_kernels() -> None:
     """Have the compiled kernels ready, to be called while a run is still being read."""
-    drive = straight_drive()
+    path, one = np.arange(20.0), np.ones(20)
+    track = Track.of_states(path, one, one, one, path, 0.0 * path, 0.0 * path, path)
     icrs = FrozenIcrs.constant(1.0, -1.0, 0.0)
-    ends = trial_ends(drive, np.array([1.0]))
-    open_loop_errors(drive, icrs, ends)
+    ends = trial_ends(track, np.array([1.0]))
+    open_loop_errors(track, icrs, ends)
 
 
 def models_of(run: Run) -> tuple[Model, ...]:
@@ -290,9 +292,9 @@ def models_of(run: Run) -> tuple[Model, ...]:
     return tuple(models)
 
 
-def sparse_starts(drive: Drive) -> Ints:
+def sparse_starts(track: Track) -> Ints:
     """Return evenly spaced starts of a drive without standstill, at most some `MOST_STARTS`."""
-    moving = np.flatnonzero(~standing_states(drive))
+    moving = np.flatnonzero(~standing_states(track))
     return moving[:: max(len(moving) // MOST_STARTS, 1)]
 
 
@@ -302,14 +304,14 @@ def _groups(horizons: int, states: int) -> list[slice]:
     return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
 
 
-def _ends(drive: Drive, horizons: Floats, left_out: Bools, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
+def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
     """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
-    states = len(drive.distance)
+    states = len(track.distance)
     ends = np.empty((len(horizons), states), np.int32)
 
     def fill(lo: int) -> TrialCounts:
         hi = min(lo + STARTS_AT_ONCE, states)
-        found = trial_ends(drive, horizons, lo, hi)
+        found = trial_ends(track, horizons, lo, hi)
         leave_out_standing(found, left_out[lo:hi])
         ends[:, lo:hi] = found.T
         return count_trials(found)
@@ -344,13 +346,13 @@ def _blocks(path_m: Floats, horizons: Floats, ends: NDArray[np.signedinteger], p
     return list(pool.map(cut, range(len(horizons))))
 
 
-def _errors(drive: Drive, model: Model, ends: NDArray[np.int32], pool: Executor) -> Floats:
+def _errors(track: Track, model: Model, ends: NDArray[np.int32], pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
     states, errors = ends.shape[1], np.empty(ends.shape)
 
     def fill(lo: int) -> None:
         hi = min(lo + STARTS_AT_ONCE, states)
-        errors[:, lo:hi] = open_loop_errors(drive, model.icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
+        errors[:, lo:hi] = open_loop_errors(track, model.icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
 
     list(pool.map(fill, range(0, states, STARTS_AT_ONCE)))
     return errors.T

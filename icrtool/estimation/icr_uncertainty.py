@@ -10,8 +10,8 @@ import numpy as np
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
-from icrtool.kernels.open_loop.trials import Drive
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
+from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import PathKnots, path_at, window_residuals
 from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.memory import give_back_freed
@@ -73,22 +73,16 @@ class StateWindows(NamedTuple):
         return np.array([place, place, math.sqrt(2.0) * self.heading_std_rad])
 
 
-def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
-    """Return the windows of a drive, with the motion by constant ICRs (3,) [m]: y right, y left, x."""
-    dt = np.where(drive.gap, 0.0, drive.dt_s)
-    driven, distance = np.abs(drive.v_left), np.zeros(len(dt))
-    driven += np.abs(drive.v_right)
-    driven *= dt
-    driven /= 2.0
-    np.cumsum(driven[:-1], out=distance[1:])
-    del driven
+def cut_states(table: States, track: Track, icrs_m: Floats) -> StateWindows:
+    """Return windows of states, with the motion by constant ICRs (3,) [m]: y right, y left, x."""
+    distance = track.travel
     window_m = min(WINDOW_M, WINDOW_IN_SEPARATIONS * float(icrs_m[0] - icrs_m[1]))
     rows = rows_at_steps(distance, window_m)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
     parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
     give_back_freed()
-    path = _path(drive, dt, table.t_s, rows, parameters)
+    path = _path(track, rows, parameters)
     place, heading = table.north_m[rows] + 1j * table.east_m[rows], table.heading_rad[rows]
     moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
     missed, jacobian = window_residuals(path, start, end, moved, 0.0, np.ones(len(start)))
@@ -109,15 +103,14 @@ def cut_drive(table: States, drive: Drive, icrs_m: Floats) -> StateWindows:
     )
 
 
-def _path(drive: Drive, dt: Floats, t_s: Floats, rows: Ints, parameters: Floats) -> PathKnots:
-    """Return the path that the wheels of a drive make at some rows (m,) of times (n,)."""
+def _path(track: Track, rows: Ints, parameters: Floats) -> PathKnots:
+    """Return the path that the wheels of a drive make at some rows (m,) of its states."""
 
     def twists(some: slice) -> tuple[Floats, Ints, Floats]:
-        motion = wheel_motion(drive.v_left[some], drive.v_right[some], WIDTH_M)
+        motion = wheel_motion(track.v_left[some], track.v_right[some], WIDTH_M)
         return model_columns(FULL_LINEAR, motion)
 
-    # a broadcast zero takes no memory: each step's heading is that at its start
-    return path_at(t_s, dt, np.broadcast_to(0.0, len(dt)), twists, parameters, t_s[rows])
+    return path_at(track, twists, parameters, track.t[rows])
 
 
 def prior_std(width_m: float) -> Floats:

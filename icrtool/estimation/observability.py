@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.estimation.icr_uncertainty import StateWindows, prior_std
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.track import Track
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, width_or_usual_m
 from icrtool.records.run_document import Excited
 from icrtool.records.tables import States
@@ -77,13 +77,13 @@ class Excitation:
         }
 
 
-def find_excitation(table: States, drive: Drive, track_width_m: float | None, windows: StateWindows) -> Excitation:
+def find_excitation(table: States, track: Track, track_width_m: float | None, windows: StateWindows) -> Excitation:
     """Return which ICRs a drive could show.
 
     Parameters
     ----------
     table : the recorded states
-    drive : the same for the kernels
+    track : the same as a track
     track_width_m : b, None where not known
     windows : of the drive, with `nominal_icrs`
 
@@ -100,11 +100,11 @@ def find_excitation(table: States, drive: Drive, track_width_m: float | None, wi
     p = nominal_icrs(table, track_width_m)
     width = float(p[0] - p[1])
     std = _posterior(windows, width)
-    omega = (drive.v_left - drive.v_right) / width
-    spins = np.abs(drive.v_left - drive.v_right) > SPIN_RATIO * np.abs(drive.v_left + drive.v_right) / 2
+    omega = (track.v_left - track.v_right) / width
+    spins = np.abs(track.v_left - track.v_right) > SPIN_RATIO * np.abs(track.v_left + track.v_right) / 2
     # noise of standing encoders is no turn
-    moving = np.abs(drive.v_left) + np.abs(drive.v_right) > 0.02
-    turns = np.where(moving & ~drive.gap, drive.dt_s * omega, 0.0)
+    moving = np.abs(track.v_left) + np.abs(track.v_right) > 0.02
+    turns = np.where(moving, track.held * omega, 0.0)
     right, left, spun_right, spun_left = (
         float(turns[turns > 0].sum()), abs(float(turns[turns < 0].sum())),
         float(turns[spins & (turns > 0)].sum()), abs(float(turns[spins & (turns < 0)].sum())),

@@ -8,7 +8,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.open_loop.direct import open_loop_path
-from icrtool.records.run import make_drive
+from icrtool.records.run import track_of_states
 from icrtool.records.tables import Icrs, States
 
 
@@ -43,12 +43,12 @@ def drive_wheels(table: States, in_gap: Bools, icrs: Icrs) -> OdometryPath:
     Nobody knows what the wheels did in a gap. The filter's displacement stands in for it, turned by the heading error
     that the odometry has gathered so far, so that a gap neither adds an error nor forgives one.
     """
-    drive = make_drive(table, in_gap, np.empty((0, 2), np.int64))
+    track = track_of_states(table, in_gap, np.empty((0, 2), np.int64))
     north, east, heading = (np.empty(len(table)) for _ in range(3))
     edges = np.flatnonzero(in_gap[:-1])
     miss_north, miss_east, turned = 0.0, 0.0, 0.0
     for first, last in zip([0, *(edges + 1)], [*edges, len(table) - 1], strict=True):
-        piece = open_loop_path(drive, *icrs, int(first), int(last))
+        piece = open_loop_path(track, *icrs, int(first), int(last))
         stretch = slice(first, last + 1)
         if first:
             # The error at the gap's begin is carried over it: the displacement turned by `turned`, less itself.

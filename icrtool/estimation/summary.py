@@ -12,7 +12,7 @@ import numpy as np
 from icrtool import __version__
 from icrtool.alignment.position.gnss_quality import CLASSES
 from icrtool.config import Config
-from icrtool.estimation.icr_uncertainty import cut_drive, final_covariance, multiplier_std
+from icrtool.estimation.icr_uncertainty import cut_states, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.estimation.run_filter import Filtered
@@ -30,7 +30,7 @@ from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.events import ReferenceJump, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, make_drive, no_slip_icrs
+from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, no_slip_icrs, track_of_states
 from icrtool.records.run_document import EVENT_COLUMNS, IcrColumn, RunDocument
 from icrtool.records.samples import Datum, InputFile
 from icrtool.records.tables import States
@@ -180,10 +180,10 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     Preset ``paper``: the filter's own covariance, and what the drive could show.
     """
     table, width = filtered.table, config.robot.track_width_m
-    drive = make_drive(table, filtered.in_gap, filtered.outages_ns)
+    track = track_of_states(table, filtered.in_gap, filtered.outages_ns)
     p = nominal_icrs(table, width)
-    windows, own = cut_drive(table, drive, p), filtered.covariance[3:, 3:]
-    excitation = find_excitation(table, drive, width, windows)
+    windows, own = cut_states(table, track, p), filtered.covariance[3:, 3:]
+    excitation = find_excitation(table, track, width, windows)
     if config.filter.preset == "paper":
         return own, excitation, 0.0
     covariance = final_covariance(
@@ -200,8 +200,8 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
         start_std_m=filtered.start_std_m,
         least_icr_m=filtered.least_icr_m,
     )
-    turning = drive.dt_s * (drive.v_left - drive.v_right) ** 2
-    speed = float((turning * (drive.v_left + drive.v_right)).sum() / 2 / max(float(turning.sum()), 1e-12))
+    turning = np.diff(table.t_s, append=table.t_s[-1:]) * (track.v_left - track.v_right) ** 2
+    speed = float((turning * (track.v_left + track.v_right)).sum() / 2 / max(float(turning.sum()), 1e-12))
     x_clock_std_m = abs(speed) * clock_std_s
     return covariance + np.diag([0.0, 0.0, x_clock_std_m**2]), excitation, x_clock_std_m
 

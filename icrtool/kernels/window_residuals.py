@@ -14,6 +14,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE
+from icrtool.kernels.track import Track
 
 VX, VY, OMEGA = 0, 1, 2
 """Axes of the body twist."""
@@ -48,29 +49,28 @@ def locate(t: Floats, held: Floats, at: Floats) -> tuple[Ints, Floats]:
     return row, np.divide(passed, lasting, out=np.zeros(len(at)), where=lasting > 0.0)
 
 
-def path_at(t: Floats, held: Floats, into: Floats, twists: Twists, parameters: Floats, at: Floats) -> PathKnots:
-    """Return the path of steps (n,) at knots.
+def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> PathKnots:
+    """Return the path that a model makes of the wheel samples of a track, at knots.
 
     Parameters
     ----------
-    t, held : begin of each step [s], ascending, and its duration [s], 0 over gaps
-    into : how far into the step its heading is taken [s]
     twists : called for some steps at a time: of a long drive, columns of all would take much memory
     parameters : (k,) of the free terms
     at : (m,) time of each knot [s], ascending
     """
     k, m = len(parameters), len(at)
-    row, part = locate(t, held, at)
+    row, part = locate(track.t, track.held, at)
     found = PathKnots(
         np.empty(m), np.empty(m), np.empty(m, np.complex128), np.empty(m, np.complex128),
         np.zeros((k, m)), np.empty((k, m), np.complex128),
     )  # fmt: skip
     heading, place = np.zeros(1), np.zeros(1, np.complex128)
     heading_by, place_by = np.zeros((k, 1)), np.zeros((k, 1), np.complex128)
-    for lo in range(0, len(t), ROWS_AT_ONCE):
+    for lo in range(0, len(track.t), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE)
         fixed, axis, columns = twists(some)
-        lasting, ahead = held[some], into[some]
+        lasting = track.held[some]
+        ahead = track.into * lasting
         v_x, v_y, omega = (fixed[one] + parameters[axis == one] @ columns[axis == one] for one in (VX, VY, OMEGA))
         here = slice(*np.searchsorted(row, [lo, lo + len(lasting)]))
         step, share = row[here] - lo, part[here]

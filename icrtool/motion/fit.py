@@ -291,9 +291,7 @@ class WindowResiduals:
             columns[-1] = (1.0 + parameters @ self._gains) * self._gyro_change
         at = windows.knot_t + delay
         terms = len(axes)
-        path = path_at(
-            steps.t, steps.held, steps.into, lambda some: (fixed[:, some], axes, columns[:, some]), values, at
-        )
+        path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, at)
         residual, jacobian = window_residuals(path, windows.start, windows.end, windows.reference, offset, self._root)
         # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
         return residual, jacobian[:, [*range(k), terms, terms + 1, *range(k, terms)]]

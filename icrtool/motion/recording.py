@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.kernels.equal_steps import rows_at_steps
-from icrtool.kernels.open_loop.direct import ends_from
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.track import Track, cut
 from icrtool.motion.models import NO_LEVER, Lever
 
 WINDOWS_M = (5.0, 10.0)
@@ -39,9 +37,6 @@ STRETCH_M = 20.0
 
 FEWEST_WINDOWS = 10
 
-LONGEST_DELAY_S = 1.0
-"""Of the wheels against the poses."""
-
 MOVING_MPS = 0.01
 """Slower than this the robot stands: its starts are copies of one another."""
 
@@ -52,58 +47,24 @@ class Recording:
 
     Attributes
     ----------
-    t_s : (n,) time of each state [s]
-    drive : wheel speeds at the configured radius and the reference
-    gyro_radps : (n,) turn rate over the interval after each state, clockwise, read when the reference turns; None
-        without a gyro
+    track : its states, with wheel speeds at the configured radius, and the turn rate of its gyro
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
     gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
     begin_ns : stamp of the first state; 0 where it is not known
-    slipping : (n,) whether the interval after a state lies in a slip event, which no window crosses; None without one
     lever : what is known of the place of the position on the robot
     x_clock_std_m : what is not known of the time between position and heading looks like an x_icr so far off
     """
 
     name: str
-    t_s: Floats
-    drive: Drive
-    gyro_radps: Floats | None
+    track: Track
     width_m: float
     path: str = ""
     sha256: str = ""
     gyro_reversed: bool = False
     begin_ns: int = 0
-    slipping: Bools | None = None
     lever: Lever = NO_LEVER
     x_clock_std_m: float = 0.0
-
-    @property
-    def held_s(self) -> Floats:
-        """How long each wheel sample holds (n,) [s]; 0 over gaps and for the last one."""
-        held: Floats = np.where(self.drive.gap, 0.0, self.drive.dt_s)
-        held[-1] = 0.0
-        return held
-
-    def cumulate(self, rate: Floats) -> Floats:
-        """Return the integral of a rate (n,) until each wheel sample (n,)."""
-        by_step, sums = self.held_s, np.zeros(len(self.t_s))
-        by_step *= rate
-        np.cumsum(by_step[:-1], out=sums[1:])
-        return sums
-
-    def around(self, begin_s: float, end_s: float) -> Steps:
-        """Return single wheel samples as `Steps.around` does; of a long log, columns of all would take much memory."""
-        near = rows_around(self.t_s, begin_s, end_s)
-        return joined_steps(self.part(near.start, near.stop + 1), 1)
-
-    def part(self, first: int, stop: int) -> Recording:
-        """Return the states [first, stop) as a recording."""
-        rows = slice(first, stop)
-        gyro = None if self.gyro_radps is None else self.gyro_radps[rows]
-        slipping = None if self.slipping is None else self.slipping[rows]
-        drive = Drive._make(c[rows] for c in self.drive)
-        return replace(self, t_s=self.t_s[rows], drive=drive, gyro_radps=gyro, slipping=slipping)
 
 
 class LogConstants(NamedTuple):
@@ -126,51 +87,12 @@ class LogConstants(NamedTuple):
 NO_CONSTANTS = LogConstants()
 
 
-class Steps(NamedTuple):
-    """Wheel samples of a recording, joined; (n,) each.
-
-    Attributes
-    ----------
-    t, held : begin and duration [s], `held` 0 over gaps
-    v_left, v_right, gyro : mean over the step
-    into : [s] how far into a step its heading is taken: Euler steps of m samples at a constant turn rate move along the
-        heading (m - 1) / 2 samples into them
-    """
-
-    t: Floats
-    held: Floats
-    v_left: Floats
-    v_right: Floats
-    gyro: Floats
-    into: Floats
-
-    def around(self, begin_s: float, end_s: float) -> Steps:
-        """Return the steps of the time between the first begin and the last end of trials, and a little for delays."""
-        near = rows_around(self.t, begin_s, end_s)
-        return Steps._make(column[near] for column in self)
-
-    def gyro_change(self, some: slice = slice(None)) -> Floats:
-        """Return the change of the gyro's turn rate by time (n,) [rad/s^2], of some steps; 0 where it has none."""
-        rows = np.arange(*some.indices(len(self.t)))
-        before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(self.t) - 1)
-        apart = (self.t[after] + self.held[after] / 2.0) - (self.t[before] + self.held[before] / 2.0)
-        risen = self.gyro[after] - self.gyro[before]
-        change: Floats = np.divide(risen, apart, out=np.zeros(len(risen)), where=apart > 0.0)
-        return change
-
-
-def rows_around(t_s: Floats, begin_s: float, end_s: float) -> slice:
-    """Return the rows of times (n,) from a begin to an end, and of a little more for delays."""
-    first, stop = np.searchsorted(t_s, [begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S], side="right").tolist()
-    return slice(max(first - 1, 0), stop)
-
-
 class Windows(NamedTuple):
     """Overlapping windows of driven distance of one recording, ready to be fitted.
 
     Attributes
     ----------
-    steps : wheel samples joined
+    steps : the track, its wheel samples joined
     knot_t : (m,) times at which windows start or end [s], ascending
     start, end : (w,) rows of `knot_t`
     start_m, end_m, length_m : (w,) path length at start and end, and nominal length [m]
@@ -178,7 +100,7 @@ class Windows(NamedTuple):
     turned : (w,) turn of the reference [rad]
     """
 
-    steps: Steps
+    steps: Track
     knot_t: Floats
     start: Ints
     end: Ints
@@ -199,7 +121,8 @@ class Totals(NamedTuple):
 def totals_of(*recordings: Recording) -> Totals:
     """Return distance and time of recordings together."""
     return Totals(
-        sum(float(one.drive.distance[-1]) for one in recordings), sum(float(one.held_s.sum()) for one in recordings)
+        sum(float(one.track.distance[-1]) for one in recordings),
+        sum(float(one.track.held.sum()) for one in recordings),
     )
 
 
@@ -223,74 +146,53 @@ def cut_windows(
     DataError
         There are fewer than `FEWEST_WINDOWS`.
     """
-    drive = recording.drive
-    pooled, size = pooled or totals_of(recording), size_of(recording.width_m)
+    track, pooled, size = recording.track, pooled or totals_of(recording), size_of(recording.width_m)
     lengths_m = [size * one for one in WINDOWS_M] if lengths_m is None else lengths_m
     every = min(max(size * EVERY_M, pooled.metres / MOST_STARTS), size * LEAST_OFTEN_M)
-    begins = rows_at_steps(drive.distance, every)
-    begins = begins[~drive.in_outage[begins]]
-    ends = ends_from(drive, np.array(lengths_m, np.float64), begins)
-    row, column = np.nonzero(ends.T >= 0)[::-1]
-    if recording.slipping is not None:
-        before: Ints = np.cumsum(recording.slipping) - recording.slipping
-        quiet: Bools = before[begins[row]] == before[ends[row, column]]
-        row, column = row[quiet], column[quiet]
-    if len(row) < FEWEST_WINDOWS:
-        why = f"only {len(row)} windows of {min(lengths_m):g} m of driven distance"
+    start, end, length = cut(track, lengths_m, every)
+    if len(start) < FEWEST_WINDOWS:
+        why = f"only {len(start)} windows of {min(lengths_m):g} m of driven distance"
         raise DataError(recording.name, why, "a calibration needs a longer drive")
-    start, end = begins[row], ends[row, column]
-    begin_place, end_place = (drive.north[rows] + 1j * drive.east[rows] for rows in (start, end))
+    begin_place, end_place = (track.north[rows] + 1j * track.east[rows] for rows in (start, end))
     knots, rows = np.unique(np.concatenate([start, end]), return_inverse=True)
     return Windows(
-        joined_steps(recording, samples_a_step(recording, pooled.seconds)),
-        knot_t=recording.t_s[knots],
+        steps_of(recording, pooled.seconds),
+        knot_t=track.t[knots],
         start=rows[: len(start)],
         end=rows[len(start) :],
-        start_m=drive.distance[start],
-        end_m=drive.distance[end],
-        length_m=np.asarray(lengths_m, np.float64)[column],
-        reference=np.exp(-1j * drive.heading[start]) * (end_place - begin_place),
-        turned=drive.heading[end] - drive.heading[start],
+        start_m=track.distance[start],
+        end_m=track.distance[end],
+        length_m=length,
+        reference=np.exp(-1j * track.heading[start]) * (end_place - begin_place),
+        turned=track.heading[end] - track.heading[start],
     )
 
 
-def moving_states(drive: Drive) -> Bools:
+def moving_states(track: Track) -> Bools:
     """Return the states (n,) in which the robot moves."""
-    return np.append(np.diff(drive.distance) > MOVING_MPS * drive.dt_s[:-1], False)
+    return np.append(np.diff(track.distance) > MOVING_MPS * np.diff(track.t), False)
 
 
-def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
+def samples_a_step(track: Track, pooled_s: float | None = None) -> int:
     """Return how many wheel samples make a step of the fits; `pooled_s` is the time of all that is fitted together.
 
     A tenth of a second; on a long drive longer, up to four tenths, as long as a step is no more than a quarter of a
     metre.
     """
-    drive, held = recording.drive, recording.held_s
-    lasting = held > 0.0
+    lasting = track.held > 0.0
     if not lasting.any():
         return 1
-    total_s = float(held.sum())
-    speed_mps = float((held * (np.abs(drive.v_left) + np.abs(drive.v_right))).sum()) / 2.0 / total_s
+    total_s = float(track.held.sum())
+    speed_mps = float((track.held * (np.abs(track.v_left) + np.abs(track.v_right))).sum()) / 2.0 / total_s
     step_s = min(
         (total_s if pooled_s is None else pooled_s) / MOST_STEPS, LONGEST_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S
     )
-    return max(int(max(step_s, STEP_S) / float(np.median(held[lasting]))), 1)
+    return max(int(max(step_s, STEP_S) / float(np.median(track.held[lasting]))), 1)
 
 
-def joined_steps(recording: Recording, samples: int) -> Steps:
-    """Return a recording's wheel samples, so many joined to a step with the mean speeds over its time."""
-    drive, held = recording.drive, recording.held_s
-    gyro = recording.gyro_radps if recording.gyro_radps is not None else np.zeros(len(held))
+def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:
+    """Return the track of a recording with its wheel samples joined to the steps of the fits (`samples_a_step`)."""
+    track, samples = recording.track, samples_a_step(recording.track, pooled_s)
     if samples == 1:
-        return Steps(recording.t_s, held, drive.v_left, drive.v_right, gyro, np.zeros(len(held)))
-    first = np.arange(0, len(held), samples)
-    lasting = np.add.reduceat(held, first)
-
-    def mean(column: Floats) -> Floats:
-        total = np.add.reduceat(held * column, first)
-        return np.divide(total, lasting, out=np.zeros(len(first)), where=lasting > 0.0)
-
-    return Steps(
-        recording.t_s[first], lasting, mean(drive.v_left), mean(drive.v_right), mean(gyro),
-        lasting * (samples - 1) / (2.0 * samples),
-    )  # fmt: skip
+        return track
+    return track.joined(np.arange(0, len(track.t), samples), (samples - 1) / (2.0 * samples))

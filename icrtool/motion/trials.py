@@ -8,16 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.open_loop.direct import ends_from
+from icrtool.kernels.track import Track, ends_from
 from icrtool.kernels.window_residuals import OMEGA, path_at
 from icrtool.motion.models import FittedModel, wheel_motion
 from icrtool.motion.recording import (
     NO_CONSTANTS,
     LogConstants,
     Recording,
-    Steps,
     Totals,
-    joined_steps,
     moving_states,
     samples_a_step,
 )
@@ -48,10 +46,10 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals
     ----------
     pooled : of all that is fitted together, default the recording
     """
-    moving = np.flatnonzero(moving_states(recording.drive))
-    step = samples_a_step(recording, None if pooled is None else pooled.seconds)
+    moving = np.flatnonzero(moving_states(recording.track))
+    step = samples_a_step(recording.track, None if pooled is None else pooled.seconds)
     starts = moving[:: max(step, len(moving) // MOST_STARTS)].copy()
-    return Trials(starts, ends_from(recording.drive, np.array(horizons_m, np.float64), starts))
+    return Trials(starts, ends_from(recording.track, np.array(horizons_m, np.float64), starts))
 
 
 class TrialErrors(NamedTuple):
@@ -91,20 +89,20 @@ def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> 
     -----
     The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
     """
-    drive, first = recording.drive, int(start.min())
+    track, first = recording.track, int(start.min())
     s, e = start - first, end - first
     used = np.zeros(int(e.max()) + 1, np.bool_)
     used[s] = used[e] = True
     rows, number = first + np.flatnonzero(used), np.cumsum(used) - 1
-    turned, place = path(recording.t_s[rows])
-    s, e, off = number[s], number[e], turned - drive.heading[rows]
-    turn, reference = np.exp(-1j * off), drive.north[rows] + 1j * drive.east[rows]
+    turned, place = path(recording.track.t[rows])
+    s, e, off = number[s], number[e], turned - track.heading[rows]
+    turn, reference = np.exp(-1j * off), track.north[rows] + 1j * track.east[rows]
     missed = turn[s] * (place[e] - place[s]) - (reference[e] - reference[s])
     return TrialErrors(np.abs(missed), np.abs(off[e] - off[s]))
 
 
 def predicted_path(
-    recording: Recording, fitted: FittedModel, own: LogConstants = NO_CONSTANTS, steps: Steps | None = None
+    recording: Recording, fitted: FittedModel, own: LogConstants = NO_CONSTANTS, steps: Track | None = None
 ) -> PathAt:
     """Return the path that a model makes of a recording's wheels and gyro, at times of its poses.
 
@@ -117,19 +115,19 @@ def predicted_path(
     -----
     Nothing moves through a gap in the wheel data. The offset of the reference's heading is taken from that of the path.
     """
-    of = steps if steps is not None else joined_steps(recording, 1)
+    of = steps if steps is not None else recording.track
 
     def twists(some: slice) -> tuple[Floats, Ints, Floats]:
-        gyro = of.gyro[some]
-        if own.gyro_later_s:
+        gyro = None if of.gyro is None else of.gyro[some]
+        if gyro is not None and own.gyro_later_s:
             gyro = gyro + own.gyro_later_s * of.gyro_change(some)
         motion = wheel_motion(of.v_left[some], of.v_right[some], recording.width_m, gyro)
         moving = fitted.twist(motion)
         moving[OMEGA] += own.gyro_bias_radps
-        return moving, np.empty(0, np.int64), np.empty((0, len(gyro)))
+        return moving, np.empty(0, np.int64), np.empty((0, len(motion.v)))
 
     def at_times(at: Floats) -> tuple[Floats, Complexes]:
-        path = path_at(of.t, of.held, of.into, twists, np.empty(0), at + own.wheels_later_s)
+        path = path_at(of, twists, np.empty(0), at + own.wheels_later_s)
         return path.heading - own.heading_offset_rad, path.place
 
     return at_times

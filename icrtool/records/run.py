@@ -12,7 +12,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.track import Track
 from icrtool.records.events import intervals_in
 from icrtool.records.late_output import FigureSet, call_output
 from icrtool.records.measurements import SensorData
@@ -262,46 +262,23 @@ def no_slip_icrs(track_width_m: float) -> Icrs:
     return track_width_m / 2, -track_width_m / 2, 0.0
 
 
-def drive_of(run: Run) -> Drive:
-    """Return the states of a run as input of the kernels."""
-    return make_drive(run.table, run.in_gap, run.outages_ns, run.jumping)
+def track_of(run: Run) -> Track:
+    """Return the states of a run as a track."""
+    return track_of_states(run.table, run.in_gap, run.outages_ns, jumping=run.jumping, slipping=run.slipping)
 
 
-def make_drive(table: States, in_gap: Bools, outages_ns: Ints, jumping: Bools | None = None) -> Drive:
-    """Return states as input of the kernels; `jumping` as that of `Run`, None for no jumps."""
+def track_of_states(
+    table: States, in_gap: Bools, outages_ns: Ints, *, jumping: Bools | None = None, slipping: Bools | None = None
+) -> Track:
+    """Return states as a track; `jumping` and `slipping` as those of `Run`, None for none."""
     in_outage = np.zeros(len(table), np.bool_)
     for begin, end in outages_ns:
         # The last fix is still good at `begin`, and the first one again at `end`.
         in_outage |= (table.stamp_ns > begin) & (table.stamp_ns < end)
-    dt_s = np.zeros(len(table))
-    np.divide(np.diff(table.stamp_ns), 1e9, out=dt_s[:-1])
-    return Drive(
-        dt_s=dt_s,
-        v_left=table.v_left_mps,
-        v_right=table.v_right_mps,
-        north=table.north_m,
-        east=table.east_m,
-        heading=table.heading_rad,
-        distance=table.distance_m,
-        gap=in_gap,
-        in_outage=in_outage,
-        jump=np.zeros(len(table), np.bool_) if jumping is None else jumping,
-    )
-
-
-def straight_drive() -> Drive:
-    """Return twenty states of straight driving, with which compiled kernels are loaded."""
-    path = np.arange(20.0)
-    no = np.zeros(len(path), np.bool_)
-    return Drive(
-        np.ones_like(path),
-        np.ones_like(path),
-        np.ones_like(path),
-        path,
-        0 * path,
-        0 * path,
-        path,
-        no,
-        no.copy(),
-        no.copy(),
-    )
+    held = np.zeros(len(table))
+    np.divide(np.diff(table.stamp_ns), 1e9, out=held[:-1])
+    held[in_gap] = 0.0
+    return Track.of_states(
+        table.t_s, held, table.v_left_mps, table.v_right_mps, table.north_m, table.east_m, table.heading_rad,
+        table.distance_m, in_outage=in_outage, jump=jumping, slipping=slipping,
+    )  # fmt: skip

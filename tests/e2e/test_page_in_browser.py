@@ -31,7 +31,7 @@ from icrtool.output.page.comparison_page import comparison_page
 from icrtool.output.page.fleet_page import fleet_page
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import run_page
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 from icrtool.records.samples import GyroSamples
 from icrtool.records.text import LogText
 from support.barn import TRACK_WIDTH_M, configured, simulate
@@ -165,7 +165,7 @@ def test_a_click_on_the_map_draws_three_paths_and_lists_all_errors(chrome: Brows
 
 
 def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: Run, report: DropoutReport) -> None:
-    drive, table, b = drive_of(run), run.table, TRACK_WIDTH_M
+    drive, table, b = track_of(run), run.table, TRACK_WIDTH_M
     ends = trial_ends(drive, np.array(LENGTHS_M))
     starts = np.flatnonzero((ends >= 0).all(axis=1))
     starts = starts[:: len(starts) // 8]
@@ -211,7 +211,7 @@ def test_paths_of_joined_samples_are_close_to_those_of_the_library(
     page.open(file)
     joined = page.evaluate("icrtoolPage.data.steps.joined")
     assert joined == 3
-    drive, table = drive_of(run), run.table
+    drive, table = track_of(run), run.table
     ends = trial_ends(drive, np.array(LENGTHS_M))
     for step in (50, 150, 300):
         start = step * joined
@@ -252,7 +252,7 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     assert table is not None
     drawn = set(page.evaluate("icrtoolPage.data.models.map((one) => one.name)"))
     assert {"recommended", "recommended_gyro", "controller", "controller_gyro", "no_slip", "icr"} <= drawn
-    ends = trial_ends(drive_of(run), np.array(LENGTHS_M))
+    ends = trial_ends(track_of(run), np.array(LENGTHS_M))
     starts = np.flatnonzero((ends >= 0).all(axis=1))[::300]
     trials = Trials(starts, ends[starts])
     for name, with_gyro in names.items():

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from icrtool.kernels.open_loop import prefix_sums as open_loop_fast
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
+from icrtool.kernels.open_loop.trials import FrozenIcrs
+from icrtool.kernels.track import Track
 
 EQUAL_M = 1e-9  # what the fast algorithm promises; moving the world by 1e5 m rounds positions to 1.5e-11 m
 HORIZONS = np.array([0.3, 1.0, 2.5, 6.0])
@@ -58,7 +59,8 @@ def drives(draw, least_separation=0.0):
     reference = [np.cumsum(rng.normal(0.0, 0.02, n)) for _ in range(3)]
     gap, in_outage = (rng.random(n) < draw(st.sampled_from([0.0, 0.02])) for _ in range(2))
     icrs = FrozenIcrs(y_right, y_left, icr_track(0.1, jumps, n, rng))
-    return Drive(dt_s, v_left, v_right, *reference, distance, gap, in_outage, np.zeros(len(gap), np.bool_)), icrs
+    t, held = np.cumsum(dt_s) - dt_s, np.where(gap, 0.0, dt_s)
+    return Track.of_states(t, held, v_left, v_right, *reference, distance, in_outage=in_outage), icrs
 
 
 def assert_equal(errors, expected):
@@ -124,10 +126,10 @@ def test_order_of_horizons_changes_nothing(drive_and_icrs, order):
 @given(drives(least_separation=0.1), st.data())
 def test_ranges_of_starts_make_up_the_whole(drive_and_icrs, data):
     drive, icrs = drive_and_icrs
-    cut = data.draw(st.integers(0, len(drive.dt_s)))
+    cut = data.draw(st.integers(0, len(drive.t)))
     whole = open_loop_errors(drive, icrs, trial_ends(drive, HORIZONS))
     parts = [
         open_loop_errors(drive, icrs, trial_ends(drive, HORIZONS, lo, hi), lo)
-        for lo, hi in [(0, cut), (cut, len(drive.dt_s))]
+        for lo, hi in [(0, cut), (cut, len(drive.t))]
     ]
     assert_equal(np.concatenate(parts), whole)

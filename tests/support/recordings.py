@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.direct import ends_from
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.track import Track, ends_from
 from icrtool.motion.models import MotionModel, twist, wheel_motion
 from icrtool.motion.recording import Recording
 from icrtool.motion.trials import PathAt, Trials, trial_errors
@@ -52,15 +51,15 @@ def make_recording(
     v_x, v_y, omega = v_x * (1 + wander[0]), v_y + v_x * wander[1] / 3, omega * (1 + wander[2])
     heading = np.concatenate([[0.3], 0.3 + np.cumsum(dt * omega)[:-1]])
     place = np.concatenate([[0.0], np.cumsum(dt * (v_x + 1j * v_y) * np.exp(1j * heading))[:-1]])
-    no = np.zeros(n, np.bool_)
-    drive = Drive(
-        np.append(np.full(n - 1, dt), 0.0), v_left, v_right,
+    track = Track.of_states(
+        t, np.append(np.full(n - 1, dt), 0.0), v_left, v_right,
         place.real + rng.normal(0.0, noise_m, n), place.imag + rng.normal(0.0, noise_m, n),
         heading + rng.normal(0.0, noise_rad, n),
-        np.concatenate([[0.0], np.cumsum(dt * np.hypot(v_x, v_y))[:-1]]), no, no.copy(), no.copy(),
+        np.concatenate([[0.0], np.cumsum(dt * np.hypot(v_x, v_y))[:-1]]),
     )  # fmt: skip
-    rate_radps = omega + rng.normal(0.0, 0.005, n) + 0.002 if gyro else None
-    return Recording(name, t, drive, rate_radps, WIDTH_M, f"/logs/{name}", name)
+    if gyro:
+        track = track._replace(gyro=omega + rng.normal(0.0, 0.005, n) + 0.002)
+    return Recording(name, track, WIDTH_M, f"/logs/{name}", name)
 
 
 def table_errors(recording: Recording, trials: Trials, path: PathAt) -> Floats:
@@ -73,5 +72,5 @@ def table_errors(recording: Recording, trials: Trials, path: PathAt) -> Floats:
 
 def trials_from_all(recording: Recording, horizons_m: Sequence[float]) -> Trials:
     """Return the trials from every recorded state."""
-    starts = np.arange(len(recording.t_s))
-    return Trials(starts, ends_from(recording.drive, np.array(horizons_m), starts))
+    starts = np.arange(len(recording.track.t))
+    return Trials(starts, ends_from(recording.track, np.array(horizons_m), starts))

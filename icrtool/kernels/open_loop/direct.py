@@ -16,26 +16,16 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, euler_step
-from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs, OpenLoopPath, TrialCounts
+from icrtool.kernels.open_loop.trials import FrozenIcrs, OpenLoopPath, TrialCounts
+from icrtool.kernels.track import GAP, JUMP, OUTAGE, SHORT, STANDING, Track, ends_from
 
-SHORT = -1
-"""No trial: less than the horizon is left of the log's distance."""
-GAP = -2
-"""No trial: the trial spans a gap in the wheel data."""
-OUTAGE = -3
-"""No trial: it ends at a state without a reference (a real outage)."""
-STANDING = -4
-"""No trial: the robot stands at the start, and another start counts for this standstill."""
-JUMP = -5
-"""No trial: the reference jumps between its start and its end."""
-
-BEFORE = 1.0 - 2.0**-51
-"""Of a path length: less than rounding may add to it."""
+Columns = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
+"""Of a track that is made of states: held, v_left, v_right, north, east, heading."""
 
 
 @njit
 def integrate_trials(
-    drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int, row_lo: int, row_hi: int, errors: Floats
+    columns: Columns, icrs: FrozenIcrs, ends: Ints, lo: int, row_lo: int, row_hi: int, errors: Floats
 ) -> None:
     """Fill rows [row_lo, row_hi) of `errors` (n_horizons, n_starts): each path is integrated once for all horizons.
 
@@ -44,12 +34,13 @@ def integrate_trials(
     The path is integrated from the origin with heading zero and turned into place at its end: the same path, but its
     rounding does not depend on where the datum is or how often the robot has turned.
     """
+    held, v_left, v_right, north, east, heading = columns
     each = 0 if len(icrs.x_icr) == 1 else 1
     for row in range(row_lo, row_hi):
         start = lo + row
         y_icr_right, y_icr_left = icrs.y_icr_right[start * each], icrs.y_icr_left[start * each]
         x_icr = icrs.x_icr[start * each]
-        cos_psi, sin_psi = math.cos(drive.heading[start]), math.sin(drive.heading[start])
+        cos_psi, sin_psi = math.cos(heading[start]), math.sin(heading[start])
         ahead, aside, turned = 0.0, 0.0, 0.0
         state, reached = start, start - 1
         while True:
@@ -64,78 +55,41 @@ def integrate_trials(
                     ahead,
                     aside,
                     turned,
-                    drive.dt_s[i],
-                    drive.v_left[i],
-                    drive.v_right[i],
+                    held[i],
+                    v_left[i],
+                    v_right[i],
                     y_icr_right,
                     y_icr_left,
                     x_icr,
                 )
             state, reached = end, end
-            miss_north = ahead * cos_psi - aside * sin_psi - (drive.north[end] - drive.north[start])
-            miss_east = ahead * sin_psi + aside * cos_psi - (drive.east[end] - drive.east[start])
+            miss_north = ahead * cos_psi - aside * sin_psi - (north[end] - north[start])
+            miss_east = ahead * sin_psi + aside * cos_psi - (east[end] - east[start])
             for h in range(ends.shape[0]):
                 if ends[h, row] == end:
                     errors[h, row] = math.sqrt(miss_north * miss_north + miss_east * miss_east)
 
 
-def compiled_drive(drive: Drive) -> Drive:
-    """Return `drive` with its columns in the one form the kernels are compiled for; copies only what is not in it.
+def compiled_columns(track: Track) -> Columns:
+    """Return the columns of a track in the one form the kernels are compiled for; copies only what is not in it.
 
     Notes
     -----
     A read-only column (pandas hands those out) would be another type to numba, and cost a second compilation.
     """
-    floats = [np.require(column, np.float64, ["C", "A", "W"]) for column in drive[:7]]
-    flags = [np.require(column, np.bool_, ["C", "A", "W"]) for column in drive[7:]]
-    return Drive(*floats, *flags)
+    columns = (track.held, track.v_left, track.v_right, track.north, track.east, track.heading)
+    held, left, right, north, east, heading = (np.require(one, np.float64, ["C", "A", "W"]) for one in columns)
+    return held, left, right, north, east, heading
 
 
 def compiled_icrs(icrs: FrozenIcrs) -> FrozenIcrs:
-    """Return `icrs` in the one form the kernels are compiled for (see `compiled_drive`)."""
+    """Return `icrs` in the one form the kernels are compiled for (see `compiled_columns`)."""
     return FrozenIcrs(*[np.require(column, np.float64, ["C", "A", "W"]) for column in icrs])
 
 
-def trial_ends(drive: Drive, horizons_m: Floats, lo: int = 0, hi: int | None = None) -> Ints:
-    """Find the state at which the trial from each start in [lo, hi) ends, for every horizon.
-
-    Parameters
-    ----------
-    drive : recorded states (n,)
-    horizons_m : float64 (n_horizons,), path lengths [m] in any order
-    lo, hi : the range of starts; all of them by default
-
-    Returns
-    -------
-    int64 (hi - lo, n_horizons), one horizon contiguous: index of the first state j with
-    ``distance[j] - distance[k] >= horizon``, or `SHORT`, `GAP`, `OUTAGE`, `JUMP`. The same for every model.
-    """
-    return ends_from(drive, horizons_m, np.arange(lo, len(drive.distance) if hi is None else hi))
-
-
-def ends_from(drive: Drive, horizons_m: Floats, starts: Ints) -> Ints:
-    """Return `trial_ends` (k, n_horizons) of some starts (k,), ascending."""
-    distance, states = np.asarray(drive.distance, np.float64), len(drive.distance)
-    ends = np.empty((len(horizons_m), len(starts)), np.int64)
-    first = int(starts[0]) if len(starts) else 0
-    gaps = np.concatenate([[0], np.cumsum(np.asarray(drive.gap, np.bool_)[first:])])
-    in_outage, begin = np.asarray(drive.in_outage, np.bool_), distance[starts]
-    for end, horizon in zip(ends, horizons_m, strict=True):
-        # the sum may be rounded up: begin the search a little before it
-        end[:] = np.searchsorted(distance, (begin + horizon) * BEFORE)
-        while True:
-            last, inside = np.minimum(end, states - 1), end < states
-            short = np.flatnonzero(inside & (distance[last] - begin < horizon))
-            if not len(short):
-                break
-            end[short] = np.searchsorted(distance, distance[end[short]], side="right")
-        end[inside & in_outage[last]] = OUTAGE
-        end[inside & (gaps[last - first] > gaps[starts - first])] = GAP
-        end[~inside] = SHORT
-    if drive.jump.any():
-        jumps: Ints = np.cumsum(drive.jump) - drive.jump
-        ends[(ends >= 0) & (jumps[np.maximum(ends, 0)] > jumps[starts])] = JUMP
-    return ends.T
+def trial_ends(track: Track, horizons_m: Floats, lo: int = 0, hi: int | None = None) -> Ints:
+    """Return `icrtool.kernels.track.ends_from` of all starts in [lo, hi), by default of all states."""
+    return ends_from(track, horizons_m, np.arange(lo, len(track.distance) if hi is None else hi))
 
 
 def count_trials(ends: Ints) -> TrialCounts:
@@ -144,12 +98,12 @@ def count_trials(ends: Ints) -> TrialCounts:
     return TrialCounts(len(ends) - np.sum(kinds, axis=0), *kinds)
 
 
-def open_loop_errors_direct(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
+def open_loop_errors_direct(track: Track, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
     """Integrate every trajectory step by step: O(starts x steps), the oracle.
 
     Parameters
     ----------
-    drive : recorded states (n,)
+    track : of recorded states (n,)
     icrs : what each start drives with
     ends : int64 (n_starts, n_horizons) of `trial_ends`, for the starts from `lo` on
 
@@ -164,12 +118,12 @@ def open_loop_errors_direct(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int 
     """
     by_horizon = np.ascontiguousarray(ends.T)
     errors = np.full(by_horizon.shape, np.nan)
-    integrate_trials(compiled_drive(drive), compiled_icrs(icrs), by_horizon, lo, 0, len(ends), errors)
+    integrate_trials(compiled_columns(track), compiled_icrs(icrs), by_horizon, lo, 0, len(ends), errors)
     return errors.T
 
 
 def open_loop_path(
-    drive: Drive, y_icr_right: float, y_icr_left: float, x_icr: float, start: int, end: int
+    track: Track, y_icr_right: float, y_icr_left: float, x_icr: float, start: int, end: int
 ) -> OpenLoopPath:
     """Drive open loop from state `start` to state `end` with constant ICRs [m].
 
@@ -178,19 +132,19 @@ def open_loop_path(
     The path at every state from `start` to `end`, both included, beginning at the reference pose of `start`.
     """
     path = OpenLoopPath(*np.empty((3, end - start + 1)))
-    path.north[0], path.east[0], path.heading[0] = drive.north[start], drive.east[start], drive.heading[start]
+    path.north[0], path.east[0], path.heading[0] = track.north[start], track.east[start], track.heading[start]
     separation, turned, place = max(abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M), 0.0, 0j
-    ahead = cmath.exp(1j * drive.heading[start])
+    ahead = cmath.exp(1j * track.heading[start])
     for lo in range(start, end, ROWS_AT_ONCE):  # paths of whole drives are as long as a column of the run
         some = slice(lo, min(lo + ROWS_AT_ONCE, end))
-        reached, over = slice(some.start - start + 1, some.stop - start + 1), drive.dt_s[some] / separation
-        left, right = drive.v_left[some] * over, drive.v_right[some] * over
+        reached, over = slice(some.start - start + 1, some.stop - start + 1), track.held[some] / separation
+        left, right = track.v_left[some] * over, track.v_right[some] * over
         turn = left - right
         heading = turned + np.cumsum(np.append(0.0, turn))
         moved = (left * y_icr_right - right * y_icr_left - 1j * x_icr * turn) * np.exp(1j * heading[:-1])
         places = place + np.cumsum(moved)
         turned, place = heading[-1], places[-1]
         places *= ahead
-        path.north[reached], path.east[reached] = drive.north[start] + places.real, drive.east[start] + places.imag
-        path.heading[reached] = drive.heading[start] + heading[1:]
+        path.north[reached], path.east[reached] = track.north[start] + places.real, track.east[start] + places.imag
+        path.heading[reached] = track.heading[start] + heading[1:]
     return path

@@ -26,8 +26,9 @@ import numpy as np
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.open_loop.direct import compiled_drive, compiled_icrs, integrate_trials
-from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
+from icrtool.kernels.open_loop.direct import Columns, compiled_columns, compiled_icrs, integrate_trials
+from icrtool.kernels.open_loop.trials import FrozenIcrs
+from icrtool.kernels.track import Track
 
 TOLERANCE_M = 1e-11
 """Largest error [m] of an end position by the moments left out. With rounding the total stays well below 1e-9 m."""
@@ -77,18 +78,18 @@ class WheelSteps(NamedTuple):
     turn: Floats
 
 
-def wheel_steps(drive: Drive, first: int, last: int, turn: float) -> Iterator[WheelSteps]:
+def wheel_steps(columns: Columns, first: int, last: int, turn: float) -> Iterator[WheelSteps]:
     """Yield the steps from state `first`, where D is `turn` [m], to state `last`, some at a time."""
+    held, v_left, v_right, *_ = columns
     for lo in range(first, last, MAX_BLOCK):
         some = slice(lo, min(lo + MAX_BLOCK, last))
-        held = np.where(drive.gap[some], 0.0, drive.dt_s[some])
-        left, right = held * drive.v_left[some], held * drive.v_right[some]
+        left, right = held[some] * v_left[some], held[some] * v_right[some]
         turns = turn + np.cumsum(np.append(0.0, left - right))
         yield WheelSteps(lo, left, right, turns)
         turn = turns[-1]
 
 
-def plan_block(drive: Drive, icrs: FrozenIcrs, last: int, starts: slice) -> BlockPlan:
+def plan_block(columns: Columns, icrs: FrozenIcrs, last: int, starts: slice) -> BlockPlan:
     """Choose the moments for some starts and their `icrs`, whose trials end at state `last` at the latest.
 
     Notes
@@ -97,7 +98,7 @@ def plan_block(drive: Drive, icrs: FrozenIcrs, last: int, starts: slice) -> Bloc
     scale the length of a path on which nothing cancels.
     """
     turn_min, turn_max, travel_left, travel_right = 0.0, 0.0, 0.0, 0.0
-    for steps in wheel_steps(drive, starts.start, last, 0.0):
+    for steps in wheel_steps(columns, starts.start, last, 0.0):
         turn_min, turn_max = min(turn_min, steps.turn.min()), max(turn_max, steps.turn.max())
         travel_left, travel_right = travel_left + np.abs(steps.left).sum(), travel_right + np.abs(steps.right).sum()
     a, forward = _turn_gain(icrs), np.abs(icrs.x_icr)
@@ -204,24 +205,32 @@ def fill_errors(
 
 
 def solve_block(
-    drive: Drive, icrs: FrozenIcrs, plan: BlockPlan, ends: Ints, row_lo: int, starts: slice, last: int, errors: Floats
+    columns: Columns,
+    icrs: FrozenIcrs,
+    plan: BlockPlan,
+    ends: Ints,
+    row_lo: int,
+    starts: slice,
+    last: int,
+    errors: Floats,
 ) -> None:
     """Fill `errors` of some starts, rows of `ends` from `row_lo` on; all parameters as in `plan_block`."""
+    north, east, heading = columns[3:]
     rows, frozen = np.zeros((min(max(last - starts.start, 0), MAX_BLOCK) + 1, plan.moments, 4)), np.zeros((0, 7))
-    for steps in wheel_steps(drive, starts.start, last, plan.first_turn):
+    for steps in wheel_steps(columns, starts.start, last, plan.first_turn):
         # the starts are all among the first states
         if steps.first == starts.start:
             turn = steps.turn[: starts.stop - starts.start]
-            heading, own = drive.heading[starts][: len(turn)], FrozenIcrs(*(column[: len(turn)] for column in icrs))
-            frozen = freeze_starts(plan, own, heading, turn)
+            own = FrozenIcrs(*(column[: len(turn)] for column in icrs))
+            frozen = freeze_starts(plan, own, heading[starts][: len(turn)], turn)
         else:
             rows[0] = rows[-1]
         sums = rows[: len(steps.turn)]
         sum_moments(steps.left, steps.right, steps.turn, plan.a_centre, plan.half_width, plan.moments, sums)
-        fill_errors(ends, row_lo, steps.first, sums, frozen, starts.start, drive.north, drive.east, errors)
+        fill_errors(ends, row_lo, steps.first, sums, frozen, starts.start, north, east, errors)
 
 
-def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
+def open_loop_errors(track: Track, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
     """Return what `open_loop_errors_direct` returns, equal to 1e-9 m, far sooner.
 
     Notes
@@ -232,7 +241,7 @@ def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) ->
     """
     by_horizon = np.ascontiguousarray(ends.T)
     errors = np.full(by_horizon.shape, np.nan)
-    drive, icrs = compiled_drive(drive), compiled_icrs(icrs)
+    columns, icrs = compiled_columns(track), compiled_icrs(icrs)
     constant = len(icrs.x_icr) == 1
     row_lo, size, starts = 0, MAX_BLOCK, len(ends)
     while row_lo < starts:
@@ -242,13 +251,13 @@ def open_loop_errors(drive: Drive, icrs: FrozenIcrs, ends: Ints, lo: int = 0) ->
         while True:
             block, last = slice(lo + row_lo, lo + row_hi), int(by_horizon[:, row_lo:row_hi].max(initial=-1))
             own = icrs if constant else FrozenIcrs(*(column[block] for column in icrs))
-            plan = plan_block(drive, own, last, block)
+            plan = plan_block(columns, own, last, block)
             if plan.moments or row_hi - row_lo <= MIN_BLOCK:
                 break
             row_hi = row_lo + (row_hi - row_lo) // 2
         if plan.moments:
-            solve_block(drive, own, plan, by_horizon, row_lo, block, last, errors)
+            solve_block(columns, own, plan, by_horizon, row_lo, block, last, errors)
         else:
-            integrate_trials(drive, icrs, by_horizon, lo, row_lo, row_hi, errors)
+            integrate_trials(columns, icrs, by_horizon, lo, row_lo, row_hi, errors)
         row_lo, size = row_hi, min(2 * (row_hi - row_lo), MAX_BLOCK)
     return errors.T

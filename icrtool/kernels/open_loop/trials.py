@@ -9,33 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Floats, Ints
-
-
-class Drive(NamedTuple):
-    """The recorded states, as open-loop propagation sees them. All of shape (n,).
-
-    Attributes
-    ----------
-    dt_s : float64, interval [s] from state k to state k + 1; the last one is never used
-    v_left, v_right : float64, track speeds [m/s] held over that interval
-    north, east, heading : float64, reference pose [m, m, rad]: start of a trial, compared with its end
-    distance : float64, path length [m], non-decreasing
-    gap : bool, the interval from k to k + 1 is a gap in the wheel data
-    in_outage : bool, state k has no reference to compare a trial's end with
-    jump : bool, the reference jumps in the interval from k to k + 1
-    """
-
-    dt_s: Floats
-    v_left: Floats
-    v_right: Floats
-    north: Floats
-    east: Floats
-    heading: Floats
-    distance: Floats
-    gap: Bools
-    in_outage: Bools
-    jump: Bools
+from icrtool.kernels.arrays import Floats, Ints
 
 
 class FrozenIcrs(NamedTuple):

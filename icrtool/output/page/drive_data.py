@@ -26,7 +26,7 @@ from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import predicted_path
 from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
-from icrtool.records.run import Run, drive_of, no_slip_icrs, width_or_usual_m
+from icrtool.records.run import Run, no_slip_icrs, track_of, width_or_usual_m
 from icrtool.records.tables import Icrs
 
 MOST_STEPS = 150_000
@@ -116,23 +116,21 @@ def errors_data(report: Mapping[str, Any]) -> dict[str, Any]:
 
 def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict[str, Any]:
     """Return what the wheels did and where the reference was, at every step."""
-    drive, rows = drive_of(run), steps.rows
-    held = np.where(drive.gap, 0.0, drive.dt_s)
-    held[-1] = 0.0
+    track, rows = track_of(run), steps.rows
     columns = {
-        "left": np.append(0.0, np.cumsum(held * drive.v_left)[:-1])[rows],
-        "right": np.append(0.0, np.cumsum(held * drive.v_right)[:-1])[rows],
-        "distance": drive.distance[rows],
-        "north": drive.north[rows],
-        "east": drive.east[rows],
+        "left": track.cumulate(track.v_left)[rows],
+        "right": track.cumulate(track.v_right)[rows],
+        "distance": track.distance[rows],
+        "north": track.north[rows],
+        "east": track.east[rows],
     }
-    gaps = np.searchsorted(rows, np.flatnonzero(drive.gap), side="right") - 1
+    gaps = np.searchsorted(rows, np.flatnonzero(track.held[:-1] == 0.0), side="right") - 1
     return {
         "joined": steps.joined,
-        "first_north": float(drive.north[0]) - origin[0],
-        "first_east": float(drive.east[0]) - origin[1],
+        "first_north": float(track.north[0]) - origin[0],
+        "first_east": float(track.east[0]) - origin[1],
         "gaps": np.unique(gaps).tolist(),
-        "without_reference": _spans(drive.in_outage[rows]),
+        "without_reference": _spans(track.in_outage[rows]),
     } | {name: packed_sums(column) for name, column in columns.items()}
 
 
@@ -246,14 +244,14 @@ def _held_out(
     wheels = {name: _fitted(name, ladder) for name in (FIVE, RECOMMENDED)}
     for model, base in ((RECOMMENDED, RECOMMENDED), (CONTROLLER, FIVE)):
         fits = {model: wheels[base]}
-        if recording.gyro_radps is not None:
+        if recording.track.gyro is not None:
             fits[f"{model}_{kind}"] = replace(_fitted(f"{base}_gyro", ladder), wheels=wheels[base])
         for name, fit in fits.items():
             # Too short a drive to find the delay of its wheels has no path.
             with suppress(DataError):
                 own = own_constants(windows(), fit, recording.width_m)
                 fitted = controller_model(fit, recording.lever, recording.width_m) if model == CONTROLLER else fit
-                yield ModelPath(name, labels[name], *predicted_path(recording, fitted, own)(recording.t_s[rows]))
+                yield ModelPath(name, labels[name], *predicted_path(recording, fitted, own)(recording.track.t[rows]))
 
 
 def _fitted(name: str, ladder: Mapping[str, Any]) -> FittedModel:
@@ -268,10 +266,10 @@ def _calibrated(recording_of: Callable[[str], Recording], report: Mapping[str, A
     recording = recording_of("gyro") if report["calibrations"] else None
     for one in report["calibrations"]:
         turned, document = one["with_gyro"], one["calibration"]
-        if recording is not None and document and not (turned and recording.gyro_radps is None):
+        if recording is not None and document and not (turned and recording.track.gyro is None):
             with suppress(DataError):
                 model = calibrated(calibration_of({"created": "", **document}), recording, with_gyro=turned)
-                yield ModelPath(one["name"], one["label"], *predicted_path(recording, *model)(recording.t_s[rows]))
+                yield ModelPath(one["name"], one["label"], *predicted_path(recording, *model)(recording.track.t[rows]))
 
 
 def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.trials import FrozenIcrs
 from icrtool.motion.trials import cut_trials
 from icrtool.records.dropout import MeasuredHeading
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 from support.drives import make_log
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
@@ -49,7 +49,7 @@ def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
     recording = recording_of(run, MeasuredHeading("gyro", turned))
     trials = cut_trials(recording, (5.0,))
     icrs = FrozenIcrs.constant(0.5, -0.6, 0.1)
-    found = _errors_along(turned_path(run, recording), recording.drive, icrs, trials).position
+    found = _errors_along(turned_path(run, recording), recording.track, icrs, trials).position
     ahead = (0.5 * table.v_left_mps + 0.6 * table.v_right_mps) / width
     aside = -0.1 * (table.v_left_mps - table.v_right_mps) / width
     step = (dt * (ahead + 1j * aside))[:-1] * np.exp(0.5j * (turned[1:] + turned[:-1]))
@@ -96,7 +96,7 @@ def test_all_rows_have_errors_in_the_same_trials(run: Run) -> None:
 
 def test_the_path_of_a_row_ends_where_its_trial_does(run: Run) -> None:
     found, errors = compared_errors(run, measured_headings(run))
-    drive, (start, end) = drive_of(run), (found.trials.starts, found.trials.ends[:, 1])
+    drive, (start, end) = track_of(run), (found.trials.starts, found.trials.ends[:, 1])
     for row in found.rows:
         if row.path is None:
             continue

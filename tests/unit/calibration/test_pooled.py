@@ -55,12 +55,12 @@ def test_the_parameters_that_made_the_logs_come_back(result: CalibrationResult) 
 def test_a_gyro_on_a_circle_turns_with_the_robot() -> None:
     """A noisy gyro of constant rate: a scale of 0.9 with a bias makes the same turns as a scale of one."""
     made, rng = make_recording(SIX, TRUTH, seconds=120.0), np.random.default_rng(4)
-    circle = replace(made, drive=made.drive._replace(heading=0.18 * made.t_s))
-    angle = circle.drive.heading + np.cumsum(rng.normal(0.0, 0.003, len(made.t_s)))
+    circle = replace(made, track=made.track._replace(heading=0.18 * made.track.t))
+    angle = circle.track.heading + np.cumsum(rng.normal(0.0, 0.003, len(made.track.t)))
     found = with_turn_rate(circle, MeasuredHeading("gyro", angle))
-    assert found.gyro_radps is not None
-    other = np.cumsum(rng.normal(0.0, 0.003, len(made.t_s)))
-    assert with_turn_rate(circle, MeasuredHeading("gyro", other)).gyro_radps is None
+    assert found.track.gyro is not None
+    other = np.cumsum(rng.normal(0.0, 0.003, len(made.track.t)))
+    assert with_turn_rate(circle, MeasuredHeading("gyro", other)).track.gyro is None
 
 
 def test_wheels_and_gyro_together_are_not_worse_than_either(result: CalibrationResult) -> None:
@@ -83,9 +83,9 @@ def test_a_log_is_tested_with_parameters_of_the_others() -> None:
 
 def test_a_block_that_is_spoilt_does_not_change_what_it_is_predicted_by() -> None:
     clean = logs(1)[0]
-    folds, drive = plan_folds([clean]), clean.drive
+    folds, drive = plan_folds([clean]), clean.track
     inside = (drive.distance > folds[-1].begin_m) & (drive.distance <= folds[-1].end_m)
-    spoilt = replace(clean, drive=drive._replace(north=drive.north * np.where(inside, 1.5, 1.0)))
+    spoilt = replace(clean, track=drive._replace(north=drive.north * np.where(inside, 1.5, 1.0)))
     before, after = (hold_out([one], (5.0,)) for one in (clean, spoilt))
     of_last = [one.without("recommended", folds[-1]) for one in (before, after)]
     assert of_last[0] is not None
@@ -167,7 +167,7 @@ def test_a_trial_is_predicted_without_what_is_near_it(horizon_m: float) -> None:
     """Against fits made here to the windows that keep clear of the trial."""
     recording = logs(1)[0]
     table = hold_out([recording], (horizon_m,))
-    distance, windows = recording.drive.distance, cut_windows(recording)
+    distance, windows = recording.track.distance, cut_windows(recording)
     trials = cut_trials(recording, (horizon_m,))
     errors = table.errors("recommended", 0, trials).position
     differs = []
@@ -215,7 +215,7 @@ def test_a_run_with_configured_scales_gives_the_same_calibration(scales: tuple[f
     runs = [fit(log, parse_config({"robot": {"track_width_m": 0.6}, "wheels": wheels})) for wheels in ({}, given)]
     assert runs[1].wheel_scales == pytest.approx(scales)
     assert runs[1].table.v_left_mps == pytest.approx(scales[0] / runs[0].wheel_scales[0] * runs[0].table.v_left_mps)
-    for one, other in zip(*(recording_of(run).drive[1:3] for run in runs), strict=True):
+    for one, other in zip(*(recording_of(run).track[2:4] for run in runs), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
     robots = [robot_of(run) for run in runs]
     assert robots[0] == robots[1]

@@ -111,7 +111,7 @@ def test_pairs_of_blocks_take_what_is_hard_for_both_out_of_the_difference() -> N
 
 def test_the_same_route_driven_twice_is_paired() -> None:
     first, second = (make_recording(FIVE, OLD, 1, 150.0, name=name) for name in ("one", "two"))
-    second = replace(second, drive=second.drive._replace(north=second.drive.north + 0.2))
+    second = replace(second, track=second.track._replace(north=second.track.north + 0.2))
     groups = {"one": [first], "two": [second]}
     found = compare_calibrations({name: calibrate_recordings(logs) for name, logs in groups.items()}, groups)
     assert found.pairs[0].paired

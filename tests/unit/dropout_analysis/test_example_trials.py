@@ -13,13 +13,13 @@ from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
 from icrtool.motion.trials import Trials
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 
 EQUAL_M = 1e-9
 
 
 def errors_of(run: Run, horizon_m: float, model: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    drive = drive_of(run)
+    drive = track_of(run)
     ends = trial_ends(drive, np.array([horizon_m]))
     return open_loop_errors_direct(drive, models_of(run)[model].icrs, ends)[:, 0], ends[:, 0]
 
@@ -41,7 +41,7 @@ def test_the_worst_trials_are_those_of_the_recommended_model(make_run: Callable[
     run = make_run(duration_s=150.0, troubles=False)
     compared = compare_models(run)
     row = next(row for row in compared.rows if row.name == "recommended")
-    ends = trial_ends(drive_of(run), np.array([5.0]))[compared.trials.starts]
+    ends = trial_ends(track_of(run), np.array([5.0]))[compared.trials.starts]
     errors = row.errors_of(Trials(compared.trials.starts, ends)).position[:, 0]
     worst = worst_trials(run, compared, 5.0, count=3)
     assert {one.model for one in worst} == {"recommended"}

@@ -17,7 +17,7 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.fit import fit
 from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
 from icrtool.logs.read_log import read_log
-from icrtool.records.run import STATE_COLUMNS, Run, WarmStart, drive_of
+from icrtool.records.run import STATE_COLUMNS, Run, WarmStart, track_of
 from support.barn import OUTAGE_S, START_NS, configured, simulate
 from support.matrix_filter import step_state
 
@@ -210,7 +210,7 @@ def test_an_outage_lasts_until_a_fix_is_used_again_and_its_error_is_that_of_the_
     (outage,) = (one for one in real_outages(moved) if one.begin_s == (begin - origin) / 1e9)
     assert outage.end_error_m == pytest.approx(3.0, abs=0.15)
     # No trial ends where the filter was without fixes; from the outage's end on it is where the fixes are.
-    drive = drive_of(moved)
+    drive = track_of(moved)
     assert drive.in_outage[np.searchsorted(moved.table.stamp_ns, stamps[inside])].all()
     first, fix = np.searchsorted(moved.table.stamp_ns, end), np.searchsorted(stamps, end)
     assert not drive.in_outage[first]

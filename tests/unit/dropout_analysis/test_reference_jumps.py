@@ -15,12 +15,13 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.direct import JUMP, trial_ends
+from icrtool.kernels.open_loop.direct import trial_ends
+from icrtool.kernels.track import JUMP
 from icrtool.motion.recording import cut_windows
 from icrtool.motion.trials import cut_trials
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.stored_run import open_run
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 from support.drives import make_log
 
 HORIZONS_M = (1.0, 5.0, 10.0)
@@ -58,7 +59,7 @@ def test_the_jump_is_in_the_run_with_time_and_size(jumping: Run) -> None:
 
 def test_no_trial_of_any_row_crosses_it(jumping: Run, report: DropoutReport) -> None:
     begin, end = (jumping.summary["reference_jumps"][0][key] for key in ("begin_s", "end_s"))
-    t, ends = jumping.table.t_s, trial_ends(drive_of(jumping), np.array(HORIZONS_M))
+    t, ends = jumping.table.t_s, trial_ends(track_of(jumping), np.array(HORIZONS_M))
     starts, horizons = np.nonzero(ends >= 0)
     assert not ((t[starts] < begin) & (t[ends[starts, horizons]] > end)).any()
     recording = recording_of(jumping)
@@ -118,7 +119,7 @@ def test_an_excursion_that_the_filter_rejects_is_no_jump_of_its_states() -> None
 
 
 def test_the_mark_of_a_trial_across_a_jump_is_its_own(jumping: Run) -> None:
-    drive = drive_of(jumping)
+    drive = track_of(jumping)
     ends = trial_ends(drive, np.array([10.0]))[:, 0]
     free = trial_ends(drive._replace(jump=np.zeros_like(drive.jump)), np.array([10.0]))[:, 0]
     crossing = ends == JUMP

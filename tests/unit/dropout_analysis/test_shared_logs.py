@@ -9,8 +9,9 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis.trials import dropout, models_of
-from icrtool.kernels.open_loop.direct import SHORT, open_loop_errors_direct, trial_ends
-from icrtool.records.run import drive_of
+from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
+from icrtool.kernels.track import SHORT
+from icrtool.records.run import track_of
 
 LOGS = {
     "real/warthog_grass.bag": "warthog",
@@ -42,7 +43,7 @@ def test_every_error_equals_brute_force(shared_logs: Path, name: str) -> None:
     run = icrtool.fit(icrtool.read_log(shared_logs / name, config), config)
     fast: dict[str, list[np.ndarray]] = {}
     report = dropout(run, starts="all", sink=lambda model, _, errors: fast.setdefault(model, []).append(errors.copy()))
-    drive = drive_of(run)
+    drive = track_of(run)
     ends = np.array(trial_ends(drive, report.horizons_m), order="F")
     furthest = ends.max(axis=1)
     steps = float((furthest - np.arange(len(ends)))[furthest >= 0].sum())

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from icrtool.dropout_analysis.straight_and_turning import CELLS, STRAIGHT_RAD, heading_range
-from icrtool.kernels.open_loop.trials import Drive
+from icrtool.kernels.track import Track
 
 HORIZON_M, STEP_M = 5.0, 0.6
 
 
-def drive_along(distance: np.ndarray, heading: np.ndarray) -> Drive:
-    one, no = np.ones(len(distance)), np.zeros(len(distance), np.bool_)
-    return Drive(one, one, one, 0 * one, 0 * one, heading, distance, no, no.copy(), no.copy())
+def drive_along(distance: np.ndarray, heading: np.ndarray) -> Track:
+    one = np.ones(len(distance))
+    return Track.of_states(np.cumsum(one), one, one, one, 0 * one, 0 * one, heading, distance)
 
 
 @pytest.mark.parametrize("seed", range(5))

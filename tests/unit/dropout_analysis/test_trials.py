@@ -19,7 +19,7 @@ from icrtool.dropout_analysis.trials import Model, dropout, models_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
 from icrtool.kernels.open_loop.trials import FrozenIcrs
-from icrtool.records.run import ICR_COLUMNS, Run, drive_of
+from icrtool.records.run import ICR_COLUMNS, Run, track_of
 from support.contract import SUMMARY_COLUMNS
 
 EQUAL_M = 1e-9
@@ -47,7 +47,7 @@ def changed(run: Run, **columns) -> Run:
 
 def test_every_single_error_equals_brute_force_for_all_models(run: Run) -> None:
     _, errors = gathered(run)
-    drive, horizons = drive_of(run), np.array(HORIZONS_M)
+    drive, horizons = track_of(run), np.array(HORIZONS_M)
     ends = trial_ends(drive, horizons)
     assert [model.name for model in models_of(run)] == ["icr", "no_slip", "icr_final"]
     for model in models_of(run):

@@ -15,7 +15,7 @@ from icrtool.kernels.open_loop.direct import trial_ends
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.events import SlipEvent
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 from support.drives import make_log
 
 HORIZONS_M = (1.0, 5.0, 10.0)
@@ -39,7 +39,7 @@ def test_only_trials_across_an_event_are_left_out(run: Run) -> None:
     assert cost is not None
     assert cost.events == 1
     t = run.table.t_s
-    ends = trial_ends(drive_of(run), np.array(HORIZONS_M))
+    ends = trial_ends(track_of(run), np.array(HORIZONS_M))
     for h, horizon in enumerate(HORIZONS_M):
         last = t[np.maximum(ends[:, h], 0)]
         crossing = (ends[:, h] >= 0) & (t < EVENT_S[1]) & (last > EVENT_S[0])

@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest
 
 from icrtool.estimation.fit import fit
-from icrtool.estimation.icr_uncertainty import cut_drive
+from icrtool.estimation.icr_uncertainty import cut_states
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 from support.exact_drives import CONFIG, simulate
 
 
 def excitation_of(run: Run) -> Excitation:
-    drive = drive_of(run)
-    windows = cut_drive(run.table, drive, nominal_icrs(run.table, run.track_width_m))
+    drive = track_of(run)
+    windows = cut_states(run.table, drive, nominal_icrs(run.table, run.track_width_m))
     return find_excitation(run.table, drive, run.track_width_m, windows)
 
 

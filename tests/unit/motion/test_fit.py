@@ -12,6 +12,7 @@ from icrtool.calibration.held_out import hold_out
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import LOSS_SIGMAS
+from icrtool.kernels.track import Track
 from icrtool.motion.fit import SETTLED, Fold, Pool, PooledFit, WindowResiduals, own_constants
 from icrtool.motion.models import FAMILY, TERMS, FittedModel, MotionModel, find_model, twist, wheel_motion
 from icrtool.motion.recording import LogConstants, Recording, cut_windows
@@ -73,15 +74,15 @@ def test_window_ends_equal_the_direct_integration() -> None:
     parameters = draw_parameters(EIGHT, np.random.default_rng(2))
     recording = make_recording(EIGHT, parameters, seconds=60.0)
     trials = trials_from_all(recording, (5.0, 10.0))
-    path, drive = predicted_path(recording, fitted(EIGHT, parameters)), recording.drive
+    path, drive = predicted_path(recording, fitted(EIGHT, parameters)), recording.track
     errors = table_errors(recording, trials, path)
     rates = twist(EIGHT, parameters, wheel_motion(drive.v_left, drive.v_right, WIDTH_M))
     for start in range(0, 300, 50):
         end, north, east, psi = trials.ends[start, 1], 0.0, 0.0, drive.heading[start]
         for i in range(start, end):
-            north += drive.dt_s[i] * (rates[0, i] * np.cos(psi) - rates[1, i] * np.sin(psi))
-            east += drive.dt_s[i] * (rates[0, i] * np.sin(psi) + rates[1, i] * np.cos(psi))
-            psi += drive.dt_s[i] * rates[2, i]
+            north += drive.held[i] * (rates[0, i] * np.cos(psi) - rates[1, i] * np.sin(psi))
+            east += drive.held[i] * (rates[0, i] * np.sin(psi) + rates[1, i] * np.cos(psi))
+            psi += drive.held[i] * rates[2, i]
         miss = np.hypot(north - drive.north[end] + drive.north[start], east - drive.east[end] + drive.east[start])
         assert errors[start, 1] == pytest.approx(miss, abs=ROUNDING_M)
 
@@ -94,9 +95,9 @@ def count_within(model: MotionModel, seeds: range, *, gyro: bool = False) -> tup
         parameters = draw_parameters(model, rng)
         made = make_recording(model, parameters, seed, gyro=gyro)
         found, truth = fit_to(model, made), dict(zip(model.terms, parameters, strict=True))
-        if made.gyro_radps is not None:
+        if made.track.gyro is not None:
             truth["gyro_scale"] = rng.normal(0.0, TERMS["gyro_scale"].std)
-            scaled = replace(made, gyro_radps=made.gyro_radps / (1.0 + truth["gyro_scale"]))
+            scaled = replace(made, track=made.track._replace(gyro=made.track.gyro / (1.0 + truth["gyro_scale"])))
             pool = Pool([cut_windows(scaled)], [WIDTH_M])
             found = pool.fit(model.with_gyro(), pool.fit(model))
         # the weight of the wheels is no property of the robot
@@ -145,8 +146,8 @@ def test_two_standard_deviations_hold_where_the_robot_changes_between_recordings
 def test_pooled_recordings_have_constants_of_their_own() -> None:
     parameters = FAMILY["five"].prior_mean
     one, two = make_recording(FAMILY["five"], parameters, 1), make_recording(FAMILY["five"], parameters, 2)
-    turned = two.drive._replace(heading=two.drive.heading + 0.03)
-    late = Recording("late", two.t_s, turned, None, WIDTH_M)
+    turned = two.track._replace(heading=two.track.heading + 0.03)
+    late = Recording("late", turned, WIDTH_M)
     found = fit_to(FAMILY["five"], one, late)
     assert found.constants(0).heading_offset_rad == pytest.approx(0.0, abs=0.01)
     # the reference's heading is too large: what is added to it is negative
@@ -200,7 +201,7 @@ def test_a_pooled_fit_is_that_of_the_dense_least_squares() -> None:
 def test_what_is_left_beside_a_fold_is_not_enough() -> None:
     short = make_recording(EIGHT, EIGHT.prior_mean, seconds=60.0)
     found = fit_to(EIGHT, short)
-    assert found.without(Fold("", 0, 0, 5.0, float(short.drive.distance[-1]))) is None
+    assert found.without(Fold("", 0, 0, 5.0, float(short.track.distance[-1]))) is None
 
 
 def test_joined_steps_give_the_parameters_of_single_samples() -> None:
@@ -217,12 +218,11 @@ def test_a_drive_too_short_is_an_error() -> None:
 def test_a_delay_of_the_wheels_is_found_and_used() -> None:
     model = FAMILY["five"]
     made = make_recording(model, model.prior_mean, 5, slip=0.0, noise_rad=0.0)
-    shift = 2
-    d = made.drive
-    pose = {name: np.roll(getattr(d, name), -shift)[:-shift] for name in ("north", "east", "heading", "distance")}
-    others = {name: getattr(d, name)[:-shift] for name in d._fields if name not in pose}
+    shift, d = 2, made.track
     # the poses are those of 0.2 s later: the wheels are to be read later
-    moved = Recording("late", made.t_s[:-shift], type(d)(**others, **pose), None, WIDTH_M)
+    pose = (getattr(d, name)[shift:] for name in ("north", "east", "heading", "distance"))
+    wheels = (getattr(d, name)[:-shift] for name in ("t", "held", "v_left", "v_right"))
+    moved = Recording("late", Track.of_states(*wheels, *pose), WIDTH_M)
     found = fit_to(model, moved)
     assert found.constants(0).wheels_later_s == pytest.approx(0.2, abs=0.02)
     trials = cut_trials(moved, (10.0,))
@@ -237,9 +237,9 @@ def test_a_gyro_read_at_another_time_than_the_wheels_is_found() -> None:
     """Without its own time, the heading of a gyro 0.15 s apart is off by that time's turn at every start and end."""
     model = FAMILY["five"]
     made = make_recording(model, model.prior_mean, 6, gyro=True, rate=20.0)
-    assert made.gyro_radps is not None
+    assert made.track.gyro is not None
     shift = 3
-    late = replace(made, gyro_radps=np.roll(made.gyro_radps, shift))
+    late = replace(made, track=made.track._replace(gyro=np.roll(made.track.gyro, shift)))
     pool = Pool([cut_windows(late)], [WIDTH_M])
     found = pool.fit(model.with_gyro(), pool.fit(model))
     assert found.constants(0).gyro_later_s == pytest.approx(shift / 20.0, abs=0.03)
@@ -258,11 +258,11 @@ def test_a_poor_gyro_gives_way_to_the_wheels() -> None:
     keep = np.exp(-0.1 / 5.0)
     poor = []
     for one in logs:
-        assert one.gyro_radps is not None
-        drift = np.zeros(len(one.t_s))
+        assert one.track.gyro is not None
+        drift = np.zeros(len(one.track.t))
         for k in range(1, len(drift)):
             drift[k] = keep * drift[k - 1] + rng.normal(0.0, 0.05 * np.sqrt(1.0 - keep**2))
-        poor.append(replace(one, gyro_radps=one.gyro_radps + drift))
+        poor.append(replace(one, track=one.track._replace(gyro=one.track.gyro + drift)))
     table = hold_out(poor)
     weight = table.fits["five_gyro"].parameters[-1]
     assert 0.5 < weight < 1.2

@@ -27,7 +27,7 @@ from icrtool.output.exports.geojson import format_geojson
 from icrtool.output.exports.kml import GX, KML, format_kml
 from icrtool.output.exports.paths import paths_of
 from icrtool.output.exports.trajectories import format_trajectory
-from icrtool.records.run import Run, drive_of
+from icrtool.records.run import Run, track_of
 from support.barn import BAD_FIXES, OUTAGE_S
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
@@ -106,9 +106,9 @@ def test_the_yaw_of_the_odometry_points_along_its_path(run: Run) -> None:
     """Without slip a robot moves where it points; x_icr is zero in that model."""
     path = paths_of(run)[-1]
     assert path.name == "no_slip"
-    drive = drive_of(run)
+    drive = track_of(run)
     steps = np.diff(path.x_m) + 1j * np.diff(path.y_m)
-    along = (np.abs(steps) > 0.005) & ~drive.gap[:-1]
+    along = (np.abs(steps) > 0.005) & (drive.held[:-1] > 0.0)
     assert np.count_nonzero(along) > 1000
     assert np.abs(np.angle(steps[along] / np.exp(1j * path.yaw_rad[:-1][along]))).max() < 1e-6
 
@@ -187,7 +187,7 @@ def test_the_geojson_holds_states_fixes_events_and_outages(slipping: Run) -> Non
     assert uses.count("rejected") == BAD_FIXES
     assert len(uses) == len(slipping.sensors.fixes.stamp_ns)
 
-    table, drive = slipping.table, drive_of(slipping)
+    table, drive = slipping.table, track_of(slipping)
     row_of = {stamp: row for row, stamp in enumerate(table.stamp_ns.tolist())}
     rows = [row_of[state["properties"]["stamp_ns"]] for state in layers["state"]]
     assert len(rows) > 100
@@ -278,8 +278,8 @@ def test_the_mcap_holds_fixes_icrs_errors_and_events(slipping: Run, mcap_file: P
     assert icrs.y_icr_left_plus_std_m == icrs.y_icr_left_m + icrs.std_y_icr_left_m
     assert [event.kind for event in messages["/events"]] == ["slip", "none"]
     assert [event.kind for event in messages["/outages"]] == ["outage", "none"]
-    ends = trial_ends(drive_of(slipping), np.array([10.0]))
-    direct = open_loop_errors_direct(drive_of(slipping), models_of(slipping)[1].icrs, ends)[:, 0]
+    ends = trial_ends(track_of(slipping), np.array([10.0]))
+    direct = open_loop_errors_direct(track_of(slipping), models_of(slipping)[1].icrs, ends)[:, 0]
     stamps = {stamp: row for row, stamp in enumerate(table.stamp_ns.tolist())}
     for one in messages["/open_loop_error"]:
         row = stamps[one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec]

@@ -9,16 +9,14 @@ import pytest
 from icrtool.kernels.open_loop import direct as open_loop
 from icrtool.kernels.open_loop import prefix_sums as open_loop_fast
 from icrtool.kernels.open_loop.direct import (
-    GAP,
-    OUTAGE,
-    SHORT,
     count_trials,
     open_loop_errors_direct,
     open_loop_path,
     trial_ends,
 )
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import Drive, FrozenIcrs
+from icrtool.kernels.open_loop.trials import FrozenIcrs
+from icrtool.kernels.track import GAP, OUTAGE, SHORT, Track
 
 EQUAL_M = 1e-9  # what the fast algorithm promises against the direct integration
 ROUNDING = 1e-12  # two orders of the same few hundred additions of metres and radians
@@ -41,10 +39,9 @@ def make_drive(v_left, v_right, icrs, dt=0.01, north0=0.0, east0=0.0, heading0=0
     heading = heading0 + integral(omega)
     north = north0 + integral(v_x * np.cos(heading) - v_y * np.sin(heading))
     east = east0 + integral(v_x * np.sin(heading) + v_y * np.cos(heading))
-    none = np.zeros(n, dtype=bool)
-    distance = integral(np.hypot(v_x, v_y))
-    flags = none, none.copy(), none.copy()
-    return Drive(dt_s, v_left.copy(), v_right.copy(), north, east, heading, distance, *flags)
+    distance, t = integral(np.hypot(v_x, v_y)), integral(np.ones(n))
+    dt_s[-1:] = 0.0
+    return Track.of_states(t, dt_s, v_left.copy(), v_right.copy(), north, east, heading, distance)
 
 
 def winding_drive(n=1500, dt=0.02, seed=0):
@@ -74,7 +71,7 @@ def plain_ends(drive, horizons, kinds=(SHORT, GAP, OUTAGE)):
             far = [j for j in range(k, n) if drive.distance[j] - drive.distance[k] >= horizon]
             if not far:
                 ends[k, h] = short
-            elif drive.gap[k : far[0]].any():
+            elif (drive.held[k : far[0]] == 0.0).any():
                 ends[k, h] = gap
             else:
                 ends[k, h] = outage if drive.in_outage[far[0]] else far[0]
@@ -88,7 +85,7 @@ def plain_errors(drive, icrs, ends):
         y_r, y_l, x = (float(column[k if len(column) > 1 else 0]) for column in icrs)
         north, east, psi = float(drive.north[k]), float(drive.east[k]), float(drive.heading[k])
         for i in range(k, ends[k, h]):
-            dt, v_l, v_r = float(drive.dt_s[i]), float(drive.v_left[i]), float(drive.v_right[i])
+            dt, v_l, v_r = float(drive.held[i]), float(drive.v_left[i]), float(drive.v_right[i])
             omega = (v_l - v_r) / abs(y_l - y_r)
             v_x = (v_l * y_r - v_r * y_l) / abs(y_l - y_r)
             v_y = -omega * x
@@ -101,7 +98,7 @@ def plain_errors(drive, icrs, ends):
 
 def troubled_drive():
     drive, icrs = winding_drive(n=260, dt=0.05)
-    drive.gap[[77, 150]] = True
+    drive.held[[77, 150]] = 0.0
     drive.in_outage[100:120] = True
     return drive, icrs
 
@@ -147,7 +144,7 @@ def test_last_window_ends_exactly_on_the_last_state():
 def test_gap_or_outage_at_the_border_of_a_window_counts_where_it_is_inside():
     speed = np.full(6, 1.0)
     drive = make_drive(speed, speed, NO_SLIP, dt=0.25)
-    drive.gap[2] = True  # between the states 2 and 3
+    drive.held[2] = 0.0  # a gap between the states 2 and 3
     drive.in_outage[5] = True
     assert trial_ends(drive, np.array([0.5])).ravel().tolist() == [2, GAP, GAP, OUTAGE, SHORT, SHORT]
 
@@ -181,7 +178,7 @@ def test_the_model_that_drove_makes_no_error():
 @pytest.mark.parametrize("seed", [0, 1])
 def test_fast_equals_direct_over_many_blocks_tiles_and_ranges(monkeypatch, seed):
     drive, icrs = winding_drive(n=7000, seed=seed)
-    drive.gap[::1777] = True
+    drive.held[::1777] = 0.0
     ends = trial_ends(drive, HORIZONS)
     direct = open_loop_errors_direct(drive, icrs, ends)
     np.testing.assert_allclose(open_loop_errors(drive, icrs, ends), direct, rtol=0.0, atol=EQUAL_M)
@@ -260,12 +257,13 @@ def test_path_begins_at_the_reference_and_ends_as_far_off_as_the_error_says():
     assert miss == pytest.approx(errors[start, 0], abs=EQUAL_M)
 
 
-def test_read_only_strided_and_integer_columns_are_taken():
+def test_read_only_and_strided_columns_are_taken():
     drive, icrs = winding_drive(n=400)
     expected = open_loop_errors(drive, icrs, trial_ends(drive, HORIZONS))
-    table = np.stack(drive[:7], axis=1)
+    names = ("t", "held", "v_left", "v_right", "north", "east", "heading", "distance")
+    table = np.stack([getattr(drive, name) for name in names], axis=1)
     table.flags.writeable = False
-    odd = Drive(*table.T, drive.gap.astype(int), drive.in_outage.tolist(), drive.jump)
+    odd = Track.of_states(*table.T)
     np.testing.assert_array_equal(open_loop_errors(odd, icrs, trial_ends(odd, HORIZONS)), expected)
 
 
@@ -274,7 +272,7 @@ class TestKernelsAgainstTheirPythonFunction:
         drive, icrs = troubled_drive()
         ends = np.ascontiguousarray(trial_ends(drive, HORIZONS).T)
         errors = np.full(ends.shape, np.nan)
-        open_loop.integrate_trials.py_func(drive, icrs, ends, 0, 0, 260, errors)
+        open_loop.integrate_trials.py_func(open_loop.compiled_columns(drive), icrs, ends, 0, 0, 260, errors)
         np.testing.assert_allclose(errors.T, open_loop_errors_direct(drive, icrs, ends.T), rtol=0.0, atol=ROUNDING)
 
     def test_fast_algorithm(self, monkeypatch):

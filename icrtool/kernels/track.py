@@ -1,0 +1,190 @@
+"""Wheels and reference of one drive along time, and windows of driven distance cut from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self, TypeVar
+
+import numpy as np
+
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.kernels.equal_steps import rows_at_steps
+
+Rate = TypeVar("Rate", Floats, Complexes)
+
+LONGEST_DELAY_S = 1.0
+"""Of the wheels against the reference."""
+
+SHORT, GAP, OUTAGE, STANDING, JUMP = -1, -2, -3, -4, -5
+"""No row is so far away: the drive ends before; a gap in the wheel data, no reference there, the robot stands at the
+start and another start counts for this standstill, the reference jumps in between."""
+
+BEFORE = 1.0 - 2.0**-51
+"""Of a path length: less than rounding may add to it."""
+
+
+class Track(NamedTuple):
+    """Wheels and reference of one drive, each on its own clock, seconds since any one epoch.
+
+    Of recorded states (`Track.of_states`) all clocks are the same, and every column has a row for each state.
+
+    Attributes
+    ----------
+    t : (n,) begin of each wheel sample; held : (n,) how long it holds [s], 0 over gaps and for the last one
+    v_left, v_right : (n,) [m/s], held so long
+    place_t : (m,); north, east : (m,) position of the reference [m]
+    heading_t : (h,); heading : (h,) of the reference [rad], unwrapped, clockwise from north
+    distance : (m,) path length at the positions [m], non-decreasing
+    in_outage : (m,) positions that are no reference to compare with
+    jump, slipping : (m,) intervals after a position in which the reference jumps, or that lie in a slip event
+    gyro : (n,) turn rate while a wheel sample holds [rad/s], read when the reference turns; None without one
+    into : share of a wheel sample's time at which its heading is taken: 0 of Euler steps, (k - 1) / 2k of k joined ones
+    place_std_m : noise of the positions, an axis; 0 where it is not asked for
+    same_clock : position and heading are fields of the same messages
+    """
+
+    t: Floats
+    held: Floats
+    v_left: Floats
+    v_right: Floats
+    place_t: Floats
+    north: Floats
+    east: Floats
+    heading_t: Floats
+    heading: Floats
+    distance: Floats
+    in_outage: Bools
+    jump: Bools
+    slipping: Bools
+    gyro: Floats | None = None
+    into: float = 0.0
+    place_std_m: float = 0.0
+    same_clock: bool = True
+
+    @classmethod
+    def of_states(
+        cls, t: Floats, held: Floats, v_left: Floats, v_right: Floats, north: Floats, east: Floats, heading: Floats,
+        distance: Floats, *, in_outage: Bools | None = None, jump: Bools | None = None, slipping: Bools | None = None,
+    ) -> Self:  # fmt: skip
+        """Return the track of states, every column (n,); no flags: there are none."""
+        outage, jumps, slips = (
+            np.zeros(len(t), np.bool_) if one is None else one for one in (in_outage, jump, slipping)
+        )
+        return cls(t, held, v_left, v_right, t, north, east, t, heading, distance, outage, jumps, slips)
+
+    @property
+    def gap_t(self) -> Floats:
+        """Begins of the gaps in the wheel data (g,) [s]."""
+        return np.asarray(self.t[:-1][self.held[:-1] == 0.0])
+
+    @property
+    def travel(self) -> Floats:
+        """Mean distance of the sides until each wheel sample (n,) [m], forward or not."""
+        speed = np.abs(self.v_left)
+        speed += np.abs(self.v_right)
+        speed /= 2.0
+        return self.cumulate(speed)
+
+    def cumulate(self, rate: Rate) -> Rate:
+        """Return the integral of a rate (n,) until each wheel sample (n,)."""
+        by_sample = rate * self.held
+        sums = np.zeros_like(by_sample)
+        np.cumsum(by_sample[:-1], out=sums[1:])
+        return sums
+
+    def wheels(self, rows: slice) -> Self:
+        """Return the track with some of its wheel samples."""
+        gyro = None if self.gyro is None else self.gyro[rows]
+        left, right = self.v_left[rows], self.v_right[rows]
+        return self._replace(t=self.t[rows], held=self.held[rows], v_left=left, v_right=right, gyro=gyro)
+
+    def around(self, begin_s: float, end_s: float) -> Self:
+        """Return the track with the wheel samples from a begin to an end, and of a little more for delays."""
+        edges = [begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S]
+        first, stop = np.searchsorted(self.t, edges, side="right").tolist()
+        return self.wheels(slice(max(first - 1, 0), stop))
+
+    def joined(self, first: Ints, into: float = 0.0) -> Self:
+        """Return the track with the wheel samples from each row in `first` on joined to one: means over their time."""
+        held = np.add.reduceat(self.held, first)
+
+        def mean(column: Floats, over_gaps: Floats) -> Floats:
+            total = np.add.reduceat(self.held * column, first)
+            return np.divide(total, held, out=over_gaps, where=held > 0.0)
+
+        left, right = (mean(speed, speed[first].copy()) for speed in (self.v_left, self.v_right))
+        gyro = None if self.gyro is None else mean(self.gyro, np.zeros(len(first)))
+        return self._replace(t=self.t[first], held=held, v_left=left, v_right=right, gyro=gyro, into=into)
+
+    def gyro_change(self, some: slice = slice(None)) -> Floats:
+        """Return the change of the gyro's turn rate by time [rad/s^2], of some wheel samples (n,); 0 without a gyro."""
+        rows = np.arange(*some.indices(len(self.t)))
+        if self.gyro is None:
+            return np.zeros(len(rows))
+        before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(self.t) - 1)
+        apart = (self.t[after] + self.held[after] / 2.0) - (self.t[before] + self.held[before] / 2.0)
+        risen = self.gyro[after] - self.gyro[before]
+        return np.divide(risen, apart, out=np.zeros(len(rows)), where=apart > 0.0)
+
+
+class Cut(NamedTuple):
+    """Windows of driven distance: rows of the positions at begin and end (w,), and their nominal length (w,) [m]."""
+
+    begin: Ints
+    end: Ints
+    length_m: Floats
+
+
+def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Cut:
+    """Cut a drive into windows of driven distance; none crosses a gap, a jump or a slip event, or ends in an outage.
+
+    Parameters
+    ----------
+    every_m : a window of each length starts every so much distance
+    """
+    lengths, begins = np.asarray(lengths_m, np.float64), rows_at_steps(track.distance, every_m)
+    begins = begins[~track.in_outage[begins]]
+    ends = ends_from(track, lengths, begins)
+    column, row = np.nonzero(ends.T >= 0)
+    found = Cut(begins[row], ends[row, column], lengths[column])
+    quiet = _before(track.slipping, found.begin) == _before(track.slipping, found.end)
+    return Cut(*(values[quiet] for values in found))
+
+
+def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Ints:
+    """Return the row of the positions at which each distance ends, from some rows (k,) on, ascending.
+
+    Parameters
+    ----------
+    horizons_m : (h,) distances [m] in any order
+
+    Returns
+    -------
+    int64 (k, h), one horizon contiguous: the first row j with ``distance[j] - distance[start] >= horizon``, or `SHORT`,
+    `GAP`, `OUTAGE`, `JUMP`.
+    """
+    distance, rows = np.asarray(track.distance, np.float64), len(track.distance)
+    ends = np.empty((len(horizons_m), len(starts)), np.int64)
+    begin, gap_t = distance[starts], track.gap_t
+    gaps = np.searchsorted(gap_t, track.place_t[starts])
+    for end, horizon in zip(ends, horizons_m, strict=True):
+        # the sum may be rounded up: begin the search a little before it
+        end[:] = np.searchsorted(distance, (begin + horizon) * BEFORE)
+        while True:
+            last, inside = np.minimum(end, rows - 1), end < rows
+            short = np.flatnonzero(inside & (distance[last] - begin < horizon))
+            if not len(short):
+                break
+            end[short] = np.searchsorted(distance, distance[end[short]], side="right")
+        end[inside & track.in_outage[last]] = OUTAGE
+        if len(gap_t):
+            end[inside & (np.searchsorted(gap_t, track.place_t[last]) > gaps)] = GAP
+        end[~inside] = SHORT
+    if track.jump.any():
+        ends[(ends >= 0) & (_before(track.jump, ends) > _before(track.jump, starts))] = JUMP
+    return ends.T
+
+
+def _before(flags: Bools, rows: Ints) -> Ints:
+    """Return how many of the flags (m,) are set before each row."""
+    return np.searchsorted(np.flatnonzero(flags), rows)
