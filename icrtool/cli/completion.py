@@ -108,6 +108,8 @@ def _topics(logs: object) -> tuple[str, ...]:
 
     topics: set[str] = set()
     for log in logs if isinstance(logs, tuple | list) else ():
+        if log == "-":
+            continue  # a completion must not wait for its input
         try:
             container = open_log(Path(log))
         except IcrToolError:

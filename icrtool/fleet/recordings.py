@@ -12,13 +12,16 @@ from typing import NamedTuple
 
 from icrtool.errors import LogError
 from icrtool.fleet.row import as_text
-from icrtool.logs.containers.one_recording import LEAST_OVERLAP_S, STORAGE, natural_order, storage_files
+from icrtool.logs.containers.one_recording import (
+    LEAST_OVERLAP_S,
+    LOG_SUFFIXES,
+    is_bag_directory,
+    natural_order,
+    unpacked_name,
+)
 from icrtool.logs.containers.open_log import container_of, open_log
 from icrtool.logs.containers.split_files import NumberedFile, log_name, numbered_file, split_files, split_path
 from icrtool.logs.containers.sqlite_bag import SqliteBag
-
-LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
-"""A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
 
 RUN_FILE = "run.json"
 
@@ -184,7 +187,7 @@ def is_recording(file: Path) -> bool:
     """Return whether a file is a recording: by its first bytes, or by a recorder's suffix."""
     if not file.is_file():
         return False
-    if file.suffix in LOG_SUFFIXES:
+    if Path(unpacked_name(file.name)).suffix in LOG_SUFFIXES:
         return True
     try:
         with file.open("rb") as stream:
@@ -197,22 +200,6 @@ def is_recording(file: Path) -> bool:
             return b"messages" in first and b"topics" in first
     except OSError:
         return False
-
-
-def is_bag_directory(folder: Path) -> bool:
-    """Return whether a folder is one ROS 2 recording: it has metadata.yaml, or holds the files of one split alone."""
-    if (folder / "metadata.yaml").is_file():
-        return any(STORAGE.search(entry.name) for entry in folder.iterdir())
-    try:
-        files = storage_files(folder)
-    except (LogError, OSError):
-        return False
-    # The recorder counts its files up: bag_0, bag_1, … A packed file can be read as part of a directory only.
-    stems = [file.name.split(".")[0].rpartition("_") for file in files]
-    numbers = [int(number) if stem and number.isdecimal() else -1 for stem, _, number in stems]
-    counted = len({stem for stem, _, _ in stems}) == 1 and all(b == a + 1 for a, b in pairwise(numbers))
-    packed = files[0].suffix not in LOG_SUFFIXES
-    return packed or (len(files) > 1 and counted and min(numbers) >= 0)
 
 
 def _search(folder: Path) -> Iterable[Path]:

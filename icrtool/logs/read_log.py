@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
@@ -17,7 +17,7 @@ from icrtool.errors import DataError, DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.split_files import file_sha256, log_name
+from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.collectors import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
@@ -100,17 +100,17 @@ def survey_log(
     config = config if config is not None else Config()
     path = Path(path)
     begin, stop = moment(start, "start"), moment(end, "end")
-    container = open_log(path)
+    container = open_log(path, progress)
     ended = Event()
     try:
         with ThreadPoolExecutor(1) as pool:
             try:
-                hashes = [pool.submit(file_sha256, file, ended) for file in container.files]
+                inputs = pool.submit(container.inputs, ended)
                 cut = cut_of(container, begin, stop, path)
                 tables, unread = _collect(container, config, progress, cut)
                 problems = tuple(container.problems)
                 candidates = find_candidates(tables, config, unread)
-                inputs = tuple(_input_of(file, pending) for file, pending in zip(container.files, hashes, strict=True))
+                inputs.result()
             except BaseException:
                 # The pool waits for its threads before it passes on Ctrl-C or an error.
                 ended.set()
@@ -126,7 +126,7 @@ def survey_log(
         tables=tuple(tables),
         candidates=candidates,
         problems=problems,
-        inputs=inputs,
+        inputs=inputs.result(),
     )
 
 
@@ -149,8 +149,9 @@ def read_log(
 
     Parameters
     ----------
-    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``; ``drive_{0..3}.bag`` for the files of a split
-        recording; or a ``.csv`` of `icrtool.records.frames`
+    path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``, each also compressed or in an archive; ``-`` for
+        standard input; ``drive_{0..3}.bag`` for the files of a split recording; or a ``.csv`` of
+        `icrtool.records.frames`
     config : topics, robot and frames; default: all found by type and content
     progress : called with the share of the bytes that are read, 0 to 1
     start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
@@ -304,10 +305,6 @@ def _collect(
 
 def _empty_table(channel: Channel) -> TopicTable:
     return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0)
-
-
-def _input_of(file: Path, pending: Future[str]) -> InputFile:
-    return InputFile(str(file), file.stat().st_size, pending.result())
 
 
 def _stream(

@@ -127,8 +127,7 @@ def log_of(run: Run) -> Path:
         beside = {file for file in folder.iterdir() if file.suffix == files[0].suffix}
         if files[0].suffix == ".bag" or (beside != set(files) and not (folder / "metadata.yaml").is_file()):
             return split_path(files)
-    packed = files[0].suffix in {".zstd", ".zst"}
-    return folder if len(files) > 1 or packed or (folder / "metadata.yaml").is_file() else files[0]
+    return folder if len(files) > 1 or (folder / "metadata.yaml").is_file() else files[0]
 
 
 def newest_run(runs: Path) -> Path:

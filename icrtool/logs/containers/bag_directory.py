@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.containers.channel import CUT_OFF, WHOLE, Block, Channel, Container, Cut, Problems, some_of
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATIO
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems, some_of
 from icrtool.logs.containers.mcap_file import McapFile
-from icrtool.logs.containers.one_recording import Span, check_spans, storage_files
+from icrtool.logs.containers.one_recording import Span, check_spans, storage_files, unpacked_name
 from icrtool.logs.containers.ros1_bag import Ros1Bag
+from icrtool.logs.containers.split_files import inputs_of
 from icrtool.logs.containers.sqlite_bag import SqliteBag
-from icrtool.records import unfinished
+from icrtool.logs.containers.unpack import ScratchFolder, unpack
+from icrtool.records.samples import InputFile
 
 _LARGEST_METADATA_BYTES, _DEEPEST = 1 << 18, 20
 """Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""
@@ -53,7 +53,7 @@ class BagDirectory:
     def __init__(self, path: Path, files: Sequence[Path] = ()) -> None:
         self._path = path
         self.own_problems = Problems(path.name)
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch: ScratchFolder | None = None
         self._parts: list[Container] = []
         self._by_name = False
         self._reading = 0
@@ -78,6 +78,10 @@ class BagDirectory:
         """What could not be read, of the directory and of each file."""
         return self.own_problems + [problem for part in self._parts for problem in part.problems]
 
+    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
+        """Return the files with their SHA-256."""
+        return inputs_of(self.files, ended)
+
     def share_read(self) -> float:
         """Return the mean over the files, which are read one after the other."""
         return (self._reading + self._parts[self._reading].share_read()) / len(self._parts)
@@ -87,8 +91,7 @@ class BagDirectory:
         for part in self._parts:
             part.close()
         if self._scratch is not None:
-            self._scratch.cleanup()
-            unfinished.end(Path(self._scratch.name))
+            self._scratch.close()
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return first and last log time of all files, None where one of them has no index."""
@@ -141,7 +144,7 @@ class BagDirectory:
 
     def _find_files(self, names: tuple[str, ...]) -> list[Path]:
         """Return the files that metadata.yaml names and that are there; all storage files where it names none."""
-        named = [self._path / name for name in dict.fromkeys(Path(name).name for name in names)]
+        named = list(dict.fromkeys(self._there(Path(name).name) for name in names))
         there = [file for file in named if os.path.isfile(file)]  # noqa: PTH113 - also of a name that is too long
         if len(there) < len(named):
             found = frozenset(there)
@@ -152,9 +155,14 @@ class BagDirectory:
         self._by_name = True
         return storage_files(self._path)
 
+    def _there(self, name: str) -> Path:
+        """Return the path of a file that metadata.yaml names; of one that was unpacked since, without that suffix."""
+        file, unpacked = self._path / name, self._path / unpacked_name(name)
+        return unpacked if not os.path.isfile(file) and os.path.isfile(unpacked) else file  # noqa: PTH113 - as below
+
     def _open_part(self, file: Path, message_compression: str) -> None:
         try:
-            storage = self._unpacked(file) if file.suffix in (".zstd", ".zst") else file
+            storage = file if unpacked_name(file.name) == file.name else self._unpacked(file)
             self._parts.append(_part(storage, message_compression))
             self.files.append(file)
         except LogError as err:
@@ -163,37 +171,15 @@ class BagDirectory:
             self.own_problems.add(f"{file.name}: cannot be read; {err.strerror}")
 
     def _unpacked(self, file: Path) -> Path:
-        """Decompress a storage file to a temporary folder, a piece at a time."""
-        import zstandard
-
+        """Decompress a storage file to a temporary folder."""
         if self._scratch is None:
-            self._scratch = tempfile.TemporaryDirectory(prefix="icrtool-")
-            unfinished.begin(Path(self._scratch.name))
-        folder = Path(self._scratch.name) / str(len(self.files))
+            self._scratch = ScratchFolder()
+        folder = self._scratch.path / str(len(self.files))
         folder.mkdir(exist_ok=True)
-        target = folder / file.stem
-        left = LARGEST_CHUNK_BYTES + LARGEST_RATIO * file.stat().st_size
-        try:
-            with (
-                file.open("rb") as source,
-                zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True) as reader,
-                target.open("wb") as sink,
-            ):
-                while left > 0 and (piece := reader.read(1 << 20)):
-                    sink.write(piece)
-                    left -= len(piece)
-            if left <= 0:
-                self.own_problems.add(
-                    f"{file.name}: is more than {LARGEST_RATIO} times its size when decompressed; the rest was not read"
-                )
-        except zstandard.ZstdError as err:
-            if not target.stat().st_size:
-                raise LogError(file, "does not decompress", str(err)) from err
-            self.own_problems.add(f"{file.name}: {CUT_OFF} or damaged ({err}); what could be decompressed was read")
-        except OSError as err:
-            free = shutil.disk_usage(self._scratch.name).free
-            raise LogError(file, f"cannot be decompressed: {err.strerror}", f"{free} bytes are free for it") from err
-        return target
+        path, problem = unpack(file, folder)
+        if problem:
+            self.own_problems.add(f"{file.name}: {problem}")
+        return path
 
     def _merge_channels(self) -> list[Channel]:
         """Give a topic that stands in several files one number."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
+from threading import Event
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.records.samples import InputFile
 from icrtool.records.text import LogText, escaped, shortened
 
 MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
@@ -113,9 +114,8 @@ class Container(Protocol):
         """What could not be read and was left out; complete after the last block."""
         ...
 
-    @property
-    def files(self) -> Sequence[Path]:
-        """The files that make up this log."""
+    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
+        """Return the files that make up this log, with their SHA-256: of their beginning once `ended` is set."""
         ...
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:

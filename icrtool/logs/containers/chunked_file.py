@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from threading import Lock
+from threading import Event, Lock
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -24,6 +24,8 @@ from icrtool.logs.containers.decompress import (
     decompress,
 )
 from icrtool.logs.containers.record_table import Records
+from icrtool.logs.containers.split_files import inputs_of
+from icrtool.records.samples import InputFile
 
 Item = TypeVar("Item")
 
@@ -87,7 +89,6 @@ class ChunkedFile(ABC):
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.files = [path]
         self.problems = Problems(path.name)
         self._inflation = Inflation()
         self._spaces: deque[Spaces] = deque()
@@ -225,6 +226,10 @@ class ChunkedFile(ABC):
         """Return the memory of the block that was used first."""
         self._spaces.rotate(1)
         return self._spaces[0]
+
+    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
+        """Return the file with its SHA-256."""
+        return inputs_of([self._path], ended)
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""

@@ -11,7 +11,16 @@ from typing import NamedTuple
 from icrtool.errors import LogError
 from icrtool.logs.containers.channel import some_of
 
-STORAGE = re.compile(r"\.(mcap|db3)(\.zstd|\.zst)?$")
+LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
+"""A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
+
+PACKED = r"\.(?:zstd|zst|gz|lz4|bz2|xz)"
+"""What the names of compressed files end with."""
+
+_PACKED_END = re.compile(rf"{PACKED}$", re.IGNORECASE)
+_ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
+
+STORAGE = re.compile(rf"\.(mcap|db3)(?:{PACKED})?$")
 
 LONGEST_PAUSE_S = 3600.0
 """The files of a split recording follow one another without a gap. A longer gap: they are separate recordings."""
@@ -57,6 +66,21 @@ def storage_files(directory: Path) -> list[Path]:
     return found
 
 
+def is_bag_directory(folder: Path) -> bool:
+    """Return whether a folder is one ROS 2 recording: it has metadata.yaml, or holds the files of one split alone."""
+    if (folder / "metadata.yaml").is_file():
+        return any(STORAGE.search(entry.name) for entry in folder.iterdir())
+    try:
+        files = storage_files(folder)
+    except (LogError, OSError):
+        return False
+    # The recorder counts its files up: bag_0, bag_1, …
+    stems = [file.name.split(".")[0].rpartition("_") for file in files]
+    numbers = [int(number) if stem and number.isdecimal() else -1 for stem, _, number in stems]
+    counted = len({stem for stem, _, _ in stems}) == 1 and all(b == a + 1 for a, b in pairwise(numbers))
+    return len(files) > 1 and counted and min(numbers) >= 0
+
+
 def check_spans(directory: Path, spans: Sequence[Span]) -> list[str]:
     """Compare the log times of files that were found by name.
 
@@ -94,6 +118,11 @@ def _is_other_log(entry: Path) -> bool:
     if entry.is_dir():
         return (entry / "metadata.yaml").is_file()
     return entry.suffix == ".bag" and entry.is_file()
+
+
+def unpacked_name(name: str) -> str:
+    """Return a file's name without the suffixes of compression and archives: ``a.mcap`` of ``a.mcap.zst``."""
+    return _ARCHIVE_END.sub("", _PACKED_END.sub("", name))
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:

@@ -3,26 +3,92 @@
 from __future__ import annotations
 
 import stat
+import sys
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
+from threading import Event
 from typing import BinaryIO
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.bag_directory import BagDirectory
-from icrtool.logs.containers.channel import Container
+from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems
 from icrtool.logs.containers.mcap_file import McapFile, is_mcap
 from icrtool.logs.containers.ros1_bag import Ros1Bag, is_ros1_bag
-from icrtool.logs.containers.split_files import split_files
+from icrtool.logs.containers.split_files import STANDARD_INPUT, inputs_of, split_files
 from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
+from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save, unpack
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
+from icrtool.records.samples import InputFile
 
 MOST_CHANNELS = 2048
 """Topics of a log, each publisher of a ROS 1 bag by itself, that are looked at: some 0.5 ms of time each."""
 
-KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file"
+KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file, also compressed"
 
 
-def open_log(path: Path) -> Container:
-    """Return the opened container at a path.
+class UnpackedLog:
+    """A log that lies in a temporary folder, which is removed when it is closed.
+
+    Parameters
+    ----------
+    path : what the user named
+    problem : what went wrong while it was unpacked, empty for nothing
+    inputs : what was read, where that is known
+    """
+
+    def __init__(
+        self, path: Path, log: Path, scratch: ScratchFolder, problem: str = "", inputs: tuple[InputFile, ...] = ()
+    ) -> None:
+        self._path, self._scratch, self._inputs = path, scratch, inputs
+        try:
+            self._log = _plain_log(log)
+        except LogError as err:
+            # Its own path is gone when the user reads this.
+            raise LogError(path, err.why, "; ".join(filter(None, [problem, err.advice]))) from err
+        if problem:
+            _problems_of(self._log).add(problem)
+
+    @property
+    def channels(self) -> Sequence[Channel]:
+        """The topics."""
+        return self._log.channels
+
+    @property
+    def problems(self) -> Sequence[str]:
+        """What could not be read."""
+        return self._log.problems
+
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
+        """Yield the messages of the wanted channels."""
+        try:
+            yield from self._log.blocks(wanted, cut)
+        except LogError as err:
+            raise LogError(self._path, err.why, err.advice) from err
+
+    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
+        """Return the file that the user named, with its SHA-256."""
+        return self._inputs or inputs_of([self._path], ended)
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return first and last log time."""
+        return self._log.span_ns()
+
+    def share_read(self) -> float:
+        """Return the share of the log that has been read."""
+        return self._log.share_read()
+
+    def close(self) -> None:
+        """Release files, and remove what was unpacked."""
+        self._log.close()
+        self._scratch.close()
+
+
+def open_log(path: Path, share: Callable[[float], None] | None = None) -> Container:
+    """Return the opened container at a path; ``-``: of what comes on standard input.
+
+    Parameters
+    ----------
+    share : called with the share of a packed log that was unpacked
 
     Raises
     ------
@@ -30,23 +96,60 @@ def open_log(path: Path) -> Container:
         The path does not exist, the file is empty, is not a known container, or nothing in it can be read.
     """
     try:
-        container = _open(path)
+        return _open(path, share)
     except FileNotFoundError as err:
         raise LogError(path, "no such file or directory") from err
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
+
+
+def _open(path: Path, share: Callable[[float], None] | None) -> Container:
+    if path != STANDARD_INPUT and not _is_packed_file(path):
+        return _plain_log(path)
+    scratch = ScratchFolder()
+    try:
+        if path != STANDARD_INPUT:
+            log, problem = unpack(path, scratch.path, share)
+            return UnpackedLog(path, log, scratch, problem)
+        if sys.stdin.isatty():
+            raise LogError(path, "standard input is a terminal", "pipe a log into it, or name one")
+        log, problem = scratch.path / "stdin", ""
+        digest = save(sys.stdin.buffer, log)
+        inputs = (InputFile(str(path), log.stat().st_size, digest),)
+        if _is_packed_file(log):
+            log, problem = unpack(log, scratch.path / "unpacked")
+        return UnpackedLog(path, log, scratch, problem, inputs)
+    except BaseException:
+        scratch.close()
+        raise
+
+
+def _is_packed_file(path: Path) -> bool:
+    """Return whether there is a file that `unpack` reads."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return is_packed(stream.read(512))
+
+
+def _plain_log(path: Path) -> BagDirectory | McapFile | Ros1Bag | SqliteBag:
+    """Return the container of a log that is not packed."""
+    container = _container_at(path)
     if (count := len(container.channels)) > MOST_CHANNELS:
         kept = sorted(container.channels, key=lambda channel: -(channel.count or 0))[:MOST_CHANNELS]
         container.channels = sorted(kept, key=lambda channel: channel.id)
-        problems = container.own_problems if isinstance(container, BagDirectory) else container.problems
-        problems.add(f"{count:,} topics and publishers: the {MOST_CHANNELS:,} of most messages are used")
+        _problems_of(container).add(f"{count:,} topics and publishers: the {MOST_CHANNELS:,} of most messages are used")
     if container.problems and not container.channels:
         container.close()
         raise LogError(path, "nothing in it can be read", container.problems[0])
     return container
 
 
-def _open(path: Path) -> BagDirectory | McapFile | Ros1Bag | SqliteBag:
+def _problems_of(container: BagDirectory | McapFile | Ros1Bag | SqliteBag) -> Problems:
+    return container.own_problems if isinstance(container, BagDirectory) else container.problems
+
+
+def _container_at(path: Path) -> BagDirectory | McapFile | Ros1Bag | SqliteBag:
     if files := split_files(path):
         return BagDirectory(path, files)
     if stat.S_ISDIR(path.stat().st_mode):

@@ -13,10 +13,15 @@ from pathlib import Path
 from threading import Event
 from typing import NamedTuple
 
+from icrtool.logs.containers.one_recording import LOG_SUFFIXES, unpacked_name
 from icrtool.records.regular_file import open_regular
+from icrtool.records.samples import InputFile
 
 _NAME = re.compile(r"^(|.*?[_\-. ])((?:19|20)\d\d[\d_.\-T]*|\d+)(\.[A-Za-z]\w*)$")
 """What comes before a count or a date, the count or date (and count), the suffix."""
+
+STANDARD_INPUT = Path("-")
+"""Stands for the log that is given on standard input."""
 
 _RANGE = re.compile(r"^(.*)\{([\d_.\-T]+?)\.\.([\d_.\-T]+)\}(\.[A-Za-z]\w*)$")
 
@@ -90,10 +95,20 @@ def log_name(path: Path) -> str:
 
     Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
     """
+    if path == STANDARD_INPUT:
+        return "stdin"
     files = split_files(path)
     named = Path(os.path.normpath((files[0] if files else path).absolute()))
-    name = named.name if named.is_dir() else named.stem
+    name = named.name
+    if not named.is_dir():
+        plain = unpacked_name(name)
+        name = Path(plain).stem if plain == name or Path(plain).suffix in LOG_SUFFIXES else plain
     return name if name.strip(".") else "log"
+
+
+def inputs_of(files: Iterable[Path], ended: Event) -> tuple[InputFile, ...]:
+    """Return files with their size and SHA-256, as `file_sha256`."""
+    return tuple(InputFile(str(file), file.stat().st_size, file_sha256(file, ended)) for file in files)
 
 
 def file_sha256(file: Path, ended: Event | None = None) -> str:

@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable, Generator, Iterable, Iterator
 from functools import cache
 from pathlib import Path
+from threading import Event
 from typing import Any, BinaryIO
 from urllib.parse import quote
 
@@ -26,6 +27,8 @@ from icrtool.logs.containers.channel import (
     with_possible_times,
 )
 from icrtool.logs.containers.decompress import ZSTD_MAGIC, unpack_messages
+from icrtool.logs.containers.split_files import inputs_of
+from icrtool.records.samples import InputFile
 from icrtool.records.text import LogText
 
 MAGIC = b"SQLite format 3\0"
@@ -68,7 +71,6 @@ class SqliteBag:
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
         self._path = path
-        self.files = [path]
         self.problems = Problems(path.name)
         self._made_beside: Path | None = None
         self._last_row = 0
@@ -89,6 +91,10 @@ class SqliteBag:
                 raise self._interruption from None
             found = "; ".join([str(err), *self.problems])
             raise LogError(path, "not a readable rosbag2 database", found) from err
+
+    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
+        """Return the file with its SHA-256."""
+        return inputs_of([self._path], ended)
 
     def share_read(self) -> float:
         """Return the last row read as a share of all rows."""

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.errors import LogError
-from icrtool.logs.containers import bag_directory
+from icrtool.logs.containers import bag_directory, unpack
 from icrtool.logs.containers.channel import MOST_PROBLEMS
 from icrtool.logs.containers.open_log import open_log
 
@@ -714,8 +714,8 @@ def test_a_compressed_file_that_is_none_is_refused(tmp_path, content):
 
 def test_a_compressed_file_that_is_a_bomb_does_not_fill_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr(bag_directory, "LARGEST_CHUNK_BYTES", 1 << 20)
-    monkeypatch.setattr(bag_directory, "LARGEST_RATIO", 10)
+    monkeypatch.setattr(unpack, "LARGEST_CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr(unpack, "LARGEST_RATIO", 10)
     path = write_directory(tmp_path / "log", make_messages(2), mode=CompressionMode.FILE)
     (file,) = path.glob("*.zstd")
     file.write_bytes(rle_bomb(100_000))

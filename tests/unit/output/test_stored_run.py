@@ -293,7 +293,7 @@ def test_a_log_is_its_file_or_its_bag_directory(run: Run, tmp_path: Path) -> Non
         file.touch()
     assert log_of(with_inputs(run, first)) == first
     assert log_of(with_inputs(run, first, second)) == bag
-    assert log_of(with_inputs(run, packed)) == bag
+    assert log_of(with_inputs(run, packed)) == packed
     (bag / "metadata.yaml").touch()
     assert log_of(with_inputs(run, first)) == bag
     with pytest.raises(RunError, match="the log it was made from is gone"):

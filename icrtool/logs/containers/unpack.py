@@ -1,0 +1,392 @@
+"""Compressed logs and archives of them: unpacked below a temporary folder, a piece at a time and with a limit.
+
+The first bytes of a file state what it is. A log may be compressed (``drive.mcap.zst``), alone in an archive, or a bag
+directory in an archive; what stands in an archive may be compressed again.
+"""
+
+from __future__ import annotations
+
+import bz2
+import hashlib
+import lzma
+import re
+import shutil
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from gzip import GzipFile
+from io import BufferedReader
+from pathlib import Path, PurePosixPath
+from tarfile import AREGTYPE, CONTTYPE, REGTYPE, SUPPORTED_TYPES, TarError, TarInfo
+from typing import Any, NamedTuple, Protocol
+
+from icrtool.errors import LogError
+from icrtool.logs.containers.channel import CUT_OFF, some_of
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATIO, ZSTD_MAGIC
+from icrtool.logs.containers.one_recording import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
+from icrtool.records import unfinished
+from icrtool.records.regular_file import open_regular
+
+_PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED})?$|\.db3-wal$|^metadata\.yaml$")
+
+_PIECE_BYTES = 1 << 20
+_MOST_ENTRIES = 100_000
+"""Of an archive that are looked at."""
+
+_LARGEST_EXTRA_BYTES, _LARGEST_READ_BYTES = 1 << 16, 1 << 22
+"""Of a long name in a tar archive; of what zipfile reads at once, such as the directory of an archive."""
+
+_LARGEST_WINDOW_BYTES = 1 << 27
+"""Of memory that a decoder takes."""
+
+_BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
+
+
+class Readable(Protocol):
+    """What is read from start to end."""
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`; none at the end."""
+        ...
+
+
+class ScratchFolder:
+    """A temporary folder, removed when it is closed, or when the process is ended by force."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="icrtool-")
+        self.path = Path(self._folder.name)
+        unfinished.begin(self.path)
+
+    def close(self) -> None:
+        """Remove it."""
+        self._folder.cleanup()
+        unfinished.end(self.path)
+
+
+class Unpacked(NamedTuple):
+    """A log that was unpacked, a file or a bag directory, and what went wrong (empty: nothing)."""
+
+    path: Path
+    problem: str
+
+
+def is_packed(start: bytes) -> bool:
+    """Return whether a file is compressed or an archive, by its first 512 bytes."""
+    return start.startswith((_ZIP, *_DECODERS)) or _is_tar(start)
+
+
+def save(source: Readable, place: Path) -> str:
+    """Write a stream to a file, and return the SHA-256 of it (hex).
+
+    Raises
+    ------
+    OSError
+        The disk is full.
+    """
+    digest = hashlib.sha256()
+    with place.open("wb") as sink:
+        while piece := source.read(_PIECE_BYTES):
+            sink.write(piece)
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = None) -> Unpacked:
+    """Unpack a file that is compressed, or an archive.
+
+    Parameters
+    ----------
+    folder : where to; files keep the names that they have in an archive
+    share : called with the share of the file that was unpacked
+
+    Raises
+    ------
+    LogError
+        It does not decompress, the disk is full, or it is an archive without a log, or with several.
+    """
+    folder.mkdir(exist_ok=True)
+    try:
+        with open_regular(path) as file:
+            size = path.stat().st_size
+            budget = _Budget(LARGEST_CHUNK_BYTES + LARGEST_RATIO * size)
+            watch = (lambda: share(file.tell() / max(size, 1))) if share is not None else None
+            found = _unpacked(path, file, folder, budget, watch)
+    except OSError as err:
+        free = shutil.disk_usage(folder).free
+        raise LogError(path, f"cannot be unpacked: {err.strerror}", f"{free} bytes are free for it") from err
+    written = [file for file in folder.rglob("*") if file.is_file() and file.stat().st_size]
+    if budget.trouble and not written:
+        raise LogError(path, "does not decompress", budget.trouble)
+    return Unpacked(found, f"{budget.trouble}; what could be unpacked was read" if budget.trouble else "")
+
+
+class _Budget:
+    """The bytes that a file may still be unpacked to, and the first thing that went wrong."""
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+        self.trouble = ""
+
+    def stop(self, trouble: object) -> None:
+        """Let nothing more be read."""
+        self.trouble = self.trouble or str(trouble)
+
+
+class _Stream:
+    """A stream that also ends where it is damaged, or is longer than its budget allows.
+
+    Parameters
+    ----------
+    size : of the part of `source` that it is; None: all
+    """
+
+    def __init__(self, source: Readable, budget: _Budget, size: int | None = None) -> None:
+        # What a decoder gives at once is kept where the next bytes are damaged.
+        self._read: Callable[[int], bytes] = getattr(source, "read1", source.read)
+        self._budget, self._left, self._head = budget, size, b""
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`."""
+        if self._head:
+            piece, self._head = self._head[:count], self._head[count:]
+            return piece
+        if self._left is not None:
+            count = min(count, self._left)
+        if self._budget.trouble or not count:
+            return b""
+        try:
+            piece = self._read(count)
+        except _damage() as err:
+            if isinstance(err, OSError) and err.errno is not None:
+                raise  # of the disk, not of the data
+            self._budget.stop(f"{CUT_OFF} or damaged ({err})")
+            return b""
+        if self._left is not None:
+            self._left -= len(piece)
+            if not piece:
+                self._budget.stop(CUT_OFF)
+        self._budget.left -= len(piece)
+        if self._budget.left < 0:
+            self._budget.stop(f"more than {LARGEST_RATIO} times its size when unpacked")
+            return b""
+        return piece
+
+    def exactly(self, count: int) -> bytes:
+        """Return the next `count` bytes, fewer at the end."""
+        pieces = []
+        while count and (piece := self.read(min(count, _PIECE_BYTES))):
+            pieces.append(piece)
+            count -= len(piece)
+        return b"".join(pieces)
+
+    def skip(self, count: int | None = None) -> None:
+        """Pass over the next `count` bytes; None: over all."""
+        while count != 0 and (piece := self.read(_PIECE_BYTES if count is None else min(count, _PIECE_BYTES))):
+            count = None if count is None else count - len(piece)
+
+    def start(self) -> bytes:
+        """Return the first 512 bytes, which stay there to be read."""
+        self._head = self.exactly(_BLOCK_BYTES)
+        return self._head
+
+    def decompressed(self) -> _Stream:
+        """Return the stream that it is when decompressed, itself where it is not compressed."""
+        start = self.start()
+        made = next((decoder for magic, decoder in _DECODERS.items() if start.startswith(magic)), None)
+        return self if made is None else _Stream(made(self), self._budget)
+
+    def write_to(self, place: Path, watch: Callable[[], None] | None) -> None:
+        """Write all of it to a file."""
+        with place.open("wb") as sink:
+            while piece := self.read(_PIECE_BYTES):
+                sink.write(piece)
+                if watch is not None:
+                    watch()
+
+
+def _unpacked(
+    path: Path, file: BufferedReader, folder: Path, budget: _Budget, watch: Callable[[], None] | None
+) -> Path:
+    """Unpack an open file, and return the file or bag directory that is the log."""
+    packed = _Stream(file, budget)
+    if not is_packed(start := packed.start()):
+        raise LogError(path, "does not decompress", "its first bytes are those of no known compression")
+    if start.startswith(_ZIP):
+        entries = _zip_entries(file, budget)
+    else:
+        content = packed.decompressed()
+        if not _is_tar(content.start()):
+            whole = folder / (unpacked_name(path.name) or "log")
+            content.write_to(whole, watch)
+            return whole
+        entries = _tar_entries(content, budget)
+    groups: dict[PurePosixPath, Path] = {}
+    others: list[str] = []
+    logs: list[str] = []
+    found: list[Path] = []
+    for name, entry in entries:
+        place = PurePosixPath(name)
+        if not _PARTS_OF_LOGS.search(place.name):
+            others.append(name)
+            continue
+        group = groups.setdefault(place.parent, folder / str(len(groups)) / (place.parent.name.strip(".") or "log"))
+        group.mkdir(parents=True, exist_ok=True)
+        target = group / unpacked_name(place.name)
+        if target.suffix in LOG_SUFFIXES:
+            logs.append(name)
+            found.append(target)
+        if not target.exists():
+            entry.decompressed().write_to(target, watch)
+    if not logs and not budget.trouble:
+        raise LogError(path, "no log in it", f"it holds {some_of(others) or 'nothing'}")
+    if not found:
+        return folder
+    # Whatever its directory is called, a bag is one recording; a file that is there twice is two.
+    bags = {group for group in groups.values() if is_bag_directory(group)}
+    found = [*bags] + [file for file in found if file.parent not in bags]
+    if len(found) > 1:
+        raise LogError(path, f"holds more than one recording: {some_of(logs)}", "unpack it, and name one of them")
+    return found[0]
+
+
+def _is_tar(start: bytes) -> bool:
+    return start[257:262] == b"ustar"
+
+
+def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Stream]]:
+    """Yield name and content of the files in a tar archive.
+
+    Notes
+    -----
+    `tarfile` keeps all entries, and reads a name of any length: an archive could exhaust the memory with either.
+    """
+    name, stated = "", None
+    for _ in range(_MOST_ENTRIES):
+        head = stream.exactly(_BLOCK_BYTES)
+        if not any(head):
+            return
+        try:
+            info = TarInfo.frombuf(head, "utf-8", "surrogateescape")
+        except TarError as err:
+            return budget.stop(f"{CUT_OFF} or damaged ({err})")
+        if info.type in {b"L", b"x"}:
+            # A name, or a size, that the header of the next entry has no space for.
+            fields = _extra_fields(info.type, stream.exactly(min(info.size, _LARGEST_EXTRA_BYTES)))
+            stream.skip(max(info.size - _LARGEST_EXTRA_BYTES, 0) + -info.size % _BLOCK_BYTES)
+            name = fields.get(b"path", name.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
+            stated = int(fields[b"size"]) if fields.get(b"size", b"").isdigit() else stated
+            continue
+        size = info.size if stated is None else stated
+        if info.type in {REGTYPE, AREGTYPE, CONTTYPE}:
+            entry = _Stream(stream, budget, size)
+            yield name or info.name, entry
+            entry.skip()
+            stream.skip(-size % _BLOCK_BYTES)
+        elif info.type not in SUPPORTED_TYPES or info.type == b"g":
+            stream.skip(size + -size % _BLOCK_BYTES)
+        name, stated = "", None
+    return budget.stop(f"more than {_MOST_ENTRIES} entries")
+
+
+def _extra_fields(kind: bytes, extra: bytes) -> dict[bytes, bytes]:
+    """Return the fields of an extended header: a long name, or those of the pax format (``20 path=drive.mcap``)."""
+    if kind == b"L":
+        return {b"path": extra.partition(b"\0")[0]}
+    fields, at = {}, 0
+    while match := re.compile(rb"(\d{1,6}) ([^=]*)=").match(extra, at):
+        if (end := at + int(match[1])) <= match.end():
+            break
+        fields[match[2]] = extra[match.end() : end - 1].partition(b"\0")[0]
+        at = end
+    return fields
+
+
+class _FrugalFile:
+    """A file of which no more is read at once than a sound archive asks for."""
+
+    def __init__(self, file: BufferedReader) -> None:
+        self._file = file
+        self.seek, self.tell, self.seekable, self.close = file.seek, file.tell, file.seekable, file.close
+
+    def read(self, count: int = -1, /) -> bytes:
+        """Return the next bytes.
+
+        Raises
+        ------
+        zipfile.BadZipFile
+            They are too many.
+        """
+        if count > _LARGEST_READ_BYTES:
+            raise zipfile.BadZipFile("its directory is too large")
+        return self._file.read(count if count >= 0 else _LARGEST_READ_BYTES)
+
+
+def _zip_entries(file: BufferedReader, budget: _Budget) -> Iterator[tuple[str, _Stream]]:
+    """Yield name and content of the files in a zip archive."""
+    try:
+        with zipfile.ZipFile(_FrugalFile(file)) as archive:
+            for info in archive.infolist()[:_MOST_ENTRIES]:
+                if info.is_dir():
+                    continue
+                if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2}:
+                    budget.stop(f"compression {info.compress_type} of {info.filename} is not known")
+                with archive.open(info) as content:
+                    yield info.filename, _Stream(content, budget)
+    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, ValueError) as err:
+        budget.stop(err)
+
+
+class _Frames:
+    """What a decoder of the standard library, or of lz4, makes of frames that follow one another."""
+
+    def __init__(self, make: Callable[[], Any], source: Readable) -> None:
+        self._make, self._source, self._decoder = make, source, make()
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`."""
+        while True:
+            data = b""
+            if self._decoder.eof:
+                if not (data := self._decoder.unused_data or self._source.read(_PIECE_BYTES)):
+                    return b""
+                self._decoder = self._make()
+            elif self._decoder.needs_input and not (data := self._source.read(_PIECE_BYTES)):
+                raise EOFError("no end mark")
+            if out := self._decoder.decompress(data, max_length=count):
+                return bytes(out)
+
+
+def _zstd(source: Readable) -> Readable:
+    import zstandard
+
+    decoder = zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW_BYTES)
+    return decoder.stream_reader(source, read_across_frames=True)  # type: ignore[arg-type]  # reads alone are needed
+
+
+def _lz4(source: Readable) -> Readable:
+    import lz4.frame
+
+    return _Frames(lz4.frame.LZ4FrameDecompressor, source)
+
+
+_DECODERS: dict[bytes, Callable[[Readable], Readable]] = {
+    ZSTD_MAGIC: _zstd,
+    b"\x1f\x8b": lambda source: GzipFile(fileobj=source, mode="rb"),  # type: ignore[call-overload]  # as above
+    b"BZh": partial(_Frames, bz2.BZ2Decompressor),
+    b"\x04\x22\x4d\x18": _lz4,
+    b"\xfd7zXZ\0": partial(_Frames, partial(lzma.LZMADecompressor, memlimit=_LARGEST_WINDOW_BYTES)),
+}
+
+
+@cache
+def _damage() -> tuple[type[Exception], ...]:
+    """Return what decoders raise of data that is damaged or cut off."""
+    import zstandard
+
+    return (
+        OSError, EOFError, RuntimeError, ValueError, NotImplementedError, zlib.error, lzma.LZMAError,
+        zipfile.BadZipFile, zstandard.ZstdError,
+    )  # fmt: skip

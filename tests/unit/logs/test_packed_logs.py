@@ -1,0 +1,341 @@
+"""Compressed logs and archives, packed by each format's own library: read as what is in them, and nothing is left."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import hashlib
+import io
+import lzma
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from threading import Event
+
+import lz4.frame
+import pytest
+import zstandard
+
+from icrtool.errors import LogError
+from icrtool.fleet.recordings import find_recordings
+from icrtool.logs.containers import unpack
+from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.containers.split_files import log_name
+
+SAMPLES = Path(__file__).parents[3] / "sample_logs"
+MCAP, BAG, DIRECTORY = (
+    SAMPLES / name for name in ("wheeled_lawnmower.mcap", "tracked_curved.bag", "wheeled_figure_eight")
+)
+DB3 = DIRECTORY / "wheeled_figure_eight.db3"
+PACKERS: dict[str, Callable[[bytes], bytes]] = {
+    ".gz": gzip.compress,
+    ".bz2": bz2.compress,
+    ".xz": lzma.compress,
+    ".zst": zstandard.compress,
+    ".lz4": lz4.frame.compress,
+}
+MODES = {".tar": "w", ".tar.gz": "w:gz", ".tar.bz2": "w:bz2", ".tar.xz": "w:xz", ".tgz": "w:gz"}
+
+
+@pytest.fixture(autouse=True)
+def temporary(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch):
+    """Give the folder of temporary files, which must be empty in the end."""
+    folder = tmp_path_factory.mktemp("temporary")
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    yield folder
+    assert not list(folder.iterdir())
+
+
+def content(path: Path) -> tuple[list[tuple[str, int, bytes]], list[str]]:
+    """Return the messages of a log, and what could not be read."""
+    container = open_log(path)
+    try:
+        topics = {channel.id: str(channel.topic) for channel in container.channels}
+        found = [
+            (topics[channel], time_ns, block.data[start:end].tobytes())
+            for block in container.blocks(frozenset(topics))
+            for channel, time_ns, start, end in zip(*(column.tolist() for column in block[1:]), strict=True)
+        ]
+        return found, list(container.problems)
+    finally:
+        container.close()
+
+
+@pytest.mark.parametrize("log", [MCAP, BAG, DB3], ids=lambda log: log.suffix)
+@pytest.mark.parametrize("packing", PACKERS)
+def test_a_compressed_log_is_read_as_what_is_in_it(tmp_path, log, packing):
+    path = tmp_path / f"{log.name}{packing}"
+    half = len(log.read_bytes()) // 2
+    # Two parts that follow one another, as parallel compressors write them.
+    path.write_bytes(PACKERS[packing](log.read_bytes()[:half]) + PACKERS[packing](log.read_bytes()[half:]))
+    assert content(path) == content(log)
+
+
+@pytest.mark.parametrize("ending", MODES)
+@pytest.mark.parametrize("log", [MCAP, DIRECTORY], ids=["file", "directory"])
+def test_a_log_or_bag_directory_in_a_tar_archive_is_read(tmp_path, log, ending):
+    path = tmp_path / f"x{ending}"
+    with tarfile.open(path, MODES[ending]) as archive:
+        archive.add(log, f"season/2026/{log.name}")
+        archive.add(SAMPLES / "README.md", "README.md")
+    assert content(path) == content(log)
+
+
+@pytest.mark.parametrize("layout", [tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
+def test_names_and_links_of_every_kind_of_tar_archive_are_understood(tmp_path, layout):
+    path, deep = tmp_path / "x.tar", "/".join(["a_folder_of_a_season"] * 6)
+    name = f"{deep}/{'ä' if layout != tarfile.USTAR_FORMAT else 'a'}.mcap"
+    with tarfile.open(path, "w", format=layout) as archive:
+        link = tarfile.TarInfo("link.mcap")
+        link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+        archive.addfile(link)
+        archive.add(MCAP, name)
+    assert content(path) == content(MCAP)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
+def test_a_log_in_a_zip_archive_is_read_compressed_again_or_not(tmp_path, method):
+    for name, data in (("a.mcap", MCAP.read_bytes()), ("a.mcap.zst", zstandard.compress(MCAP.read_bytes()))):
+        path = tmp_path / f"{name}.zip"
+        with zipfile.ZipFile(path, "w", method) as archive:
+            archive.writestr("season/", "")
+            archive.writestr(f"season/{name}", data)
+            archive.writestr("season/__MACOSX/._a.mcap", b"x")
+        assert content(path) == content(MCAP)
+
+
+def test_a_bag_directory_whose_files_are_compressed_is_read_from_an_archive(tmp_path):
+    path = tmp_path / "x.tar"
+    metadata = (DIRECTORY / "metadata.yaml").read_bytes().replace(b".db3", b".db3.zstd")
+    assert b"db3.zstd" in metadata
+    with tarfile.open(path, "w") as archive:
+        for name, data in (("metadata.yaml", metadata), (f"{DB3.name}.zstd", zstandard.compress(DB3.read_bytes()))):
+            entry = tarfile.TarInfo(f"bag/{name}")
+            entry.size = len(data)
+            archive.addfile(entry, io.BytesIO(data))
+    assert content(path) == content(DIRECTORY)
+
+
+def test_the_sum_of_a_packed_log_is_that_of_the_file_that_was_named(tmp_path):
+    path = tmp_path / "a.mcap.gz"
+    path.write_bytes(gzip.compress(MCAP.read_bytes()))
+    container = open_log(path)
+    (found,) = container.inputs(Event())
+    container.close()
+    assert (found.path, found.bytes) == (str(path), path.stat().st_size)
+    assert found.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("name", "log"),
+    [("a.mcap.zst", "a"), ("a.tar.gz", "a"), ("a.v2.zip", "a.v2"), ("a.db3.zip", "a"), ("a.b.mcap", "a.b")],
+)
+def test_a_run_is_named_after_the_log_without_what_it_is_packed_in(name, log):
+    assert log_name(Path(name)) == log
+
+
+@pytest.mark.parametrize("packing", PACKERS)
+def test_of_a_compressed_log_that_is_cut_off_the_beginning_is_read(tmp_path, packing):
+    data = PACKERS[packing](BAG.read_bytes())
+    path = tmp_path / f"cut.bag{packing}"
+    path.write_bytes(data[: len(data) * 3 // 5])  # bz2 gives whole blocks of 900 kB
+    found, problems = content(path)
+    whole, _ = content(BAG)
+    assert 0.2 * len(whole) < len(found) < 0.8 * len(whole)
+    assert set(found) <= set(whole)
+    assert any("cut off" in one for one in problems)
+
+
+@pytest.mark.parametrize("packing", [*PACKERS, ".zip", *MODES])
+def test_a_damaged_file_gives_a_log_or_one_line(tmp_path, packing):
+    path = tmp_path / f"a.mcap{packing}"
+    if packing in PACKERS:
+        path.write_bytes(PACKERS[packing](MCAP.read_bytes()[:60_000]))
+    elif packing == ".zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("a.mcap", MCAP.read_bytes()[:60_000])
+    else:
+        with tarfile.open(path, MODES[packing]) as archive:
+            entry = tarfile.TarInfo("a.mcap")
+            entry.size = 60_000
+            archive.addfile(entry, io.BytesIO(MCAP.read_bytes()))
+    sound, rng = path.read_bytes(), random.Random(1)
+    for _ in range(40):
+        data = bytearray(sound)
+        for at in rng.choices(range(min(len(data), 600)), k=2) + rng.choices(range(len(data)), k=3):
+            data[at] = rng.randrange(256)
+        path.write_bytes(data[: rng.choice([len(data), rng.randrange(len(data))])])
+        with suppress(LogError):
+            content(path)
+
+
+def zeros(count: int) -> io.BufferedReader:
+    """Return a file of so many zeros, which takes no memory."""
+
+    class Zeros(io.RawIOBase):
+        left = count
+
+        def readable(self) -> bool:
+            return True
+
+        def readinto(self, space) -> int:
+            part = min(len(space), self.left)
+            space[:part] = bytes(part)
+            self.left -= part
+            return part
+
+    return io.BufferedReader(Zeros(), 1 << 20)
+
+
+@pytest.mark.parametrize("packing", [*PACKERS, ".zip", ".tar.gz"])
+def test_a_bomb_is_unpacked_to_its_limit_only(tmp_path, temporary, monkeypatch, packing):
+    path, size = tmp_path / f"a.mcap{packing}", 200_000_000
+    if packing == ".zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.mcap", "w") as entry:
+            shutil.copyfileobj(zeros(size), entry)
+    elif packing == ".tar.gz":
+        with tarfile.open(path, "w:gz") as archive:
+            entry = tarfile.TarInfo("a.mcap")
+            entry.size = size
+            archive.addfile(entry, zeros(size))
+    else:
+        path.write_bytes(PACKERS[packing](bytes(size)))
+    monkeypatch.setattr(unpack, "LARGEST_CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr(unpack, "LARGEST_RATIO", 10)
+    largest = []
+    closed = unpack.ScratchFolder.close
+
+    def watched(scratch):
+        largest.append(sum(file.stat().st_size for file in scratch.path.rglob("*") if file.is_file()))
+        closed(scratch)
+
+    monkeypatch.setattr(unpack.ScratchFolder, "close", watched)
+    with pytest.raises(LogError):
+        open_log(path)
+    assert 0 < largest[0] <= (1 << 20) + 10 * path.stat().st_size
+
+
+def test_an_archive_of_very_many_entries_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(unpack, "_MOST_ENTRIES", 1000)
+    path = tmp_path / "many.tar.gz"
+    with tarfile.open(path, "w:gz") as archive:
+        for number in range(1200):
+            archive.addfile(tarfile.TarInfo(f"{number}.txt"))
+    with pytest.raises(LogError, match="more than 1000 entries"):
+        open_log(path)
+
+
+@pytest.mark.parametrize("name", ["../../a.mcap", "/tmp/a.mcap", "..", "a/../../b.mcap", "x\0.mcap"])
+def test_no_name_in_an_archive_leads_out_of_the_temporary_folder(tmp_path, name):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("x.mcap", MCAP.read_bytes())
+    with tarfile.open(tmp_path / "a.tar", "w") as archive:
+        entry = tarfile.TarInfo(name)
+        entry.size = MCAP.stat().st_size
+        archive.addfile(entry, io.BytesIO(MCAP.read_bytes()))
+    before = sorted(tmp_path.rglob("*")), sorted(tmp_path.parent.iterdir())
+    with suppress(LogError):
+        open_log(tmp_path / "a.tar").close()
+    assert (sorted(tmp_path.rglob("*")), sorted(tmp_path.parent.iterdir())) == before
+    assert not Path("/tmp/a.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("entries", "why"),
+    [
+        ({"a.mcap": MCAP, "b.bag": BAG}, "holds more than one recording: a.mcap, b.bag"),
+        ({"a/a.mcap": MCAP, "b/a.mcap": MCAP}, "holds more than one recording: a/a.mcap, b/a.mcap"),
+        ({"README.md": SAMPLES / "README.md"}, "no log in it; it holds README.md"),
+    ],
+)
+def test_an_archive_of_several_logs_or_none_is_refused(tmp_path, entries, why):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, file in entries.items():
+            archive.write(file, name)
+    with pytest.raises(LogError, match=why):
+        open_log(path)
+
+
+def test_an_encrypted_archive_is_refused_in_one_line(tmp_path):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.mcap", b"x")
+    data = bytearray(path.read_bytes())
+    for magic, at in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+        data[data.index(magic) + at] |= 1
+    path.write_bytes(data)
+    with pytest.raises(LogError, match="encrypted"):
+        open_log(path)
+
+
+def test_compressed_logs_in_a_folder_are_a_recording_each(tmp_path):
+    for name in ("mon.mcap.zst", "tue.bag.gz", "wed/log.db3.lz4", "notes.txt.gz"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    assert [one.name for one in find_recordings([tmp_path])] == ["mon", "tue", "wed/log"]
+
+
+def command(*arguments: str, temporary: Path, **options) -> subprocess.Popen[bytes]:
+    """Start icrtool with its own folder of temporary files."""
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "icrtool", *arguments],
+        env={**os.environ, "TMPDIR": str(temporary)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        **options,
+    )
+
+
+def test_standard_input_gives_the_numbers_of_the_file(tmp_path, temporary):
+    data = gzip.compress(MCAP.read_bytes())
+    piped = command(
+        *("fit", "-", "--robot", "segway-rmp400", "--plots", "none"),
+        temporary=temporary, stdin=subprocess.PIPE, cwd=tmp_path,
+    )  # fmt: skip
+    _, said = piped.communicate(data, timeout=120)
+    assert piped.returncode == 0, said
+    named = command(
+        *("fit", str(MCAP), "--robot", "segway-rmp400", "--plots", "none", "-o", "named"),
+        temporary=temporary, cwd=tmp_path,
+    )  # fmt: skip
+    named.communicate(timeout=120)
+    states = [(tmp_path / place / "states.csv").read_bytes() for place in ("icrtool-runs/stdin", "named")]
+    assert states[0] == states[1]
+    document = (tmp_path / "icrtool-runs/stdin/run.json").read_text()
+    assert hashlib.sha256(data).hexdigest() in document
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("log", ["-", "endless.mcap.gz"])
+def test_ctrl_c_while_unpacking_leaves_nothing_behind(tmp_path, temporary, log):
+    path = tmp_path / "endless.mcap.gz"
+    with gzip.open(path, "wb", 0) as file:
+        file.write(MCAP.read_bytes()[:100_000])
+        for _ in range(200):
+            file.write(bytes(1 << 20))
+    one = command("info", log, temporary=temporary, stdin=subprocess.PIPE, cwd=tmp_path)
+    if log == "-":
+        one.stdin.write(MCAP.read_bytes()[:100_000])  # and never an end
+        one.stdin.flush()
+    deadline = time.monotonic() + 60
+    while not [file for file in temporary.rglob("*") if file.is_file()] and time.monotonic() < deadline:
+        time.sleep(0.002)
+    assert one.poll() is None
+    one.send_signal(signal.SIGINT)
+    begun = time.monotonic()
+    assert one.wait(30) == 130
+    assert time.monotonic() - begun < 5
+    one.stdin.close()
+    one.stdout.close()
+    one.stderr.close()
