@@ -194,8 +194,8 @@ def other_serialization(folder: Path) -> list[str]:
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start("", "test")
-        schema = writer.register_schema("sensor_msgs/msg/JointState", "jsonschema", b"{}")
-        writer.add_message(writer.register_channel("/joint_states", "json", schema), START_NS, b"{}", START_NS)
+        schema = writer.register_schema("sensor_msgs/msg/JointState", "flatbuffer", b"{}")
+        writer.add_message(writer.register_channel("/joint_states", "flatbuffer", schema), START_NS, b"{}", START_NS)
         writer.finish()
     return [str(path)]
 
@@ -298,7 +298,7 @@ REFUSED: dict[str, tuple[Callable[[Path], list[str]], str]] = {
     "cut before anything": (mcap_cut_before_anything, "nothing in it can be read; drive.mcap: cut off"),
     "an unknown compression": (unknown_compression, "compression 'oodl' is not known"),
     "missing definitions": (missing_definitions, "definition"),
-    "another serialization": (other_serialization, "serialization 'json' is not read"),
+    "another serialization": (other_serialization, "serialization 'flatbuffer' is not read"),
     "topics with line breaks": (topics_with_line_breaks, r"/x\nError: forged\n"),
     "no wheels": (made(lambda columns: without(columns, "wheel")), "no wheels"),
     "no GNSS": (made(lambda columns: without(columns, "gnss")), "no position"),

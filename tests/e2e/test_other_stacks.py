@@ -1,13 +1,15 @@
-"""Logs of other stacks, written by rosbags with the real definitions: the topic is listed, and the ICRs are found.
+"""Logs of other stacks, written by other libraries with the real definitions: topics are listed, the ICRs found.
 
-One drive of known ICRs, as OpenMower, as ublox_dgnss beside joint states, and as an autopilot with NMEA sentences.
+One drive of known ICRs, as OpenMower, as ublox_dgnss beside joint states, as an autopilot with NMEA sentences (rosbags,
+pynmea2), and in Foxglove's schemas, in Protobuf (mcap-protobuf-support) and in JSON.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pynmea2
 import pytest
+from foxglove_schemas_protobuf.JointState_pb2 import JointState
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.json_format import MessageToDict
+from google.protobuf.message import Message
+from mcap.writer import Writer as McapWriter
+from mcap_protobuf.writer import Writer as ProtobufWriter
 from pymap3d import ned2geodetic
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -23,6 +33,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from icrtool.config import load_config
+from icrtool.kernels.arrays import Floats
 from icrtool.logs.read_log import read_log
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX
 from icrtool.records.tables import RobotLog
@@ -120,7 +131,7 @@ def openmower() -> tuple[Types, list[Logged]]:
             "xbot_msgs/WheelTick", stamp=types.time(stamp_ns), wheel_tick_factor=TICKS_PER_M, **ticks, **directions
         )
         messages.append(Logged("/ll/wheel_ticks", "xbot_msgs/WheelTick", stamp_ns, message))
-    headings = np.interp(FIX_STAMPS, WHEEL_STAMPS, np.unwrap(DRIVE.heading.heading_rad))
+    headings = headings_at(FIX_STAMPS)
     for i, stamp_ns in enumerate(FIX_STAMPS):
         position = types("geometry_msgs/Point", x=EAST[i], y=NORTH[i])
         pose = types("geometry_msgs/PoseWithCovariance", pose=types("geometry_msgs/Pose", position=position))
@@ -178,7 +189,7 @@ def sentences(i: int, quality: int, *, gga: bool = True) -> list[str]:
     place = (*angle(LATITUDE[i], 2, "NS"), *angle(LONGITUDE[i], 3, "EW"))
     time = f"{10 + i // 72000:02d}{i // 1200 % 60:02d}{i % 1200 / 20:05.2f}"
     height = f"{HEIGHT[i] - GEOID_M:.3f}"
-    heading = f"{math.degrees(np.interp(FIX_STAMPS[i], WHEEL_STAMPS, np.unwrap(DRIVE.heading.heading_rad))) % 360:.2f}"
+    heading = f"{math.degrees(headings_at(FIX_STAMPS[i : i + 1])[0]) % 360:.2f}"
     mode = {0: "N", 1: "A", 4: "R", 5: "F"}[quality]
     fix = (time, *place, str(quality), "17", "0.7", height, "M", f"{GEOID_M}", "M", "1.0", "0001")
     told = [
@@ -204,22 +215,103 @@ def autopilot(*, gga: bool = True) -> tuple[Types, list[Logged]]:
     return types, messages
 
 
-LOGS: dict[str, Callable[[], tuple[Types, list[Logged]]]] = {
-    "openmower": openmower,
-    "ublox_dgnss": ublox_dgnss,
-    "autopilot": autopilot,
+def headings_at(stamps_ns: list[int]) -> Floats:
+    return np.interp(stamps_ns, WHEEL_STAMPS, np.unwrap(DRIVE.heading.heading_rad))
+
+
+def foxglove() -> Iterator[tuple[str, int, Message]]:
+    """Yield topic, log time and message of joint states, fixes with a heading, and poses of a motion capture."""
+
+    def time(stamp_ns: int) -> dict[str, int]:
+        return dict(zip(("seconds", "nanos"), divmod(stamp_ns, 10**9), strict=True))
+
+    for i, stamp_ns in enumerate(WHEEL_STAMPS):
+        joints = [
+            JointState(name=f"{name}_wheel_joint", position=side[i] / RADIUS_M)
+            for name, side in zip(("left", "right"), TRAVELLED, strict=True)
+        ]
+        yield "/joints", stamp_ns, JointStates(timestamp=time(stamp_ns), joints=joints)
+    headings = headings_at(FIX_STAMPS)
+    for i, stamp_ns in enumerate(FIX_STAMPS):
+        yield "/fix", stamp_ns, LocationFix(
+            timestamp=time(stamp_ns), frame_id="antenna", latitude=LATITUDE[i], longitude=LONGITUDE[i],
+            altitude=HEIGHT[i], position_covariance=[0.011**2, 0, 0, 0, 0.013**2, 0, 0, 0, 1],
+            position_covariance_type=LocationFix.KNOWN, heading=headings[i],
+            metadata=[{"key": "satellites", "value": "17"}],
+        )  # fmt: skip
+        half = (math.pi / 2 - headings[i]) / 2
+        pose = {"position": {"x": EAST[i], "y": NORTH[i]}, "orientation": {"z": math.sin(half), "w": math.cos(half)}}
+        yield "/mocap/pose", stamp_ns, PoseInFrame(timestamp=time(stamp_ns), frame_id="world", pose=pose)
+
+
+def write_protobuf(path: Path) -> Path:
+    path = path.with_suffix(".mcap")
+    with path.open("wb") as stream, ProtobufWriter(stream) as writer:
+        for topic, stamp_ns, message in sorted(foxglove(), key=lambda one: one[1]):
+            writer.write_message(topic, message, stamp_ns, stamp_ns)
+    return path
+
+
+def as_json(message: Message) -> dict[str, Any]:
+    """Return a message as Foxglove's JSON schemas have it: times are ``sec`` and ``nsec``, enumerations numbers."""
+    found = MessageToDict(
+        message,
+        always_print_fields_with_no_presence=True,
+        preserving_proto_field_name=True,
+        use_integers_for_enums=True,
+    )
+    stamp = message.timestamp  # type: ignore[attr-defined]
+    return found | {"timestamp": {"sec": stamp.seconds, "nsec": stamp.nanos}}
+
+
+def json_schema(value: Any) -> dict[str, Any]:
+    """Return the schema of a value."""
+    if isinstance(value, dict):
+        return {"type": "object", "properties": {name: json_schema(one) for name, one in value.items()}}
+    if isinstance(value, list):
+        return {"type": "array", "items": json_schema(value[0])}
+    return {"type": {int: "integer", float: "number", str: "string"}[type(value)]}
+
+
+def write_json(path: Path, *, schemas: bool = True) -> Path:
+    path = path.with_suffix(".mcap")
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start()
+        channels: dict[str, int] = {}
+        for topic, stamp_ns, message in sorted(foxglove(), key=lambda one: one[1]):
+            content = as_json(message)
+            if topic not in channels:
+                schema = json.dumps(json_schema(content)).encode() if schemas else b"{}"
+                number = writer.register_schema(message.DESCRIPTOR.full_name, "jsonschema", schema)
+                channels[topic] = writer.register_channel(topic, "json", number)
+            writer.add_message(channels[topic], stamp_ns, json.dumps(content).encode(), stamp_ns)
+        writer.finish()
+    return path
+
+
+LOGS: dict[str, Callable[[Path], Path]] = {
+    "openmower": lambda path: write(path, *openmower()),
+    "ublox_dgnss": lambda path: write(path, *ublox_dgnss()),
+    "autopilot": lambda path: write(path, *autopilot()),
+    "protobuf": write_protobuf,
+    "json": write_json,
+    "json without schemas": functools.partial(write_json, schemas=False),
 }
+FOXGLOVE = ("/joints", "/fix", "/fix")
 TOPICS = {
     "openmower": ("/ll/wheel_ticks", "/ll/position/gps", "/ll/position/gps"),
     "ublox_dgnss": ("/joint_states", "/ubx_nav_pvt", "/imu/data"),
     "autopilot": ("/mavros/wheel_odometry/distance", "/nmea_sentence", "/nmea_sentence"),
+    **dict.fromkeys(("protobuf", "json", "json without schemas"), FOXGLOVE),
 }
+JOINTS = ("ublox_dgnss", "protobuf", "json", "json without schemas")
+NO_CLASS = ("protobuf", "json", "json without schemas")
 
 
 @pytest.fixture(scope="module", params=LOGS)
 def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    types, messages = LOGS[request.param]()
-    return request.param, write(tmp_path_factory.mktemp("log") / request.param, types, messages)
+    return request.param, LOGS[request.param](tmp_path_factory.mktemp("log") / request.param.replace(" ", "_"))
 
 
 def log_of(path: Path) -> RobotLog:
@@ -235,18 +327,22 @@ def test_the_positions_are_those_that_were_measured(written: tuple[str, Path]) -
     name, path = written
     fixes = log_of(path).gnss
     kept = np.isin(DRIVE.gnss.stamp_ns, fixes.stamp_ns)
-    assert len(FIX_STAMPS) - len(fixes.stamp_ns) == {"openmower": 0, "ublox_dgnss": 2, "autopilot": 1}[name]
+    assert len(FIX_STAMPS) - len(fixes.stamp_ns) == {"ublox_dgnss": 2, "autopilot": 1}.get(name, 0)
     resolution_m = 0.012 if name == "ublox_dgnss" else 1e-3  # 1e-7 degrees of latitude
     for found, true in ((fixes.north_m, NORTH[kept]), (fixes.east_m, EAST[kept])):
         np.testing.assert_allclose(found - found[0], true - true[0], atol=resolution_m)
-    std = {"openmower": (0.014, 0.014), "ublox_dgnss": (0.014, 0.014), "autopilot": (0.013, 0.011)}[name]
+    std = (0.014, 0.014) if name in ("openmower", "ublox_dgnss") else (0.013, 0.011)
     np.testing.assert_allclose(
         np.sqrt(np.column_stack([fixes.var_north_m2, fixes.var_east_m2])), [std] * len(kept[kept]), rtol=1e-6
     )
 
 
 def test_the_state_of_the_carrier_phase_is_read(written: tuple[str, Path]) -> None:
-    fixes = log_of(written[1]).gnss
+    name, path = written
+    fixes = log_of(path).gnss
+    if name in NO_CLASS:
+        assert fixes.stated_class is None
+        return
     expected = [FIXED_FIX if i % 4 else FLOAT_FIX for i in np.flatnonzero(np.isin(FIX_STAMPS, fixes.stamp_ns))]
     assert fixes.stated_class is not None
     assert fixes.stated_class.tolist() == expected
@@ -255,7 +351,7 @@ def test_the_state_of_the_carrier_phase_is_read(written: tuple[str, Path]) -> No
 def test_the_wheels_travel_as_far_as_they_did(written: tuple[str, Path]) -> None:
     name, path = written
     wheels = log_of(path).wheels
-    per_unit = RADIUS_M if name == "ublox_dgnss" else 1.0
+    per_unit = RADIUS_M if name in JOINTS else 1.0
     seconds = np.diff(wheels.stamp_ns) / 1e9
     rounding_m = 1.1 / TICKS_PER_M
     for side, true in ((wheels.left, TRAVELLED[0]), (wheels.right, TRAVELLED[1])):
@@ -285,3 +381,15 @@ def test_without_gga_the_fixes_of_rmc_are_used(tmp_path: Path) -> None:
     )
     assert log.gnss.stated_class is not None
     assert set(log.gnss.stated_class.tolist()) == {FIXED_FIX, FLOAT_FIX}
+
+
+@pytest.mark.parametrize("kind", ["protobuf", "json"])
+def test_poses_in_foxglove_s_schema_are_a_reference_of_position_and_heading(tmp_path: Path, kind: str) -> None:
+    log = read_log(
+        LOGS[kind](tmp_path / "poses"), load_config(sets=["topics.gnss=/mocap/pose", "topics.heading=/mocap/pose"])
+    )
+    assert np.abs(log.gnss.north_m - NORTH).max() < 1e-9
+    assert np.abs(log.gnss.east_m - EAST).max() < 1e-9
+    turned = log.heading.heading_rad - headings_at(FIX_STAMPS)
+    assert np.abs(np.angle(np.exp(1j * turned))).max() < 1e-9
+    assert [stream.clock for stream in log.streams] == ["header"] * 3

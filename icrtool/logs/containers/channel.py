@@ -31,9 +31,10 @@ class Channel:
     ----------
     id : the number that blocks refer to
     message_type : ``package/Name``, without ROS 2's ``/msg/``
-    encoding : ``cdr`` (ROS 2), ``ros1``, or what the log calls an encoding that cannot be read
-    definition : text of the message definition, empty when the log does not carry it
-    definition_format : how `definition` is written
+    encoding : ``cdr`` (ROS 2), ``ros1``, ``protobuf``, ``json``, or what the log calls one that cannot be read
+    definition : text of the message definition, empty when the log does not carry it; of Protobuf a character for each
+        byte of its FileDescriptorSet
+    definition_format : how a definition of ROS is written
     count : number of messages by the log's index, None without an index
     """
 
@@ -198,6 +199,6 @@ def some_of(names: Sequence[str]) -> str:
 
 
 def ros_type_name(name: str) -> LogText:
-    """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``."""
-    package, _, rest = name.partition("/")
-    return LogText(f"{package}/{rest.removeprefix('msg/')}")
+    """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``; a name of one part as it is."""
+    package, separator, rest = name.partition("/")
+    return LogText(f"{package}{separator}{rest.removeprefix('msg/')}")

@@ -39,7 +39,9 @@ _FOOTER, _CHUNK, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 8, 11, 15
 _HEAD_BYTES, _FOOTER_BYTES = 9, 20
 _MESSAGE_INDEX, _INDEX_HEAD = 7, struct.Struct("<BQHI")
 _CHECKSUM_BYTES = 4
-_ENCODINGS = {("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")}
+_ENCODINGS = {
+    ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg"), ("protobuf", "protobuf"), ("json", "jsonschema")
+}  # fmt: skip
 
 _LARGEST_BLOCK_BYTES = (1 << 17) + 1024
 """Of a zstd block with the frame's header: so many compressed bytes more give all bytes up to a place."""
@@ -147,7 +149,7 @@ class McapFile(ChunkedFile):
             topic=LogText(channel.topic),
             message_type=ros_type_name(schema.name) if schema else LogText(""),
             encoding=LogText(encoding),
-            definition=schema.data.decode("utf-8", "replace") if schema and (encoding, written) in _ENCODINGS else "",
+            definition=_definition(schema) if schema is not None and (encoding, written) in _ENCODINGS else "",
             definition_format="idl" if written == "ros2idl" else "msg",
             count=self._counts.get(number) if self._chunks is not None else None,
         )
@@ -380,6 +382,10 @@ def _parse(opcode: int, content: bytes) -> _Parsed | None:
     except (McapError, struct.error, ValueError, OverflowError, MemoryError):
         return None
     return record
+
+
+def _definition(schema: Schema) -> str:
+    return schema.data.decode("latin-1") if schema.encoding == "protobuf" else schema.data.decode("utf-8", "replace")
 
 
 def is_mcap(stream: BinaryIO) -> bool:

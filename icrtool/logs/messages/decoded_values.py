@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -14,17 +13,13 @@ from numpy.typing import NDArray
 from icrtool.kernels.arrays import Bools, Ints
 from icrtool.logs.containers.channel import Block
 from icrtool.logs.messages.decoder import MESSAGES_AT_ONCE, text_numbers
-from icrtool.logs.messages.schema import MOST_ELEMENTS, Slot
+from icrtool.logs.messages.schema import MOST_ELEMENTS, Slot, Step, steps_of
 from icrtool.records.text import LONGEST_TEXT
 
 LONGEST_MESSAGE_BYTES = 1 << 20
 """Of a message that is decoded by itself; those that icrtool uses have some hundred bytes."""
 
-_STEP = re.compile(r"([^.\[\]]+)|\[(\d+|\*)\]")
 _LARGEST_INTEGER = 1 << 62
-
-Step = str | int | None
-"""A field's name, an element's place, or None for all elements of a sequence."""
 
 
 class MessageColumns(Protocol):
@@ -64,11 +59,13 @@ class DecodedValues:
     Attributes
     ----------
     messages : the readable ones (n,)
+    paths : by column, the field that it is made of where that has another name
     """
 
     slots: Mapping[str, Slot]
     messages: Sequence[object]
     readable: Bools
+    paths: Mapping[str, str] = field(default_factory=dict)
 
     def numbers(self, path: str) -> NDArray[Any]:
         """Return a field of numbers; what a message lacks is NaN or 0."""
@@ -87,7 +84,7 @@ class DecodedValues:
         return _padded([text_numbers([_text(one) for one in _listed(values)], known) for values in found], -1, np.int64)
 
     def _at(self, path: str) -> list[object]:
-        steps = steps_of(path)
+        steps = steps_of(self.paths.get(path, path))
         return [value_at(message, steps) for message in self.messages]
 
 
@@ -97,10 +94,12 @@ class ValueDecoder:
 
     Attributes
     ----------
+    paths : by column, the field that it is made of
     parse : returns a message's nested values, None where it is not readable
     """
 
     slots: Mapping[str, Slot]
+    paths: Mapping[str, str]
     parse: Callable[[bytes], object] = field(repr=False)
 
     def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, DecodedValues]]:
@@ -114,13 +113,7 @@ class ValueDecoder:
                 for start, end in ends
             ]
             readable = np.array([one is not None for one in found], np.bool_)
-            yield some, DecodedValues(self.slots, [one for one in found if one is not None], readable)
-
-
-def steps_of(path: str) -> tuple[Step, ...]:
-    """Return the steps of a path such as ``joints[*].name`` or ``position_covariance[4]``."""
-    found = (match.groups() for match in _STEP.finditer(path))
-    return tuple(name or (None if place == "*" else int(place)) for name, place in found)
+            yield some, DecodedValues(self.slots, [one for one in found if one is not None], readable, self.paths)
 
 
 def value_at(value: object, steps: Sequence[Step]) -> object:
@@ -147,7 +140,7 @@ def _float(value: object) -> float:
     try:
         return float(value)
     except OverflowError:
-        return math.copysign(math.inf, value)
+        return math.inf if value > 0 else -math.inf
 
 
 def _integer(value: object) -> int:

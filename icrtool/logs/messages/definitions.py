@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache, lru_cache
 from importlib import resources
 from itertools import islice
@@ -11,7 +11,9 @@ from typing import Any, Literal
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.channel import Channel
-from icrtool.logs.messages.schema import BASE, NAME, SIZES, Definitions
+from icrtool.logs.messages.json_messages import definitions_in_schema
+from icrtool.logs.messages.protobuf import definitions_in, descriptors_of
+from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, SIZES, Definitions, FieldDetail, Step
 from icrtool.records.text import LONGEST_NAME, shortened
 
 _SEPARATOR = "=" * 80 + "\n"
@@ -43,6 +45,10 @@ def definitions_of(channel: Channel) -> Definitions:
     DefinitionError
         Neither the log nor the bundle knows the type, or the log's text cannot be parsed.
     """
+    if channel.encoding == "protobuf":
+        return definitions_in(descriptors_of(channel.definition, channel.message_type))
+    if channel.encoding == "json":
+        return definitions_in_schema(channel.definition, channel.message_type)
     if channel.definition:
         types = {**_TIME, **parse_definition(channel)}
         return types if _is_complete(types) else {**standard_definitions(), **types}
@@ -74,6 +80,23 @@ def _numbers_in(definitions: Definitions, name: str, prefix: str, depth: int) ->
             yield from _numbers_in(definitions, detail, f"{prefix}{field}.", depth + 1)
 
 
+def kind_at(definitions: Definitions, name: str, steps: Sequence[Step]) -> str | None:
+    """Return the primitive type of the field at some steps, None where a message of this type has none there."""
+    node: int = NAME
+    detail: FieldDetail = name
+    for step in steps:
+        if isinstance(step, str):
+            fields = dict(definitions[detail][1]) if node == NAME and detail in definitions else {}
+            if step not in fields:
+                return None
+            node, detail = fields[step]
+        elif node in (ARRAY, SEQUENCE):
+            (node, detail), _ = detail
+        else:
+            return None
+    return str(detail[0]) if node == BASE else None
+
+
 def _is_complete(types: Definitions) -> bool:
     """Return whether every type that a field refers to is among the types."""
     for _, fields in types.values():
@@ -85,9 +108,9 @@ def _is_complete(types: Definitions) -> bool:
 
 
 def full_name(message_type: str) -> str:
-    """Return ``package/msg/Name`` for ``package/Name``."""
+    """Return ``package/msg/Name`` for ``package/Name``; a name without a package, as Protobuf's, as it is."""
     package, _, name = message_type.partition("/")
-    return f"{package}/msg/{name}"
+    return f"{package}/msg/{name}" if name else message_type
 
 
 def parse_definition(channel: Channel) -> Definitions:
@@ -97,7 +120,7 @@ def parse_definition(channel: Channel) -> Definitions:
     ------
     DefinitionError
     """
-    return _parse(channel.definition, channel.definition_format, channel.message_type)
+    return _parse(channel.definition, "idl" if channel.definition_format == "idl" else "msg", channel.message_type)
 
 
 @lru_cache(maxsize=64)

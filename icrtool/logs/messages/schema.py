@@ -6,6 +6,7 @@ lists what to pass over and what to take; `icrtool.logs.messages.decoder` runs i
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -37,6 +38,11 @@ Real definitions reach a depth of 6 and some hundred fields; a definition that r
 """
 MOST_ELEMENTS = 256
 """Taken of a sequence."""
+
+Step = str | int | None
+"""A field's name, an element's place, or None for all elements of a sequence."""
+
+_STEP = re.compile(r"([^.\[\]]+)|\[(\d+|\*)\]")
 
 COUNTED = -1
 """In place of a number of elements: the message states it before them."""
@@ -90,6 +96,12 @@ class Layout:
     taken: int
     cdr: bool
     most: int = MOST_ELEMENTS
+
+
+def steps_of(path: str) -> tuple[Step, ...]:
+    """Return the steps of a path such as ``joints[*].name`` or ``position_covariance[4]``."""
+    found = (match.groups() for match in _STEP.finditer(path))
+    return tuple(name or (None if place == "*" else int(place)) for name, place in found)
 
 
 class _Compiler:

@@ -250,6 +250,14 @@ def _nmea(table: TopicTable) -> HeadingSource:
     return _stated(headings, heading, unknown, all_of_them, 88.0, "heading of the GNSS receiver (HDT)", what)
 
 
+def _location_fix(table: TopicTable) -> HeadingSource:
+    """Return the headings of Foxglove's LocationFix, clockwise from north."""
+    variance = table.floats("heading_variance")
+    variance, usable = np.where(variance > 0, variance, np.nan), np.ones(len(table), np.bool_)
+    what = "Foxglove: clockwise from north"
+    return _stated(table, table.column("heading"), variance, usable, 88.0, "heading of the GNSS receiver", what)
+
+
 def _absolute_pose(table: TopicTable) -> HeadingSource:
     """Return the headings of OpenMower, counter-clockwise from east, where its receiver has two antennas."""
     std = table.floats("orientation_accuracy")
@@ -271,6 +279,8 @@ HEADING_TYPES: dict[str, Entry] = {
     ),
     "geographic_msgs/GeoPoseStamped": _orientation("pose.orientation", "", 0, 50.0, "orientation of the pose"),
     "geometry_msgs/PoseStamped": _orientation("pose.orientation", "", 0, 50.0, "orientation of the pose"),
+    "foxglove.PoseInFrame": _orientation("pose.orientation", "", 0, 50.0, "orientation of the pose"),
+    "foxglove.LocationFix": ((*HEADER, "heading", "heading_variance"), _location_fix),
     "geometry_msgs/PoseWithCovarianceStamped": _orientation(
         "pose.pose.orientation", "pose.covariance", 35, 50.0, "orientation of the pose"
     ),

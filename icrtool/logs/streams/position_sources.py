@@ -290,6 +290,7 @@ _OEM7_BESTPOS = _novatel(
 
 POSITION_TYPES: dict[str, PositionEntry] = {
     "sensor_msgs/NavSatFix": (_FIX, _navsatfix),
+    "foxglove.LocationFix": (_FIX, _navsatfix),
     "gps_common/GPSFix": ((*_FIX, "err_horz"), _gpsfix),
     "gps_msgs/GPSFix": ((*_FIX, "err_horz"), _gpsfix),
     "ublox_msgs/NavPVT": (("lat", "lon", "height", *H_ACC, "flags"), _navpvt),
@@ -324,6 +325,7 @@ POSITION_TYPES: dict[str, PositionEntry] = {
         (*HEADER, *(f"{_GEO}{name}" for name in ("latitude", "longitude", "altitude"))), _geopose
     ),
     "geometry_msgs/PoseStamped": metric("pose.", "", 70.0, "metric pose"),
+    "foxglove.PoseInFrame": metric("pose.", "", 70.0, "metric pose"),
     "geometry_msgs/PoseWithCovarianceStamped": metric("pose.pose.", "pose.covariance", 70.0, "metric pose"),
     "xbot_msgs/AbsolutePose": ABSOLUTE_POSE,
     "nav_msgs/Odometry": metric(

@@ -352,6 +352,7 @@ def _twist(prefix: str, score: float, what: str = "body twist", fused: float = 4
 
 
 _JOINTS = ("name[*]", "position[*]", "velocity[*]")
+_JOINT_STATES = ("joints[*].name", "joints[*].position", "joints[*].velocity")
 _LYNX = ("drivers[*].joint_name", "drivers[*].travel", "drivers[*].velocity")
 _PUMA = _by_name(
     ("drivers_feedback[*].device_name", "drivers_feedback[*].travel", "drivers_feedback[*].speed"),
@@ -368,6 +369,7 @@ _SEGWAY_BARE, _SEGWAY_STAMPED = _segway(""), _segway("segway.", *HEADER)
 WHEEL_TYPES: dict[str, Entry] = {
     "sensor_msgs/JointState": _by_name(_JOINTS, 100.0, "wheel joints by name"),
     DYNAMIC_JOINT_STATE: _by_name(_JOINTS, 95.0, "wheel joints by name"),
+    "foxglove.JointStates": _by_name(_JOINT_STATES, 100.0, "wheel joints by name"),
     "jackal_msgs/Feedback": _TWO_DRIVERS,
     "clearpath_platform_msgs/Feedback": _TWO_DRIVERS,
     "clearpath_motor_msgs/LynxMultiFeedback": _by_name(_LYNX, 90.0, "motor driver feedback by joint name"),

@@ -431,17 +431,19 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool.fleet import manifest
     from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, open_log, sqlite_bag, unpack
-    from icrtool.logs.messages import decoder, schema
+    from icrtool.logs.messages import decoded_values, decoder, json_messages, protobuf, schema
     from icrtool.logs.streams import wheel_sources
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
     rows = [line for line in promised.splitlines() if line.startswith("|")][2:]
     stated = [int(number.replace(",", "")) for row in rows for number in re.findall(r"(?<!\w)\d[\d,]*(?= |;)", row)]
+    assert json_messages.LONGEST_SCHEMA == protobuf.LONGEST_DESCRIPTORS
     assert stated == [
         decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, decompress.FREE_BYTES,
         unpack._MOST_ENTRIES, unpack._LARGEST_READ_BYTES, unpack._LARGEST_EXTRA_BYTES,
-        sqlite_bag._LARGEST_MESSAGE_BYTES, schema.DEEPEST, schema.MOST_FIELDS,
+        sqlite_bag._LARGEST_MESSAGE_BYTES, decoded_values.LONGEST_MESSAGE_BYTES, protobuf.LONGEST_DESCRIPTORS,
+        schema.DEEPEST, schema.MOST_FIELDS,
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
         bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheel_sources.MOST_WHEELS,
         table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
