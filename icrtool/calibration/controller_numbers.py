@@ -29,9 +29,10 @@ def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
     p95, expected = calibration.held_out_m(RECOMMENDED, POSE_AFTER_M)
     _, without = calibration.held_out_m(NO_SLIP, POSE_AFTER_M)
     if p95 > LARGEST_SHARE * POSE_AFTER_M:
-        reasons.append(f"its error after {POSE_AFTER_M:g} m is {p95:.1f} m (95 %, held out)")
+        reasons.append(f"its error after {POSE_AFTER_M:g} m is {p95:.1f} m (95 %, held out of the fit)")
     if expected >= without:
-        reasons.append(f"it is no better than no slip: expected error {expected:.2f} m and {without:.2f} m, held out")
+        errors = f"expected error {expected:.2f} m and {without:.2f} m, held out of the fit"
+        reasons.append(f"it is no better than no slip: {errors}")
     if "omega_w" in calibration.fitted.not_shown:
         reasons.append("the driving did not show how the robot turns (omega_w)")
     return tuple(reasons)

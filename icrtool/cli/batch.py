@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import shutil
 import sys
 import textwrap
@@ -284,7 +285,9 @@ def line_of(row: Row) -> str:
     if row.distance_m is not None:
         parts.append(f"{row.distance_m:.0f} m")
     if not row.usable:
-        return "  ".join([*parts, f"do not use: {escaped(row.reason.removeprefix('not usable: '))}"])
+        # the first cause; all of it stands in fleet.csv
+        cause = re.split("[:;] ", row.reason.removeprefix("not usable: "))[0]
+        return "  ".join([*parts, f"do not use: {escaped(cause)}"])
     if row.multiplier is not None:
         parts.append(f"multiplier {row.multiplier:.3f} ± {row.multiplier_std or 0.0:.3f}")
     if (p95 := row.shown_error()) is not None:

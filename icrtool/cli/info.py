@@ -82,6 +82,11 @@ class Found:
     problem: IcrToolError | None = None
 
     @property
+    def name(self) -> str:
+        """That of the log, which its errors and warnings begin with."""
+        return self.survey.name if self.survey is not None else LogText(self.log.stem)
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Those of the last step that was done."""
         found = self.run if self.run is not None else self.measured
@@ -132,7 +137,7 @@ def _print(found: Found, config: Config, given: Sequence[str], *, everything: bo
         click.echo(describe_log(found.measured))
     rows = overview_rows(found.measured, found.run) if found.measured is not None else []
     rows += [excitation_row(found.run)] if found.run is not None else []
-    rows += verdict_rows(found.run, found.problem, config)
+    rows += verdict_rows(found.run, found.problem, found.name, config)
     last = [Line(f"{'next':<12}{command}", "as is")] if command is not None else []
     show(Text(["", *labelled(rows), *last]))
 
@@ -149,7 +154,7 @@ def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:
         **(survey_document(found.survey) if found.survey is not None else {}),
         "streams": streams_document(found.measured) if found.measured is not None else [],
         "warnings": list(found.warnings),
-        "verdict": verdict(found.run, found.problem),
+        "verdict": verdict(found.run, found.problem, found.name),
         "next": next_command(escaped(str(found.log)), given, found.run),
         "run": found.run.summary if found.run is not None else None,
     }

@@ -71,7 +71,8 @@ def unusable_reasons(
     if filtered:
         return [f"filtered or fused odometry ({filtered}); wheel speeds are needed: topics.wheels names their topic"]
     hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
-    reasons = [f"{', '.join(hidden)} not shown by this drive"] if hidden else []
+    why = "it turns too little, or its sensors disagree"
+    reasons = [f"this drive does not show {', '.join(hidden)}: {why}"] if hidden else []
     reasons += ["the ICRs ended inverted: check sides and signs of the wheels"] if inverted and not hidden else []
     for word, outcome in (("fixes", gnss), ("headings", heading)):
         share = rejected_share(outcome)

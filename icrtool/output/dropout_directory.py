@@ -40,7 +40,7 @@ SCHEMA_FAMILY = "icrtool/dropout/"
 KNOWS = {
     "icr": "the distance up to each start",
     "no_slip": "the track width",
-    "icr_final": "all of the drive (in sample)",
+    "icr_final": "all of the drive, the trial too",
 }
 """What the numbers of a model were learned from; those of the others from the rest of the drive."""
 

@@ -58,6 +58,7 @@ def excitation_text(excitation: Mapping[str, Any]) -> str:
         shown = "enough to show all three ICRs"
     else:
         shown = ", ".join(f"{ICR_WORDS[column]} {verdict}" for column, verdict in verdicts.items())
+        shown += " (weak: found roughly; not shown: cannot be found)"
     spun = excitation["spun_right_deg"] + excitation["spun_left_deg"]
     right, left = (f"{excitation[f'turned_{side}_deg']:,.0f}° {side}" for side in ("right", "left"))
     return f"{shown}; turned {right}, {left}, {spun:,.0f}° of it on the spot"
@@ -194,7 +195,7 @@ def controller_error_text(errors: ControllerErrors | None) -> str:
         return ""
     return (
         f"with these numbers alone the error after {CHOICE_HORIZON_M:g} m is {error_text(errors.p95_m)} (95 %, held "
-        f"out), with the whole model {error_text(errors.full_p95_m)}"
+        f"out of the fit), with the whole model {error_text(errors.full_p95_m)}"
     )
 
 

@@ -98,6 +98,25 @@ def test_a_drive_that_shows_too_little_says_what_to_drive(screen: Screen) -> Non
     check_fits(lines)
     assert (status, lines[0][:11]) == (0, "Do not use:")
     assert "How far within" not in " ".join(lines)
+    assert "two full turns on the spot to the right and two to the left" in " ".join(" ".join(lines).split())
+
+
+def test_a_drive_with_turns_to_one_side_names_the_other(screen: Screen) -> None:
+    assert screen("simulate", "-o", "circle.mcap", "--path", "circle", "--duration", "60", "-q", *ROBOT)[0] == 0
+    status, lines = screen("fit", "circle.mcap", *ROBOT, "--plots", "none")
+    check_fits(lines)
+    assert status == 0
+    first = next(number for number, line in enumerate(lines) if "excitation" in line)
+    row = " ".join(" ".join(lines[first : first + 2]).split())
+    assert re.fullmatch("! excitation y right.* weak: drive two full turns on the spot, or circles, to the left", row)
+
+
+def test_without_a_track_width_no_slip_is_not_known(screen: Screen) -> None:
+    status, lines = screen("dropout-report", ROOT / "sample_logs" / "tracked_curved.bag", "--plots", "none")
+    check_fits(lines)
+    text = " ".join(" ".join(lines).split())
+    assert status == 0
+    assert re.search(r"no slip not known needs robot\.track_width_m", text)
 
 
 def test_all_is_printed_on_request(screen: Screen) -> None:

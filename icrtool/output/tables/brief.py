@@ -29,7 +29,7 @@ from icrtool.output.text_format import (
     turn_text,
     unusable_lines,
 )
-from icrtool.records.dropout import BudgetDistance
+from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, shortened
@@ -62,25 +62,30 @@ def brief_run(run: Run, directory: str, examine: str) -> Text:
     examine : command that names what is wrong in the log
     """
     summary = run.summary
-    blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary), "title"), *_state_lines(summary)]
+    title = Line(_title(summary, _turned_text(summary)), "title")
+    blocks: list[Block] = [*unusable_lines(summary), title, *_state_lines(summary)]
     if summary["usable"]:
         blocks += [
             Line(line, "as is") for line in (*_controller_lines(run), _icr_line(run.summary.get("geometry") or {}))
         ]
-    for number, (good, what, text) in enumerate(run_checks(summary)):
-        label = "checks" if not number else ""
-        blocks.append(Line(_cut(f"{label:{LABEL}}{'ok' if good else '!':4}{what:12}{text}"), "as is"))
+    blocks += _check_lines(summary)
     if corrected := corrections(summary):
         blocks.append(labelled_line("corrected", "; ".join(corrected)))
     blocks.append(labelled_line("inputs", "; ".join(_inputs(summary))))
     blocks.append(labelled_line("written to", directory))
     if summary["usable"]:
         blocks.append(copied("next", shlex.join(["icrtool", "dropout-report", directory])))
-    elif lacks := _lacking_turns(summary):
-        blocks.append(labelled_line("next", lacks))
     else:
-        blocks.append(copied("next", examine))
+        drive = to_drive(summary)
+        blocks.append(labelled_line("next", drive) if drive else copied("next", examine))
     return Text(blocks)
+
+
+def _check_lines(summary: RunDocument) -> Iterator[Line]:
+    """Yield what was checked; what is not in order takes up to two lines."""
+    for number, (good, what, text) in enumerate(run_checks(summary)):
+        first = f"{'' if number else 'checks':{LABEL}}{'ok' if good else '!':4}{what:{LABEL}}"
+        yield Line(_wrapped(first, text, 1 if good else 2), "as is")
 
 
 def brief_dropout(report: DropoutReport, place: str) -> Text:
@@ -91,7 +96,9 @@ def brief_dropout(report: DropoutReport, place: str) -> Text:
     place : page or directory of the report
     """
     summary = report.run_summary
-    blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary), "title")]
+    blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary, _trials_text(report)), "title")]
+    if not report.usable and (drive := to_drive(summary)):
+        blocks.append(labelled_line("next", drive))
     if report.usable:
         blocks += _reach_blocks(report)
         _, sentence = trust(summary, passed=report.passed, events_left_out=report.event_cost is not None)
@@ -108,10 +115,21 @@ def brief_dropout(report: DropoutReport, place: str) -> Text:
     return Text(blocks)
 
 
-def _title(summary: RunDocument) -> str:
-    drive, excitation = summary["drive"], summary["excitation"]
+def _turned_text(summary: RunDocument) -> str:
+    excitation = summary["excitation"]
     turned = f"{excitation['turned_right_deg']:,.0f}° right, {excitation['turned_left_deg']:,.0f}° left"
-    facts = f"{drive['distance_m']:.1f} m, {duration_text(drive['duration_s'])}, turned {turned}"
+    return f"{duration_text(summary['drive']['duration_s'])}, turned {turned}"
+
+
+def _trials_text(report: DropoutReport) -> str:
+    """Return how many trials the numbers rest on, at the horizon nearest to `CHOICE_HORIZON_M` that has any."""
+    trials = report.results[0].summary.trials
+    h = int(np.argmin(np.where(trials > 0, np.abs(report.horizons_m - CHOICE_HORIZON_M), np.inf)))
+    return f"{trials[h]:,} trials of {report.horizons_m[h]:g} m"
+
+
+def _title(summary: RunDocument, more: str) -> str:
+    facts = f"{distance_text(summary['drive']['distance_m'])}, {more}"
     title = run_title(summary)
     return f"{shortened(title, max(WIDTH - len(facts) - 3, LABEL))}   {facts}"
 
@@ -135,7 +153,9 @@ def _controller_lines(run: Run) -> Iterator[str]:
     if run.track_width_m is None:
         yield f"{'controller':{LABEL}}no multiplier: robot.track_width_m is not known (--robot, --set)"
     elif not (numbers := run.summary.get("controller")):
-        yield f"{'controller':{LABEL}}no multiplier: y right and y left are not shown"
+        geometry: Mapping[str, Any] = run.summary.get("geometry") or {}
+        unknown = [ICR_WORDS[name] for name in ("y_icr_right_m", "y_icr_left_m") if geometry.get(name) is None]
+        yield f"{'controller':{LABEL}}no multiplier: {' and '.join(unknown) or 'the ICRs'} could not be found"
     else:
         yield from _number_lines(numbers, run.track_width_m)
 
@@ -166,12 +186,17 @@ def run_checks(summary: RunDocument) -> list[Check]:
         found.append((agreement.endswith("agrees"), "EKF", agreement))
     excitation, gnss, heading = summary["excitation"], summary["gnss"], summary["heading"]
     verdicts: Mapping[Any, Any] = excitation["verdict"]
-    lacks = _lacking_turns(summary)
+    # what was lacking stands beside the ICRs; what to drive, alone
+    lacks = to_drive(summary).rpartition(": ")[2]
     if set(verdicts.values()) == {"shown"}:
-        found.append((not lacks, "excitation", f"all three ICRs shown{f'; {lacks}' if lacks else ''}"))
+        found.append((not lacks, "excitation", lacks or "all three ICRs shown: enough turns for each"))
     else:
-        weak = ", ".join(f"{ICR_WORDS[name]} {one}" for name, one in verdicts.items() if one != "shown")
-        found.append((False, "excitation", f"{weak}{f': {lacks}' if lacks else ''}"))
+        weak = [(one, ICR_WORDS[name]) for name, one in verdicts.items() if one != "shown"]
+        words = "; ".join(
+            f"{', '.join(name for one, name in weak if one == verdict)} {verdict}"
+            for verdict in dict.fromkeys(one for one, _ in weak)
+        )
+        found.append((False, "excitation", f"{words}{f': {lacks}' if lacks else ''}"))
     if of := gnss["used"] + gnss["rejected"]:
         good = gnss["rejected"] < NOTED_SHARE * of
         word = "fixes" if position_word(summary) == "GNSS fixes" else "positions"
@@ -213,10 +238,12 @@ def _inputs(summary: RunDocument) -> list[str]:
     return [f"{topic} ({', '.join(taken)})" for topic, taken in roles.items()]
 
 
-def _lacking_turns(summary: RunDocument) -> str:
+def to_drive(summary: RunDocument) -> str:
+    """Return what to drive to find the ICRs that a run does not show; empty where turns would not help."""
     excitation = summary["excitation"]
     right, left = np.radians([excitation["turned_right_deg"], excitation["turned_left_deg"]]).tolist()
-    return lacking_turns(right, left)
+    advised = (one for one in excitation["sentences"] if "drive two full turns" in one)
+    return lacking_turns(right, left) or next(advised, "")
 
 
 NOTES = {"controller": "in any diff_drive_controller"}
@@ -258,13 +285,15 @@ def reach_rows(
 def _reach_blocks(report: DropoutReport) -> list[Block]:
     """Return how far the robot stays within each budget."""
     blocks: list[Block] = []
+    width_m = report.run_summary["config"]["robot"]["track_width_m"]
+    unknown = [("   no slip", "not known", "needs robot.track_width_m (--robot, --set)")] if width_m is None else []
     given = [(one.name, one.label, one.fitted_text) for one in report.calibrations]
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows = [
             (f"   {shortened(label, 28)}", text, note)
             for label, text, note in reach_rows(report.budgets, given, budget_m, len(report.run_summary["events"]))
         ]
-        blocks += [Line(f"How far within {budget_m:g} m (95 %)?", "title"), Table("lrl", rows)]
+        blocks += [Line(f"How far within {budget_m:g} m (95 %)?", "title"), Table("lrl", rows + unknown)]
     return blocks or ["How far?  No trial is as long as the shortest horizon."]
 
 
@@ -322,13 +351,18 @@ def _metres(error_m: float) -> str:
     return f"{error_m:7.2f}" if np.isfinite(error_m) else "-"
 
 
-def labelled_line(label: str, text: str, look: Look = "as is") -> Line:
-    """Return a label and a text in two lines of at most `WIDTH`; a path is not broken."""
+def labelled_line(label: str, text: str, look: Look = "as is", most: int = 2) -> Line:
+    """Return a label and a text in so many lines of at most `WIDTH`; a path is not broken."""
+    return Line(_wrapped(f"{label:{LABEL}}", text, most) or label, look)
+
+
+def _wrapped(first: str, text: str, most: int) -> str:
+    """Return a text behind `first` in so many lines at most."""
     lines = textwrap.wrap(
-        text, WIDTH, initial_indent=f"{label:{LABEL}}", subsequent_indent=" " * LABEL, break_long_words=False,
-        break_on_hyphens=False, max_lines=2, placeholder=" …",
+        text, WIDTH, initial_indent=first, subsequent_indent=" " * len(first), break_long_words=False,
+        break_on_hyphens=False, max_lines=most, placeholder=" …",
     )  # fmt: skip
-    return Line("\n".join(lines) or label, look)
+    return "\n".join(lines)
 
 
 def copied(label: str, command: str) -> Line:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import textwrap
 
 from icrtool.calibration.one_log import LogCalibration, Parameter
 from icrtool.output.text_blocks import Block, Line, Table, Text, labelled
+
+OPTIONS_WIDTH = 76
+"""Characters of options in a line of a terminal of 80 columns, beside indent and backslash."""
 
 DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
 
@@ -46,5 +50,9 @@ def setting_blocks(calibration: LogCalibration) -> list[Block]:
         shown = any(one.verdict == "shown" for one in calibration.parameters)
         why = "the drive confirms the configuration" if shown else "the drive showed nothing well enough"
         return [f"nothing to configure: {why}"]
-    options = " ".join(f"--set {setting.key}={setting.value:g}" for setting in calibration.settings)
-    return [Line(f"to configure:\n  {options}", "as is")]
+    # an option and its value stay together
+    options = " ".join(f"--set\u00a0{setting.key}={setting.value:g}" for setting in calibration.settings)
+    lines = textwrap.wrap(options, OPTIONS_WIDTH, break_long_words=False, break_on_hyphens=False)
+    # a shell joins the lines again
+    joined = " \\\n  ".join(lines).replace("\u00a0", " ")
+    return [Line(f"to configure:\n  {joined}", "as is")]

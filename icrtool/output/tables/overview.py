@@ -41,9 +41,9 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
     return rows + _extent_rows(log)
 
 
-def verdict_rows(run: Run | None, problem: IcrToolError | None, config: Config) -> list[Row]:
+def verdict_rows(run: Run | None, problem: IcrToolError | None, log: str, config: Config) -> list[Row]:
     """Return whether a log can be fitted, and what is missing."""
-    rows = [("verdict", verdict(run, problem))]
+    rows = [("verdict", verdict(run, problem, log))]
     if run is not None and config.robot.track_width_m is None:
         missing = (
             "robot.track_width_m (no multiplier, no no-slip odometry): --robot NAME (icrtool robots lists them), or "
@@ -66,8 +66,9 @@ def brief_info(
     command : to run next
     """
     name = survey.name if survey is not None else log.name if log is not None else ""
-    (_, decision), *missing = verdict_rows(run, problem, config)
-    blocks: list[Block] = [labelled_line("verdict", decision, "good" if run is not None and run.usable else "bad")]
+    (_, decision), *missing = verdict_rows(run, problem, name, config)
+    good = run is not None and run.usable
+    blocks: list[Block] = [labelled_line("verdict", decision, "good" if good else "bad", most=3)]
     rows = [*_holds_rows(survey, log), *(overview_rows(log, run) if log is not None else [])]
     rows += [excitation_row(run)] if run is not None else []
     rows += _topic_rows(survey, log)
@@ -114,10 +115,10 @@ def _topic_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
             yield "others", f"{counted(len(others), 'topic')} (-v names them, and why they are not used)"
 
 
-def verdict(run: Run | None, problem: IcrToolError | None) -> str:
-    """Return in a sentence whether a log can be fitted and used, and whether it shows the ICRs."""
+def verdict(run: Run | None, problem: IcrToolError | None, log: str) -> str:
+    """Return in a sentence whether a log, of this name, can be fitted and used, and whether it shows the ICRs."""
     if run is None:
-        return f"cannot be fitted: {problem}" if problem is not None else "cannot be fitted"
+        return f"cannot be fitted: {problem.beside(log)}" if problem is not None else "cannot be fitted"
     if not run.usable:
         return f"not usable: {run.summary['unusable_because']}"
     verdicts = run.summary["excitation"]["verdict"].values()

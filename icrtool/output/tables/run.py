@@ -38,7 +38,7 @@ SMALLEST_DELAY_S = 0.05
 """A delay below this is not worth a line."""
 
 
-SHOWN_WORDS = {"weak": "weakly shown", "not shown": "not shown"}
+SHOWN_WORDS = {"weak": "weak: found roughly", "not shown": "not shown: cannot be found"}
 """What is printed beside an ICR, by the verdict of `find_excitation`."""
 
 Row = tuple[str, str]

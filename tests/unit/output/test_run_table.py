@@ -81,7 +81,7 @@ def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., R
 def test_a_parked_robot_has_a_table_too(make_run: Callable[..., Run]) -> None:
     text = format_run(make_run(speed_mps=0.01, duration_s=20.0))
     assert line_of(text, "y right").split() == ["y", "right", "not", "shown"]
-    assert text.startswith("Do not use: y right, y left, x not shown")
+    assert text.startswith("Do not use: this drive does not show y right, y left, x: ")
     assert "too little straight driving" in text
 
 
