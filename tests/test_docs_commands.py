@@ -22,6 +22,7 @@ ELSEWHERE = {
     "docs/how-to/another-robot.md": "tests/test_docs_site.py runs it in order",
     "docs/how-to/controllers.md": "tests/test_docs_site.py runs it in order",
     "docs/how-to/notebook.md": "tests/test_docs_site.py runs it in order",
+    "docs/how-to/autopilot.md": "tests/test_docs_autopilot.py runs it on logs of both autopilots",
 }
 NOT_RUN = {
     "icrtool batch /shared/season -o /shared/results --scheduler tcp://host:8786": "needs a cluster; "
