@@ -24,9 +24,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import LEAST_CHORD_M, DriveArrays, DriveWindows, cut_chords
+from icrtool.alignment.drive_windows import LEAST_CHORD_M, DriveWindows, cut_chords
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares, sandwich_covariance, soft_l1_loss
+from icrtool.kernels.track import Track
 from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
@@ -68,24 +69,24 @@ class Convention(NamedTuple):
     heading: int
     position: int
 
-    def faults(self, offset: float, drive: DriveArrays, gyro_sense: int) -> float:
+    def faults(self, offset: float, track: Track, gyro_sense: int) -> float:
         """Return how many things would be wrong; `gyro_sense` as in `decide_conventions`."""
         count = FAULTS["swapped"] * self.swapped
         signs = self.sign_left + self.sign_right
         count += FAULTS["one side reversed"] * (signs == 0) + FAULTS["both reversed"] * (signs == -2)
-        if self.heading < 0 and self.position < 0 and drive.same_clock:
+        if self.heading < 0 and self.position < 0 and track.same_clock:
             count += FAULTS["pose mirrored"]
         else:
             count += FAULTS["heading mirrored"] * (self.heading < 0) + FAULTS["position mirrored"] * (self.position < 0)
             # an ENU yaw read as a NED one, or the reverse, is turned by a quarter as well
-            if self.heading < 0 and not drive.same_clock:
+            if self.heading < 0 and not track.same_clock:
                 offset = math.remainder(offset - math.pi / 2, 2 * math.pi)
         count += FAULTS["turned about"] * (abs(offset) > ABOUT_RAD)
-        count += FAULTS["drives backwards"] * self._drives_backwards(drive)
+        count += FAULTS["drives backwards"] * self._drives_backwards(track)
         return count + FAULTS["gyro upside down"] * (gyro_sense * self.heading < 0)
 
-    def _drives_backwards(self, drive: DriveArrays) -> bool:
-        distance = (self.sign_left * drive.v_left + self.sign_right * drive.v_right) * drive.wheel_dt
+    def _drives_backwards(self, track: Track) -> bool:
+        distance = (self.sign_left * track.v_left + self.sign_right * track.v_right) * track.held
         return float(-np.minimum(distance, 0.0).sum()) > BACKWARDS_SHARE * float(np.abs(distance).sum()) > 0.0
 
 
@@ -115,7 +116,7 @@ class _Shown(NamedTuple):
 
 
 def decide_conventions(
-    drive: DriveArrays, windows: DriveWindows, *, metric: bool, gyro_sense: int = 0, mirror_allowed: bool = True
+    track: Track, windows: DriveWindows, *, metric: bool, gyro_sense: int = 0, mirror_allowed: bool = True
 ) -> Decision:
     """Compare all hypotheses.
 
@@ -127,8 +128,8 @@ def decide_conventions(
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
         return Decision(AS_NAMED, None)
-    shown = {hand: _show(drive, windows, hand) for hand in (1, -1)}
-    losses = _losses(shown, 0.5 * drive.fix_std_m / windows.length_m)
+    shown = {hand: _show(track, windows, hand) for hand in (1, -1)}
+    losses = _losses(shown, 0.5 * track.place_std_m / windows.length_m)
     costs: dict[Convention, tuple[float, float]] = {}
     for swapped, left, right, heading, position in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1)):
         if (position < 0 and not metric) or (heading < 0 and not mirror_allowed):
@@ -140,21 +141,21 @@ def decide_conventions(
     best = min(cost for cost, _ in costs.values())
     if named - best < DECISIVE:
         return Decision(AS_NAMED, None)
-    likely = {one: one.faults(offset, drive, gyro_sense) for one, (cost, offset) in costs.items() if cost < best + TIE}
+    likely = {one: one.faults(offset, track, gyro_sense) for one, (cost, offset) in costs.items() if cost < best + TIE}
     ranked = sorted(likely, key=lambda one: (likely[one], costs[one][0]))
     chosen = ranked[0]
     close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5
     return Decision(chosen, ranked[1] if close else None)
 
 
-def senses_by_distance(drive: DriveArrays) -> Convention:
+def senses_by_distance(track: Track) -> Convention:
     """Return whether one side counts backwards, by distances alone: for a drive without a heading.
 
     Of two such sides, that one is reversed with which the robot drives forward.
     """
-    _, step, left, right = cut_chords(drive)
+    _, step, left, right = cut_chords(track)
     chord = np.abs(step)
-    moved = chord > max(LEAST_CHORD_M, CHORD_IN_POSITION_STD * drive.fix_std_m)
+    moved = chord > max(LEAST_CHORD_M, CHORD_IN_POSITION_STD * track.place_std_m)
     if np.count_nonzero(moved) < FEWEST_WINDOWS:
         return AS_NAMED
     as_named, reversed_ = (
@@ -172,24 +173,21 @@ TIE = 9.0
 FEWEST_WINDOWS = 16
 
 
-def _show(drive: DriveArrays, windows: DriveWindows, hand: int) -> _Shown:
+def _show(track: Track, windows: DriveWindows, hand: int) -> _Shown:
     """Fit displacements and turns for one handedness, with hardly any prior."""
-    v, u = drive.mean_speed, drive.half_difference
+    v, u = track.mean_speed, track.half_difference
     some = slice(None, None, max(1, len(windows.begin) // MOST_WINDOWS))
     begin, end = windows.begin[some], windows.end[some]
-    nose = drive.nose if hand > 0 else np.conj(drive.nose)
-    spans = [(at[end] - at[begin]) / windows.length_m for at in map(drive.until_fixes, (v * nose, u * nose))]
-    seen = (drive.fix[end] - drive.fix[begin]) / windows.length_m
+    nose = track.nose if hand > 0 else track.nose.conj()
+    spans = [(at[end] - at[begin]) / windows.length_m for at in (track.at_places(rate * nose) for rate in (v, u))]
+    seen = (track.place[end] - track.place[begin]) / windows.length_m
     columns = np.column_stack([spans[0], 1j * spans[0], spans[1], 1j * spans[1]])
     design, target = np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])
     place = _linear(design, target)
     few = slice(None, None, max(1, len(windows.turn_begin) // MOST_WINDOWS))
     first, last = windows.turn_begin[few], windows.turn_end[few]
-    turned = hand * (np.interp(last, drive.heading_t, drive.heading) - np.interp(first, drive.heading_t, drive.heading))
-    by = [
-        np.interp(last, drive.wheel_t, total) - np.interp(first, drive.wheel_t, total)
-        for total in map(drive.cumulate, (u, v))
-    ]
+    turned = hand * (track.heading_at(last) - track.heading_at(first))
+    by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in map(track.cumulate, (u, v))]
     turn = _linear(np.column_stack(by), turned)
     of_place = sandwich_covariance(place, np.tile(windows.group[some], 2))
     return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group[few]), place.residuals)
@@ -259,16 +257,16 @@ def _in_words(one: Convention) -> str:
     return " with ".join(parts) if parts else "sides as named and a heading turned by 180°"
 
 
-def gyro_sense(log: RobotLog, drive: DriveArrays) -> int:
+def gyro_sense(log: RobotLog, track: Track) -> int:
     """Return +1 where the gyro turns as the heading is named, -1 where in the opposite sense, 0 where not shown."""
-    if log.gyro is None or len(drive.heading_t) < 3:
+    if log.gyro is None or len(track.heading_t) < 3:
         return 0
     t = (log.gyro.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
     turned = np.concatenate([[0.0], np.cumsum(np.diff(t) * log.gyro.rate_radps[:-1])])
     edges = t[0] + np.unique(np.floor(t - t[0]))
     by_gyro, by_heading = (
         np.diff(np.interp(edges, t, turned)),
-        np.diff(np.interp(edges, drive.heading_t, drive.heading)),
+        np.diff(track.heading_at(edges)),
     )
     if len(by_gyro) < FEWEST_WINDOWS or not (np.ptp(by_gyro) > 0 and np.ptp(by_heading) > 0):
         return 0

@@ -20,7 +20,7 @@ from icrtool.alignment.conventions import (
     gyro_sense,
     senses_by_distance,
 )
-from icrtool.alignment.drive_windows import DriveArrays, DriveWindows, alignment_window_m, cut_windows, drive_arrays
+from icrtool.alignment.drive_windows import DriveWindows, alignment_window_m, cut_windows, track_of_log
 from icrtool.alignment.estimator import AlignmentFit, Geometry, estimate_alignment
 from icrtool.alignment.heading.heading_alignment import (
     FEWEST_WINDOWS,
@@ -54,6 +54,7 @@ from icrtool.alignment.wheels.wheel_alignment import (
 from icrtool.alignment.wheels.wheel_units import refuse_parked
 from icrtool.config import Config
 from icrtool.errors import DataError
+from icrtool.kernels.track import Track
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
@@ -67,7 +68,7 @@ class AlignedStreams(NamedTuple):
     Attributes
     ----------
     log : corrected; the heading's offset stands in `heading`, which the filter applies
-    drive : what the estimate was made of; fit : the estimate, None where the drive is too short
+    track : what the estimate was made of; fit : the estimate, None where the drive is too short
     derived : the heading where it was estimated, else None
     """
 
@@ -75,7 +76,7 @@ class AlignedStreams(NamedTuple):
     wheels: WheelAlignment
     heading: HeadingAlignment
     delays: StreamDelays
-    drive: DriveArrays
+    track: Track
     fit: AlignmentFit | None
     derived: DerivedHeading | None
 
@@ -92,18 +93,18 @@ class AlignedStreams(NamedTuple):
     @property
     def fix_steps(self) -> FixSteps:
         """Steps between the fixes beyond the motion of the wheels."""
-        expected = self.drive.laid_until_fixes() if self.fit is None else self.fit.expected_motion()[0]
-        return measure_steps(self.drive.fix_t, self.drive.fix, expected)
+        expected = self.track.laid if self.fit is None else self.fit.expected_motion()[0]
+        return measure_steps(self.track.place_t, self.track.place, expected)
 
     @property
     def heading_steps(self) -> FixSteps:
         """Steps of the heading between the fixes [rad] beyond the turn of the wheels; none without an estimate."""
-        drive = self.drive
-        if self.fit is None or not len(drive.heading_t):
+        track = self.track
+        if self.fit is None or not len(track.heading_t):
             return measure_steps(np.empty(0), np.empty(0, np.complex128), np.empty(0, np.complex128))
-        turned = np.interp(drive.fix_t, drive.heading_t, drive.heading)
+        turned = track.heading_at(track.place_t)
         by_wheels = self.fit.expected_motion()[1]
-        return measure_steps(drive.fix_t, turned.astype(np.complex128), by_wheels.astype(np.complex128))
+        return measure_steps(track.place_t, turned.astype(np.complex128), by_wheels.astype(np.complex128))
 
 
 def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
@@ -116,11 +117,11 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     """
     corrects, width = config.filter.preset == "field", width_or_usual_m(config.robot.track_width_m)
     as_sent = log
-    log, derived, decision, drive, windows, notes, sound = _name_streams(log, config, width)
-    refuse_standing(log, drive, windows)
-    course = compare_with_course(drive, windows)
+    log, derived, decision, track, windows, notes, sound = _name_streams(log, config, width)
+    refuse_standing(log, track, windows)
+    course = compare_with_course(track, windows)
     free, convention = config.frames.heading_offset_deg == "auto" and corrects, decision.convention
-    fit = estimate_alignment(drive, windows, width)
+    fit = estimate_alignment(track, windows, width)
     if derived is not None:
         heading = align_estimated_heading(log, derived, None)
     else:
@@ -137,23 +138,23 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
             refuse_unexplained(log, course)
         heading = align_heading(log, config, fit, course, stated_source(log), convention)
         if free and config.frames.heading == "auto":
-            derived = fuse_heading(log, drive)
+            derived = fuse_heading(log, track)
         if derived is not None:
             log = derived.apply(log)
-            drive = drive_arrays(log, derived.smoothed)
-            fit = estimate_alignment(drive, cut_windows(drive, alignment_window_m(drive, width)), width)
+            track = track_of_log(log, derived.smoothed)
+            fit = estimate_alignment(track, cut_windows(track, alignment_window_m(track, width)), width)
             heading = align_estimated_heading(log, derived, heading)
     configured = configured_scales(config)
     if convention.swapped and corrects:
         configured = configured[::-1]
     wheels = align_wheels(log, config, fit, configured, notes, sound=sound)
     delays = find_delays(log, config, fit)
-    return AlignedStreams(delays.apply(scaled(log, *wheels.applied)), wheels, heading, delays, drive, fit, derived)
+    return AlignedStreams(delays.apply(scaled(log, *wheels.applied)), wheels, heading, delays, track, fit, derived)
 
 
 def _name_streams(
     log: RobotLog, config: Config, width_m: float
-) -> tuple[RobotLog, DerivedHeading | None, Decision, DriveArrays, DriveWindows, list[str], bool]:
+) -> tuple[RobotLog, DerivedHeading | None, Decision, Track, DriveWindows, list[str], bool]:
     """Find the heading of a log without one, then which side is which, and in which sense streams turn.
 
     Returns
@@ -170,11 +171,11 @@ def _name_streams(
         log = derived.apply(log)
     check_streams(log)
     faults = dead_or_copied(log)
-    drive = drive_arrays(log, None if derived is None else derived.smoothed)
-    windows = cut_windows(drive, alignment_window_m(drive, width_m))
+    track = track_of_log(log, None if derived is None else derived.smoothed)
+    windows = cut_windows(track, alignment_window_m(track, width_m))
     free = config.frames.heading == "auto" and derived is None
     decision = decide_conventions(
-        drive, windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, drive), mirror_allowed=free
+        track, windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, track), mirror_allowed=free
     )
     named = apply_convention(log, decision.convention)
     if named is not log:
@@ -182,23 +183,23 @@ def _name_streams(
             # it was made with wheels whose sides are exchanged, or run backwards
             derived = _derived_heading(named, width_m)
             named = derived.apply(named)
-        drive = drive_arrays(named, None if derived is None else derived.smoothed)
-        windows = cut_windows(drive, alignment_window_m(drive, width_m))
+        track = track_of_log(named, None if derived is None else derived.smoothed)
+        windows = cut_windows(track, alignment_window_m(track, width_m))
     notes = [
         *faults,
         *convention_notes(Decision(senses, None), corrects=True),
         *convention_notes(decision, corrects=corrects),
     ]
     if derived is None and config.frames.heading != "auto":
-        free_hand = decide_conventions(drive, windows, metric=False)
+        free_hand = decide_conventions(track, windows, metric=False)
         if free_hand.convention.heading < 0:
             notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
-    return named if corrects else log, derived, decision, drive, windows, notes, not faults
+    return named if corrects else log, derived, decision, track, windows, notes, not faults
 
 
 def _senses_without_heading(log: RobotLog) -> Convention:
     few = min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < 2
-    return AS_NAMED if few else senses_by_distance(drive_arrays(log))
+    return AS_NAMED if few else senses_by_distance(track_of_log(log))
 
 
 def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
@@ -209,12 +210,12 @@ def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         refuse_parked(log)
         if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < FEWEST_WINDOWS:
             raise
-        drive = drive_arrays(log)
-        if drive.travel[-1] < FAR_IN_POSITION_STD * max(drive.fix_std_m, SHORT_DRIVE_M):
+        track = track_of_log(log)
+        if track.travel[-1] < FAR_IN_POSITION_STD * max(track.place_std_m, SHORT_DRIVE_M):
             raise
         raise DataError(
             log.name,
-            f"no heading in it, and a drive of {drive.travel[-1]:.0f} m is too short to find one from positions of "
-            f"±{drive.fix_std_m:.1f} m",
+            f"no heading in it, and a drive of {track.travel[-1]:.0f} m is too short to find one from positions of "
+            f"±{track.place_std_m:.1f} m",
             "record an orientation (AHRS), use RTK, or drive several times as far",
         ) from error

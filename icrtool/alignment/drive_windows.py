@@ -9,6 +9,7 @@ import numpy as np
 
 from icrtool.alignment.position.gnss_steps import bend_std_m, unbroken
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.kernels.track import Track, cut
 from icrtool.records.measurements import TURNING_MPS, Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
@@ -42,60 +43,6 @@ STANDS_S = 5.0
 
 MOST_WHEEL_SAMPLES = 100_000
 """The samples of a longer drive are joined to about so many: 1 h at 28 Hz, where windows last seconds."""
-
-
-class DriveArrays(NamedTuple):
-    """A log in seconds since its first wheel sample.
-
-    Attributes
-    ----------
-    wheel_t, wheel_dt : (n,) `wheel_dt` is 0 where the next sample is too far away
-    v_left, v_right : (n,) [m/s]
-    heading_t, heading : (h,) unwrapped [rad], clockwise from north
-    fix_t : (m,); fix : complex (m,), north + j east [m]
-    travel : (n,) mean of the distances of both sides [m], without their signs
-    fix_std_m : noise of the fixes, an axis
-    same_clock : position and heading are fields of the same messages
-    """
-
-    wheel_t: Floats
-    wheel_dt: Floats
-    v_left: Floats
-    v_right: Floats
-    heading_t: Floats
-    heading: Floats
-    fix_t: Floats
-    fix: Complexes
-    travel: Floats
-    fix_std_m: float
-    same_clock: bool
-
-    @property
-    def mean_speed(self) -> Floats:
-        """Mean of the sides' speeds (n,) [m/s]."""
-        return (self.v_left + self.v_right) / 2
-
-    @property
-    def half_difference(self) -> Floats:
-        """Half of what left is faster than right (n,) [m/s]."""
-        return (self.v_left - self.v_right) / 2
-
-    @property
-    def nose(self) -> Complexes:
-        """Heading as a unit vector in the middle of each wheel interval (n,)."""
-        return np.asarray(np.exp(1j * np.interp(self.wheel_t + self.wheel_dt / 2, self.heading_t, self.heading)))
-
-    def cumulate(self, rate: Floats | Complexes) -> Complexes:
-        """Return the integral of a rate (n,) until each wheel sample (n,)."""
-        return np.concatenate([[0.0], np.cumsum((rate * self.wheel_dt)[:-1])])
-
-    def until_fixes(self, rate: Floats | Complexes) -> Complexes:
-        """Return the integral of a rate (n,) until each fix (m,)."""
-        return np.asarray(np.interp(self.fix_t, self.wheel_t, self.cumulate(rate)))
-
-    def laid_until_fixes(self) -> Complexes:
-        """Return the mean of the sides laid along the heading, until each fix (m,) [m]."""
-        return self.until_fixes(self.mean_speed * self.nose)
 
 
 class Chords(NamedTuple):
@@ -140,57 +87,50 @@ class DriveWindows(NamedTuple):
         )  # fmt: skip
 
 
-def drive_arrays(log: RobotLog, heading: HeadingSamples | None = None) -> DriveArrays:
+def track_of_log(log: RobotLog, heading: HeadingSamples | None = None) -> Track:
     """Return a log as arrays; `heading` in place of its own."""
     stated = log.heading if heading is None else heading
-    return join_streams(
+    return track_of_streams(
         log.wheels, log.gnss, stated, same_clock=log.heading_is_of_position, slipping_ns=log.slipping_ns
     )
 
 
-def join_streams(
+def track_of_streams(
     wheels: WheelSamples, gnss: PositionFixes | Fixes, heading: HeadingSamples, *, same_clock: bool,
     slipping_ns: tuple[tuple[int, int], ...] = (),
-) -> DriveArrays:  # fmt: skip
-    """Return streams as arrays; `same_clock` as in `DriveArrays`; `slipping_ns`, of `RobotLog`, are gaps."""
+) -> Track:  # fmt: skip
+    """Return streams as arrays; `same_clock` as in `Track`; `slipping_ns`, of `RobotLog`, are gaps."""
     epoch = int(wheels.stamp_ns[0])
     wheel_t, fix_t, heading_t = (
         (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, gnss.stamp_ns, heading.stamp_ns)
     )
-    dt = np.append(unbroken(np.diff(wheel_t)), 0.0)
+    held = np.append(unbroken(np.diff(wheel_t)), 0.0)
     for span in slipping_ns:
-        dt[slice(*np.searchsorted(wheels.stamp_ns, span))] = 0.0
+        held[slice(*np.searchsorted(wheels.stamp_ns, span))] = 0.0
     left, right = wheels.v_left_mps, wheels.v_right_mps
     turns = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
     so_far = np.concatenate([[0], np.cumsum(turns)])
     near = [np.searchsorted(wheel_t, heading_t + shift) for shift in (-STANDS_S, STANDS_S)]
     heading_t, angle = _averaged(heading_t, np.unwrap(heading.heading_rad), so_far[near[1]] > so_far[near[0]])
-    wheel_t, dt, left, right = _joined(wheel_t, dt, left, right, turns)
-    step = dt * (np.abs(left) + np.abs(right)) / 2
-    return DriveArrays(
-        wheel_t, dt, left, right, heading_t, angle,
-        fix_t, gnss.north_m + 1j * gnss.east_m, np.concatenate([[0.0], np.cumsum(step[:-1])]),
-        fix_std_m(gnss), same_clock,
+    none = np.zeros(len(fix_t), np.bool_)
+    track = _joined(
+        Track(
+            wheel_t, held, left, right, fix_t, gnss.north_m, gnss.east_m, heading_t, angle, np.zeros(len(fix_t)),
+            none, none, none, place_std_m=fix_std_m(gnss), same_clock=same_clock,
+        ), turns,
     )  # fmt: skip
+    return track._replace(distance=np.interp(fix_t, track.t, track.travel))
 
 
-def _joined(t: Floats, dt: Floats, left: Floats, right: Floats, turns: Bools) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return times, intervals and speeds with neighbouring samples of a long drive joined; distances are the same.
+def _joined(track: Track, turns: Bools) -> Track:
+    """Return a track, of a long drive with neighbouring wheel samples joined; distances are the same.
 
-    Gaps (`dt` 0) stay samples of their own; `turns` (n,) marks where the wheels do.
+    Gaps stay samples of their own; `turns` (n,) marks where the wheels do.
     """
-    if len(t) <= MOST_WHEEL_SAMPLES:
-        return t, dt, left, right
-    gap = dt == 0.0
-    begins = gap | np.append(True, gap[:-1])
-    begins[_thinned(turns)] = begins[-1] = True
-    first = np.flatnonzero(begins)
-    joined = np.add.reduceat(dt, first)
-    speeds = []
-    for speed in (left, right):
-        distance = np.add.reduceat(dt * speed, first)
-        speeds.append(np.divide(distance, joined, out=speed[first].copy(), where=joined > 0.0))
-    return t[first], joined, speeds[0], speeds[1]
+    if len(track.t) <= MOST_WHEEL_SAMPLES:
+        return track
+    gaps = np.flatnonzero(track.held[:-1] == 0.0)
+    return track.joined(np.unique(np.concatenate([_thinned(turns), gaps, gaps + 1, [len(track.t) - 1]])))
 
 
 def _thinned(busy: Bools) -> Ints:
@@ -222,18 +162,18 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     return seen if seen > NOISIER * stated else stated
 
 
-def window_length(drive: DriveArrays, least_m: float) -> float:
+def window_length(track: Track, least_m: float) -> float:
     """Return how long windows are [m]: at least so, and as the noise of the fixes and held wheel values ask for."""
-    noise = WINDOW_IN_POSITION_STD * min(drive.fix_std_m, 10.0)
-    return max(least_m, noise, min(WINDOW_IN_VALUES * _value_length(drive), LONGEST_WINDOW_M))
+    noise = WINDOW_IN_POSITION_STD * min(track.place_std_m, 10.0)
+    return max(least_m, noise, min(WINDOW_IN_VALUES * _value_length(track), LONGEST_WINDOW_M))
 
 
-def alignment_window_m(drive: DriveArrays, width_m: float) -> float:
+def alignment_window_m(track: Track, width_m: float) -> float:
     """Return how long the windows of the alignment are [m], for a robot of track width b [m]."""
-    return window_length(drive, min(WINDOW_M, WINDOW_IN_WIDTHS * width_m))
+    return window_length(track, min(WINDOW_M, WINDOW_IN_WIDTHS * width_m))
 
 
-def cut_windows(drive: DriveArrays, length_m: float | None = None) -> DriveWindows:
+def cut_windows(track: Track, length_m: float | None = None) -> DriveWindows:
     """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
 
     All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
@@ -242,38 +182,34 @@ def cut_windows(drive: DriveArrays, length_m: float | None = None) -> DriveWindo
     ----------
     length_m : of a window; default that of the alignment of a robot of usual size
     """
-    length = window_length(drive, WINDOW_M) if length_m is None else length_m
-    at_fix = np.interp(drive.fix_t, drive.wheel_t, drive.travel)
-    cell = np.floor(at_fix / (length / STARTS_A_WINDOW))
-    begin = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1) > 0) if len(cell) else np.empty(0, np.int64)
-    end = np.searchsorted(at_fix, at_fix[begin] + length)
-    begin, end = begin[end < len(at_fix)], end[end < len(at_fix)]
-    first, last = _common_span(drive)
-    whole = (drive.fix_t[begin] >= first) & (drive.fix_t[end] <= last)
-    whole &= drive.fix_t[end] - drive.fix_t[begin] < LONGEST_WINDOW_S
-    whole &= (at_fix[end] - at_fix[begin] < 2.0 * length) & _clear(drive, drive.fix_t[begin], drive.fix_t[end])
+    length = window_length(track, WINDOW_M) if length_m is None else length_m
+    begin, end, _ = cut(track, [length], length / STARTS_A_WINDOW)
+    first, last = _common_span(track)
+    t, at = track.place_t, track.distance
+    whole = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_WINDOW_S)
+    whole &= at[end] - at[begin] < 2.0 * length
     begin, end = begin[whole], end[whole]
-    turn_begin, turn_end = _turn_windows(drive, first, last)
-    size = _group_length(float(drive.travel[-1]), length)
-    turn_travel = np.interp(turn_begin, drive.wheel_t, drive.travel)
+    turn_begin, turn_end = _turn_windows(track, first, last)
+    size = _group_length(float(track.travel[-1]), length)
+    turn_travel = np.interp(turn_begin, track.t, track.travel)
     return DriveWindows(
         begin, end, length, turn_begin, turn_end,
-        np.floor(at_fix[begin] / size).astype(np.int64), np.floor(turn_travel / size).astype(np.int64),
+        np.floor(at[begin] / size).astype(np.int64), np.floor(turn_travel / size).astype(np.int64),
     )  # fmt: skip
 
 
-def cut_chords(drive: DriveArrays) -> Chords:
+def cut_chords(track: Track) -> Chords:
     """Cut a drive into spans of `CHORD_S` from fix to fix, without a heading."""
-    rows = np.unique(np.floor(drive.fix_t / CHORD_S), return_index=True)[1]
-    left, right = (np.diff(drive.until_fixes(speed)[rows]).real for speed in (drive.v_left, drive.v_right))
-    return Chords(np.diff(drive.fix_t[rows]), np.diff(drive.fix[rows]), left, right)
+    rows = np.unique(np.floor(track.place_t / CHORD_S), return_index=True)[1]
+    left, right = (np.diff(track.at_places(speed)[rows]) for speed in (track.v_left, track.v_right))
+    return Chords(np.diff(track.place_t[rows]), np.diff(track.place[rows]), left, right)
 
 
-def _value_length(drive: DriveArrays) -> float:
+def _value_length(track: Track) -> float:
     """Return the distance [m] on which a wheel value lasts while the robot moves, however often it is repeated."""
-    moving = np.diff(drive.travel) > 0
-    changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (drive.v_left, drive.v_right)]
-    return float(drive.travel[-1]) / max(sum(changes) / 2, 1.0)
+    moving = np.diff(track.travel) > 0
+    changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
+    return float(track.travel[-1]) / max(sum(changes) / 2, 1.0)
 
 
 def _group_length(total: float, length: float) -> float:
@@ -281,24 +217,18 @@ def _group_length(total: float, length: float) -> float:
     return min(max(total / 40.0, 2.0 * length), 10.0 * length)
 
 
-def _common_span(drive: DriveArrays) -> tuple[float, float]:
+def _common_span(track: Track) -> tuple[float, float]:
     """Return begin and end of what wheels and heading both cover [s]."""
-    starts, ends = [drive.wheel_t[0]], [drive.wheel_t[-1]]
-    if len(drive.heading_t):
-        starts.append(drive.heading_t[0])
-        ends.append(drive.heading_t[-1])
+    starts, ends = [track.t[0]], [track.t[-1]]
+    if len(track.heading_t):
+        starts.append(track.heading_t[0])
+        ends.append(track.heading_t[-1])
     return float(max(starts)), float(min(ends))
 
 
-def _clear(drive: DriveArrays, begin: Floats, end: Floats) -> Bools:
-    """Return which spans (w,) hold no gap in the wheel data."""
-    gap = drive.wheel_t[:-1][drive.wheel_dt[:-1] == 0.0]
-    return np.asarray(np.searchsorted(gap, begin) == np.searchsorted(gap, end))
-
-
-def _turn_windows(drive: DriveArrays, first: float, last: float) -> tuple[Floats, Floats]:
+def _turn_windows(track: Track, first: float, last: float) -> tuple[Floats, Floats]:
     """Return begin and end of windows [s] in which wheels and heading were sampled and the wheels turned."""
-    t = drive.heading_t
+    t = track.heading_t
     if not len(t):
         return np.empty(0), np.empty(0)
     begin = t[0] + TURN_STEP_S * np.unique(np.floor((t - t[0]) / TURN_STEP_S))
@@ -308,6 +238,6 @@ def _turn_windows(drive: DriveArrays, first: float, last: float) -> tuple[Floats
     begin = begin[(begin >= first) & (begin + length <= last)]
     end = begin + length
     sampled = np.searchsorted(t, end) > np.searchsorted(t, begin) + 1
-    moved = np.interp(end, drive.wheel_t, drive.travel) > np.interp(begin, drive.wheel_t, drive.travel)
-    kept = sampled & moved & _clear(drive, begin, end)
+    moved = np.interp(end, track.t, track.travel) > np.interp(begin, track.t, track.travel)
+    kept = sampled & moved & track.clear(begin, end)
     return begin[kept], end[kept]

@@ -21,9 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
+from icrtool.alignment.drive_windows import DriveWindows
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
+from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S
 
 NAMES = (
@@ -138,7 +139,7 @@ class AlignmentFit(NamedTuple):
     width_m: float
     windows: DriveWindows
     turning_speed_mps: float
-    drive: DriveArrays
+    track: Track
 
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
@@ -166,7 +167,7 @@ class AlignmentFit(NamedTuple):
         return self._beyond_noise(float(self.fit.scale[0]))
 
     def _beyond_noise(self, scatter_m: float) -> float:
-        return math.sqrt(max(scatter_m**2 - 2.0 * self.drive.fix_std_m**2, 0.0)) / self.windows.length_m
+        return math.sqrt(max(scatter_m**2 - 2.0 * self.track.place_std_m**2, 0.0)) / self.windows.length_m
 
     @property
     def turn_wander_rad(self) -> float:
@@ -178,7 +179,7 @@ class AlignmentFit(NamedTuple):
     @property
     def turn_slip(self) -> float:
         """Robust scatter of the turns within a second about those of the wheels, in parts of the usual turn."""
-        turned = _turned(self.drive, self.windows)
+        turned = _turned(self.track, self.windows)
         return float(self.fit.scale[-1]) / max(math.sqrt(float(np.mean(turned**2))), LEAST_TURN_RAD)
 
     @property
@@ -188,7 +189,7 @@ class AlignmentFit(NamedTuple):
 
     def expected_motion(self) -> tuple[Complexes, Floats]:
         """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,), by this estimate."""
-        return _Model(self.drive, self.windows, self.width_m).until_fixes(self.fit.x)
+        return _Model(self.track, self.windows, self.width_m).until_fixes(self.fit.x)
 
     def geometry(self) -> Geometry:
         """Return ICRs and side scales, and their covariance by complex-step differentiation of first order."""
@@ -202,13 +203,13 @@ class AlignmentFit(NamedTuple):
         values = _geometry(x.astype(np.complex128), b, self.turning_speed_mps).real
         covariance = jacobian @ self.covariance @ jacobian.T
         # at one speed, positions that lag look like an antenna further back
-        covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.drive, self.width_m)) ** 2
+        covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.track, self.width_m)) ** 2
         return Geometry(values, covariance)
 
 
 def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
-    model, w = _Model(found.drive, found.windows, found.width_m), len(found.windows.begin)
+    model, w = _Model(found.track, found.windows, found.width_m), len(found.windows.begin)
     neutral = PRIOR_MEAN.copy()
     neutral[K] = found.fit.x[K]
     parts = []
@@ -219,9 +220,9 @@ def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     return ResidualsByEstimate(before, after, turn_before, turn_after, model.turned)
 
 
-def _clock_std_s(drive: DriveArrays, width_m: float) -> float:
+def _clock_std_s(track: Track, width_m: float) -> float:
     """Return what no drive shows of the time between position and heading, or of a robot's response."""
-    return RESPONSE_STD_S if drive.same_clock else max(CLOCK_S_PER_M * width_m, RESPONSE_STD_S)
+    return RESPONSE_STD_S if track.same_clock else max(CLOCK_S_PER_M * width_m, RESPONSE_STD_S)
 
 
 def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
@@ -232,12 +233,12 @@ def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
     return np.array([y_right, y_left, -x[C] - x[L] * speed, left * width, right * width, width])
 
 
-def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float) -> AlignmentFit | None:
+def estimate_alignment(track: Track, windows: DriveWindows, width_m: float) -> AlignmentFit | None:
     """Estimate all parameters jointly; None with too few windows.
 
     Parameters
     ----------
-    drive : with a heading; windows : of the same drive
+    track : with a heading; windows : of the same drive
     width_m : the track width b
 
     Notes
@@ -247,7 +248,7 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
         return None
-    model = _Model(drive, windows, width_m)
+    model = _Model(track, windows, width_m)
     start = PRIOR_MEAN.copy()
     offset = model.first_offset()
     start[D] = 0.0 if offset is None else offset
@@ -257,7 +258,7 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
     prior_std = PRIOR_STD.copy()
     # spins show the distance of the ICRs' middle from the antenna, and not its direction
     prior_std[D] = MOUNTING_STD_RAD if offset is None else prior_std[D]
-    prior_std[TP] = SAME_CLOCK_STD_S if drive.same_clock else prior_std[TP]
+    prior_std[TP] = SAME_CLOCK_STD_S if track.same_clock else prior_std[TP]
     prior_std[M] = MIDDLE_STD_M / (1.5 * width_m)
     prior_std[C] *= width_m
     try:
@@ -272,12 +273,12 @@ def estimate_alignment(drive: DriveArrays, windows: DriveWindows, width_m: float
         return None
     covariance[TH, TH] += RESPONSE_STD_S**2
     covariance[A, A] += SCALE_STD**2
-    if not drive.same_clock:
-        covariance[TP, TP] += _clock_std_s(drive, width_m) ** 2
-        covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(drive.wheel_t[-1]), 1e-9))
-    weight = drive.wheel_dt * model.u**2
+    if not track.same_clock:
+        covariance[TP, TP] += _clock_std_s(track, width_m) ** 2
+        covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(track.t[-1]), 1e-9))
+    weight = track.held * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
-    return AlignmentFit(fit, covariance, width_m, windows, speed, drive)
+    return AlignmentFit(fit, covariance, width_m, windows, speed, track)
 
 
 def _smooth(t: Floats, angle: Floats) -> Floats:
@@ -290,31 +291,31 @@ def _smooth(t: Floats, angle: Floats) -> Floats:
     return np.where(reach > 0.0, mean, angle)
 
 
-def _turned(drive: DriveArrays, windows: DriveWindows) -> Floats:
+def _turned(track: Track, windows: DriveWindows) -> Floats:
     """Return the turn of the heading in each short window (m,) [rad]."""
-    begin, end = (np.interp(at, drive.heading_t, drive.heading) for at in (windows.turn_begin, windows.turn_end))
+    begin, end = (track.heading_at(at) for at in (windows.turn_begin, windows.turn_end))
     return np.asarray(end - begin)
 
 
 class _Model:
     """Residuals of the windows and their Jacobian."""
 
-    def __init__(self, drive: DriveArrays, windows: DriveWindows, width_m: float) -> None:
-        self.drive, self.windows, self.b = drive, windows, width_m
-        self.v, self.u = drive.mean_speed, drive.half_difference
-        self.middle_t = drive.wheel_t + drive.wheel_dt / 2
+    def __init__(self, track: Track, windows: DriveWindows, width_m: float) -> None:
+        self.track, self.windows, self.b = track, windows, width_m
+        self.v, self.u = track.mean_speed, track.half_difference
+        self.middle_t = track.t + track.held / 2
         # places are needed where a window begins or ends: at few of the fixes of a long drive
         edges = np.stack([windows.begin, windows.end])
-        self.edge_t = drive.fix_t[edges]
-        self.seen = drive.fix[windows.end] - drive.fix[windows.begin]
-        self.level = np.exp(-0.5j * np.interp(self.edge_t, drive.heading_t, drive.heading).sum(axis=0))
-        self.smooth_heading = _smooth(drive.heading_t, drive.heading)
-        self.turn_v, self.turn_w = drive.cumulate(self.v).real, drive.cumulate(2 * self.u / width_m).real
-        self.turned = _turned(drive, windows)
+        self.edge_t = track.place_t[edges]
+        self.seen = track.place[windows.end] - track.place[windows.begin]
+        self.level = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
+        self.smooth_heading = _smooth(track.heading_t, track.heading)
+        self.turn_v, self.turn_w = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
+        self.turned = _turned(track, windows)
 
     def first_offset(self) -> float | None:
         """Return the direction of the displacements from wheels laid along the heading [rad]; None where it spins."""
-        at = self.drive.laid_until_fixes()
+        at = self.track.laid
         laid = at[self.windows.end] - at[self.windows.begin]
         unit = (self.seen * np.conj(laid))[np.abs(laid) > self.windows.length_m / 3]
         if len(unit) < FEWEST_WINDOWS:
@@ -333,25 +334,25 @@ class _Model:
     def until_fixes(self, x: Floats) -> tuple[Complexes, Floats]:
         """Return place [m] and turn [rad] of the wheels until each fix (m,)."""
         nose, rate = self._directions(x)
-        path = self.drive.cumulate(self._velocity(x, rate) * nose)
-        t = self.drive.fix_t
-        turn = x[K] * self.turn_w + x[Q] / self.b * self.turn_v + x[G] * self.drive.wheel_t
+        path = self.track.cumulate(self._velocity(x, rate) * nose)
+        t = self.track.place_t
+        turn = x[K] * self.turn_w + x[Q] / self.b * self.turn_v + x[G] * self.track.t
         return (
-            np.asarray(np.interp(t - x[TP] - x[TH], self.drive.wheel_t, path), np.complex128),
-            np.asarray(np.interp(t - x[TH], self.drive.wheel_t, turn), np.float64),
+            np.asarray(np.interp(t - x[TP] - x[TH], self.track.t, path), np.complex128),
+            np.asarray(np.interp(t - x[TH], self.track.t, turn), np.float64),
         )
 
     def _heading_at(self, t: Floats, x: Floats) -> Floats:
         """Return the heading that a wheel speed of time t (n,) acts along: a response delays both alike."""
-        return np.asarray(np.interp(t + x[TH], self.drive.heading_t, self.drive.heading) + x[D], np.float64)
+        return np.asarray(np.interp(t + x[TH], self.track.heading_t, self.track.heading) + x[D], np.float64)
 
     def _directions(self, x: Floats) -> tuple[Complexes, Floats]:
         """Return the measured heading as a unit vector, and its rate [rad/s] (n,)."""
-        edges = self._heading_at(np.append(self.drive.wheel_t, self.drive.wheel_t[-1] + self.drive.wheel_dt[-1]), x)
-        dt = np.maximum(self.drive.wheel_dt, 1e-9)
-        ends = np.append(self.drive.wheel_t, self.drive.wheel_t[-1] + self.drive.wheel_dt[-1]) + x[TH]
-        smooth = np.interp(ends, self.drive.heading_t, self.smooth_heading)
-        rate = np.where(self.drive.wheel_dt > 0.0, np.diff(smooth) / dt, 0.0)
+        edges = self._heading_at(np.append(self.track.t, self.track.t[-1] + self.track.held[-1]), x)
+        dt = np.maximum(self.track.held, 1e-9)
+        ends = np.append(self.track.t, self.track.t[-1] + self.track.held[-1]) + x[TH]
+        smooth = np.interp(ends, self.track.heading_t, self.smooth_heading)
+        rate = np.where(self.track.held > 0.0, np.diff(smooth) / dt, 0.0)
         return np.exp(0.5j * (edges[1:] + edges[:-1])), rate
 
     def _smooth_turn(self, t: Floats, x: Floats) -> Complexes:
@@ -366,16 +367,16 @@ class _Model:
 
     def _displacements(self, x: Floats) -> tuple[Complexes, Complexes]:
         """Return predicted minus seen displacements in the frame of the heading (w,), and their Jacobian (w, k)."""
-        drive = self.drive
+        track = self.track
         nose, rate = self._directions(x)
         v, u, drag = self.v, self.u, np.abs(self.u)
         t = self.edge_t - x[TP] - x[TH]
-        step = nose * drive.wheel_dt
+        step = nose * track.held
         integral = np.zeros(len(nose), np.complex128)
 
         def laid(speed: Floats) -> Complexes:
             np.cumsum((speed * step)[:-1], out=integral[1:])
-            return np.asarray(np.interp(t, drive.wheel_t, integral), np.complex128)
+            return np.asarray(np.interp(t, track.t, integral), np.complex128)
 
         def between(at: Complexes) -> Complexes:
             return np.asarray(at[1] - at[0], np.complex128)
@@ -387,7 +388,7 @@ class _Model:
         predicted = sum((x[name] * jacobian[:, name] for name in (A, M, C, L, N)), np.zeros(1))
         jacobian[:, D] = 1j * predicted
         np.cumsum((self._velocity(x, rate) * step)[:-1], out=integral[1:])
-        after, before = (np.interp(t + shift, drive.wheel_t, integral) for shift in (STEP_S, -STEP_S))
+        after, before = (np.interp(t + shift, track.t, integral) for shift in (STEP_S, -STEP_S))
         jacobian[:, TP] = -between((after - before) / (2 * STEP_S))
         sideways = np.interp(t, self.middle_t, x[C] + x[L] * v) * self._smooth_turn(t, x)
         turning = 1j * laid(rate * (x[A] * v + x[M] * u + x[N] * drag))
@@ -397,7 +398,7 @@ class _Model:
 
     def _turns(self, x: Floats) -> tuple[Floats, Floats]:
         """Return predicted minus seen heading changes (u,), and their jacobian (u, k)."""
-        windows, t = self.windows, self.drive.wheel_t
+        windows, t = self.windows, self.track.t
         begin, end = windows.turn_begin - x[TH], windows.turn_end - x[TH]
 
         def over(values: Floats, shift: float = 0.0) -> Floats:

@@ -73,6 +73,26 @@ class Track(NamedTuple):
         return cls(t, held, v_left, v_right, t, north, east, t, heading, distance, outage, jumps, slips)
 
     @property
+    def place(self) -> Complexes:
+        """Positions of the reference (m,), north + j east [m]."""
+        return np.asarray(self.north + 1j * self.east)
+
+    @property
+    def mean_speed(self) -> Floats:
+        """Mean of the sides' speeds (n,) [m/s]."""
+        return (self.v_left + self.v_right) / 2
+
+    @property
+    def half_difference(self) -> Floats:
+        """Half of what left is faster than right (n,) [m/s]."""
+        return (self.v_left - self.v_right) / 2
+
+    @property
+    def nose(self) -> Complexes:
+        """Heading as a unit vector in the middle of each wheel sample (n,)."""
+        return np.asarray(np.exp(1j * np.interp(self.t + self.held / 2, self.heading_t, self.heading)))
+
+    @property
     def gap_t(self) -> Floats:
         """Begins of the gaps in the wheel data (g,) [s]."""
         return np.asarray(self.t[:-1][self.held[:-1] == 0.0])
@@ -91,6 +111,29 @@ class Track(NamedTuple):
         sums = np.zeros_like(by_sample)
         np.cumsum(by_sample[:-1], out=sums[1:])
         return sums
+
+    def at_places(self, rate: Rate) -> Rate:
+        """Return the integral of a rate (n,) until each position (m,)."""
+        return np.interp(self.place_t, self.t, self.cumulate(rate))
+
+    @property
+    def laid(self) -> Complexes:
+        """Mean distance of the sides laid along the heading, until each position (m,), north + j east [m]."""
+        return self.at_places(np.asarray(self.mean_speed * self.nose))
+
+    def heading_at(self, t: Floats) -> Floats:
+        """Return the heading at some times."""
+        return np.interp(t, self.heading_t, self.heading)
+
+    def clear(self, begin_s: Floats, end_s: Floats) -> Bools:
+        """Return which spans of time (w,) hold no gap in the wheel data."""
+        gap_t = self.gap_t
+        return np.asarray(np.searchsorted(gap_t, begin_s) == np.searchsorted(gap_t, end_s))
+
+    def places(self, rows: Ints | Bools | slice) -> Self:
+        """Return the track with some of its positions."""
+        names = ("place_t", "north", "east", "distance", "in_outage", "jump", "slipping")
+        return self._replace(**{name: getattr(self, name)[rows] for name in names})
 
     def wheels(self, rows: slice) -> Self:
         """Return the track with some of its wheel samples."""

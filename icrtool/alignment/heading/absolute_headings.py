@@ -6,11 +6,12 @@ import math
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, fix_std_m
+from icrtool.alignment.drive_windows import fix_std_m
 from icrtool.alignment.heading.courses import TurnRate
 from icrtool.alignment.heading.gyro_heading import AbsoluteHeading
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import mad_std
+from icrtool.kernels.track import Track
 from icrtool.records.samples import PositionFixes
 from icrtool.records.tables import RobotLog
 
@@ -21,9 +22,9 @@ SHORTEST_BASELINE_M = 0.2
 LEAST_ATTITUDE_STD_RAD = math.radians(0.01)
 
 
-def attitude_heading(drive: DriveArrays, turn: TurnRate) -> AbsoluteHeading:
+def attitude_heading(track: Track, turn: TurnRate) -> AbsoluteHeading:
     """Return the heading of a drive, with the white noise that it shows beside the turn rate."""
-    found = _averaged(drive.heading_t, drive.heading, turn, ATTITUDE_CELL_S)
+    found = _averaged(track.heading_t, track.heading, turn, ATTITUDE_CELL_S)
     step = np.diff(found.heading - np.interp(found.t, turn.t, turn.integrated()))
     noise = mad_std(np.angle(np.exp(1j * (step - np.median(step))))) / math.sqrt(2.0) if len(step) else 0.0
     return found._replace(std=np.full(len(found.t), max(noise, LEAST_ATTITUDE_STD_RAD)))

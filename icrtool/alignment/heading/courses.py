@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import huber_weights, mad_std
+from icrtool.kernels.track import Track
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
 ENOUGH_COURSES = 24.0
@@ -123,21 +123,21 @@ class Courses(NamedTuple):
     of_middle: Floats
 
 
-def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses:
+def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     """Cut the drive into windows of distance that follow one another, and measure the course over ground in each."""
     corrected = turn._replace(rate=turn.rate - guess.bias).integrated()
-    v, u = (drive.v_left + drive.v_right) / 2, (drive.v_left - drive.v_right) / 2
-    middle = drive.wheel_t + drive.wheel_dt / 2
+    v, u = track.mean_speed, track.half_difference
+    middle = track.t + track.held / 2
     psi = np.interp(middle, turn.t, corrected)
-    nose = np.exp(1j * psi) * drive.wheel_dt
+    nose = np.exp(1j * psi) * track.held
     step = (v + guess.middle * u) * nose
-    gone = drive.cumulate(np.abs(v)).real
-    length = _course_length(drive)
+    gone = track.cumulate(np.abs(v))
+    length = _course_length(track)
     t, place = _without_spikes(
-        drive._replace(fix_t=drive.fix_t - guess.delay_s),
-        max(drive.wheel_t[0], turn.t[0]), min(drive.wheel_t[-1], turn.t[-1]),
+        track._replace(place_t=track.place_t - guess.delay_s),
+        max(track.t[0], turn.t[0]), min(track.t[-1], turn.t[-1]),
     )  # fmt: skip
-    edge = _edges(np.interp(t, drive.wheel_t, gone), length)
+    edge = _edges(np.interp(t, track.t, gone), length)
     begin, end = edge[:-1], edge[1:] - 1
     if not len(begin):
         return Courses(*(np.empty(0) for _ in Courses._fields))
@@ -151,7 +151,7 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
 
     def laid(rate: Complexes) -> Complexes:
         along = np.concatenate([[0.0], np.cumsum(rate[:-1])])
-        return np.asarray(np.interp(t, drive.wheel_t, along), np.complex128)
+        return np.asarray(np.interp(t, track.t, along), np.complex128)
 
     def product(values: Complexes) -> Complexes:
         return np.asarray(np.add.reduceat(values * np.conj(path), first), np.complex128)
@@ -160,14 +160,13 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
     swing = np.exp(1j * turned)
     whole = laid(step)
     path = centred(whole - guess.x * swing)
-    speed = v[np.clip(np.searchsorted(drive.wheel_t, t, side="right") - 1, 0, len(v) - 1)]
+    speed = v[np.clip(np.searchsorted(track.t, t, side="right") - 1, 0, len(v) - 1)]
     square = np.maximum(product(path).real, 1e-12)
     seen = product(centred(place)) / square
     unknown = guess.bias_std * (t[end] - t[begin]) + guess.scale_std * np.abs(turned[end] - turned[begin])
     kept = (unknown < LARGEST_TURN_ERROR_RAD) & (np.abs(seen) > 0.3)
     kept &= np.abs(whole[end] - whole[begin]) > 0.5 * length * (count - 1) / count
-    gap = drive.wheel_t[:-1][drive.wheel_dt[:-1] == 0.0]
-    kept &= np.searchsorted(gap, t[begin]) == np.searchsorted(gap, t[end])
+    kept &= track.clear(t[begin], t[end])
     kept &= np.searchsorted(turn.holes[:, 1], t[begin]) == np.searchsorted(turn.holes[:, 0], t[end])
     of_x, of_delay = (product(centred(-one)).imag / square for one in (swing, speed * swing))
     of_bias = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
@@ -176,7 +175,7 @@ def measure_courses(drive: DriveArrays, turn: TurnRate, guess: Guess) -> Courses
     bias_at = np.interp(t[end], turn.t, guess.bias)
     angle = np.angle(seen * np.exp(1j * turned[end])) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
     found = Courses(
-        t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, drive.fix_std_m / np.sqrt(square),
+        t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, track.place_std_m / np.sqrt(square),
         np.abs(seen), product(centred(laid(u * nose))).real / square,
     )  # fmt: skip
     return Courses(*(values[kept] for values in found))
@@ -195,17 +194,17 @@ def fit_middle(courses: Courses, guess: Guess) -> float:
     return guess.middle + slope
 
 
-def course_changes(drive: DriveArrays) -> tuple[Floats, Floats, Floats]:
+def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
     """Return middles (m,) [s] of windows and of those that follow, and how far the course over ground turns [rad].
 
     Only displacements and the sense of the wheels' turning: nothing is known of the heading yet.
     """
-    along, gone = (drive.cumulate(one).real for one in (drive.mean_speed, np.abs(drive.mean_speed)))
-    t, place = _without_spikes(drive, float(drive.wheel_t[0]), float(drive.wheel_t[-1]))
-    length = _course_length(drive)
-    edge = _edges(np.interp(t, drive.wheel_t, gone), length)
+    along, gone = (track.cumulate(one) for one in (track.mean_speed, np.abs(track.mean_speed)))
+    t, place = _without_spikes(track, float(track.t[0]), float(track.t[-1]))
+    length = _course_length(track)
+    edge = _edges(np.interp(t, track.t, gone), length)
     begin, end = edge[:-1], edge[1:] - 1
-    went = np.interp(t[end], drive.wheel_t, along) - np.interp(t[begin], drive.wheel_t, along)
+    went = np.interp(t[end], track.t, along) - np.interp(t[begin], track.t, along)
     seen = (place[end] - place[begin]) * np.sign(went)
     kept = (np.abs(went) > 0.3 * length) & (np.abs(seen) > 0.3 * np.abs(went))
     kept &= t[end] - t[begin] < LONGEST_STRETCH_S
@@ -214,9 +213,9 @@ def course_changes(drive: DriveArrays) -> tuple[Floats, Floats, Floats]:
     return middle[:-1][near], middle[1:][near], np.angle(seen[1:] * np.conj(seen[:-1]))[near]
 
 
-def _course_length(drive: DriveArrays) -> float:
-    std = min(drive.fix_std_m, 10.0)
-    short = max(float(drive.travel[-1]) / ENOUGH_COURSES, SHORTEST_IN_POSITION_STD * std)
+def _course_length(track: Track) -> float:
+    std = min(track.place_std_m, 10.0)
+    short = max(float(track.travel[-1]) / ENOUGH_COURSES, SHORTEST_IN_POSITION_STD * std)
     return max(COURSE_WINDOW_M, min(COURSE_IN_POSITION_STD * std, short))
 
 
@@ -231,14 +230,14 @@ def _edges(gone: Floats, length: float) -> np.ndarray:
     return np.array(edges)
 
 
-def _without_spikes(drive: DriveArrays, first: float, last: float) -> tuple[Floats, Complexes]:
+def _without_spikes(track: Track, first: float, last: float) -> tuple[Floats, Complexes]:
     """Return times and places of the fixes in a span, without those that lie far from both neighbours."""
-    rows = np.flatnonzero((drive.fix_t >= first) & (drive.fix_t <= last))
-    t, place = drive.fix_t[rows], drive.fix[rows]
+    rows = np.flatnonzero((track.place_t >= first) & (track.place_t <= last))
+    t, place = track.place_t[rows], track.place[rows]
     if len(rows) < 3:
         return t, place
     bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
-    far = bend > SPIKE_SIGMAS * max(mad_std(bend, 0.0), drive.fix_std_m)
+    far = bend > SPIKE_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
     # the neighbours of a spike bend by half as much
     spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
     kept = np.concatenate([[True], ~spike, [True]])

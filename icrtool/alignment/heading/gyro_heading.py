@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays
 from icrtool.alignment.heading.courses import Guess, TurnRate, fit_middle, measure_courses
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import long_run_factor, mad_std
+from icrtool.kernels.track import Track
 
 if TYPE_CHECKING:
     from icrtool.kernels.filter.heading_kalman import HeadingEvents, HeadingModel, HeadingPasses
@@ -126,7 +126,7 @@ class HeadingEstimate:
 
 
 def estimate_heading(
-    drive: DriveArrays, turn: TurnRate, absolute: Sequence[AbsoluteHeading] = (), *, stands: bool = True
+    track: Track, turn: TurnRate, absolute: Sequence[AbsoluteHeading] = (), *, stands: bool = True
 ) -> HeadingEstimate | None:
     """Estimate the heading; None with too few courses.
 
@@ -136,13 +136,13 @@ def estimate_heading(
     absolute : further headings
     stands : whether the rate is zero while the wheels stand
     """
-    problem = _Problem(drive, turn, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std), (), stands=stands)
+    problem = _Problem(track, turn, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std), (), stands=stands)
     if problem.courses < FEWEST_COURSES:
         return None
     noises = problem.usual()
     guess = problem.guess(noises)
     for _ in range(ROUNDS):
-        problem = _Problem(drive, turn, guess, (), stands=stands)
+        problem = _Problem(track, turn, guess, (), stands=stands)
         if problem.courses < FEWEST_COURSES:
             return None
         # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
@@ -153,7 +153,7 @@ def estimate_heading(
             break
         guess = better
     if absolute:
-        problem = _Problem(drive, turn, guess, absolute, stands=stands)
+        problem = _Problem(track, turn, guess, absolute, stands=stands)
         grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
         noises = problem.choose(grids, problem.usual() | noises)
     found = problem.solve(noises)
@@ -166,12 +166,12 @@ def estimate_heading(
     return found
 
 
-def _standing(drive: DriveArrays, turn: TurnRate) -> tuple[Floats, Floats]:
+def _standing(track: Track, turn: TurnRate) -> tuple[Floats, Floats]:
     """Return ends of spans [s] in which the wheels stood, and the mean rate in each [rad/s]."""
-    edges = drive.wheel_t[0] + STANDING_S * np.unique(np.floor((drive.wheel_t - drive.wheel_t[0]) / STANDING_S))
+    edges = track.t[0] + STANDING_S * np.unique(np.floor((track.t - track.t[0]) / STANDING_S))
     begin, end = edges[:-1], edges[1:]
-    gone = drive.cumulate(np.abs(drive.v_left) + np.abs(drive.v_right)).real
-    still = np.interp(end, drive.wheel_t, gone) - np.interp(begin - STANDING_S, drive.wheel_t, gone) < 1e-3
+    gone = track.cumulate(np.abs(track.v_left) + np.abs(track.v_right))
+    still = np.interp(end, track.t, gone) - np.interp(begin - STANDING_S, track.t, gone) < 1e-3
     still &= (end - begin < 1.5 * STANDING_S) & (begin >= turn.t[0]) & (end <= turn.t[-1])
     G = turn.integrated()
     rate = (np.interp(end, turn.t, G) - np.interp(begin, turn.t, G)) / (end - begin)
@@ -182,17 +182,17 @@ class _Problem:
     """The events of a log, in order, and what is not known of their noise."""
 
     def __init__(
-        self, drive: DriveArrays, turn: TurnRate, guess: Guess, absolute: Sequence[AbsoluteHeading], *, stands: bool
+        self, track: Track, turn: TurnRate, guess: Guess, absolute: Sequence[AbsoluteHeading], *, stands: bool
     ) -> None:
         """Measure the courses about a guess."""
         self.turn, self.absolute, self.G = turn, absolute, turn.integrated()
-        courses = measure_courses(drive, turn, guess)
+        courses = measure_courses(track, turn, guess)
         self.courses = len(courses.end)
         if self.courses < FEWEST_COURSES:
             return
         self.middle = fit_middle(courses, guess)
         self.window_s = float(np.median(courses.end - courses.begin))
-        still_t, still_rate = _standing(drive, turn) if stands else (np.empty(0), np.empty(0))
+        still_t, still_rate = _standing(track, turn) if stands else (np.empty(0), np.empty(0))
         t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
         kind = np.repeat(
             [COURSE, STANDING, *range(ABSOLUTE, ABSOLUTE + len(absolute))],

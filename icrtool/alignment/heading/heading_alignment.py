@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.alignment.conventions import Convention
-from icrtool.alignment.drive_windows import STARTS_A_WINDOW, DriveArrays, DriveWindows
+from icrtool.alignment.drive_windows import STARTS_A_WINDOW, DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.heading.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
 from icrtool.alignment.heading.heading_offset_cause import NO_NAME, OffsetName, name_offset
@@ -17,6 +17,7 @@ from icrtool.alignment.position.gnss_steps import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.track import Track
 from icrtool.records.tables import RobotLog
 
 FEWEST_WINDOWS = 8
@@ -83,14 +84,14 @@ class CourseAngles(NamedTuple):
         return len(self.angle) >= FEWEST_WINDOWS and max(self.agreement, self.mirrored_agreement) >= EXPLAINED
 
 
-def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngles:
+def compare_with_course(track: Track, windows: DriveWindows) -> CourseAngles:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
     begin, end = (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
-    v, nose = drive.mean_speed, drive.nose
-    seen = drive.fix[end] - drive.fix[begin]
-    along, mirrored = drive.until_fixes(v * nose), drive.until_fixes(v * np.conj(nose))
+    v, nose = track.mean_speed, track.nose
+    seen = track.place[end] - track.place[begin]
+    along, mirrored = track.at_places(v * nose), track.at_places(v * np.conj(nose))
     laid, other = (at[end] - at[begin] for at in (along, mirrored))
-    travel = drive.until_fixes(v).real
+    travel = track.at_places(v)
     went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
     moved = went & led
     return CourseAngles(
@@ -98,7 +99,7 @@ def compare_with_course(drive: DriveArrays, windows: DriveWindows) -> CourseAngl
         np.angle(other * np.conj(seen))[moved],
         (travel[end] < travel[begin])[moved],
         int(np.count_nonzero(went & ~led)),
-        float(np.median((drive.fix_t[end] - drive.fix_t[begin])[moved])) if moved.any() else 0.0,
+        float(np.median((track.place_t[end] - track.place_t[begin])[moved])) if moved.any() else 0.0,
     )
 
 
@@ -180,7 +181,7 @@ def align_heading(
     )  # fmt: skip
     if fit is None:
         return nothing
-    pose_mirrored = mirrored and convention.position < 0 and fit.drive.same_clock
+    pose_mirrored = mirrored and convention.position < 0 and fit.track.same_clock
     turn, std = fit.estimate("offset")
     offset = math.remainder(-turn, 2 * math.pi)
     scatter = fit.across_scatter

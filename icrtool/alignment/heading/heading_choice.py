@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, drive_arrays
+from icrtool.alignment.drive_windows import track_of_log
 from icrtool.alignment.estimator import ATTITUDE_STD_RAD
 from icrtool.alignment.heading.absolute_headings import antenna_heading, attitude_heading
 from icrtool.alignment.heading.courses import TurnRate
@@ -16,6 +16,7 @@ from icrtool.alignment.heading.gyro_heading import LAG, OFFSET, AbsoluteHeading,
 from icrtool.alignment.heading.turn_rates import gyro_rate, wheel_rate
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, trapezoids
+from icrtool.kernels.track import Track
 from icrtool.records.samples import NO_HEADINGS, GyroAxes, GyroSamples, HeadingSamples, StreamChoice, thin
 from icrtool.records.tables import RobotLog
 
@@ -93,15 +94,15 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         raise DataError(
             log.name, "no heading in it, and too few wheel or position samples", "record at least two of each"
         )
-    drive = drive_arrays(log)
-    found, against = _with_gyro(log, drive, None)
+    track = track_of_log(log)
+    found, against = _with_gyro(log, track, None)
     if found is not None and _is_alive(found.estimate):
         return found
-    turn = wheel_rate(drive, width_m)
+    turn = wheel_rate(track, width_m)
     pair, length = _pair(log, turn)
-    estimate = estimate_heading(drive, turn, [pair] if pair is not None else [], stands=False)
+    estimate = estimate_heading(track, turn, [pair] if pair is not None else [], stands=False)
     doubted = found if found is not None else against
-    if doubted is not None and _follows_wheels(doubted, drive, width_m, int(log.wheels.stamp_ns[0])):
+    if doubted is not None and _follows_wheels(doubted, track, width_m, int(log.wheels.stamp_ns[0])):
         # what contradicts it contradicts the wheels as much: it is the fixes that err
         return doubted
     if estimate is not None and (found is None or estimate.median_std < found.estimate.median_std):
@@ -120,7 +121,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     return found
 
 
-def fuse_heading(log: RobotLog, drive: DriveArrays) -> DerivedHeading | None:
+def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
     """Estimate the heading from gyro, course over ground and the heading that the log states.
 
     None without a gyro, where the gyro is dead or contradicts the courses over ground, where the stated heading alone
@@ -128,11 +129,11 @@ def fuse_heading(log: RobotLog, drive: DriveArrays) -> DerivedHeading | None:
 
     Parameters
     ----------
-    drive : of the log
+    track : of the log
     """
-    if drive.same_clock:
+    if track.same_clock:
         return None
-    found, _ = _with_gyro(log, drive, log.heading)
+    found, _ = _with_gyro(log, track, log.heading)
     if found is None or not _is_alive(found.estimate):
         return None
     return found if found.estimate.median_std <= math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD) else None
@@ -143,18 +144,18 @@ def _is_alive(estimate: HeadingEstimate) -> bool:
     return estimate.noises["angle"] < LARGEST_DRIFT
 
 
-def _follows_wheels(derived: DerivedHeading, drive: DriveArrays, width_m: float, epoch_ns: int) -> bool:
+def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, epoch_ns: int) -> bool:
     """Return whether a gyro turns as the wheels of a robot that may slip do, in windows of time."""
     gyro = derived.gyro
     if gyro is None:
         return False
-    begin = np.arange(drive.wheel_t[0], drive.wheel_t[-1] - COMPARED_S, COMPARED_S)
+    begin = np.arange(track.t[0], track.t[-1] - COMPARED_S, COMPARED_S)
     t = (gyro.stamp_ns - epoch_ns) / 1e9
     turned = trapezoids(t, gyro.rate_radps)
-    wheels = drive.cumulate(2.0 * drive.half_difference / width_m).real
+    wheels = track.cumulate(2.0 * track.half_difference / width_m)
     by_gyro, by_wheels = (
         np.interp(begin + COMPARED_S, times, angle) - np.interp(begin, times, angle)
-        for times, angle in ((t, turned), (drive.wheel_t, wheels))
+        for times, angle in ((t, turned), (track.t, wheels))
     )
     both, own = float(by_gyro @ by_wheels), float(by_wheels @ by_wheels)
     if min(own, float(by_gyro @ by_gyro)) <= 0.0:
@@ -169,7 +170,7 @@ def attitude_error(estimate: HeadingEstimate) -> float:
 
 
 def _with_gyro(
-    log: RobotLog, drive: DriveArrays, stated: HeadingSamples | None
+    log: RobotLog, track: Track, stated: HeadingSamples | None
 ) -> tuple[DerivedHeading | None, DerivedHeading | None]:
     """Return the estimates with the gyro that follows the courses over ground best, and that contradicts them least.
 
@@ -179,16 +180,16 @@ def _with_gyro(
     against: DerivedHeading | None = None
     epoch = int(log.wheels.stamp_ns[0])
     for gyro in log.gyros:
-        found = gyro_rate(drive, gyro, epoch)
+        found = gyro_rate(track, gyro, epoch)
         if found is None:
             continue
         turn, axis = found
         absolute: list[AbsoluteHeading] = []
         if stated is not None:
-            absolute.append(attitude_heading(drive, turn)._replace(aligned_std=ATTITUDE_STD_RAD))
+            absolute.append(attitude_heading(track, turn)._replace(aligned_std=ATTITUDE_STD_RAD))
         pair, length = _pair(log, turn)
         absolute += [pair] if pair is not None else []
-        estimate = estimate_heading(drive, turn, absolute)
+        estimate = estimate_heading(track, turn, absolute)
         if estimate is None:
             continue
         topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays
 from icrtool.alignment.heading.courses import TurnRate, course_changes
 from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import huber_weights, mad_std
+from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.samples import GyroAxes
 
@@ -30,30 +30,28 @@ LEAST_AXIS = 0.3
 """A gyro that shows less than this share of the changes of the course over ground shows no axis."""
 
 
-def wheel_rate(drive: DriveArrays, width_m: float) -> TurnRate:
+def wheel_rate(track: Track, width_m: float) -> TurnRate:
     """Return the turn rate of the wheels, with a wide prior of its scale."""
-    rate = WHEEL_TURN * (drive.v_left - drive.v_right) / width_m
-    gaps = np.flatnonzero(drive.wheel_dt[:-1] == 0.0)
-    holes = np.column_stack([drive.wheel_t[gaps], drive.wheel_t[gaps + 1]])
-    return TurnRate(
-        drive.wheel_t, rate, holes, scale_std=WHEEL_SCALE_STD, bias_std=math.radians(0.5), delay_std_s=RESPONSE_S
-    )
+    rate = WHEEL_TURN * (track.v_left - track.v_right) / width_m
+    gaps = np.flatnonzero(track.held[:-1] == 0.0)
+    holes = np.column_stack([track.t[gaps], track.t[gaps + 1]])
+    return TurnRate(track.t, rate, holes, scale_std=WHEEL_SCALE_STD, bias_std=math.radians(0.5), delay_std_s=RESPONSE_S)
 
 
-def gyro_rate(drive: DriveArrays, gyro: GyroAxes, epoch_ns: int) -> tuple[TurnRate, str] | None:
+def gyro_rate(track: Track, gyro: GyroAxes, epoch_ns: int) -> tuple[TurnRate, str] | None:
     """Return the turn rate of a gyro about the vertical, and how it is mounted; None where it does not cover courses.
 
     Changes of the course over ground are regressed on the turns about all three axes of the sensor.
     """
     t = (gyro.stamp_ns - epoch_ns) / 1e9
-    begin, end, change = course_changes(drive)
+    begin, end, change = course_changes(track)
     inside = (begin >= t[0]) & (end <= t[-1])
     begin, end, change = begin[inside], end[inside], change[inside]
     if len(change) < 3:
         return None
     turned = np.column_stack([_turn_between(t, gyro.rates_radps[:, axis], begin, end) for axis in range(3)])
     axis, name = _vertical_axis(turned, end - begin, change)
-    return _bridged(t, gyro.rates_radps @ axis, drive), name
+    return _bridged(t, gyro.rates_radps @ axis, track), name
 
 
 def _turn_between(t: Floats, rate: Floats, begin: Floats, end: Floats) -> Floats:
@@ -99,23 +97,23 @@ def _wrapped(angle: Floats) -> Floats:
     return np.asarray(np.angle(np.exp(1j * angle)), np.float64)
 
 
-def _bridged(t: Floats, rate: Floats, drive: DriveArrays) -> TurnRate:
+def _bridged(t: Floats, rate: Floats, track: Track) -> TurnRate:
     """Return a gyro's rate with its holes bridged by the wheels' turn, scaled as the gyro shows it elsewhere."""
     usual = float(np.median(np.diff(t)))
     long = np.flatnonzero(np.diff(t) > max(HOLE_IN_INTERVALS * usual, SHORTEST_HOLE_S))
     holes = np.column_stack([t[long], t[long + 1]])
     if not len(holes):
         return TurnRate(t, rate, holes)
-    apart = drive.v_left - drive.v_right
-    there = np.interp(drive.wheel_t, t, rate)
-    hole = np.searchsorted(holes[:, 0], drive.wheel_t) > np.searchsorted(holes[:, 1], drive.wheel_t, side="right")
-    known = ~hole & (drive.wheel_t >= t[0]) & (drive.wheel_t <= t[-1])
+    apart = track.v_left - track.v_right
+    there = np.interp(track.t, t, rate)
+    hole = np.searchsorted(holes[:, 0], track.t) > np.searchsorted(holes[:, 1], track.t, side="right")
+    known = ~hole & (track.t >= t[0]) & (track.t <= t[-1])
     factor = float(apart[known] @ there[known]) / max(float(apart[known] @ apart[known]), 1e-12)
     left = there[known] - factor * apart[known]
-    wheels = hole & (drive.wheel_dt > 0.0)
-    order = np.argsort(np.concatenate([t, drive.wheel_t[wheels]]), kind="stable")
+    wheels = hole & (track.held > 0.0)
+    order = np.argsort(np.concatenate([t, track.t[wheels]]), kind="stable")
     return TurnRate(
-        np.concatenate([t, drive.wheel_t[wheels]])[order],
+        np.concatenate([t, track.t[wheels]])[order],
         np.concatenate([rate, factor * apart[wheels] + float(np.median(left))])[order],
         holes, hole_std=float(np.sqrt(np.mean(left**2))) if len(left) else math.radians(10.0),
     )  # fmt: skip

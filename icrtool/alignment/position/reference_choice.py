@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.conventions import apply_convention, decide_conventions
-from icrtool.alignment.drive_windows import cut_windows, drive_arrays
+from icrtool.alignment.drive_windows import cut_windows, track_of_log
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.stream_checks import check_streams
 from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
@@ -78,15 +78,15 @@ def agreement(log: RobotLog, config: Config) -> Agreement:
         check_streams(log)
     except (ConfigError, DataError):
         return NONE
-    drive = drive_arrays(log)
-    windows = cut_windows(drive, LENGTH_M)
+    track = track_of_log(log)
+    windows = cut_windows(track, LENGTH_M)
     free = config.frames.heading == "auto"
-    decision = decide_conventions(drive, windows, metric=log.datum is None and free, mirror_allowed=free)
+    decision = decide_conventions(track, windows, metric=log.datum is None and free, mirror_allowed=free)
     named = apply_convention(log, decision.convention)
-    found = estimate_alignment(drive if named is log else drive_arrays(named), windows, width)
+    found = estimate_alignment(track if named is log else track_of_log(named), windows, width)
     if found is None:
         return NONE
     count = len(windows.begin)
     size = np.hypot(found.fit.residuals[:count], found.fit.residuals[count : 2 * count])
-    covered = np.unique(np.floor(np.interp(drive.fix_t[windows.begin], drive.wheel_t, drive.travel) / LENGTH_M))
+    covered = np.unique(np.floor(track.distance[windows.begin] / LENGTH_M))
     return Agreement(float(np.quantile(size, SHARE)), LENGTH_M * len(covered))

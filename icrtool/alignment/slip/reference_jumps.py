@@ -55,7 +55,7 @@ def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Steps]:
 
 def _beyond(knots: Knots, first: Ints, last: Ints, width_m: float) -> Bools:
     """Return which windows (w,) move or turn further than noise, wheels and a slow slide explain."""
-    path, duration = knots.path_m[last] - knots.path_m[first], knots.t[last] - knots.t[first]
+    path, duration = knots.track.distance[last] - knots.track.distance[first], knots.t[last] - knots.t[first]
     by_robot = JUMP_SPEED_SHARE * path + JUMP_MPS * duration
     noise = np.sqrt(knots.variance[first] + knots.variance[last])
     moved = np.abs(knots.place[last] - knots.place[first]) > JUMP_SIGMAS * noise + by_robot
@@ -95,15 +95,15 @@ def decide_jumps(knots: Knots, motion: Motion, steps: Steps) -> tuple[ReferenceJ
 
 def _fastest_mps(knots: Knots, motion: Motion) -> float:
     """Return how fast the wheels drive the robot at most [m/s], but for single samples."""
-    return motion.scale * float(np.quantile(np.diff(knots.path_m) / np.diff(knots.t), 0.99))
+    return motion.scale * float(np.quantile(np.diff(knots.track.distance) / np.diff(knots.t), 0.99))
 
 
 def _by_jitter(knots: Knots, motion: Motion, steps: Steps) -> Floats:
     """Return the distance of the wheels (s,) [m] in the time by which stamps are wrong, before and after each step."""
     off = 3 * STAMP_STD_S
-    reach = np.interp(knots.t[steps.last] + off, knots.t, knots.path_m)
-    reach = reach - np.interp(knots.t[steps.first] - off, knots.t, knots.path_m)
-    return np.asarray(motion.scale * (reach - (knots.path_m[steps.last] - knots.path_m[steps.first])))
+    reach = np.interp(knots.t[steps.last] + off, knots.t, knots.track.distance)
+    reach = reach - np.interp(knots.t[steps.first] - off, knots.t, knots.track.distance)
+    return np.asarray(motion.scale * (reach - (knots.track.distance[steps.last] - knots.track.distance[steps.first])))
 
 
 def _cause(*, far: bool, turn: bool, stated: bool) -> str:

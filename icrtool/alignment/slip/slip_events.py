@@ -186,7 +186,7 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
 
 def _durations(knots: Knots) -> list[float]:
     """Return the durations of the windows: doubled until the usual distance stands out of the noise of the fixes."""
-    path, dt = np.diff(knots.path_m), np.diff(knots.t)
+    path, dt = np.diff(knots.track.distance), np.diff(knots.t)
     moving = path > TURNING_MPS * dt
     if not moving.any():
         return list(WINDOWS_S)

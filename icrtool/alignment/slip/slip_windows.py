@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, cut_windows, join_streams, window_length
+from icrtool.alignment.drive_windows import cut_windows, track_of_streams, window_length
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints
 from icrtool.kernels.robust import mad_std
+from icrtool.kernels.track import Track
 from icrtool.records.measurements import SensorData
 
 KNOT_S = 0.1
@@ -40,12 +41,10 @@ class Knots(NamedTuple):
 
     Attributes
     ----------
-    drive : with these fixes alone
-    t : (m,) [s] since `epoch_ns`; place : complex (m,) north + j east [m]
+    track : with these fixes alone, since `epoch_ns`; its distance is that of the wheels
     variance : (m,) of a place, one axis [m^2]
     heading : (m,) [rad], unwrapped; turn_variance : of one value of it [rad^2]
     velocity : complex (m,), the mean of the sides along the heading [m/s]; apart : (m,) left minus right [m/s]
-    path_m : (m,) mean distance of the sides, forward or not
     held_m2 : (m,) variance that values held from sample to sample add to a side's distance
     holes : (m,) number of holes in any stream so far
     fix_class : (m,) classes of the fixes
@@ -53,27 +52,33 @@ class Knots(NamedTuple):
     """
 
     epoch_ns: int
-    drive: DriveArrays
-    t: Floats
-    place: Complexes
+    track: Track
     variance: Floats
     heading: Floats
     turn_variance: float
     velocity: Complexes
     apart: Floats
-    path_m: Floats
     held_m2: Floats
     holes: Ints
     fix_class: Bytes
     turn_follows_place: bool
+
+    @property
+    def t(self) -> Floats:
+        """Times of the fixes (m,) [s] since `epoch_ns`."""
+        return self.track.place_t
+
+    @property
+    def place(self) -> Complexes:
+        """Fixes (m,), north + j east [m]."""
+        return self.track.place
 
     def rows(self, kept: Bools) -> Knots:
         """Return the knots marked in `kept` (m,)."""
         columns: dict[str, Any] = {
             name: value[kept] for name, value in self._asdict().items() if isinstance(value, np.ndarray)
         }
-        drive = self.drive._replace(fix_t=self.drive.fix_t[kept], fix=self.drive.fix[kept])
-        return self._replace(drive=drive, **columns)
+        return self._replace(track=self.track.places(kept), **columns)
 
 
 class Motion(NamedTuple):
@@ -134,29 +139,25 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
     if min(len(wheels.stamp_ns), len(fixes.stamp_ns), len(headings.stamp_ns)) < FEWEST_KNOTS:
         return None
-    drive = join_streams(wheels, fixes, headings, same_clock=sensors.heading_from_position)
-    wheel_t, left, right = drive.wheel_t, drive.v_left, drive.v_right
-    begin, end = (pick(wheel_t[at], drive.heading_t[at]) for pick, at in ((max, 0), (min, -1)))
-    rows = _thinned(drive.fix_t, begin, end)
+    track = track_of_streams(wheels, fixes, headings, same_clock=sensors.heading_from_position)
+    left, right = track.v_left, track.v_right
+    begin, end = (pick(track.t[at], track.heading_t[at]) for pick, at in ((max, 0), (min, -1)))
+    rows = _thinned(track.place_t, begin, end)
     if len(rows) < FEWEST_KNOTS:
         return None
-    drive = drive._replace(fix_t=drive.fix_t[rows], fix=drive.fix[rows])
-    t = drive.fix_t
-
-    def at(speed: Floats, shift_s: float = 0.0) -> Floats:
-        return np.asarray(np.interp(t + shift_s, wheel_t, drive.cumulate(speed)), np.float64)
-
-    speeds = [(at(speed, SPEED_S / 2) - at(speed, -SPEED_S / 2)) / SPEED_S for speed in (left, right)]
-    heading = np.interp(t, drive.heading_t, drive.heading)
+    track = track.places(rows)
+    t = track.place_t
+    ahead, behind = (track._replace(place_t=t + shift_s) for shift_s in (SPEED_S / 2, -SPEED_S / 2))
+    speeds = [(ahead.at_places(speed) - behind.at_places(speed)) / SPEED_S for speed in (left, right)]
+    heading = track.heading_at(t)
     gap = np.diff(t) > max(LONGEST_HOLE_S, HOLE_IN_INTERVALS * float(np.median(np.diff(t))))
     return Knots(
-        epoch_ns=int(wheels.stamp_ns[0]), drive=drive, t=t, place=drive.fix,
+        epoch_ns=int(wheels.stamp_ns[0]), track=track,
         variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2)[rows] / 2, LEAST_STD_M**2),
         heading=heading, turn_variance=_white_variance(heading),
         velocity=(speeds[0] + speeds[1]) / 2 * np.exp(1j * heading), apart=speeds[0] - speeds[1],
-        path_m=at((np.abs(left) + np.abs(right)) / 2),
-        held_m2=np.interp(t, wheel_t, _held_variance(wheel_t, left, right)),
-        holes=_holes(t, wheel_t) + _holes(t, drive.heading_t) + np.concatenate([[0], np.cumsum(gap)]),
+        held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
+        holes=_holes(t, track.t) + _holes(t, track.heading_t) + np.concatenate([[0], np.cumsum(gap)]),
         fix_class=fixes.fix_class[rows], turn_follows_place=sensors.heading_is_estimated,
     )  # fmt: skip
 
@@ -178,7 +179,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     ----------
     quiet : (m,) knots that may be inside a window
     """
-    windows = cut_windows(knots.drive, window_length(knots.drive, WINDOW_M))
+    windows = cut_windows(knots.track, window_length(knots.track, WINDOW_M))
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
 
     def clear(begin: Ints, end: Ints) -> Bools:
@@ -188,7 +189,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     turns = [
         np.searchsorted(knots.t, edge).clip(0, len(knots.t) - 1) for edge in (windows.turn_begin, windows.turn_end)
     ]
-    fit = estimate_alignment(knots.drive, windows.rows(kept, clear(turns[0], turns[1])), width_m)
+    fit = estimate_alignment(knots.track, windows.rows(kept, clear(turns[0], turns[1])), width_m)
     if fit is None:
         return None
     place, turn = fit.expected_motion()
@@ -208,7 +209,7 @@ def compare(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: f
         level * (column[last] - column[first]) for column in (knots.place, motion.place, knots.velocity)
     )
     turn, model_turn, spin = (column[last] - column[first] for column in (knots.heading, motion.turn, knots.apart))
-    missed, path_m, lever = place - model, knots.path_m[last] - knots.path_m[first], motion.lever_m
+    missed, path_m, lever = place - model, knots.track.distance[last] - knots.track.distance[first], motion.lever_m
     scale2 = motion.scale**2
     noise = knots.variance[first] + knots.variance[last]
     held = scale2 * (knots.held_m2[last] - knots.held_m2[first]) / 2

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays
 from icrtool.alignment.estimator import TURNS_SLIPPING, AlignmentFit
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import huber_weights, mad_std
+from icrtool.kernels.track import Track
 
 NOISE_S, SHORT_S, MIDDLE_S, LONGEST_S = 0.3, 1.0, 5.0, 40.0
 """Turns are compared over these times; in the first there is hardly more than noise."""
@@ -52,7 +52,7 @@ class Turns(NamedTuple):
     turn_rad: float
 
 
-def compare_turns(drive: DriveArrays, width_m: float, delay_s: float, window_s: float) -> Turns | None:
+def compare_turns(track: Track, width_m: float, delay_s: float, window_s: float) -> Turns | None:
     """Compare the turns of heading and wheels over windows of some length; None where there are too few.
 
     Parameters
@@ -60,25 +60,24 @@ def compare_turns(drive: DriveArrays, width_m: float, delay_s: float, window_s: 
     width_m : the track width b
     delay_s : by which the heading lags the wheels
     """
-    t = drive.wheel_t
-    turned = drive.cumulate(2.0 * drive.half_difference / width_m).real
-    gaps = t[:-1][drive.wheel_dt[:-1] == 0.0]
-    first = max(t[0] + delay_s, drive.heading_t[0])
-    last = min(t[-1] + delay_s, drive.heading_t[-1]) - window_s
+    t = track.t
+    turned = track.cumulate(2.0 * track.half_difference / width_m)
+    first = max(t[0] + delay_s, track.heading_t[0])
+    last = min(t[-1] + delay_s, track.heading_t[-1]) - window_s
     begin = np.arange(first, last, window_s / STARTS_A_WINDOW)
     by_wheels, by_heading = (
         np.interp(begin + window_s - shift, times, angle) - np.interp(begin - shift, times, angle)
-        for shift, times, angle in ((delay_s, t, turned), (0.0, drive.heading_t, drive.heading))
+        for shift, times, angle in ((delay_s, t, turned), (0.0, track.heading_t, track.heading))
     )
-    whole = np.searchsorted(gaps, begin - delay_s) == np.searchsorted(gaps, begin + window_s - delay_s)
-    moved = np.interp(begin + window_s - delay_s, t, drive.travel) > np.interp(begin - delay_s, t, drive.travel)
+    whole = track.clear(begin - delay_s, begin + window_s - delay_s)
+    moved = np.interp(begin + window_s - delay_s, t, track.travel) > np.interp(begin - delay_s, t, track.travel)
     kept = whole & moved
     if np.count_nonzero(kept) < STARTS_A_WINDOW * FEWEST_WINDOWS:
         return None
     return _regress(by_wheels[kept], by_heading[kept], np.arange(len(begin))[kept] // STARTS_A_WINDOW)
 
 
-def _regress(wheels: Floats, heading: Floats, group: Floats) -> Turns | None:
+def _regress(wheels: Floats, heading: Floats, group: Ints) -> Turns | None:
     """Return the ratio of two turns (w,) by robust regression, its deviation from groups of windows."""
     weight, information = np.ones(len(wheels)), float(wheels @ wheels)
     if information <= 0.0:
@@ -97,11 +96,11 @@ def _regress(wheels: Floats, heading: Floats, group: Floats) -> Turns | None:
 
 def find_filtering(fit: AlignmentFit) -> str:
     """Return how the wheels of a drive show that they are filtered or fused; empty where they do not."""
-    drive, delay = fit.drive, fit.estimate("heading_delay")[0]
-    long_s = min(LONGEST_S, float(drive.wheel_t[-1]) / LONG_WINDOWS)
+    track, delay = fit.track, fit.estimate("heading_delay")[0]
+    long_s = min(LONGEST_S, float(track.t[-1]) / LONG_WINDOWS)
     if long_s < SHORTEST_LONG_S:
         return ""
-    found = [compare_turns(drive, fit.width_m, delay, one) for one in (NOISE_S, SHORT_S, MIDDLE_S, long_s)]
+    found = [compare_turns(track, fit.width_m, delay, one) for one in (NOISE_S, SHORT_S, MIDDLE_S, long_s)]
     noise, short, middle, long = found
     if noise is None or short is None or middle is None or long is None:
         return ""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveArrays, DriveWindows
+from icrtool.alignment.drive_windows import DriveWindows
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.position.gnss_steps import unbroken
 from icrtool.alignment.wheels.filtered_odometry import find_filtering
@@ -16,6 +16,7 @@ from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.track import Track
 from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import RobotLog
 
@@ -183,24 +184,21 @@ def _held_note(wheels: WheelSamples, share: float) -> list[str]:
     return [f"wheel values are held: they change {rate:.1f} times a second while moving"]
 
 
-def refuse_standing(log: RobotLog, drive: DriveArrays, windows: DriveWindows) -> None:
+def refuse_standing(log: RobotLog, track: Track, windows: DriveWindows) -> None:
     """Raise where the wheels turn and the position does not: a robot on a stand, or held."""
     begin, end = windows.begin, windows.end
     if len(begin) < FEWEST_WINDOWS:
         return
-    turned = np.abs(np.interp(drive.fix_t[end], drive.heading_t, drive.heading)
-                    - np.interp(drive.fix_t[begin], drive.heading_t, drive.heading))  # fmt: skip
-    laid, apart = (
-        np.abs(at[end] - at[begin]) for at in (drive.laid_until_fixes(), drive.until_fixes(drive.half_difference))
-    )
-    went = np.abs(drive.fix[end] - drive.fix[begin])
+    turned = np.abs(track.heading_at(track.place_t[end]) - track.heading_at(track.place_t[begin]))
+    laid, apart = (np.abs(at[end] - at[begin]) for at in (track.laid, track.at_places(track.half_difference)))
+    went = np.abs(track.place[end] - track.place[begin])
     moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
     clear = np.maximum(laid, apart) > windows.length_m / 4
     if np.count_nonzero(clear) >= FEWEST_WINDOWS and float((~moved)[clear].mean()) > STANDS_SHARE:
-        place = drive.fix - (np.median(drive.fix.real) + 1j * np.median(drive.fix.imag))
+        place = track.place - (np.median(track.place.real) + 1j * np.median(track.place.imag))
         raise DataError(
             log.name,
-            f"the wheels turn ({drive.travel[-1]:.0f} m) and the robot does not move",
+            f"the wheels turn ({track.travel[-1]:.0f} m) and the robot does not move",
             f"95 % of the positions lie within {float(np.percentile(np.abs(place), 95)):.2f} m: is it on a stand?",
         )
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import CHORD_S, LEAST_CHORD_M, cut_chords, join_streams
+from icrtool.alignment.drive_windows import CHORD_S, LEAST_CHORD_M, cut_chords, track_of_streams
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -143,7 +143,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     """
     if min(len(stamps), len(gnss.stamp_ns)) < 2:
         return None
-    chords = cut_chords(join_streams(WheelSamples(stamps, left, right), gnss, NO_HEADINGS, same_clock=False))
+    chords = cut_chords(track_of_streams(WheelSamples(stamps, left, right), gnss, NO_HEADINGS, same_clock=False))
     sides, chord = (np.abs(chords.left), np.abs(chords.right)), np.abs(chords.step)
     distance, turn = (sides[0] + sides[1]) / 2, np.abs(sides[0] - sides[1])
     usable = (np.abs(chords.duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_CHORD_M) & (distance > 0)

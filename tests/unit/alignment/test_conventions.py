@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventions, senses_by_distance
-from icrtool.alignment.drive_windows import DriveArrays, cut_windows, drive_arrays
+from icrtool.alignment.drive_windows import cut_windows, track_of_log
+from icrtool.kernels.track import Track
 from support.exact_drives import simulate
 
 
-def spoilt(drive: DriveArrays, one: Convention) -> DriveArrays:
+def spoilt(track: Track, one: Convention) -> Track:
     """Return the drive as a log would hold it whose convention is `one`."""
-    left, right = (drive.v_right, drive.v_left) if one.swapped else (drive.v_left, drive.v_right)
-    return drive._replace(
+    left, right = (track.v_right, track.v_left) if one.swapped else (track.v_left, track.v_right)
+    return track._replace(
         v_left=one.sign_left * left,
         v_right=one.sign_right * right,
-        heading=one.heading * drive.heading,
-        fix=drive.fix if one.position > 0 else np.conj(drive.fix),
+        heading=one.heading * track.heading,
+        east=one.position * track.east,
     )
 
 
@@ -37,15 +38,15 @@ def equivalents(one: Convention) -> set[Convention]:
 
 
 @pytest.fixture(scope="module")
-def drive() -> DriveArrays:
-    return drive_arrays(simulate(3, lever=(0.0, 0.0), offset_deg=0.0, scales=(1.0, 1.0), seconds=120.0))
+def track() -> Track:
+    return track_of_log(simulate(3, lever=(0.0, 0.0), offset_deg=0.0, scales=(1.0, 1.0), seconds=120.0))
 
 
 @pytest.mark.parametrize(
     "one", [Convention(*parts) for parts in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1))]
 )
-def test_a_spoilt_log_is_recognised(drive: DriveArrays, one: Convention) -> None:
-    found = decide_conventions(spoilt(drive, one), cut_windows(drive), metric=True)
+def test_a_spoilt_log_is_recognised(track: Track, one: Convention) -> None:
+    found = decide_conventions(spoilt(track, one), cut_windows(track), metric=True)
     assert found.convention in equivalents(one)
 
 
@@ -61,40 +62,40 @@ def test_a_spoilt_log_is_recognised(drive: DriveArrays, one: Convention) -> None
         AS_NAMED._replace(position=-1),
     ],
 )
-def test_a_single_fault_is_named_itself(drive: DriveArrays, one: Convention) -> None:
-    found = decide_conventions(spoilt(drive, one), cut_windows(drive), metric=True, gyro_sense=one.heading)
+def test_a_single_fault_is_named_itself(track: Track, one: Convention) -> None:
+    found = decide_conventions(spoilt(track, one), cut_windows(track), metric=True, gyro_sense=one.heading)
     assert found.convention == one
 
 
 @pytest.mark.parametrize("swapped", [True, False])
-def test_what_drives_forward_is_likelier_than_what_drives_backwards(drive: DriveArrays, swapped: bool) -> None:
+def test_what_drives_forward_is_likelier_than_what_drives_backwards(track: Track, swapped: bool) -> None:
     """Swapped sides with a heading of the other handedness, as ENU yaw taken for NED gives it."""
     one = AS_NAMED._replace(swapped=swapped, heading=-1)
-    log = spoilt(drive, one)
+    log = spoilt(track, one)
     log = log._replace(heading=log.heading + np.pi / 2)
-    found = decide_conventions(log, cut_windows(drive), metric=False)
+    found = decide_conventions(log, cut_windows(track), metric=False)
     assert found.convention == one
     assert found.as_likely is None
 
 
-def test_a_mirrored_pose_is_likelier_than_swapped_sides(drive: DriveArrays) -> None:
+def test_a_mirrored_pose_is_likelier_than_swapped_sides(track: Track) -> None:
     one = AS_NAMED._replace(heading=-1, position=-1)
-    found = decide_conventions(spoilt(drive, one)._replace(same_clock=True), cut_windows(drive), metric=True)
+    found = decide_conventions(spoilt(track, one)._replace(same_clock=True), cut_windows(track), metric=True)
     assert found.convention == one
     assert found.as_likely == AS_NAMED._replace(swapped=True)
 
 
-def test_geodetic_positions_are_never_mirrored(drive: DriveArrays) -> None:
-    mirrored = spoilt(drive, AS_NAMED._replace(position=-1))
-    assert decide_conventions(mirrored, cut_windows(drive), metric=False).convention.position == 1
+def test_geodetic_positions_are_never_mirrored(track: Track) -> None:
+    mirrored = spoilt(track, AS_NAMED._replace(position=-1))
+    assert decide_conventions(mirrored, cut_windows(track), metric=False).convention.position == 1
 
 
 def test_a_straight_drive_decides_nothing() -> None:
-    drive = drive_arrays(simulate(1, path="straight", seconds=80.0))
-    swapped = spoilt(drive, AS_NAMED._replace(swapped=True))
+    track = track_of_log(simulate(1, path="straight", seconds=80.0))
+    swapped = spoilt(track, AS_NAMED._replace(swapped=True))
     assert decide_conventions(swapped, cut_windows(swapped), metric=True).convention == AS_NAMED
 
 
 @pytest.mark.parametrize("one", [AS_NAMED, AS_NAMED._replace(sign_left=-1), AS_NAMED._replace(sign_right=-1)])
-def test_a_reversed_side_shows_without_a_heading(drive: DriveArrays, one: Convention) -> None:
-    assert senses_by_distance(spoilt(drive, one)) == one
+def test_a_reversed_side_shows_without_a_heading(track: Track, one: Convention) -> None:
+    assert senses_by_distance(spoilt(track, one)) == one

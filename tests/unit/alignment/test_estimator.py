@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.drive_windows import cut_windows, drive_arrays
+from icrtool.alignment.drive_windows import cut_windows, track_of_log
 from icrtool.alignment.estimator import AlignmentFit, _Model, estimate_alignment
 from support.exact_drives import ICRS, simulate
 
@@ -18,9 +18,9 @@ LEAST_COVERAGE, LEAST_OF_ONE = 0.9, 0.8
 """95 % are expected; of 24 drives, each number falls below 80 % by chance once in 400."""
 
 
-def estimate(seed: int, **drive: float) -> AlignmentFit:
-    log = simulate(seed, lever=(0.0, 0.0), offset_deg=OFFSET_DEG, scales=SCALES, seconds=160.0, **drive)
-    arrays = drive_arrays(log)
+def estimate(seed: int, **track: float) -> AlignmentFit:
+    log = simulate(seed, lever=(0.0, 0.0), offset_deg=OFFSET_DEG, scales=SCALES, seconds=160.0, **track)
+    arrays = track_of_log(log)
     found = estimate_alignment(arrays, cut_windows(arrays), WIDTH_M)
     assert found is not None
     return found
@@ -60,15 +60,15 @@ def test_delays_of_either_stream_are_found(gnss: float, heading: float) -> None:
 
 @pytest.mark.parametrize("samples", [0, 1, 2, 5])
 def test_too_few_fixes_give_no_estimate(samples: int) -> None:
-    drive = drive_arrays(simulate(0, seconds=20.0))
-    short = drive._replace(fix_t=drive.fix_t[:samples], fix=drive.fix[:samples])
+    track = track_of_log(simulate(0, seconds=20.0))
+    short = track.places(slice(samples))
     assert estimate_alignment(short, cut_windows(short), WIDTH_M) is None
 
 
 def test_a_straight_drive_knows_that_it_shows_no_separation() -> None:
     log = simulate(0, path="straight", lever=(0.0, 0.0), scales=(1.0, 1.0), seconds=80.0)
-    drive = drive_arrays(log)
-    found = estimate_alignment(drive, cut_windows(drive), WIDTH_M)
+    track = track_of_log(log)
+    found = estimate_alignment(track, cut_windows(track), WIDTH_M)
     assert found is not None
     geometry = found.geometry()
     assert np.sqrt(geometry.covariance[5, 5]) > 0.3 * abs(geometry.values[5])
@@ -76,12 +76,11 @@ def test_a_straight_drive_knows_that_it_shows_no_separation() -> None:
 
 
 def test_a_damaged_speed_makes_no_more_windows_than_there_are_fixes() -> None:
-    drive = drive_arrays(simulate(0, seconds=20.0))
-    left = drive.v_left.copy()
+    log = simulate(0, seconds=20.0)
+    left = log.wheels.left.copy()
     left[100] = 1e5
-    travel = np.concatenate([[0.0], np.cumsum((drive.wheel_dt * (np.abs(left) + np.abs(drive.v_right)) / 2)[:-1])])
-    windows = cut_windows(drive._replace(v_left=left, travel=travel))
-    assert len(windows.begin) <= len(drive.fix_t)
+    windows = cut_windows(track_of_log(replace(log, wheels=replace(log.wheels, left=left))))
+    assert len(windows.begin) <= len(log.gnss.stamp_ns)
 
 
 def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
@@ -89,8 +88,8 @@ def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
     rng = np.random.default_rng(0)
     north = log.gnss.north_m.copy()
     north[rng.choice(len(north), len(north) // 100, replace=False)] += 5.0
-    drive = drive_arrays(replace(log, gnss=replace(log.gnss, north_m=north)))
-    found = estimate_alignment(drive, cut_windows(drive), WIDTH_M)
+    track = track_of_log(replace(log, gnss=replace(log.gnss, north_m=north)))
+    found = estimate_alignment(track, cut_windows(track), WIDTH_M)
     assert found is not None
     assert np.abs(found.geometry().values[:2] - ICRS[:2]).max() < 0.02
     assert np.abs(found.geometry().values[3:5] - SCALES).max() < 0.02
@@ -98,7 +97,7 @@ def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
 
 def test_the_jacobian_equals_differences() -> None:
     found = estimate(2, heading_std_deg=0.0)
-    model = _Model(found.drive, found.windows, WIDTH_M)
+    model = _Model(found.track, found.windows, WIDTH_M)
     x = np.array([1.01, 0.02, -0.1, 0.02, 0.5, 0.01, 1e-3, 0.1, 0.03, -0.02, 0.04])
     residuals, jacobian = model.evaluate(x)
     for column, step in enumerate([1e-6] * 8 + [0.02, 0.02, 1e-6]):

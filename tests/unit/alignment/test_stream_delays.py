@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.conventions import AS_NAMED, decide_conventions
-from icrtool.alignment.drive_windows import cut_windows, drive_arrays
+from icrtool.alignment.drive_windows import cut_windows, track_of_log
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.stream_delays import Delay, StreamDelays, _clear_delays
 from icrtool.config import load_config
@@ -141,8 +141,8 @@ def test_last_bits_of_an_exact_circle_name_no_side_reversed(relative: float) -> 
             for values in (log.gnss.north_m, log.gnss.east_m, log.heading.heading_rad)
         )
         moved = replace(log.gnss, north_m=north, east_m=east)
-        drive = drive_arrays(replace(log, gnss=moved, heading=replace(log.heading, heading_rad=psi)))
-        assert decide_conventions(drive, cut_windows(drive), metric=False).convention == AS_NAMED
+        track = track_of_log(replace(log, gnss=moved, heading=replace(log.heading, heading_rad=psi)))
+        assert decide_conventions(track, cut_windows(track), metric=False).convention == AS_NAMED
 
 
 @pytest.mark.parametrize("row", [0, -1])
@@ -154,8 +154,8 @@ def test_a_stamp_decades_away_neither_fills_the_memory_nor_changes_the_delay(row
     wheels, heading = replace(log.wheels, stamp_ns=stray[0]), replace(log.heading, stamp_ns=stray[1])
     tracemalloc.start()
     try:
-        drive = drive_arrays(replace(log, wheels=wheels, heading=heading))
-        found = estimate_alignment(drive, cut_windows(drive), 0.8)
+        track = track_of_log(replace(log, wheels=wheels, heading=heading))
+        found = estimate_alignment(track, cut_windows(track), 0.8)
         most = tracemalloc.get_traced_memory()[1]
     except MemoryError:
         pytest.fail("an array over the time between first and last stamp")

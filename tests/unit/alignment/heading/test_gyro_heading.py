@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 import icrtool
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.drive_windows import drive_arrays
+from icrtool.alignment.drive_windows import track_of_log
 from icrtool.alignment.heading.courses import TurnRate
 from icrtool.alignment.heading.gyro_heading import estimate_heading
 from icrtool.alignment.heading.heading_choice import DerivedHeading, derive_heading, fuse_heading
@@ -70,7 +70,7 @@ def with_attitude(log: RobotLog, truth: Truth, seed: int, offset_deg: float = 0.
 
 
 def fused(log: RobotLog) -> DerivedHeading:
-    found = fuse_heading(log, drive_arrays(log))
+    found = fuse_heading(log, track_of_log(log))
     assert found is not None
     return found
 
@@ -224,9 +224,9 @@ def test_two_antennas_point_wherever_they_are_mounted() -> None:
 
 def test_a_drive_too_short_for_courses_gives_no_heading() -> None:
     log, _ = without_heading(4)
-    drive = drive_arrays(log)
-    turn = TurnRate(drive.wheel_t[:50], np.zeros(50))
-    assert estimate_heading(drive, turn) is None
+    track = track_of_log(log)
+    turn = TurnRate(track.t[:50], np.zeros(50))
+    assert estimate_heading(track, turn) is None
 
 
 @pytest.mark.parametrize("name", ["tracked_gyro.bag", "wheeled_two_antennas"])
@@ -291,7 +291,7 @@ def test_a_gyro_that_shows_no_turn_is_not_fused_with_a_poor_compass() -> None:
     hard_iron = truth[1] + math.radians(14.0) * np.sin(truth[1])
     samples = HeadingSamples(truth[0], np.angle(np.exp(1j * hard_iron)), np.full(len(hard_iron), 3e-4))
     compass = replace(log, heading=samples, gyros=(dead,))
-    assert fuse_heading(compass, drive_arrays(compass)) is None
+    assert fuse_heading(compass, track_of_log(compass)) is None
 
 
 ROBOTS = {"tracked_gyro.bag": "pentzer-tracked", "wheeled_two_antennas": "segway-rmp400"}
