@@ -7,7 +7,7 @@ import os
 import sys
 from contextlib import suppress
 
-from icrtool.cli.interrupts import INTERRUPTED, end_in_order
+from icrtool.cli.interrupts import INTERRUPTED, end_at_once
 from icrtool.records.memory import use_one_arena
 
 __all__ = ["main"]
@@ -32,23 +32,14 @@ def main() -> None:
         import resource
 
         resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
-    try:
-        with end_in_order(main.__code__) as ending:
-            from icrtool.cli.standard_streams import standard_streams
+    with end_at_once():
+        from icrtool.cli.standard_streams import standard_streams
 
-            with standard_streams() as output:
-                status = _run()
-                if output.lost:
-                    sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
-                    status = status or 1
-            if ending.ended:
-                # The interpreter's own end takes up to a second more, in which no thread watches the time.
-                with suppress(OSError, ValueError):
-                    sys.stdout.flush()
-                os._exit(status)
-    except KeyboardInterrupt:
-        # During imports, or while a last message is printed.
-        status = INTERRUPTED
+        with standard_streams() as output:
+            status = _run()
+            if output.lost:
+                sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
+                status = status or 1
     # At its end the interpreter looks for cyclic rubbish among all that was imported: a tenth of a second or two.
     gc.freeze()
     sys.exit(status)

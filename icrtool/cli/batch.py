@@ -163,7 +163,7 @@ def executor_of(
     """Give what runs the logs (threads that own a process each, or a Dask cluster), and whether that is lost."""
     from icrtool.errors import ConfigError
     from icrtool.fleet.batch import local_executor
-    from icrtool.fleet.worker import close_all
+    from icrtool.fleet.processes import close_all
 
     if scheduler is None:
         try:

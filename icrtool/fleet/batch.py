@@ -19,9 +19,9 @@ from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.fleet_files import ROWS, check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import Request, failed, files_of, path_of
+from icrtool.fleet.processes import close_all, process_apart
 from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
 from icrtool.fleet.row import File, Row, as_text
-from icrtool.fleet.worker import close_all, process_apart
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.records.regular_file import read_regular
 

@@ -65,7 +65,7 @@ def path_of(name: bytes) -> Path:
 
 
 _REQUEST = msgspec.json.Decoder(Request)
-"""Made at import, as in `icrtool.fleet.worker`."""
+"""Made at import, as in `icrtool.fleet.processes`."""
 
 
 def decode_request(line: bytes) -> Request:

@@ -8,7 +8,7 @@ old one is renamed aside first; where a process is killed between both renames, 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from icrtool.output.files import disk
@@ -25,7 +25,7 @@ from icrtool.output.files.own_files import (
     write_own_files,
 )  # fmt: skip
 from icrtool.records.regular_file import check_folders
-from icrtool.records.unfinished import end, unfinished
+from icrtool.records.unfinished import end, unfinished, with_parents
 
 
 @contextmanager
@@ -117,29 +117,19 @@ def atomic_directory(
         As `check_directory`, and for every OSError of the block (disk full, no permission).
     """
     check_directory(directory, ours, kind=kind, inside=inside)
-    made: list[Path] = []
-    try:
-        with reported(directory):
-            place = real_place(directory)
-            made = [parent for parent in place.parents if not parent.exists()]
-            place.parent.mkdir(parents=True, exist_ok=True)
-            for parent in made:
-                disk.sync(parent.parent)
-            with hidden_directory(place) as partial:
-                yield partial
-                check_directory(directory, ours, kind=kind, inside=inside)
-                own = OwnFiles(kind, frozenset(map(str, files_in(partial))), frozenset(made_from))
-                done = keep_foreign(place, partial, names) if place.exists() else ""
-                write_own_files(partial, own)
-                disk.sync_tree(partial)
-                put(partial, place)
-            made = []
-        if note is not None and done:
-            note(f"{directory}: {done}")
-    finally:
+    place = real_place(directory)
+    with reported(directory), with_parents(place) as made, hidden_directory(place) as partial:
         for parent in made:
-            with suppress(OSError):
-                parent.rmdir()
+            disk.sync(parent.parent)
+        yield partial
+        check_directory(directory, ours, kind=kind, inside=inside)
+        own = OwnFiles(kind, frozenset(map(str, files_in(partial))), frozenset(made_from))
+        done = keep_foreign(place, partial, names) if place.exists() else ""
+        write_own_files(partial, own)
+        disk.sync_tree(partial)
+        put(partial, place)
+    if note is not None and done:
+        note(f"{directory}: {done}")
 
 
 @contextmanager
@@ -198,5 +188,6 @@ def put(partial: Path, place: Path, aside: Path | None = None) -> None:
             if not place.exists():
                 old.rename(place)
             raise
-    disk.sync(place.parent)
-    disk.remove(old)
+    with unfinished(old):
+        disk.sync(place.parent)
+        disk.remove(old)

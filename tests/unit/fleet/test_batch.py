@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from icrtool.errors import ConfigError, LogError, OutputError
-from icrtool.fleet import worker
+from icrtool.fleet import processes
 from icrtool.fleet.batch import BatchOptions, default_jobs, finished, plan, run_batch
 from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.fleet_files import write_fleet
@@ -27,7 +27,7 @@ import os, signal, sys, time
 from dataclasses import replace
 from pathlib import Path
 from icrtool.errors import DataError
-from icrtool.fleet import one_log, worker
+from icrtool.fleet import one_log, processes
 
 def results(request, stage):
     stage("reading")
@@ -56,17 +56,17 @@ def results(request, stage):
                    inputs=one_log.files_of(path))
 
 one_log._results = results
-worker.main()
+processes.main()
 """
 
 
 @pytest.fixture
 def season(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "script.py").write_text(SCRIPT)
-    monkeypatch.setattr(worker, "COMMAND", (sys.executable, str(tmp_path / "script.py")))
+    monkeypatch.setattr(processes, "COMMAND", (sys.executable, str(tmp_path / "script.py")))
     (tmp_path / "season").mkdir()
     yield tmp_path / "season"
-    worker.close_all()
+    processes.close_all()
 
 
 def add(season: Path, *names: str) -> None:
@@ -179,7 +179,7 @@ def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
     add(season, "hang")
     request = plan([season], season.parent / "out", BatchOptions())[0]
     process = subprocess.Popen(
-        worker.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3],
+        processes.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
     )  # fmt: skip
     assert process.stdin is not None

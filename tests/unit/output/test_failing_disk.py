@@ -100,7 +100,7 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
     }
 
 
-ICRS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
+ICRS = ("y_icr_right_m", "y_icr_left_m", "x_icr_m", "std_y_icr_right_m", "std_y_icr_left_m", "std_x_icr_m")
 SLOW = {"run with pictures", "study", "picture", "foxglove", "fleet"}
 """Their figures or messages take 0.2 s or more to make: they are for `make stress`."""
 

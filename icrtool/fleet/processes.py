@@ -1,0 +1,209 @@
+"""Processes of their own for the work on logs: what hangs is killed, what dies costs one log.
+
+A process is started once and processes log after log, so that libraries and compiled code are loaded once. Requests
+travel as lines of JSON through its standard input, stages (texts) and rows (objects) through its standard output. The
+same function per log serves the threads of a batch on this machine and those of the workers of a cluster.
+
+`pebble.ProcessPool` and `concurrent.futures` are not used: an exception that cannot be unpickled, or a process killed
+while it starts, ends all logs of their pools (pebble 5.2), and the second ends no log that takes too long.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import IO
+
+import msgspec
+
+from icrtool.fleet.fit_and_report import Stage
+from icrtool.fleet.one_log import Request, decode_request, failed, process
+from icrtool.fleet.row import Row
+from icrtool.records.memory import give_back_freed
+from icrtool.records.unfinished import remove_unfinished
+
+GRACE_S = 0.3
+"""Time in which a process may remove what it is writing before it is killed [s]."""
+
+LONGEST_DETAILS = 4000
+"""Letters kept of what a process printed before it died."""
+
+ENVIRONMENT = {
+    "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg",
+    "MALLOC_ARENA_MAX": "1", "ARROW_DEFAULT_MEMORY_POOL": "system",
+}  # fmt: skip
+"""One thread a log: the logs are what runs at the same time. Memory as `icrtool.cli.main` has it."""
+
+NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
+"""Dask sets it for its workers: memory then goes back to the system again and again, which doubles system time."""
+
+COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.processes")
+
+Lines = queue.SimpleQueue[bytes]
+
+_ANSWER: msgspec.json.Decoder[str | Row] = msgspec.json.Decoder(str | Row)
+"""Made at import: msgspec crashes where several threads are the first to use a type."""
+
+_all: set[Worker] = set()
+_idle: list[Worker] = []
+"""Those of them that wait for a log; each thread that asks takes one, or starts one."""
+
+
+def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) -> Row:
+    """Process a log in a process of its own; one that hangs, or kills its process, gives a row with the reason.
+
+    Parameters
+    ----------
+    request : of `Request.encode`
+    timeout_s : after which the process is killed
+    stage : called with what is done next, where the caller is on the same machine
+    """
+    try:
+        worker = _idle.pop()
+    except IndexError:
+        worker = Worker()
+    row = worker.run(decode_request(request), timeout_s, stage)
+    if worker in _all:
+        _idle.append(worker)
+    return row
+
+
+def close_all() -> None:
+    """End all worker processes."""
+    _idle.clear()
+    for worker in list(_all):
+        worker.ask_to_end()
+    for worker in list(_all):
+        worker.close()
+
+
+class Worker:
+    """A process that processes one log at a time."""
+
+    def __init__(self) -> None:
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
+        home = str(Path(__file__).resolve().parents[2])
+        paths = os.pathsep.join(filter(None, [home, os.environ.get("PYTHONPATH")]))
+        inherited = {name: value for name, value in os.environ.items() if name != NOT_INHERITED}
+        # In a session of its own: Ctrl-C reaches the command, which ends its workers.
+        self._process = subprocess.Popen(  # noqa: S603 - our own command
+            COMMAND,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+            env={**inherited, **ENVIRONMENT, "PYTHONPATH": paths}, start_new_session=True,
+        )  # fmt: skip
+        assert self._process.stdout is not None  # noqa: S101 - for the type checker
+        # At its end, a line that is no answer.
+        self._answers = _lines_of(self._process.stdout, lambda lines: lines.put(b""))
+        _all.add(self)
+
+    def run(self, request: Request, timeout_s: float, stage: Stage | None) -> Row:
+        """Process a log, as `process_apart`."""
+        begun, begin_of_errors = time.monotonic(), self._errors.seek(0, os.SEEK_END)
+        details = ""
+        try:
+            self._ask(request)
+            while not isinstance(answer := self._answer(begun + timeout_s), Row):
+                if stage is not None:
+                    stage(answer)
+        except queue.Empty:
+            why = f"took longer than {timeout_s:g} s and was ended"
+        except (OSError, ValueError):  # it died, or what it wrote was cut off when it did
+            why = self._how_it_ended()
+            with suppress(ValueError):  # closed, where the batch was interrupted
+                self._errors.seek(begin_of_errors)
+                details = self._errors.read().decode(errors="replace").strip()[-LONGEST_DETAILS:]
+            why += f": {details.splitlines()[-1]}" if details else ""
+        else:
+            return answer
+        self.close()
+        took_s = round(time.monotonic() - begun, 3)
+        return replace(failed(request, why, details=details, repeatable=False), took_s=took_s)
+
+    def ask_to_end(self) -> None:
+        """Close its input: it removes what it is writing, and ends."""
+        if self._process.stdin is not None:
+            with suppress(OSError):  # its other end is gone
+                self._process.stdin.close()
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        _all.discard(self)
+        self.ask_to_end()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(GRACE_S)
+        self._process.kill()
+        self._process.wait()
+        self._errors.close()
+
+    def _ask(self, request: Request) -> None:
+        assert self._process.stdin is not None  # noqa: S101 - for the type checker
+        self._process.stdin.write(request.encode() + b"\n")
+        self._process.stdin.flush()
+
+    def _answer(self, end_s: float) -> str | Row:
+        return _ANSWER.decode(self._answers.get(timeout=max(end_s - time.monotonic(), 0.0)))
+
+    def _how_it_ended(self) -> str:
+        try:
+            status = self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            return "its process closed its output and did not end"
+        if status >= 0:
+            return f"its process ended with exit status {status}"
+        name = signal.Signals(-status).name
+        return f"its process was ended by {name}{', perhaps for lack of memory' if name == 'SIGKILL' else ''}"
+
+
+def _lines_of(stream: IO[bytes], at_end: Callable[[Lines], object]) -> Lines:
+    """Return a queue that a thread of its own fills with the lines of a stream."""
+    lines: Lines = queue.SimpleQueue()
+
+    def read() -> None:
+        with stream:
+            for line in stream:
+                lines.put(line)
+        at_end(lines)
+
+    threading.Thread(target=read, daemon=True).start()
+    return lines
+
+
+def main() -> None:
+    """Process the logs that standard input asks for, until it ends."""
+    # What a library prints goes with the errors. Files of our own: Python's are locked by who waits for a line.
+    requests, output = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.set_threshold(100_000)
+
+    def send(answer: str | Row) -> None:
+        output.write(msgspec.json.encode(answer) + b"\n")
+        output.flush()
+
+    def begin(stage: str) -> None:
+        give_back_freed()
+        send(stage)
+
+    def end(_: Lines) -> None:
+        # The process that asked has ended, or ends this one, perhaps in the middle of a log.
+        remove_unfinished()
+        os._exit(1)
+
+    lines = _lines_of(requests, end)
+    while True:
+        send(process(decode_request(lines.get()), begin))
+
+
+if __name__ == "__main__":
+    main()
