@@ -46,7 +46,7 @@ LONGEST_LINE = 5000
 def made(folder: Path) -> Path:
     """Return a folder with a run of a short drive, its report, and a calibration."""
     import icrtool
-    from icrtool.fleet.fit_and_report import ReportOptions, report_and_write
+    from icrtool.fleet.one_log import ReportOptions, report_and_write
     from support.barn import configured, simulate
 
     run = icrtool.fit(simulate(duration_s=40.0), configured())

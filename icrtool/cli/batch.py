@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from icrtool.fleet.batch import BatchOptions, Lost
-    from icrtool.fleet.fit_and_report import ReportOptions
-    from icrtool.fleet.one_log import Request
+    from icrtool.fleet.one_log import ReportOptions, Request
     from icrtool.fleet.roll_up import PooledCalibration
     from icrtool.fleet.row import Row
 
@@ -87,7 +86,7 @@ def command(
     missing = compared.missing(row.log for row in rows) if compared is not None else []
     write_exports(rows, calibrations, missing, output if asked.page else None, junit=junit, markdown=markdown)
     if compared is not None:
-        from icrtool.fleet.acceptance import changes_of
+        from icrtool.fleet.fleet_files import changes_of
 
         options.warn([escaped(change) for change in changes_of(rows, missing)], quiet=quiet)
     print_results(rows, calibrations, output, quiet=quiet, as_json=as_json)
@@ -126,12 +125,12 @@ def write_exports(
     from icrtool.output.files.own_files import is_page
 
     if junit is not None:
-        from icrtool.fleet.acceptance import suites_of
+        from icrtool.fleet.fleet_files import suites_of
         from icrtool.output.exports.acceptance import write_junit
 
         write_junit(junit, suites_of(rows), "batch")
     if markdown is not None:
-        from icrtool.fleet.acceptance import format_fleet_markdown
+        from icrtool.fleet.fleet_files import format_fleet_markdown
 
         write_file(markdown, format_fleet_markdown(rows, missing))
     if page is not None:

@@ -20,7 +20,7 @@ from icrtool.records.text import LogText, escaped
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.dropout_analysis.report import DropoutReport
-    from icrtool.fleet.fit_and_report import ReportOptions
+    from icrtool.fleet.one_log import ReportOptions
     from icrtool.output.exports.acceptance import Outcome
     from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.run import Run
@@ -226,7 +226,7 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
 def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
     """Analyse a run, and write its report into its directory."""
     from icrtool.dropout_analysis.dropout_report import forced_lengths_s
-    from icrtool.fleet.fit_and_report import report_and_write
+    from icrtool.fleet.one_log import report_and_write
 
     if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
         raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")

@@ -181,9 +181,9 @@ def fit_log(
     Parameters
     ----------
     warm_start : run or calibration to start from
-    options_of_fit : of `icrtool.fleet.fit_and_report.fit_and_write`
+    options_of_fit : of `icrtool.fleet.one_log.fit_and_write`
     """
-    from icrtool.fleet.fit_and_report import fit_and_write
+    from icrtool.fleet.one_log import fit_and_write
 
     start = _warm_start(warm_start) if warm_start is not None else None
     notes: list[str] = []

@@ -154,7 +154,7 @@ def report(command: Command) -> Command:
         page: bool, allow_unusable: bool, figures: FigureSet, junit: Path | None, markdown: Path | None,
         **others: object,
     ) -> object:  # fmt: skip
-        from icrtool.fleet.fit_and_report import ReportOptions
+        from icrtool.fleet.one_log import ReportOptions
 
         asked = ReportOptions(plots, gates, budgets, ladder, strict, page, allow_unusable, figures)
         return command(asked=asked, junit=junit, markdown=markdown, **others)

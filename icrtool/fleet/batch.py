@@ -15,10 +15,9 @@ import msgspec
 from icrtool import __version__
 from icrtool.config import Config, builtin_robots, load_config
 from icrtool.errors import ConfigError, OutputError
-from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.fleet_files import ROWS, check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
-from icrtool.fleet.one_log import Request, failed, files_of, path_of
+from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
 from icrtool.fleet.processes import close_all, process_apart
 from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
 from icrtool.fleet.row import File, Row, as_text

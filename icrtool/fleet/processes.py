@@ -27,8 +27,7 @@ from typing import IO
 
 import msgspec
 
-from icrtool.fleet.fit_and_report import Stage
-from icrtool.fleet.one_log import Request, decode_request, failed, process
+from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
 from icrtool.fleet.row import Row
 from icrtool.records.memory import give_back_freed
 from icrtool.records.unfinished import remove_unfinished

@@ -22,7 +22,7 @@ from icrtool.output.files.checksums import list_anew
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.own_files import files_in
-from icrtool.output.files.trials_file import trials_file
+from icrtool.output.files.states_file import trials_file
 from icrtool.output.run_directory import is_run_directory
 from icrtool.output.tables.dropout import no_trial, why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows

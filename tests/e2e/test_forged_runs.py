@@ -13,7 +13,7 @@ from random import Random
 import pytest
 
 from icrtool.estimation.fit import fit
-from icrtool.fleet.fit_and_report import ReportOptions, report_and_write
+from icrtool.fleet.one_log import ReportOptions, report_and_write
 from support.barn import configured, simulate
 from support.forged import Home, forge, remove
 

@@ -1,4 +1,4 @@
-"""The recorded states as a file: CSV with every bit of every number, or Parquet."""
+"""The recorded states as a file, CSV with every bit of every number or Parquet, and every single trial as Parquet."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from itertools import islice
@@ -26,6 +27,8 @@ from icrtool.records.tables import States
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from icrtool.dropout_analysis.trials import ErrorSink
+
 StatesFormat = Literal["csv", "parquet"]
 
 COLUMNS = tuple(field.name for field in fields(States))
@@ -42,6 +45,9 @@ PARQUET_ROWS = 1 << 17
 
 FREE_BYTES = 1 << 29
 """States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
+
+ROWS_A_GROUP = 1 << 18
+"""Trials written at a time: 6 MB."""
 
 PIECES_AHEAD = 4
 """Pieces of text that wait to be written at most."""
@@ -153,6 +159,45 @@ def _array(column: pa.ChunkedArray) -> NDArray[Any]:
     if column.null_count:
         raise StatesFileError("a cell is empty")
     return np.concatenate([np.from_dlpack(chunk) for chunk in column.chunks])
+
+
+@contextmanager
+def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
+    """Give a sink that appends trials to a new Parquet file; starts without a trial are left out.
+
+    Parameters
+    ----------
+    path : the file to make
+    stamp_ns : (n,) of the starts
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = pa.dictionary(pa.int8(), pa.string())
+    schema = pa.schema({"model": names, "stamp_ns": pa.int64(), "horizon_m": pa.float64(), "error_m": pa.float64()})
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+
+        def append(model: str, horizons_m: Floats, errors_m: Floats) -> None:
+            for h, horizon in enumerate(horizons_m):
+                for lo in range(0, len(stamp_ns), ROWS_A_GROUP):
+                    error = errors_m[lo : lo + ROWS_A_GROUP, h]
+                    tried = ~np.isnan(error)
+                    rows = int(np.count_nonzero(tried))
+                    model_column = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int8)), [model])
+                    columns = [
+                        model_column,
+                        pa.array(stamp_ns[lo : lo + ROWS_A_GROUP][tried]),
+                        pa.array(np.full(rows, float(horizon))),
+                        pa.array(error[tried]),
+                    ]
+                    writer.write_table(pa.table(columns, schema=schema))
+
+        yield append
 
 
 def _csv_pieces(table: States) -> Iterator[bytes]:

@@ -16,9 +16,8 @@ import pytest
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet import processes
 from icrtool.fleet.batch import BatchOptions, default_jobs, finished, plan, run_batch
-from icrtool.fleet.fit_and_report import ReportOptions
 from icrtool.fleet.fleet_files import write_fleet
-from icrtool.fleet.one_log import Request
+from icrtool.fleet.one_log import ReportOptions, Request
 from icrtool.fleet.row import Row
 
 # A worker whose logs behave as they are named; the row is kept as `icrtool.fleet.one_log.process` keeps it.
