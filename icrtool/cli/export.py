@@ -100,30 +100,33 @@ def _path_text(run: Run, target: str) -> str:
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
     """Write a file for each path of a run."""
     from icrtool.output.exports.paths import paths_of
-    from icrtool.output.exports.trajectories import SUFFIXES, format_trajectory
+    from icrtool.output.exports.trajectories import SUFFIXES, format_trajectory, is_trajectory
 
     directory.mkdir(parents=True, exist_ok=True)
     from icrtool.output.files.atomic import write_file
+    from icrtool.output.files.own_files import check_place
 
-    for path in paths_of(run):
-        file = directory / f"{path.name}{SUFFIXES[target]}"
-        write_file(file, format_trajectory(path, target), directory)
+    files = {directory / f"{path.name}{SUFFIXES[target]}": path for path in paths_of(run)}
+    for file in files:
+        check_place(file, directory, is_trajectory)
+    for file, path in files.items():
+        write_file(file, format_trajectory(path, target), directory, is_trajectory)
         click.echo(f"written to {file}")
 
 
 def _write_foxglove(run: Run, output: Path) -> None:
     """Write the MCAP file, and the layout beside it."""
     from icrtool.output.exports.foxglove import write_foxglove
-    from icrtool.output.exports.foxglove_layout import foxglove_layout
+    from icrtool.output.exports.foxglove_layout import foxglove_layout, is_layout
     from icrtool.output.files.atomic import atomic_file, write_file
     from icrtool.output.files.json_file import json_bytes
     from icrtool.output.files.own_files import check_place
 
     layout = output.with_name(f"{output.stem}.layout.json")
-    check_place(layout, layout.parent)
+    check_place(layout, layout.parent, is_layout)
     with atomic_file(output) as partial:
         write_foxglove(run, partial)
-    write_file(layout, json_bytes(foxglove_layout(run)), layout.parent)
+    write_file(layout, json_bytes(foxglove_layout(run)), layout.parent, is_layout)
     click.echo(f"written to {output}; layout for Foxglove: {layout}")
 
 

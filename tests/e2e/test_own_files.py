@@ -85,6 +85,27 @@ def test_an_export_replaces_an_export(icrtool: Command, run: Path, run_place: Pa
         assert icrtool("export", "--for", "foxglove", run, "-o", run_place / "paths.mcap")[0] == 0
 
 
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("filter.tum", ("evo",)), ("no_slip.kitti", ("kitti",)), ("paths.layout.json", ("foxglove",))],
+)
+def test_what_an_export_writes_under_a_name_of_its_own_replaces_only_its_like(
+    icrtool: Command, run: Path, run_place: Path, name: str, options: tuple[str, ...]
+) -> None:
+    (run_place / "folder").mkdir()
+    place = run_place / "folder" / ("paths.mcap" if options == ("foxglove",) else "")
+    command = ("export", "--for", *options, run, "-o", place)
+    assert icrtool(*command)[0] == 0
+    assert icrtool(*command)[0] == 0
+    before = {file: file.read_bytes() for file in place.parent.rglob("*") if file.is_file() and file.name != name}
+    (run_place / "folder" / name).write_bytes(OWN)
+    status, _, errors = icrtool(*command)
+    assert status == 1
+    assert name in errors
+    assert (run_place / "folder" / name).read_bytes() == OWN
+    assert {file: file.read_bytes() for file in before} == before
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import icrtool

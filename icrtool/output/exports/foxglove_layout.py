@@ -32,3 +32,8 @@ def foxglove_layout(run: Run) -> dict[str, Any]:
         del panels["map!place"]
         layout["layout"]["first"] = "3D!paths"
     return layout
+
+
+def is_layout(first: bytes) -> bool:
+    """Return whether a file is a layout of ours, by its first bytes."""
+    return b"3D!paths" in first[:100]

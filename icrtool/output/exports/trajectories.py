@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Literal
 
 import numpy as np
@@ -35,6 +36,11 @@ def format_trajectory(path: ExportPath, target: TrajectoryFormat) -> str:
     stamps = zip(seconds.tolist(), rest.tolist(), strict=True)
     rows = zip(stamps, *columns, strict=True)
     return "".join(f"{whole}.{part:09d} {x} {y} 0 0 0 {qz} {qw}\n" for (whole, part), x, y, qz, qw in rows)
+
+
+def is_trajectory(first: bytes) -> bool:
+    """Return whether a file holds lines of numbers only, by its first bytes."""
+    return re.fullmatch(rb"[-+.0-9e \n]*", first) is not None
 
 
 def _numbers(column: Floats) -> list[float]:
