@@ -17,18 +17,19 @@ from icrtool.calibration.error_differences import ErrorEstimate
 from icrtool.calibration.record import (
     CalibrationLog,
     ControllerErrors,
-    ControllerNumbers,
     ErrorSources,
     HeldOutScore,
     PooledScore,
 )
 from icrtool.calibration.transfer import Difference
+from icrtool.config import Config
 from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import Row
 from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.motion.models import TrackGeometry
 from icrtool.records.dropout import BudgetDistance, Gate, UsedCalibration
-from icrtool.records.run_document import DriveDocument, IcrDocument, InputDocument, RunDocument
+from icrtool.records.run_document import ControllerNumbers, DriveDocument, IcrDocument, RunDocument
+from icrtool.records.samples import InputFile
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference" / "schemas"
 
@@ -130,8 +131,8 @@ Trial = plain("Trial", {
     "speed_mean_mps": float, "errors_m": dict[str, Number],
 })  # fmt: skip
 RunOfReport = plain("RunOfReport", {
-    "schema": Literal["icrtool/run/1"], "tool_version": str, "log": str, "inputs": list[InputDocument],
-    "config": dict[str, Any], "drive": DriveDocument, "icr": IcrDocument,
+    "schema": Literal["icrtool/run/1"], "tool_version": str, "log": str, "inputs": list[InputFile],
+    "config": Config, "drive": DriveDocument, "icr": IcrDocument,
 })  # fmt: skip
 Bootstrap = plain("Bootstrap", {"method": str, "block": str, "resamples": int, "level": float, "seed": int})
 Bootstrap.__doc__ = (
@@ -194,13 +195,14 @@ DOCUMENTS: dict[str, type] = {
 
 def schemas() -> dict[str, str]:
     """Return each schema as JSON text, by the name of its file."""
-    return {
-        f"{name}-1.json": json.dumps(
-            {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"icrtool/{name}/1"}
-            | msgspec.json.schema(kind), indent=1, sort_keys=True,
-        ) + "\n"
-        for name, kind in DOCUMENTS.items()
-    }  # fmt: skip
+    found = {}
+    for name, kind in DOCUMENTS.items():
+        schema = msgspec.json.schema(kind)
+        if "Config" in schema["$defs"]:
+            del schema["$defs"]["Config"]["properties"]["given"]  # which keys were set is not written
+        head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"icrtool/{name}/1"}
+        found[f"{name}-1.json"] = json.dumps(head | schema, indent=1, sort_keys=True) + "\n"
+    return found
 
 
 def main() -> None:

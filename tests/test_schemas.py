@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -30,6 +29,7 @@ from icrtool.output.tables.transfer import transfer_document
 from icrtool.records.dropout import Verdict
 from icrtool.records.text import LogText
 from support.barn import configured, simulate
+from support.documents import with_summary
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -50,7 +50,7 @@ SCRIPT = load_script()
 def documents() -> dict[str, Any]:
     """A document of every kind, read back from JSON."""
     run, twin = (fit(simulate(turn_mps=turn), configured()) for turn in (0.25, 0.3))
-    other = replace(twin, summary={**twin.summary, "inputs": [{"path": "b", "bytes": 1, "sha256": "b"}]})
+    other = with_summary(twin, inputs=[{"path": "b", "bytes": 1, "sha256": "b"}])
     calibration = calibrate(run)
     report = dropout_report(
         run, horizons_m=(1.0, 5.0), outage_s=(4.0,), gates=("icr.p95@5m <= 0.001",), calibrations=[calibration],
@@ -103,8 +103,7 @@ def undocumented(value: Any, schema: dict[str, Any], whole: dict[str, Any], plac
             yield f"{place}.{key}"
 
 
-# The schema of run.json is what a run must hold to be read; it has further keys that only inform.
-@pytest.mark.parametrize("name", sorted(set(SCRIPT.DOCUMENTS) - {"run"}))
+@pytest.mark.parametrize("name", sorted(SCRIPT.DOCUMENTS))
 def test_no_key_is_undocumented(documents: dict[str, Any], name: str) -> None:
     schema = json.loads(SCRIPT.schemas()[f"{name}-1.json"])
     assert not list(undocumented(documents[name], schema, schema))

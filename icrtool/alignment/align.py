@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.findings import alignment_findings, run_sections, start_icrs
+from icrtool.alignment.findings import alignment_findings, start_icrs
 from icrtool.alignment.position.gnss_quality import grade_fixes
 from icrtool.alignment.position.gnss_steps import without_frozen
 from icrtool.alignment.position.sensor_noise import heading_variance, position_variance, reference_noise
@@ -63,7 +63,6 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
     quality = grade_fixes(found.log, config, fix_steps)
     noise = reference_noise(found.log, config.filter, fix_steps, found.heading_steps)
     sensors = sensors_as_sent(quality.log, config, noise)
-    findings = alignment_findings(found, sensors.antenna_m)
     return Measurements(
         sensors=replace(
             sensors,
@@ -88,8 +87,9 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
             losses_ns=quality.losses_ns,
             icr_start=start_icrs(found.geometry, sensors.antenna_m, config),
         ),
-        findings=findings,
-        sections=run_sections(found, findings),
+        findings=alignment_findings(found, sensors.antenna_m),
+        wheels=found.wheels.facts(found.fit),
+        heading=heading.facts(),
         streams=found.log.streams,
         fix_statistics=quality.statistics,
         clock_std_s=found.delays.clock_std_s,

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from icrtool.alignment.corrections import AlignedStreams
-from icrtool.alignment.estimator import AlignmentFit, Geometry
+from icrtool.alignment.estimator import Geometry
 from icrtool.config import Config
-from icrtool.records.measurements import Finding, IcrStart, Scalar
+from icrtool.records.measurements import Finding, IcrStart
 from icrtool.records.run import width_or_usual_m
 
 LEAST_START_STD, INFLATION = 0.15, 3.0
@@ -68,27 +68,6 @@ def _robot_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> di
         "y_icr_left_m": Finding(left + right_m, std[1], 0.0, START),
         "x_icr_m": Finding(x + forward_m, std[2], 0.0, START),
     }
-
-
-def run_sections(found: AlignedStreams, findings: dict[str, Finding]) -> dict[str, dict[str, Scalar]]:
-    """Return further numbers for run.json, by section."""
-    lag, of_position = findings["heading_delay_s"], findings["position_delay_s"]
-    return {
-        "wheels": found.wheels.summary() | _window_summary(found.fit),
-        "heading": found.heading.summary()
-        | {"delay_s": lag.value, "delay_std_s": lag.std, "applied_delay_s": lag.applied},
-        "gnss": {"delay_s": of_position.value, "delay_std_s": of_position.std},
-    }
-
-
-def _window_summary(fit: AlignmentFit | None) -> dict[str, float | int | None]:
-    """Return how many windows wheels and positions were compared in, of how many stretches, and their scatter [m]."""
-    if fit is None:
-        return {"windows": 0, "stretches": 0, "residual_m": None}
-    count = len(fit.windows.begin)
-    along, across = fit.fit.scale[[0, count]].tolist()
-    stretches = len(np.union1d(fit.windows.group, fit.windows.turn_group))
-    return {"windows": count, "stretches": stretches, "residual_m": math.hypot(along, across)}
 
 
 def _finding(value: float, std: float, applied: float, nothing: float = 0.0) -> Finding:

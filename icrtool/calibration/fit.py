@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, cast
 
+import msgspec
 import numpy as np
 
 from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import fit_models
-from icrtool.calibration.record import ControllerNumbers, controller_numbers, fitted_document
+from icrtool.calibration.record import controller_numbers, fitted_document
 from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -19,13 +19,7 @@ from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Floats
 from icrtool.motion.models import FIVE, ICRS, RECOMMENDED, TrackGeometry
 from icrtool.records.run import ICR_COLUMNS, Run, WarmStart, check_type, width_or_usual_m
-from icrtool.records.run_document import (
-    ControllerDocument,
-    GeometryDocument,
-    MotionDocument,
-    RecommendedDocument,
-    RunDocument,
-)
+from icrtool.records.run_document import GeometryDocument, RunDocument
 from icrtool.records.tables import RobotLog
 
 
@@ -52,7 +46,7 @@ def fit(
     Returns
     -------
     Run
-        No file is touched. `summary` holds the motion model, as `icrtool.calibrate` fits it, the ICRs and what a
+        No file is touched. `document` holds the motion model, as `icrtool.calibrate` fits it, the ICRs and what a
         controller is given.
 
     Raises
@@ -67,11 +61,11 @@ def fit(
     logs = [log]
     del log
     run = fit_filter(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=watch)
-    return replace(run, summary=cast("RunDocument", {**run.summary, **motion_of(run)}))
+    return replace(run, document=with_motion(run))
 
 
-def motion_of(run: Run) -> MotionDocument:
-    """Return motion model, ICRs and controller numbers of a run, for its summary.
+def with_motion(run: Run) -> RunDocument:
+    """Return the document of a run with its motion model, ICRs and controller numbers.
 
     Notes
     -----
@@ -88,20 +82,19 @@ def motion_of(run: Run) -> MotionDocument:
     elif FIVE in fits:
         geometry, covariance = fits[FIVE].geometry(recording.width_m)
     else:
-        return {"recommended": None, "geometry": None, "controller": None}
+        return run.document
     robot = robot_of(run) | {"track_width_m": recording.width_m}
     found = None
     if run.usable and run.track_width_m is not None and RECOMMENDED in fits:
-        fit = fits[RECOMMENDED]
-        plain: dict[str, Any] = {"label": fit.model.label}
-        found = cast("RecommendedDocument", plain | fitted_document(fit, geometry, covariance, robot))
+        found = fitted_document(fits[RECOMMENDED], geometry, covariance, robot)
     shown = _shown(run, geometry, covariance)
     numbers = controller_numbers(geometry, covariance, robot)
-    return {
-        "recommended": found,
-        "geometry": _geometry_document(geometry, covariance, shown),
-        "controller": _controller_document(numbers) if found is not None and all(shown[:2]) else None,
-    }
+    return msgspec.structs.replace(
+        run.document,
+        recommended=found,
+        geometry=_geometry_document(geometry, covariance, shown),
+        controller=numbers if found is not None and all(shown[:2]) else None,
+    )
 
 
 def _of_filter(run: Run, width_m: float) -> tuple[TrackGeometry, Floats]:
@@ -110,13 +103,13 @@ def _of_filter(run: Run, width_m: float) -> tuple[TrackGeometry, Floats]:
     by_icr = np.zeros((len(TrackGeometry._fields), ICRS))
     by_icr[:ICRS] = np.eye(ICRS)
     by_icr[ICRS, :2] = 1.0 / width_m, -1.0 / width_m
-    covariance: Floats = by_icr @ np.array(run.summary["icr"]["final_covariance_m2"]) @ by_icr.T
+    covariance: Floats = by_icr @ np.array(run.document.icr.final_covariance_m2) @ by_icr.T
     return TrackGeometry(right, left, x, (right - left) / width_m, 1.0, 1.0), covariance
 
 
 def _shown(run: Run, geometry: TrackGeometry, covariance: Floats) -> list[bool]:
     """Return whether each ICR is shown: by the excitation of the drive, and by its own standard deviation."""
-    verdicts: Any = run.summary["excitation"]["verdict"]
+    verdicts = run.document.excitation.verdict
     largest = WEAK_SHARE * abs(geometry.y_icr_right_m - geometry.y_icr_left_m)
     std = np.sqrt(np.diag(covariance)[:ICRS])
     paper = run.config.filter.preset == "paper"
@@ -127,11 +120,8 @@ def _shown(run: Run, geometry: TrackGeometry, covariance: Floats) -> list[bool]:
 
 
 def _geometry_document(geometry: TrackGeometry, covariance: Floats, shown: list[bool]) -> GeometryDocument:
-    values: dict[str, Any] = {}
+    values: dict[str, float] = {}
     for name, value, variance, seen in zip(ICR_COLUMNS, geometry, np.diag(covariance), shown, strict=False):
-        values[name], values[f"{name}_std"] = (float(value), float(np.sqrt(variance))) if seen else (None, None)
-    return cast("GeometryDocument", values | {"covariance_m2": covariance[:ICRS, :ICRS].tolist()})
-
-
-def _controller_document(numbers: ControllerNumbers) -> ControllerDocument:
-    return cast("ControllerDocument", numbers._asdict())
+        if seen:
+            values |= {name: float(value), f"{name}_std": float(np.sqrt(variance))}
+    return GeometryDocument(**values, covariance_m2=covariance[:ICRS, :ICRS].tolist())

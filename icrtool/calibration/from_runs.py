@@ -113,7 +113,7 @@ def _is_part(one: _Taken, of: _Taken) -> bool:
 def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unusable: bool) -> str:
     """Return why a run is not calibrated with those before it; empty where it is."""
     if not (run.usable or allow_unusable):
-        return f"not usable: {run.summary['unusable_because']}"
+        return f"not usable: {run.document.unusable_because}"
     recording = one.recording
     for other in before:
         if recording.sha256 and other.recording.sha256 == recording.sha256:
@@ -139,16 +139,16 @@ def robot_of(run: Run) -> dict[str, Any]:
 
 def _from_twists(run: Run) -> bool:
     """Return whether the wheels were read from the twists of an odometry."""
-    stream = next((one for one in run.summary["streams"] if one["role"] == "wheels"), None)
-    return stream is not None and "Odometry" in stream["message_type"]
+    stream = next((one for one in run.document.streams if one.role == "wheels"), None)
+    return stream is not None and "Odometry" in stream.message_type
 
 
 def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
     """Return what to know of a run before a calibration from it is used; `alone`: it is from no other."""
     warnings: list[str] = []
     if alone:
-        warnings += [] if run.usable else [f"not usable: {run.summary['unusable_because']}"]
-        warnings += run.summary["excitation"]["sentences"]
+        warnings += [] if run.usable else [f"not usable: {run.document.unusable_because}"]
+        warnings += run.document.excitation.sentences
     if _from_twists(run) and run.config.wheels.twist_width_m is None:
         warnings.append(
             "the wheels were read from odometry twists, which hold the controller's own multipliers: "

@@ -17,7 +17,9 @@ from icrtool.calibration.run_recording import known_antenna_m
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
 from icrtool.records.measurements import RESPONSE_S
+from icrtool.records.plain_data import plain
 from icrtool.records.run import CALIBRATION_SCHEMA, Run
+from icrtool.records.samples import InputFile
 
 Verdict = Literal["shown", "weak", "not shown", "not separable", "given"]
 
@@ -123,7 +125,7 @@ class LogCalibration:
     stretches: int
     residual_m: float
     facts: DriveFacts
-    inputs: tuple[dict[str, Any], ...]
+    inputs: tuple[InputFile, ...]
 
     def parameter(self, key: str) -> Parameter:
         """Return a parameter by its key."""
@@ -135,7 +137,7 @@ class LogCalibration:
         return {
             "schema": CALIBRATION_SCHEMA,
             "log": self.name,
-            "inputs": list(self.inputs),
+            "inputs": plain(self.inputs),
             "windows": self.windows,
             "independent_stretches": self.stretches,
             "window_miss_m": self.residual_m,
@@ -160,22 +162,23 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> LogCalibration:
     DataError
         The drive is too short for an estimate.
     """
-    wheels, drive = run.summary["wheels"], run.summary["drive"]
-    if SEPARATION.finding not in run.summary["alignment"]:
-        why = f"{drive['distance_m']:.0f} m of driven distance are too few windows, or an older version made the run"
+    wheels, drive = run.document.wheels, run.document.drive
+    if SEPARATION.finding not in run.document.alignment:
+        why = f"{drive.distance_m:.0f} m of driven distance are too few windows, or an older version made the run"
         raise DataError(run.name, why, "drive longer, or fit the log again")
     facts = _drive_facts(run)
     direct = tuple(_parameter(run, kind, facts) for kind in KINDS)
     parameters = (*direct, *_derive(run, direct, x_icr_m))
     return LogCalibration(
-        name=run.name, parameters=parameters, settings=_settings(parameters, run), windows=wheels.get("windows", 0),
-        stretches=wheels.get("stretches", 0), residual_m=wheels.get("residual_m", math.nan), facts=facts,
-        inputs=tuple({key: one[key] for key in ("path", "bytes", "sha256")} for one in run.summary["inputs"]),
+        name=run.name, parameters=parameters, settings=_settings(parameters, run), windows=wheels.windows,
+        stretches=wheels.stretches, residual_m=wheels.residual_m if wheels.residual_m is not None else math.nan,
+        facts=facts,
+        inputs=run.document.inputs,
     )  # fmt: skip
 
 
 def _drive_facts(run: Run) -> DriveFacts:
-    table, excitation = run.table, run.summary["excitation"]
+    table, excitation = run.table, run.document.excitation
     left, right = (
         speed / scale for speed, scale in zip((table.v_left_mps, table.v_right_mps), run.wheel_scales, strict=True)
     )
@@ -184,9 +187,9 @@ def _drive_facts(run: Run) -> DriveFacts:
     rate = np.degrees(np.abs(left - right)[moving] / max(_finding(run, SEPARATION.finding)[0], 1e-3))
     turning = rate[rate > TURNING_DEGPS]
     return DriveFacts(
-        run.summary["drive"]["distance_m"],
-        excitation["turned_right_deg"],
-        excitation["turned_left_deg"],
+        run.document.drive.distance_m,
+        excitation.turned_right_deg,
+        excitation.turned_left_deg,
         float(np.percentile(turning, 95)) if len(turning) else 0.0,
         float(np.abs(speed).mean()) if len(speed) else 0.0,
         float(speed.std()) if len(speed) else 0.0,
@@ -195,8 +198,8 @@ def _drive_facts(run: Run) -> DriveFacts:
 
 def _finding(run: Run, name: str) -> tuple[float, float]:
     """Return value and standard deviation of an estimate of the alignment, NaN where the drive does not show it."""
-    found = run.summary["alignment"][name]
-    value, std = found["value"], found["std"]
+    found = run.document.alignment[name]
+    value, std = found.value, found.std
     return math.nan if value is None else value, math.nan if std is None else std
 
 

@@ -20,6 +20,7 @@ from icrtool.motion.models import FIVE, FittedModel, TrackGeometry, wheel_motion
 from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
 from icrtool.records.run import CALIBRATION_SCHEMA, WarmStart
+from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
 
@@ -60,23 +61,6 @@ class CalibrationLog(NamedTuple):
     heading_offset_deg: float
     wheels_delay_s: float
     begin_ns: int = 0
-
-
-class ControllerNumbers(NamedTuple):
-    """What a differential-drive controller is given, with one standard deviation each.
-
-    Attributes
-    ----------
-    multiplier : (y_r - y_l) / b, beside the radius factors
-    left_radius, right_radius : wheel radius over the configured one, configured scales included
-    """
-
-    multiplier: float
-    multiplier_std: float
-    left_radius: float
-    left_radius_std: float
-    right_radius: float
-    right_radius_std: float
 
 
 class ControllerErrors(NamedTuple):
@@ -287,6 +271,8 @@ class Calibration:
 
     def summary(self) -> dict[str, Any]:
         """Return plain data for the calibration file."""
+        fitted = plain(fitted_document(self.fitted, *self.geometry(), self.robot))
+        del fitted["label"]
         return {
             "schema": CALIBRATION_SCHEMA,
             "tool_version": self.tool_version,
@@ -294,16 +280,20 @@ class Calibration:
             "robot": dict(self.robot),
             "frame": "x forward, y right, turn rate clockwise; wheel speeds at the configured radius",
             "recommended": self.recommended,
-            **fitted_document(self.fitted, *self.geometry(), self.robot),
+            **fitted,
             "gyro": None
             if self.gyro is None
-            else {"model": self.gyro.model.name, **_plain(self.gyro), "error_sources": _sources(self.gyro_sources)},
+            else {
+                "model": self.gyro.model.name,
+                **_plain(self.gyro),
+                "error_sources": _sources(self.gyro_sources),
+            },
             "models": {name: _plain(one) for name, one in self.others.items()},
             "logs": [log._asdict() for log in self.logs],
             "held_out": [score._asdict() for score in self.held_out],
             "held_out_pooled": [score._asdict() for score in self.pooled],
             "controller": plain(
-                self.controller_numbers()._asdict() | ({} if self.controller is None else self.controller._asdict())
+                plain(self.controller_numbers()) | ({} if self.controller is None else self.controller._asdict())
             ),
             "error_sources": _sources(self.sources),
             "warnings": list(self.warnings),
@@ -312,16 +302,20 @@ class Calibration:
 
 def fitted_document(
     fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return plain data of a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
-    return {
-        "model": fitted.model.name,
-        **_plain(fitted),
-        "not_shown": list(fitted.not_shown),
-        "geometry": geometry._asdict(),
-        "geometry_std": dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
-        "controller": controller_numbers(geometry, covariance, robot)._asdict(),
-    }
+) -> RecommendedDocument:
+    """Return a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
+    own, std = _plain(fitted), np.sqrt(np.diag(covariance)).tolist()
+    return RecommendedDocument(
+        label=fitted.model.label,
+        model=fitted.model.name,
+        terms=fitted.model.terms,
+        parameters={name: ParameterDocument(**one) for name, one in own["parameters"].items()},
+        covariance=own["covariance"],
+        not_shown=fitted.not_shown,
+        geometry=geometry._asdict(),
+        geometry_std=dict(zip(geometry._fields, std, strict=True)),
+        controller=controller_numbers(geometry, covariance, robot),
+    )
 
 
 def controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]) -> ControllerNumbers:

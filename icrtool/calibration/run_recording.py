@@ -44,7 +44,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
     width = width_m if width_m is not None else run.track_width_m
     if width is None:
         raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
-    track, inputs = track_of(run), run.summary.get("inputs", [])
+    track, inputs = track_of(run), run.document.inputs
     left_scale, right_scale = run.wheel_scales
     if (left_scale, right_scale) != (1.0, 1.0):
         track = track._replace(v_left=track.v_left / left_scale, v_right=track.v_right / right_scale)
@@ -52,11 +52,11 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         name=run.name,
         track=track,
         width_m=width,
-        path=inputs[0]["path"] if inputs else "",
-        sha256=inputs[0]["sha256"] if inputs else "",
+        path=inputs[0].path if inputs else "",
+        sha256=inputs[0].sha256 if inputs else "",
         begin_ns=int(run.table.stamp_ns[0]),
         lever=Lever(*(place is not None for place in known_antenna_m(run))),
-        x_clock_std_m=run.summary["icr"].get("x_clock_std_m", 0.0),
+        x_clock_std_m=run.document.icr.x_clock_std_m,
     )
     return plain if heading is None else with_turn_rate(plain, heading)
 
@@ -64,7 +64,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
 def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
     """Return the antenna's position where it is configured, or in the log's transforms, forward and right [m]."""
     used, given = run.sensors.antenna_m, run.config.frames
-    in_log = run.summary["filter"].get("antenna_is_known", False) and given.antenna_right_m == "auto"
+    in_log = run.document.filter.antenna_is_known and given.antenna_right_m == "auto"
     return (
         used[0] if in_log or given.antenna_forward_m != "auto" else None,
         used[1] if in_log or given.antenna_right_m != "auto" else None,

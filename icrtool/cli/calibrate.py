@@ -131,8 +131,8 @@ def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> Lo
     if verbose or not sys.stderr.isatty():
         options.warn(run.warnings, quiet=quiet)
     if verbose:
-        for stream in run.summary["streams"]:
-            click.echo(f"{stream['role']}: {stream['topic']}: {stream['why']}", err=True)
+        for stream in run.document.streams:
+            click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)
     return calibrate_log(run, x_icr_m=x_icr)
 
 

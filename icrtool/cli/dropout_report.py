@@ -213,7 +213,7 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
         )  # fmt: skip
     report = reports[0]
     if report.baseline is not None:
-        options.warn([f"{run.name}: {change}" for change in report.baseline.changes(run.summary)], quiet=request.quiet)
+        options.warn([f"{run.name}: {change}" for change in report.baseline.changes(run.document)], quiet=request.quiet)
     if request.prints:
         _print(report, directory, request)
     else:
@@ -230,7 +230,7 @@ def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
 
     if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
         raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-    baseline = request.baseline.find(run.name, run.summary["inputs"]) if request.baseline is not None else None
+    baseline = request.baseline.find(run.name, run.document.content) if request.baseline is not None else None
     with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:
         return report_and_write(
             run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,

@@ -138,10 +138,10 @@ def _run(source: Path | None, output: Path | None = None) -> Run:
     if source is not None and source.is_file():
         raise RunError(source, "is a file, and paths come from a run", "name a directory that icrtool fit wrote")
     run = open_run(source or newest_run(RUNS))
-    if output is not None and output.resolve() in (Path(file["path"]).resolve() for file in run.summary["inputs"]):
+    if output is not None and output.resolve() in (Path(file.path).resolve() for file in run.document.inputs):
         raise OutputError(output, "is the log that the run was made from", "name another file")
     if not run.usable:
-        options.warn([f"{run.name}: its ICRs are not usable: {run.summary['unusable_because']}"], quiet=False)
+        options.warn([f"{run.name}: its ICRs are not usable: {run.document.unusable_because}"], quiet=False)
     return run
 
 
@@ -169,6 +169,6 @@ def read_calibration(source: Path | None, *, force: bool = False, advice: str = 
 
     run = open_run(source or newest_run(RUNS))
     if not (run.usable or force):
-        why = f"its ICRs are not usable: {run.summary['unusable_because']}"
+        why = f"its ICRs are not usable: {run.document.unusable_because}"
         raise DataError(run.name, why, f"drive again, with turns to both sides{advice}")
     return run.name, calibrate(run, allow_unusable=force)

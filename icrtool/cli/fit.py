@@ -199,9 +199,9 @@ def fit_log(
         from icrtool.output.text_format import jump_lines
         from icrtool.records.samples import ROLE_WORDS
 
-        for stream in run.summary["streams"]:
-            click.echo(f"{ROLE_WORDS[stream['role']]}: {stream['topic']}: {stream['why']}", err=True)
-        for line in jump_lines(run.summary["reference_jumps"]):
+        for stream in run.document.streams:
+            click.echo(f"{ROLE_WORDS[stream.role]}: {stream.topic}: {stream.why}", err=True)
+        for line in jump_lines(run.document.reference_jumps):
             click.echo(line, err=True)
     return run
 

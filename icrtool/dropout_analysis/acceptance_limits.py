@@ -112,7 +112,7 @@ def check_gate(
     if gate.baseline_factor and baseline is not None:
         before, old = _before(gate, baseline)
         half_width = difference_half_width(
-            sums, old, gate.metric, gate.baseline_factor, same_recording=baseline.is_of(report.run_summary)
+            sums, old, gate.metric, gate.baseline_factor, same_recording=baseline.is_of(report.run_document)
         )
     bound = gate.bound_m + (gate.baseline_factor * before if gate.baseline_factor else 0.0)
     margin = bound - value if gate.relation.startswith("<") else value - bound

@@ -72,21 +72,21 @@ class BaselineReport:
         horizons_m, p95_m = np.array(found).T
         return horizons_m, p95_m
 
-    def changes(self, run_summary: RunDocument) -> tuple[str, ...]:
+    def changes(self, run_document: RunDocument) -> tuple[str, ...]:
         """Return what differs beside the numbers: log, configuration, version; a sentence each."""
         found = []
-        if not self.is_of(run_summary):
+        if not self.is_of(run_document):
             found.append(f"another recording than in the baseline ({self.log}): the difference has a wider interval")
-        keys = sorted(_different_keys(self.config, run_summary["config"]))
+        keys = sorted(_different_keys(self.config, run_document.config.effective()))
         if keys:
             found.append(f"another configuration than in the baseline: {listed(keys)}")
         if self.tool_version != __version__:
             found.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
         return tuple(found)
 
-    def is_of(self, run_summary: RunDocument) -> bool:
+    def is_of(self, run_document: RunDocument) -> bool:
         """Return whether the report was made of the same recording as a run."""
-        return bool(self.sha256) and self.sha256 == tuple(file["sha256"] for file in run_summary["inputs"])
+        return bool(self.sha256) and self.sha256 == run_document.content
 
 
 def difference_half_width(

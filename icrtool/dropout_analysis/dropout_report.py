@@ -90,7 +90,7 @@ def dropout_report(
     limits = [gate if isinstance(gate, Gate) else parse_gate(gate) for gate in gates]
     forced = _force(run, outage_s, outage_at_s)
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
-    unusable = "" if run.usable or allow_unusable else str(run.summary["unusable_because"])
+    unusable = "" if run.usable or allow_unusable else str(run.document.unusable_because)
     used, further = _calibration_rows(compared, () if unusable else calibrations)
     found, why = _compare(compared, run) if comparison and not unusable else (None, unusable)
     give_back_freed()

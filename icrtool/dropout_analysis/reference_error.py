@@ -67,6 +67,6 @@ def reference_error(run: Run, track: Track, ends: NDArray[np.int32], seed: int) 
 
 def _spread(run: Run) -> tuple[float, float]:
     """Return the factors by which fixes and headings spread more than the filter assumes, in variance; at least 1."""
-    noise = run.summary["filter"]
-    position, heading = noise["nis_gnss_mean"], noise["nis_heading_mean"]
+    noise = run.document.filter
+    position, heading = noise.nis_gnss_mean, noise.nis_heading_mean
     return max((position or 0.0) / GNSS_NIS, 1.0), max((heading or 0.0) / HEADING_NIS, 1.0)

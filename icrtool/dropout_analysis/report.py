@@ -53,7 +53,7 @@ class DropoutReport:
     states : recorded states
     standing : states in which the robot stood: their trials are nearly copies of one another
     seed : of what the reference's own error is drawn from
-    run_summary : of the run, equal to its run.json
+    run_document : of the run, equal to its run.json
     run_directory : where the run was read from, None for one just made
     starts : ``moving``: each standstill is one start; ``all``: every state is one
     reference_error : what a perfect model would show
@@ -81,7 +81,7 @@ class DropoutReport:
     states: int
     standing: int
     seed: int
-    run_summary: RunDocument
+    run_document: RunDocument
     run_directory: Path | None
     reference_north_m: Floats
     reference_east_m: Floats

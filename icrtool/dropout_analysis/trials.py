@@ -149,7 +149,7 @@ def dropout(
         reference_error=ReferenceErrors(*_columns(part.reference for part in parts)),
         by_learning=_learned_split(run, learned, splits) if splits else None,
         seed=seed,
-        run_summary=run.summary,
+        run_document=run.document,
         run_directory=run.directory,
         reference_north_m=run.table.north_m,
         reference_east_m=run.table.east_m,

@@ -39,7 +39,7 @@ def fit(
     begin("aligning")
     log = choose_reference(log, config)
     measurements = align(log, config)
-    name, inputs, datum, rejected = log.name, log.inputs, log.datum, log.rejected_fixes
+    inputs, datum, rejected = log.inputs, log.datum, log.rejected_fixes
     # Its columns that the filter does not use take as much memory as half of the states.
     del log
     begin("filter")
@@ -48,8 +48,7 @@ def fit(
     filtered = filtered._replace(sensors=replace(filtered.sensors, jumps=jumps))
     begin("summary")
     run = Run(
-        name=name,
-        config=config,
+        document=summarise(measurements, filtered, config, inputs=inputs, datum=datum, rejected_fixes=rejected),
         table=filtered.table,
         in_gap=filtered.in_gap,
         outages_ns=filtered.outages_ns,
@@ -57,7 +56,6 @@ def fit(
         gnss=filtered.gnss,
         heading=filtered.heading,
         smoothed=None,
-        summary=summarise(measurements, filtered, config, inputs=inputs, datum=datum, rejected_fixes=rejected),
     )
     return replace(run, smoothed=smoother.smooth(run)) if smooth else run
 

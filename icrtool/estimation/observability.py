@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -12,8 +11,9 @@ from icrtool.estimation.icr_uncertainty import StateWindows, prior_std
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.track import Track
+from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, width_or_usual_m
-from icrtool.records.run_document import Excited
+from icrtool.records.run_document import ExcitationDocument, Excited, IcrColumn, NumberByIcr, VerdictByIcr
 from icrtool.records.tables import States
 
 SPIN_BOTH = "drive two full turns on the spot to the right and two to the left"
@@ -64,17 +64,22 @@ class Excitation:
         """Whether both y ICRs are shown, at least weakly."""
         return all(self.verdicts[name] != "not shown" for name in ICR_COLUMNS[:2])
 
-    def summary(self) -> dict[str, Any]:
-        """Return plain data for run.json."""
-        return {
-            "std_m": {name: std if math.isfinite(std) else None for name, std in self.std_m.items()},
-            "verdict": dict(self.verdicts),
-            "turned_right_deg": math.degrees(self.turned_right_rad),
-            "turned_left_deg": math.degrees(self.turned_left_rad),
-            "spun_right_deg": math.degrees(self.spun_right_rad),
-            "spun_left_deg": math.degrees(self.spun_left_rad),
-            "sentences": list(self.sentences),
-        }
+    @property
+    def not_shown(self) -> frozenset[IcrColumn]:
+        """The ICRs that are not shown."""
+        return frozenset(name for name in ICR_COLUMNS if self.verdicts[name] == "not shown")
+
+    def summary(self) -> ExcitationDocument:
+        """Return what run.json holds."""
+        return ExcitationDocument(
+            NumberByIcr(*(known(self.std_m[name]) for name in ICR_COLUMNS)),
+            VerdictByIcr(*(self.verdicts[name] for name in ICR_COLUMNS)),
+            math.degrees(self.turned_right_rad),
+            math.degrees(self.turned_left_rad),
+            math.degrees(self.spun_right_rad),
+            math.degrees(self.spun_left_rad),
+            self.sentences,
+        )
 
 
 def find_excitation(table: States, track: Track, track_width_m: float | None, windows: StateWindows) -> Excitation:

@@ -1,4 +1,4 @@
-"""Wheels-only paths through a whole run: with the final ICRs, and without slip (Pentzer 2014, Section 6.1)."""
+"""Distance and speed of a run, and the paths of its wheels alone (Pentzer 2014, Section 6.1)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.chords import chord_rows
 from icrtool.kernels.open_loop.direct import open_loop_path
 from icrtool.records.run import track_of_states
+from icrtool.records.run_document import DriveDocument
 from icrtool.records.tables import Icrs, States
+
+SHORTEST_STEP_M, STEP_IN_STD = 0.1, 5.0
+"""Chords of the driven path are at least this long, and so many standard deviations of the position."""
+
+LEAST_MODELLED = 0.5
+"""Part of a chord that the model shows where the speed within it is the model's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +76,48 @@ def drive_wheels(table: States, in_gap: Bools, icrs: Icrs) -> OdometryPath:
         miss_north, miss_east = north[last] - table.north_m[last], east[last] - table.east_m[last]
         turned += float(piece.heading[-1] - table.heading_rad[last])
     return OdometryPath(north, east, heading, float(np.hypot(miss_north, miss_east)))
+
+
+def path_speed(table: States) -> Floats:
+    """Return the speed over each interval between states (n - 1,) [m/s]; NaN where no time passes."""
+    interval = np.diff(table.t_s)
+    speed = np.full(len(interval), np.nan)
+    np.divide(np.diff(table.distance_m), interval, out=speed, where=interval > 0)
+    return speed
+
+
+def drive_summary(table: States) -> DriveDocument:
+    """Return duration, distance of the positions, and mean and standard deviation of the speed over time.
+
+    Notes
+    -----
+    The distance is the sum of chords between positions that lie a step apart: longer than their noise, so that a
+    parked robot stays where it is. Wheels that turn on the spot do not count. Between the ends of a chord the speed
+    follows the model's, or is constant where the model shows less than half of it.
+    """
+    weight = np.diff(table.t_s)
+    duration = float(table.t_s[-1])
+    noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m)))
+    rows, chords = _chords(table, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
+    distance = float(chords.sum())
+    modelled, lasted = np.diff(table.distance_m[rows]), np.diff(table.t_s[rows])
+    # in a gap of the wheel data the model stands still
+    known = LEAST_MODELLED * chords < modelled
+    stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=known)
+    even = np.divide(chords, lasted, out=np.zeros(len(chords)), where=~known & (lasted > 0))
+    speed = np.nan_to_num(path_speed(table)) * np.repeat(stretched, np.diff(rows)) + np.repeat(even, np.diff(rows))
+    mean = distance / duration if duration > 0 else 0.0
+    spread = float(np.sqrt(np.average((speed - mean) ** 2, weights=weight))) if duration > 0 else 0.0
+    return DriveDocument(duration, distance, mean, spread)
+
+
+def _chords(table: States, step_m: float) -> tuple[Ints, Floats]:
+    """Return rows of states (c + 1,), first and last included, at least a step apart, and the chords between (c,) [m].
+
+    The last chord may be shorter than a step; it counts for nothing then.
+    """
+    rows, last = chord_rows(table.north_m, table.east_m, step_m), len(table) - 1
+    chords = np.hypot(np.diff(table.north_m[rows]), np.diff(table.east_m[rows]))
+    if rows[-1] != last:
+        rows, chords = np.append(rows, last), np.append(chords, 0.0)
+    return rows, chords

@@ -166,8 +166,8 @@ def set_up_again(run: Run, outages_ns: tuple[tuple[int, int], ...] = ()) -> Filt
 
 def noise_of(run: Run) -> ProcessNoise:
     """Return the process noise of the pose that a run was made with."""
-    facts = run.summary["filter"]
-    return ProcessNoise(float(facts["process_position_mps"]), float(facts["process_heading_degps"]))
+    facts = run.document.filter
+    return ProcessNoise(float(facts.process_position_mps), float(facts.process_heading_degps))
 
 
 def _states(wheels: WheelSamples, output: FilterOutput) -> States:

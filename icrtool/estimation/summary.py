@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from icrtool import __version__
@@ -14,7 +14,7 @@ from icrtool.alignment.position.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_states, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
-from icrtool.estimation.odometry import drive_wheels
+from icrtool.estimation.odometry import drive_summary, drive_wheels
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import (
     antenna_warning,
@@ -24,28 +24,41 @@ from icrtool.estimation.run_warnings import (
     unusable_reasons,
 )
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.chords import chord_rows
 from icrtool.kernels.filter.measurement_codes import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.events import ReferenceJump, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements
-from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, RUN_SCHEMA, MeasurementOutcome, no_slip_icrs, track_of_states
-from icrtool.records.run_document import EVENT_COLUMNS, IcrColumn, RunDocument
+from icrtool.records.plain_data import known
+from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, no_slip_icrs, track_of_states
+from icrtool.records.run_document import (
+    RUN_SCHEMA,
+    ChangeDocument,
+    ClassDocument,
+    EndErrorDocument,
+    EventDocument,
+    FilterDocument,
+    GnssDocument,
+    HeadingDocument,
+    IcrColumn,
+    IcrDocument,
+    NumberByIcr,
+    OdometryDocument,
+    ReferenceJumpDocument,
+    RunDocument,
+    SegmentDocument,
+    SpanByIcr,
+    Spans,
+    TerrainDocument,
+    WarmStartDocument,
+)
 from icrtool.records.samples import Datum, InputFile
-from icrtool.records.tables import States
+from icrtool.records.tables import Icrs, States
 
 SETTLED_S = 2.0
 """An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""
 
 SMALLEST_CHANGE_M = 0.03
 """An ICR whose estimate moved less than this from its start has no convergence to time."""
-
-SHORTEST_STEP_M, STEP_IN_STD = 0.1, 5.0
-"""Chords of the driven path are at least this long, and so many standard deviations of the position."""
-
-LEAST_MODELLED = 0.5
-"""Part of a chord that the model shows where the speed within it is the model's."""
 
 
 def summarise(
@@ -57,7 +70,7 @@ def summarise(
     datum: Datum | None,
     rejected_fixes: dict[str, int],
 ) -> RunDocument:
-    """Return all numbers and warnings of a run as plain data, equal to what run.json gives back.
+    """Return all numbers and warnings of a run.
 
     Parameters
     ----------
@@ -68,7 +81,6 @@ def summarise(
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
-    end_errors = _end_errors(table, filtered.in_gap, width)
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation, x_clock_std_m = learned(filtered, config, measurements.clock_std_s)
     multiplier = separation_multiplier(table, width) if width is not None else None
@@ -78,60 +90,58 @@ def summarise(
     unusable = unusable_reasons(
         excitation, *filtered.in_use, filtered.noise, scale, multiplier if of_twist else None,
         contradicts_windows(table, covariance, measurements.findings) if field and not changes_s else "",
-        str(measurements.sections["wheels"]["filtered"] or "") if field else "",
+        measurements.wheels.filtered or "" if field else "",
         inverted=bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]),
     )  # fmt: skip
-    document: RunDocument = plain(
-        {
-            "schema": RUN_SCHEMA,
-            "tool_version": __version__,
-            "log": sensors.name,
-            "inputs": [asdict(file) for file in inputs],
-            "config": config.effective(),
-            "streams": [asdict(stream) for stream in measurements.streams],
-            "warnings": _warnings(
-                measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance
-            ),
-            "alignment": {key: asdict(finding) for key, finding in measurements.findings.items()},
-            "drive": drive_summary(table),
-            "usable": not unusable,
-            "unusable_because": "; ".join(unusable) if unusable else None,
-            "icr": icr_summary(table, convergence, covariance)
-            | {
-                "separation_multiplier": multiplier,
-                "separation_multiplier_std": multiplier_std(covariance, width) if width is not None else None,
-                "final_covariance_m2": filtered.covariance[3:, 3:],
-                "x_clock_std_m": x_clock_std_m,
-            },
-            "odometry": end_errors,
-            "terrain": {"changes": [{"t_s": t} for t in changes_s]},
-            "segments": segment_summary(table, changes_s),
-            "gnss": gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes.down_weighted)
-            | measurements.sections["gnss"]
-            | class_summary(sensors.fixes, measurements.fix_statistics, filtered.gnss),
-            "heading": measurements.sections["heading"] | counts(filtered.heading),
-            "wheels": measurements.sections["wheels"],
-            "events": event_summary(sensors.events, int(table.stamp_ns[0])),
-            "reference_jumps": span_rows(sensors.jumps, int(table.stamp_ns[0])),
-            "outages_ns": filtered.outages_ns,
-            "rtk_losses_ns": sensors.losses_ns,
-            "wheel_gaps_ns": [[table.stamp_ns[k], table.stamp_ns[k + 1]] for k in np.flatnonzero(filtered.in_gap)],
-            "filter": filter_summary(measurements, filtered, config),
-            "excitation": excitation.summary(),
-        }
-    )
-    return document if config.filter.preset == "paper" else without_unlearned(document)
+    hidden = frozenset() if config.filter.preset == "paper" else excitation.not_shown
+    lag = measurements.findings["heading_delay_s"]
+    start_ns = int(table.stamp_ns[0])
+    return RunDocument(
+        schema=RUN_SCHEMA,
+        tool_version=__version__,
+        log=sensors.name,
+        inputs=inputs,
+        config=config,
+        streams=measurements.streams,
+        warnings=_warnings(
+            measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance
+        ),
+        alignment=measurements.findings,
+        drive=drive_summary(table),
+        usable=not unusable,
+        unusable_because="; ".join(unusable) if unusable else None,
+        icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, width, hidden),
+        odometry=OdometryDocument(
+            _end_error(table, filtered.in_gap, table.icrs_at(-1)),
+            None if width is None else _end_error(table, filtered.in_gap, no_slip_icrs(width)),
+        ),
+        terrain=TerrainDocument(tuple(map(ChangeDocument, changes_s))),
+        segments=segment_summary(table, changes_s),
+        gnss=gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes, measurements),
+        heading=HeadingDocument(
+            **msgspec.structs.asdict(measurements.heading), delay_s=lag.value, delay_std_s=lag.std,
+            applied_delay_s=lag.applied, used=_count(filtered.heading.used), rejected=_count(filtered.heading.rejected),
+        ),
+        wheels=measurements.wheels,
+        events=tuple(EventDocument(**_with_seconds(one, start_ns)) for one in sensors.events),
+        reference_jumps=tuple(ReferenceJumpDocument(**_with_seconds(one, start_ns)) for one in sensors.jumps),
+        outages_ns=_spans(filtered.outages_ns),
+        rtk_losses_ns=_spans(sensors.losses_ns),
+        wheel_gaps_ns=_spans(table.stamp_ns[np.flatnonzero(filtered.in_gap)[:, None] + [0, 1]]),
+        filter=filter_summary(measurements, filtered, config),
+        excitation=excitation.summary(),
+    )  # fmt: skip
 
 
 def _warnings(
     measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None, excitation: Excitation,
     changes_s: Sequence[float], covariance: Floats,
-) -> list[str]:  # fmt: skip
+) -> tuple[str, ...]:  # fmt: skip
     """Return the warnings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
     name, table, width = filtered.sensors.name, filtered.table, config.robot.track_width_m
     apart = None if multiplier is None or width is None else (multiplier, multiplier_std(covariance, width))
     end_s = float(table.t_s[-1])
-    return [
+    return (
         *measurements.warnings,
         *run_warnings(name, table, *filtered.in_use, apart, excitation, measurements.findings),
         *(
@@ -146,28 +156,47 @@ def _warnings(
         ),
         *noise_warnings(name, config, filtered.noise),
         *(f"{name}: {sentence}" for sentence in excitation.sentences),
-    ]
+    )
 
 
-def filter_summary(measurements: Measurements, filtered: Filtered, config: Config) -> dict[str, Any]:
-    """Return what the filter was run with, and the statistics of its innovations."""
+def filter_summary(measurements: Measurements, filtered: Filtered, config: Config) -> FilterDocument:
+    """Return what the filter was run with, and the statistics of its innovations over measurements not gated.
+
+    The mean NIS is 2 of fixes and 1 of headings where the noise is right.
+    """
     sensors, start = filtered.sensors, filtered.began_with
-    return {
-        "preset": config.filter.preset,
-        "process_position_mps": filtered.noise.position_mps,
-        "process_heading_degps": filtered.noise.heading_degps,
-        "reference_delay_s": measurements.findings["position_delay_s"].applied,
-        "heading_correlation_s": sensors.heading_correlation_s,
-        "heading_from_position": sensors.heading_from_position,
-        "heading_is_estimated": sensors.heading_is_estimated,
-        "heading_is_measured": sensors.heading_is_measured,
-        "turn_wander_rad": sensors.turn_wander_rad,
-        "antenna_m": sensors.antenna_m,
-        "antenna_is_known": measurements.antenna_is_known,
-        "states": len(filtered.table),
-        "warm_start": None if start is None else {"icrs_m": start.icrs_m, "covariance_m2": start.covariance_m2},
-        "icr_start": None if sensors.icr_start is None else sensors.icr_start._asdict(),
-    } | nis_summary(filtered.gnss, filtered.heading)
+    return FilterDocument(
+        preset=config.filter.preset,
+        process_position_mps=filtered.noise.position_mps,
+        process_heading_degps=filtered.noise.heading_degps,
+        reference_delay_s=measurements.findings["position_delay_s"].applied,
+        heading_correlation_s=sensors.heading_correlation_s,
+        heading_from_position=sensors.heading_from_position,
+        heading_is_estimated=sensors.heading_is_estimated,
+        heading_is_measured=sensors.heading_is_measured,
+        turn_wander_rad=known(sensors.turn_wander_rad),
+        antenna_m=sensors.antenna_m,
+        antenna_is_known=measurements.antenna_is_known,
+        states=len(filtered.table),
+        warm_start=None if start is None else WarmStartDocument(start.icrs_m.tolist(), start.covariance_m2.tolist()),
+        icr_start=sensors.icr_start,
+        nis_gnss_mean=_mean(filtered.gnss.nis[filtered.gnss.used]),
+        gnss_rejected=_count(filtered.gnss.rejected),
+        nis_heading_mean=_mean(filtered.heading.nis[filtered.heading.used]),
+        heading_rejected=_count(filtered.heading.rejected),
+    )
+
+
+def _count(marked: Bools) -> int:
+    return int(np.count_nonzero(marked))
+
+
+def _mean(values: Floats) -> float | None:
+    return known(float(values.mean())) if len(values) else None
+
+
+def _spans(stamps_ns: Ints) -> Spans:
+    return tuple((int(begin), int(end)) for begin, end in stamps_ns)
 
 
 def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, Excitation, float]:
@@ -206,50 +235,32 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     return covariance + np.diag([0.0, 0.0, x_clock_std_m**2]), excitation, x_clock_std_m
 
 
-def without_unlearned(document: RunDocument) -> RunDocument:
-    """Return the summary with null in place of the ICRs that are not shown, and of a multiplier made of one."""
-    icr: Any = dict(document["icr"])
-    hidden = [name for name, verdict in document["excitation"]["verdict"].items() if verdict == "not shown"]
-    for key in ("final", "final_std", "mean", "std"):
-        icr[key] = {name: None if name in hidden else value for name, value in icr[key].items()}
-    if "y_icr_right_m" in hidden or "y_icr_left_m" in hidden:
-        icr |= {"separation_multiplier": None, "separation_multiplier_std": None}
-    return {**document, "icr": icr}
+def _with_seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, Any]:
+    """Return a span with begin and end also in seconds since the first recorded state, of stamp `start_ns`."""
+    seconds = {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
+    return span._asdict() | seconds
 
 
-def event_summary(events: tuple[SlipEvent, ...], start_ns: int) -> list[dict[str, Any]]:
-    """Return the slip events with the columns of events.csv; `start_ns` is the stamp of the first recorded state."""
-    return [{column: row[column] for column in EVENT_COLUMNS} for row in span_rows(events, start_ns)]
+def _end_error(table: States, in_gap: Bools, icrs: Icrs) -> EndErrorDocument:
+    """Return how far from the filter's last position the path by wheels alone ends, with constant ICRs."""
+    return EndErrorDocument(drive_wheels(table, in_gap, icrs).end_error_m)
 
 
-def span_rows(spans: Sequence[SlipEvent | ReferenceJump], start_ns: int) -> list[dict[str, Any]]:
-    """Return spans as rows, begin and end also in seconds since the first recorded state, of stamp `start_ns`."""
-    return [
-        one._asdict() | {"begin_s": (one.begin_ns - start_ns) / 1e9, "end_s": (one.end_ns - start_ns) / 1e9}
-        for one in spans
-    ]
-
-
-def _end_errors(table: States, in_gap: Bools, track_width_m: float | None) -> dict[str, Any]:
-    """Return how far from the filter's last position the wheels-only paths end."""
-    icrs = {"icr": table.icrs_at(-1), "no_slip": None if track_width_m is None else no_slip_icrs(track_width_m)}
-    return {
-        name: None if one is None else {"end_error_m": drive_wheels(table, in_gap, one).end_error_m}
-        for name, one in icrs.items()
-    }
-
-
-def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, Any]:
+def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, ClassDocument]:
     """Return how many fixes of each class there were and how they were used."""
-    classes = {}
-    for code, name in CLASSES.items():
-        rows = fixes.fix_class == code
-        if rows.any():
-            counted = {"fixes": rows, "used": rows & outcome.used, "rejected": rows & outcome.rejected}
-            counted |= {"down_weighted": rows & fixes.down_weighted, "sold_as_fixed": rows & fixes.misreported}
-            counts = {key: int(np.count_nonzero(marked)) for key, marked in counted.items()}
-            classes[name] = counts | {"std_m": statistics.std_m[name], "step_std_m": statistics.step_std_m[name]}
-    return {"classes": classes}
+    return {
+        name: ClassDocument(
+            fixes=_count(rows),
+            used=_count(rows & outcome.used),
+            rejected=_count(rows & outcome.rejected),
+            down_weighted=_count(rows & fixes.down_weighted),
+            sold_as_fixed=_count(rows & fixes.misreported),
+            std_m=known(statistics.std_m[name]),
+            step_std_m=known(statistics.step_std_m[name]),
+        )
+        for code, name in CLASSES.items()
+        if (rows := fixes.fix_class == code).any()
+    }
 
 
 def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:
@@ -291,91 +302,50 @@ def _first_stay(until: Ints, inside: Bools) -> int | None:
     return int(np.argmax(stays)) if stays.any() else None
 
 
-def path_speed(table: States) -> Floats:
-    """Return the speed over each interval between states (n - 1,) [m/s]; NaN where no time passes."""
-    interval = np.diff(table.t_s)
-    speed = np.full(len(interval), np.nan)
-    np.divide(np.diff(table.distance_m), interval, out=speed, where=interval > 0)
-    return speed
-
-
-def drive_summary(table: States) -> dict[str, float]:
-    """Return duration, distance of the positions, and mean and standard deviation of the speed over time.
-
-    Notes
-    -----
-    The distance is the sum of chords between positions that lie a step apart: longer than their noise, so that a
-    parked robot stays where it is. Wheels that turn on the spot do not count. Between the ends of a chord the speed
-    follows the model's, or is constant where the model shows less than half of it.
-    """
-    weight = np.diff(table.t_s)
-    duration = float(table.t_s[-1])
-    noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m)))
-    rows, chords = _chords(table, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
-    distance = float(chords.sum())
-    modelled, lasted = np.diff(table.distance_m[rows]), np.diff(table.t_s[rows])
-    # in a gap of the wheel data the model stands still
-    known = LEAST_MODELLED * chords < modelled
-    stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=known)
-    even = np.divide(chords, lasted, out=np.zeros(len(chords)), where=~known & (lasted > 0))
-    speed = np.nan_to_num(path_speed(table)) * np.repeat(stretched, np.diff(rows)) + np.repeat(even, np.diff(rows))
-    mean = distance / duration if duration > 0 else 0.0
-    spread = float(np.sqrt(np.average((speed - mean) ** 2, weights=weight))) if duration > 0 else 0.0
-    return {"duration_s": duration, "distance_m": distance, "speed_mean_mps": mean, "speed_std_mps": spread}
-
-
-def _chords(table: States, step_m: float) -> tuple[Ints, Floats]:
-    """Return rows of states (c + 1,), first and last included, at least a step apart, and the chords between (c,) [m].
-
-    The last chord may be shorter than a step; it counts for nothing then.
-    """
-    rows, last = chord_rows(table.north_m, table.east_m, step_m), len(table) - 1
-    chords = np.hypot(np.diff(table.north_m[rows]), np.diff(table.east_m[rows]))
-    if rows[-1] != last:
-        rows, chords = np.append(rows, last), np.append(chords, 0.0)
-    return rows, chords
-
-
 def icr_summary(
-    table: States, convergence: dict[IcrColumn, tuple[float, float] | None], covariance: Floats
-) -> dict[str, Any]:
+    table: States, convergence: dict[IcrColumn, tuple[float, float] | None], covariance: Floats, of_filter: Floats,
+    x_clock_std_m: float, track_width_m: float | None, hidden: Collection[IcrColumn],
+) -> IcrDocument:  # fmt: skip
     """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did.
 
-    `covariance` (3, 3) is that of the final ICRs.
+    Parameters
+    ----------
+    covariance : (3, 3) of the final ICRs [m^2]; of_filter : the filter's own
+    x_clock_std_m : part of the clocks in the standard deviation of x
+    hidden : ICRs that are not shown, and have no number; nor has a multiplier made of one
     """
     settled = max((span[1] for span in convergence.values() if span is not None), default=0.0)
     after = table.t_s >= settled
-    columns: dict[str, Floats] = {column: getattr(table, column) for column in ICR_COLUMNS}
-    return {
-        "final": {column: float(values[-1]) for column, values in columns.items()},
-        "final_std": dict(zip(columns, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
-        "mean": {column: float(values[after].mean()) for column, values in columns.items()},
-        "std": {column: float(values[after].std()) for column, values in columns.items()},
-        "convergence_s": {
-            column: span[1] - span[0] if span is not None else None for column, span in convergence.items()
-        },
-        "convergence_span_s": dict(convergence),
-    }
+
+    def by_icr(values: Iterable[float]) -> NumberByIcr:
+        rows = zip(ICR_COLUMNS, values, strict=True)
+        return NumberByIcr(*(None if column in hidden else known(value) for column, value in rows))
+
+    settled_icrs: list[Floats] = [getattr(table, column)[after] for column in ICR_COLUMNS]
+    width = None if {"y_icr_right_m", "y_icr_left_m"} & set(hidden) else track_width_m
+    return IcrDocument(
+        final=by_icr(table.icrs_at(-1)),
+        final_std=by_icr(np.sqrt(np.diag(covariance)).tolist()),
+        mean=by_icr(float(one.mean()) for one in settled_icrs),
+        std=by_icr(float(one.std()) for one in settled_icrs),
+        convergence_s=NumberByIcr(*(span[1] - span[0] if span is not None else None for span in convergence.values())),
+        convergence_span_s=SpanByIcr(*convergence.values()),
+        separation_multiplier=None if width is None else separation_multiplier(table, width),
+        separation_multiplier_std=None if width is None else multiplier_std(covariance, width),
+        final_covariance_m2=of_filter.tolist(),
+        x_clock_std_m=x_clock_std_m,
+    )
 
 
-def segment_summary(table: States, changes_s: tuple[float, ...]) -> list[dict[str, Any]]:
+def segment_summary(table: States, changes_s: tuple[float, ...]) -> tuple[SegmentDocument, ...]:
     """Return mean and standard deviation of the ICRs over the second half of each stretch between terrain changes."""
-    if not changes_s:
-        return []
-    edges = [0.0, *sorted(changes_s), float(table.t_s[-1])]
     segments = []
-    for begin, end in pairwise(edges):
+    for begin, end in pairwise([0.0, *sorted(changes_s), float(table.t_s[-1])] if changes_s else []):
         inside = (table.t_s >= (begin + end) / 2) & (table.t_s <= end)
-        columns: dict[str, Floats] = {column: getattr(table, column)[inside] for column in ICR_COLUMNS}
-        segments.append(
-            {
-                "begin_s": begin,
-                "end_s": end,
-                "mean": {column: float(values.mean()) if len(values) else None for column, values in columns.items()},
-                "std": {column: float(values.std()) if len(values) else None for column, values in columns.items()},
-            }
-        )
-    return segments
+        icrs: list[Floats] = [getattr(table, column)[inside] for column in ICR_COLUMNS]
+        means, stds = ([_mean(one) for one in icrs], [known(float(one.std())) if len(one) else None for one in icrs])
+        segments.append(SegmentDocument(begin, end, NumberByIcr(*means), NumberByIcr(*stds)))
+    return tuple(segments)
 
 
 def separation_multiplier(table: States, track_width_m: float) -> float:
@@ -384,34 +354,23 @@ def separation_multiplier(table: States, track_width_m: float) -> float:
     return max(separation, MIN_ICR_SEPARATION_M) / track_width_m
 
 
-def counts(outcome: MeasurementOutcome) -> dict[str, int]:
-    """Return how many measurements were used, and rejected by the innovation gate."""
-    return {"used": int(np.count_nonzero(outcome.used)), "rejected": int(np.count_nonzero(outcome.rejected))}
-
-
 def gnss_summary(
-    datum: Datum | None, rejected_fixes: dict[str, int], gnss: MeasurementOutcome, down_weighted: Bools
-) -> dict[str, Any]:
+    datum: Datum | None, rejected_fixes: dict[str, int], outcome: MeasurementOutcome, fixes: Fixes,
+    measurements: Measurements,
+) -> GnssDocument:  # fmt: skip
     """Return how many fixes were used and rejected, and how far the filter stays from those it used and trusted."""
-    by_gate = int(np.count_nonzero(gnss.rejected))
-    difference = gnss.difference[gnss.used & ~down_weighted]
-    return {
-        "used": int(np.count_nonzero(gnss.used)),
-        "rejected": by_gate + sum(rejected_fixes.values()),
-        "rejected_by_gate": by_gate,
-        "rejected_by_reason": dict(rejected_fixes),
-        "recoveries": int(np.count_nonzero(gnss.code == RECOVERED)),
-        "mean_difference_m": float(difference.mean()) if len(difference) else None,
-        "max_difference_m": float(difference.max()) if len(difference) else None,
-        "datum": [datum.latitude_deg, datum.longitude_deg, datum.height_m] if datum is not None else None,
-    }
-
-
-def nis_summary(gnss: MeasurementOutcome, heading: MeasurementOutcome) -> dict[str, Any]:
-    """Return mean NIS (2 and 1 expected where the noise is right) and rejections, over measurements not gated."""
-    summary: dict[str, Any] = {}
-    for name, outcome in (("gnss", gnss), ("heading", heading)):
-        nis = outcome.nis[outcome.used]
-        summary[f"nis_{name}_mean"] = float(nis.mean()) if len(nis) else None
-        summary[f"{name}_rejected"] = int(np.count_nonzero(outcome.rejected))
-    return summary
+    delay = measurements.findings["position_delay_s"]
+    difference = outcome.difference[outcome.used & ~fixes.down_weighted]
+    return GnssDocument(
+        used=_count(outcome.used),
+        rejected=_count(outcome.rejected) + sum(rejected_fixes.values()),
+        rejected_by_gate=_count(outcome.rejected),
+        rejected_by_reason=dict(rejected_fixes),
+        recoveries=_count(outcome.code == RECOVERED),
+        mean_difference_m=_mean(difference),
+        max_difference_m=known(float(difference.max())) if len(difference) else None,
+        datum=(datum.latitude_deg, datum.longitude_deg, datum.height_m) if datum is not None else None,
+        delay_s=delay.value,
+        delay_std_s=delay.std,
+        classes=class_summary(fixes, measurements.fix_statistics, outcome),
+    )

@@ -258,44 +258,44 @@ def _results(request: Request, stage: Stage) -> Row:
     reports: list[DropoutReport] = []
 
     def report(run: Run, partial: Path) -> None:
-        baseline = open_baseline(place).find(request.row.log, run.summary["inputs"]) if place is not None else None
+        baseline = open_baseline(place).find(request.row.log, run.document.content) if place is not None else None
         reports.append(report_and_write(run, partial, request.report, stage, baseline=baseline))
 
     run = fit_and_write(
         path_of(request.path), directory, request.config, stage, overwrite=request.overwrite,
         plots=request.report.plots, figures=request.report.figures, inside=path_of(request.folder), then=report,
     )  # fmt: skip
-    return _row(request, run.summary, int(run.table.stamp_ns[0]), reports[0])
+    return _row(request, run.document, int(run.table.stamp_ns[0]), reports[0])
 
 
 def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> Row:
-    geometry: Mapping[str, Any] = summary.get("geometry") or {}
-    controller: Mapping[str, Any] = summary.get("controller") or {}
-    if not controller and report.calibration is not None:
-        controller = report.calibration.controller_numbers()._asdict()
-    unusable = f"not usable: {summary['unusable_because']}" if not summary["usable"] else ""
-    cut = truncation(summary["warnings"])
+    icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}
+    controller = summary.controller
+    if controller is None and report.calibration is not None:
+        controller = report.calibration.controller_numbers()
+    unusable = f"not usable: {summary.unusable_because}" if not summary.usable else ""
+    cut = truncation(summary.warnings)
     return replace(
         request.row,
         status="done",
         reason="; ".join(filter(None, [unusable, f"truncated: {cut}" if cut else ""])),
-        usable=summary["usable"],
+        usable=summary.usable,
         robot=_robot(request),
         start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
-        duration_s=summary["drive"]["duration_s"],
-        distance_m=summary["drive"]["distance_m"],
-        icr={name: geometry.get(name) for name in ICR_COLUMNS}
-        | {f"std_{name}": geometry.get(f"{name}_std") for name in ICR_COLUMNS},
-        multiplier=controller.get("multiplier"),
-        multiplier_std=controller.get("multiplier_std"),
+        duration_s=summary.drive.duration_s,
+        distance_m=summary.drive.distance_m,
+        icr={name: value for name, (value, _) in icrs.items()}
+        | {f"std_{name}": std for name, (_, std) in icrs.items()},
+        multiplier=None if controller is None else controller.multiplier,
+        multiplier_std=None if controller is None else controller.multiplier_std,
         errors=_errors(report),
-        events=len(summary["events"]),
+        events=len(summary.events),
         outages=len(report.outages),
-        warnings=len(summary["warnings"]),
+        warnings=len(summary.warnings),
         verdicts=tuple(replace(one, log=request.row.log) for one in report.verdicts),
         baseline=_baseline_numbers(report),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
-        inputs=files_of(path_of(request.path), {file["path"]: file["sha256"] for file in summary["inputs"]}),
+        inputs=files_of(path_of(request.path), {file.path: file.sha256 for file in summary.inputs}),
     )
 
 

@@ -11,7 +11,7 @@ from icrtool.logs.read_log import Survey
 from icrtool.logs.streams.heading_sources import HeadingSource
 from icrtool.logs.streams.source import PositionSource
 from icrtool.logs.streams.wheel_sources import WheelMotion
-from icrtool.records.samples import ROLE_WORDS, Role, rate_and_jitter
+from icrtool.records.samples import ROLE_WORDS, Role, StreamChoice, rate_and_jitter
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
 
@@ -43,10 +43,7 @@ def describe_survey(survey: Survey, measured: RobotLog | None) -> str:
         if role in chosen:
             stream = chosen[role]
             lines.append(f"  -> {stream.topic}: {stream.why}")
-            lines.append(
-                f"     {stream.count} samples at {stream.rate_hz:.4g} Hz by {stream.clock} stamps, "
-                f"jitter {stream.jitter_ms:.3g} ms"
-            )
+            lines.append(f"     {stream.samples_text} by {stream.clock} stamps{_jitter(stream)}")
     if measured is not None and measured.gyro is not None:
         gyro = measured.gyro
         lines.append(f"\ngyro:\n  -> {gyro.topic}: {len(gyro.stamp_ns)} turn rates, not used by the filter")
@@ -61,9 +58,13 @@ def describe_log(log: RobotLog) -> str:
     """Return the text of ``icrtool info`` for a log that is a table."""
     lines = [f"{log.name}: table"]
     for stream in log.streams:
-        samples = f"{stream.count} samples at {stream.rate_hz:.4g} Hz, jitter {stream.jitter_ms:.3g} ms"
+        samples = f"{stream.samples_text}{_jitter(stream)}"
         lines.append(f"  {ROLE_WORDS[stream.role]}: {stream.topic}: {samples}; {stream.why}")
     return "\n".join(lines)
+
+
+def _jitter(stream: StreamChoice) -> str:
+    return f", jitter {stream.jitter_ms:.3g} ms" if stream.jitter_ms is not None else ""
 
 
 def _topics(survey: Survey) -> list[str]:
@@ -74,9 +75,7 @@ def _topics(survey: Survey) -> list[str]:
         text = f"  {topic:<{width}}  {channel.message_type}"
         if table is not None:
             rate, _ = rate_and_jitter(table.log_time_ns)
-            text += (
-                f"  {counted(len(table), 'message')}{f', {rate:.4g} Hz' if rate > 0 else ''}{_gaps(table.log_time_ns)}"
-            )
+            text += f"  {counted(len(table), 'message')}{f', {rate:.4g} Hz' if rate else ''}{_gaps(table.log_time_ns)}"
             if table.unreadable:
                 text += f", {table.unreadable} unreadable"
         elif topic in survey.candidates.unread:

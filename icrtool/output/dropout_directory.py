@@ -113,13 +113,13 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
 
 def report_document(report: DropoutReport) -> dict[str, Any]:
     """Return what report.json holds."""
-    run = report.run_summary
+    run = report.run_document
     return {
         "schema": DROPOUT_SCHEMA,
         "tool_version": __version__,
-        "run": {key: run[key] for key in ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")},
-        "usable": run["usable"],
-        "unusable_because": run["unusable_because"],
+        "run": {key: getattr(run, key) for key in RUN_KEYS},
+        "usable": run.usable,
+        "unusable_because": run.unusable_because,
         "reference": f"the {'smoother' if report.smoothed else 'filter'}'s estimate at the end of the trial",
         "smoothed": report.smoothed,
         "starts": report.states,
@@ -160,6 +160,8 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
     }  # fmt: skip
 
 
+RUN_KEYS = ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")
+
 HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent")
 
 VERDICT_KEYS = ("value_m", "baseline_m", "margin_m", "margin_low_m", "margin_high_m", "passed")
@@ -186,7 +188,7 @@ def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any
 
 
 def _baseline_document(report: DropoutReport) -> dict[str, Any] | None:
-    one, run = report.baseline, report.run_summary
+    one, run = report.baseline, report.run_document
     if one is None:
         return None
     return {"path": one.path, "log": one.log, "tool_version": one.tool_version, "same_recording": one.is_of(run),

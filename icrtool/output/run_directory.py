@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import file_sha256, files_of_log
@@ -21,7 +23,7 @@ from icrtool.output.files.states_file import StatesFormat, write_states
 from icrtool.records.late_output import FigureSet
 from icrtool.records.regular_file import read_regular
 from icrtool.records.run import Run
-from icrtool.records.run_document import EVENT_COLUMNS
+from icrtool.records.run_document import EVENT_COLUMNS, EventDocument
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
@@ -113,7 +115,7 @@ def write_run(
         states = "csv" if len(run.table) <= MOST_CSV_STATES else "parquet"
         if states != "csv" and note is not None:
             note(f"{directory}: {len(run.table):,} states: written as states.parquet, not states.csv (--states csv)")
-    sources = [os.path.realpath(file["path"]) for file in run.summary["inputs"]]
+    sources = [os.path.realpath(file.path) for file in run.document.inputs]
     with (
         atomic_directory(
             directory,
@@ -136,8 +138,8 @@ def write_run(
         if run.smoothed is not None:
             sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)
         write_measurements(run, partial / MEASUREMENTS_FILE)
-        (partial / RUN_FILE).write_bytes(json_bytes(run.summary))
-        (partial / EVENTS_FILE).write_bytes(events_csv(run.summary["events"]))
+        (partial / RUN_FILE).write_bytes(json_bytes(run.document))
+        (partial / EVENTS_FILE).write_bytes(events_csv(run.document.events))
         pictures = [f"plots/{file.name}" for file in sorted((partial / "plots").glob("*"))]
         sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE, *pictures)}
         sums[states_name] = states_sum.result()
@@ -148,8 +150,8 @@ def write_run(
 
 def replaced_log(directory: Path, run: Run) -> str | None:
     """Return the path of the log whose run a new run replaces; None where it has the same content, or none is there."""
-    before, now = _inputs_of(directory), run.summary["inputs"]
-    same = [one.get("sha256") for one in before] == [one["sha256"] for one in now]
+    before, now = _inputs_of(directory), run.document.inputs
+    same = [one.get("sha256") for one in before] == [one.sha256 for one in now]
     return str(before[0].get("path")) if before and not same else None
 
 
@@ -167,6 +169,6 @@ def is_run_directory(directory: Path) -> bool:
     return schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
 
 
-def events_csv(events: Sequence[Mapping[str, Any]]) -> bytes:
+def events_csv(events: Sequence[EventDocument]) -> bytes:
     """Return events.csv: a row an event."""
-    return csv_bytes(EVENT_COLUMNS, ([event[column] for column in EVENT_COLUMNS] for event in events))
+    return csv_bytes(EVENT_COLUMNS, map(msgspec.structs.astuple, events))

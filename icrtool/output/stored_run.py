@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -26,8 +26,8 @@ from icrtool.output.run_directory import (
 )
 from icrtool.records.memory import give_back_freed
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_regular
-from icrtool.records.run import RUN_SCHEMA, Run
-from icrtool.records.run_document import RunDocument
+from icrtool.records.run import Run
+from icrtool.records.run_document import RUN_SCHEMA, RunDocument
 from icrtool.records.tables import States
 from icrtool.records.text import LONGEST_NAME, LogText, escaped, shortened
 
@@ -36,20 +36,8 @@ FIT_AGAIN = "fit the log again"
 LONGEST_STORED = 1000
 """Characters of a text of run.json that are used: a warning of ours has a few hundred."""
 
-ADDED_LISTS = ("reference_jumps",)
-"""Keys that run.json got while its schema stayed the same: empty in a run without them."""
-
 NAMES = ("topic", "message_type")
 """Keys of run.json whose texts stand there as in the log."""
-
-TOGETHER = (
-    ("icr", "separation_multiplier", "separation_multiplier_std"),
-    ("gnss", "mean_difference_m", "max_difference_m"),
-    ("gnss", "delay_s", "delay_std_s"),
-    ("heading", "delay_s", "delay_std_s"),
-    ("heading", "offset_deg", "offset_std_deg"),
-)
-"""Section, and two keys of it that are both known or both null."""
 
 
 def open_run(path: str | Path) -> Run:
@@ -65,37 +53,33 @@ def open_run(path: str | Path) -> Run:
         Not a run directory, one of another version, or one that was edited or cut short since it was written.
     """
     directory = Path(path)
-    document = _read_document(directory)
+    stored = _read_document(directory)
     sums = read_sums(directory)
     check_sum(directory, RUN_FILE, sums)
     if MEASUREMENTS_FILE not in sums:
         raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
     try:
-        run_document = check_run_document(document)
-        config = parse_config(document["config"])
-        # Keys that somebody removed have their defaults.
-        document["config"] = config.effective()
+        config = parse_config(msgspec.convert(stored.get("config"), dict[str, Any]))
+        document = msgspec.convert(stored | {"config": config}, RunDocument)
         table = _read_states(directory, STATES_FILES, sums)
         if table is None:
             raise RunError(directory, f"{CHECKSUM_FILE} names no states", FIT_AGAIN)
         if table.fault:
             raise ValueError(table.fault)
         check_sum(directory, MEASUREMENTS_FILE, sums)
-        table, sensors, gnss, heading = read_measurements(directory, table, run_document)
+        table, sensors, gnss, heading = read_measurements(directory, table, document)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
         run = Run(
-            name=document["log"],
-            config=config,
+            document=document,
             table=table,
-            in_gap=np.isin(table.stamp_ns, spans_of(run_document["wheel_gaps_ns"])[:, 0]),
-            outages_ns=spans_of(run_document["outages_ns"]),
+            in_gap=np.isin(table.stamp_ns, spans_of(document.wheel_gaps_ns)[:, 0]),
+            outages_ns=spans_of(document.outages_ns),
             sensors=sensors,
             gnss=gnss,
             heading=heading,
             smoothed=smoothed,
-            summary=run_document,
             directory=directory,
         )
     except ConfigError as err:
@@ -114,7 +98,7 @@ def log_of(run: Run) -> Path:
     RunError
         It is not where it was when the run was made.
     """
-    files = [Path(file["path"]) for file in run.summary["inputs"]]
+    files = [Path(file.path) for file in run.document.inputs]
     gone = [file for file in files if not file.is_file()]
     if gone or not files:
         what = gone[0] if gone else "a list of inputs"
@@ -144,30 +128,6 @@ def newest_run(runs: Path) -> Path:
     return max(found, key=lambda file: (file.stat().st_mtime_ns, str(file))).parent
 
 
-def check_run_document(document: dict[str, Any]) -> RunDocument:
-    """Return plain data, which must be that of a run.
-
-    Raises
-    ------
-    ValueError
-        A key is missing, of another type, or null without its companion; its path is named.
-    """
-    try:
-        msgspec.convert(document, RunDocument)
-    except msgspec.ValidationError as err:
-        raise ValueError(str(err)) from err
-    for section, one, other in TOGETHER:
-        if (document[section][one] is None) != (document[section][other] is None):
-            raise ValueError(f"only one of {one} and {other} is known - at `$.{section}`")
-    icr = document["icr"]
-    for column in icr["final"]:
-        if len({icr[key][column] is None for key in ("final", "final_std", "mean", "std")}) > 1:
-            raise ValueError(f"only some of final, final_std, mean and std are known of {column} - at `$.icr`")
-    if document["usable"] != (document["unusable_because"] is None):
-        raise ValueError("usable and unusable_because contradict each other - at `$`")
-    return cast("RunDocument", document)
-
-
 def _read_document(directory: Path) -> dict[str, Any]:
     try:
         raw = read_regular(directory / RUN_FILE, directory)
@@ -188,8 +148,7 @@ def _read_document(directory: Path) -> dict[str, Any]:
             directory, f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}", FIT_AGAIN
         )
     # What a log wrote there is printed from here on.
-    read = {escaped(key): value if key == "inputs" else _escaped(value) for key, value in document.items()}
-    return {name: [] for name in ADDED_LISTS} | read
+    return {key: value if key == "inputs" else _escaped(value) for key, value in document.items()}
 
 
 def _escaped(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from icrtool.output.text_blocks import Line
 from icrtool.records.dropout import CHOICE_HORIZON_M
@@ -17,7 +17,14 @@ from icrtool.records.text import counted
 if TYPE_CHECKING:
     from icrtool.calibration.record import ControllerErrors
     from icrtool.motion.models import FittedModel
-    from icrtool.records.run_document import DriveDocument, IcrColumn, RunDocument
+    from icrtool.records.run_document import (
+        ControllerNumbers,
+        DriveDocument,
+        EventDocument,
+        ExcitationDocument,
+        ReferenceJumpDocument,
+        RunDocument,
+    )
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -32,66 +39,65 @@ FITTED = {"never": "not fitted", "before": "up to the start", "all": "in sample"
 
 def run_title(summary: RunDocument) -> str:
     """Return the log's name, and the robot's where it has one; `summary` is that of a run."""
-    log, robot = summary["log"], summary["config"]["robot"]["name"]
+    log, robot = summary.log, summary.config.robot.name
     return f"{log}  ({robot})" if robot else str(log)
 
 
 def unusable_lines(summary: RunDocument) -> list[Line]:
     """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
-    return [] if summary["usable"] else [Line(f"Do not use: {summary['unusable_because']}", "bad")]
+    return [] if summary.usable else [Line(f"Do not use: {summary.unusable_because}", "bad")]
 
 
 def position_word(summary: RunDocument) -> str:
     """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
-    return "GNSS fixes" if summary["gnss"]["datum"] is not None else "position reference"
+    return "GNSS fixes" if summary.gnss.datum is not None else "position reference"
 
 
 def role_word(summary: RunDocument, role: Role) -> str:
     """Return what a stream is called: a position reference that was metric already is no GNSS."""
-    return ROLE_WORDS[role] if summary["gnss"]["datum"] is None else role
+    return ROLE_WORDS[role] if summary.gnss.datum is None else role
 
 
-def excitation_text(excitation: Mapping[str, Any]) -> str:
+def excitation_text(excitation: ExcitationDocument) -> str:
     """Return what a drive could show of the ICRs at best, and how it turned; from the key of a run's summary."""
-    verdicts = excitation["verdict"]
-    if set(verdicts.values()) == {"shown"}:
+    if excitation.verdict.all_shown:
         shown = "enough to show all three ICRs"
     else:
-        shown = ", ".join(f"{ICR_WORDS[column]} {verdict}" for column, verdict in verdicts.items())
+        shown = ", ".join(f"{ICR_WORDS[column]} {excitation.verdict[column]}" for column in ICR_COLUMNS)
         shown += " (weak: found roughly; not shown: cannot be found)"
-    spun = excitation["spun_right_deg"] + excitation["spun_left_deg"]
-    right, left = (f"{excitation[f'turned_{side}_deg']:,.0f}° {side}" for side in ("right", "left"))
-    return f"{shown}; turned {right}, {left}, {spun:,.0f}° of it on the spot"
+    spun = excitation.spun_right_deg + excitation.spun_left_deg
+    turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
+    return f"{shown}; turned {turned}, {spun:,.0f}° of it on the spot"
 
 
-def event_kinds(events: Sequence[Mapping[str, Any]]) -> str:
+def event_kinds(events: Sequence[EventDocument]) -> str:
     """Return how many slip events there are of each kind, as ``2 skid, 1 spin``."""
-    return ", ".join(f"{count} {kind}" for kind, count in Counter(event["kind"] for event in events).items())
+    return ", ".join(f"{count} {kind}" for kind, count in Counter(event.kind for event in events).items())
 
 
-def jump_lines(jumps: Sequence[Mapping[str, Any]]) -> list[str]:
+def jump_lines(jumps: Sequence[ReferenceJumpDocument]) -> list[str]:
     """Return a line for each jump of the reference: when, how large, why it is one, and what follows."""
-    listed = sorted(jumps, key=lambda one: (one["undecided"], -one["size_m"]))[:MOST_LINES]
+    listed = sorted(jumps, key=lambda one: (one.undecided, -one.size_m))[:MOST_LINES]
     lines = [
-        f"reference jump from {one['begin_s']:.1f} to {one['end_s']:.1f} s: {_jump_size(one)}: {one['why']}; "
-        f"{'trials cross it' if one['undecided'] else 'no trial crosses it'}"
-        for one in sorted(listed, key=lambda one: one["begin_ns"])
+        f"reference jump from {one.begin_s:.1f} to {one.end_s:.1f} s: {_jump_size(one)}: {one.why}; "
+        f"{'trials cross it' if one.undecided else 'no trial crosses it'}"
+        for one in sorted(listed, key=lambda one: one.begin_ns)
     ]
     return [*lines, f"and {len(jumps) - len(lines):,} more in run.json"] if len(jumps) > len(lines) else lines
 
 
-def _jump_size(jump: Mapping[str, Any]) -> str:
-    turned = f"{abs(jump['turn_deg']):.0f}°"
-    return turned if jump["kind"] == "heading" else f"{error_text(jump['size_m'])} and {turned}"
+def _jump_size(jump: ReferenceJumpDocument) -> str:
+    turned = f"{abs(jump.turn_deg):.0f}°"
+    return turned if jump.kind == "heading" else f"{error_text(jump.size_m)} and {turned}"
 
 
-def jump_count(jumps: Sequence[Mapping[str, Any]]) -> str:
+def jump_count(jumps: Sequence[ReferenceJumpDocument]) -> str:
     """Return how often the reference jumps, as ``2 jumps of the reference, up to 3.1 m``; empty where it does not."""
-    decided = [one for one in jumps if not one["undecided"]]
+    decided = [one for one in jumps if not one.undecided]
     undecided = f"{counted(len(jumps) - len(decided), 'step')} of undecided cause" if len(jumps) > len(decided) else ""
     if not decided:
         return undecided
-    largest = max(decided, key=lambda one: (one["kind"] == "position", one["size_m"], abs(one["turn_deg"])))
+    largest = max(decided, key=lambda one: (one.kind == "position", one.size_m, abs(one.turn_deg)))
     text = f"{counted(len(decided), 'jump')} of the reference, up to {_jump_size(largest)}"
     return f"{text}; {undecided}" if undecided else text
 
@@ -141,29 +147,23 @@ def duration_text(seconds: float) -> str:
 
 def driven_text(drive: DriveDocument) -> str:
     """Return distance and duration of a drive, as ``398.5 m in 14:59 min``; `drive` of a run's summary."""
-    return f"{distance_text(drive['distance_m'])} in {duration_text(drive['duration_s'])}"
+    return f"{distance_text(drive.distance_m)} in {duration_text(drive.duration_s)}"
 
 
 AGREES_SIGMAS = 3.0
 """Two estimates of an ICR agree where they differ by less than so many standard deviations."""
 
 
-def icr_value_text(geometry: Mapping[str, Any], column: IcrColumn) -> str:
-    """Return an ICR with its standard deviation, of the section ``geometry`` of a run's summary."""
-    value, std = geometry.get(column), geometry.get(f"{column}_std")
-    return f"{value:+.3f} ± {std:.3f}" if value is not None else "not shown"
-
-
 def filter_agreement(summary: RunDocument) -> str:
     """Return where the filter's ICRs ended, and whether they agree with those of the drive; empty without both."""
-    geometry: Mapping[str, Any] = summary.get("geometry") or {}
-    final, final_std = summary["icr"]["final"], summary["icr"]["final_std"]
+    final, final_std = summary.icr.final, summary.icr.final_std
     ends, apart = [], []
     for column in ICR_COLUMNS:
         word = ICR_WORDS[column]
-        value, std, at, at_std = geometry.get(column), geometry.get(f"{column}_std"), final[column], final_std[column]
-        if value is None or at is None or std is None or at_std is None:
+        at, at_std, of_drive = final[column], final_std[column], summary.icr_of_drive(column)
+        if of_drive is None or at is None or at_std is None:
             continue
+        value, std = of_drive
         ends.append(f"{word.removeprefix('y ')} {at:+.3f}")
         sigmas = abs(at - value) / max(math.hypot(std, at_std), 1e-9)
         if sigmas > AGREES_SIGMAS:
@@ -181,11 +181,11 @@ def fitted_model_text(fitted: FittedModel) -> str:
     return model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
 
 
-def controller_text(numbers: Mapping[str, Any]) -> str:
-    """Return what a controller is given, from the keys of `icrtool.calibration.record.ControllerNumbers`."""
+def controller_text(numbers: ControllerNumbers) -> str:
+    """Return what a controller is given."""
     return (
-        f"wheel_separation_multiplier {numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}, left/right wheel "
-        f"radius {numbers['left_radius']:.3f}/{numbers['right_radius']:.3f} of the configured"
+        f"wheel_separation_multiplier {numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}, left/right wheel "
+        f"radius {numbers.left_radius:.3f}/{numbers.right_radius:.3f} of the configured"
     )
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.events import ReferenceJump, SlipEvent
+from icrtool.records.plain_data import Record
 from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
 RESPONSE_S = 0.1
@@ -18,8 +18,7 @@ RESPONSE_S = 0.1
 MOVING_S, TURNING_MPS = 60.0, 0.01
 """A robot is in use, and counts as moving, for so long before and after its wheels turn faster than that."""
 
-Scalar = str | float | bool | None
-"""A value as JSON has it (an int is a float to Python's types)."""
+Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +62,11 @@ class Fixes(Samples):
     down_weighted: Bools
 
 
-class IcrStart(NamedTuple):
+class IcrStart(Record, frozen=True):
     """ICRs to start the filter from, right, left, x, and their standard deviations (3,) [m]."""
 
-    icrs_m: tuple[float, float, float]
-    std_m: tuple[float, float, float]
+    icrs_m: Triple
+    std_m: Triple
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +151,66 @@ class FixStatistics:
     step_std_m: dict[str, float]
 
 
+class WheelFacts(Record, frozen=True, kw_only=True):
+    """What is known of the wheels, and what was done with it; as ``wheels`` in run.json.
+
+    Attributes
+    ----------
+    scale, scale_std : distance by the position reference per distance by the wheels; None where not shown
+    applied_scale : mean of what both sides were multiplied with
+    applied_left_scale, applied_right_scale : what each was multiplied with, configured scales included
+    held_share : share of samples, while moving, that repeat the one before
+    filtered : how they show that a filter made them; None for none
+    windows, stretches : windows in which wheels and positions were compared, and how many count as independent
+    residual_m : robust standard deviation of their displacements; None without windows
+    """
+
+    scale: float | None
+    scale_std: float | None
+    applied_scale: float
+    applied_left_scale: float
+    applied_right_scale: float
+    held_share: float | None
+    filtered: str | None
+    windows: int
+    stretches: int
+    residual_m: float | None
+
+
+class HeadingFacts(Record, frozen=True, kw_only=True):
+    """What is known of the heading, and what is done with it; in ``heading`` of run.json.
+
+    Attributes
+    ----------
+    source : orientation, dual_antenna_message, antenna_pair, gyro_course, wheels_course or fused
+    parts : of an estimated heading, in words; None for a stated one
+    windows : stretches of distance compared
+    applied_mirror : the heading is turned over
+    offset_deg, offset_std_deg : heading minus course over ground; None when there was nothing to compare
+    scatter_deg : robust standard deviation of the differences
+    applied_offset_deg : what is subtracted; applied_std_deg : the least noise that the filter uses
+    std_deg : median standard deviation of an estimated heading, as the filter is given it; None for a stated one
+    offset_name : what a significant offset may come from
+    agreement, mirrored_agreement : mean resultant length of heading minus course over ground, in either sense
+    """
+
+    source: str
+    parts: str | None
+    windows: int
+    applied_mirror: bool
+    offset_deg: float | None
+    offset_std_deg: float | None
+    scatter_deg: float | None
+    applied_offset_deg: float
+    applied_std_deg: float
+    std_deg: float | None
+    offset_name: str | None
+    magnetic_declination_deg: float | None
+    utm_convergence_deg: float | None
+    agreement: float | None
+    mirrored_agreement: float | None
+
+
 @dataclass(frozen=True, slots=True)
 class Measurements:
     """The aligned sensors of one log, and what the alignment found.
@@ -160,7 +219,7 @@ class Measurements:
     ----------
     findings : by name with unit; run.json has them as ``alignment``
     streams : the log's chosen topics; ``why`` also names the unit of the wheels
-    sections : more numbers for run.json, by section (``wheels``, ``heading``, ``gnss``)
+    wheels, heading : what is known of them, for run.json
     clock_std_s : standard deviation of the time between position and heading after that
     antenna_is_known : its place was configured, or in the log
     warnings : sentences for the user, in the order they were found
@@ -168,7 +227,8 @@ class Measurements:
 
     sensors: SensorData
     findings: dict[str, Finding]
-    sections: dict[str, dict[str, Scalar]]
+    wheels: WheelFacts
+    heading: HeadingFacts
     streams: tuple[StreamChoice, ...]
     fix_statistics: FixStatistics
     clock_std_s: float

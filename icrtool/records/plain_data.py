@@ -1,16 +1,34 @@
-"""Plain data: what JSON holds and gives back unchanged."""
+"""Plain data: what JSON holds and gives back unchanged; and the records that JSON documents are made of."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 
 
+class Record(msgspec.Struct, frozen=True):
+    """Part of a JSON document: read with its types checked; keys that it does not know are ignored."""
+
+
+def known(value: float) -> float | None:
+    """Return a number, None where it is not finite."""
+    return value if math.isfinite(value) else None
+
+
 def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return a value as JSON gives it back: lists, dicts, text, numbers; None for what is not a finite number."""
+    """Return a value as JSON gives it back: lists, dicts, text, numbers; None for what is not a finite number.
+
+    Of a dataclass the fields that are compared count: the others are no content.
+    """
+    if isinstance(value, msgspec.Struct):
+        value = msgspec.structs.asdict(value)
+    elif is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value) if field.compare}
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

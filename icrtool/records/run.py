@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -16,15 +16,13 @@ from icrtool.kernels.track import Track
 from icrtool.records.events import intervals_in
 from icrtool.records.late_output import FigureSet, call_output
 from icrtool.records.measurements import SensorData
+from icrtool.records.plain_data import plain
 from icrtool.records.tables import Icrs, States
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from icrtool.records.run_document import IcrColumn, IcrDocument, RunDocument
-
-RUN_SCHEMA = "icrtool/run/1"
-"""Version of what the summary of a run holds."""
+    from icrtool.records.run_document import IcrColumn, RunDocument
 
 CALIBRATION_SCHEMA = "icrtool/calibration/1"
 """Version of calibration files."""
@@ -108,20 +106,17 @@ class Run:
 
     Attributes
     ----------
-    name : of the log
-    config : the configuration it was made with
+    document : what run.json holds
     table : the recorded states; `states` is the same as a DataFrame
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
     outages_ns : half-open spans without usable GNSS, (k, 2)
     sensors : the streams as the filter used them
     gnss, heading : how the filter used each fix and heading
     smoothed : states of the RTS smoother at the same stamps, None where they were not asked for
-    summary : equal to run.json
     directory : where it was read from, None for one just made
     """
 
-    name: str
-    config: Config
+    document: RunDocument
     table: States
     in_gap: Bools
     outages_ns: Ints
@@ -129,7 +124,6 @@ class Run:
     gnss: MeasurementOutcome
     heading: MeasurementOutcome
     smoothed: States | None
-    summary: RunDocument = field(repr=False)
     directory: Path | None = None
 
     @property
@@ -138,9 +132,25 @@ class Run:
         return self.table.frame()
 
     @property
+    def name(self) -> str:
+        """Name of the log."""
+        return self.document.log
+
+    @property
+    def config(self) -> Config:
+        """The configuration it was made with."""
+        return self.document.config
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What run.json holds, as plain data."""
+        found: dict[str, Any] = plain(self.document)
+        return found
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences for the user, in the order they were found."""
-        return tuple(self.summary["warnings"])
+        return self.document.warnings
 
     @property
     def track_width_m(self) -> float | None:
@@ -150,7 +160,7 @@ class Run:
     @property
     def changes_s(self) -> tuple[float, ...]:
         """Terrain changes, seconds since the first recorded state."""
-        return tuple(change["t_s"] for change in self.summary["terrain"]["changes"])
+        return tuple(change.t_s for change in self.document.terrain.changes)
 
     @property
     def slipping(self) -> Bools:
@@ -166,8 +176,8 @@ class Run:
     @property
     def convergence_s(self) -> dict[IcrColumn, tuple[float, float] | None]:
         """By ICR column, first and last second of the 10-90 % convergence, or None."""
-        spans = self.summary["icr"]["convergence_span_s"]
-        return {name: (span[0], span[1]) if (span := spans[name]) is not None else None for name in ICR_COLUMNS}
+        spans = self.document.icr.convergence_span_s
+        return {name: getattr(spans, name) for name in ICR_COLUMNS}
 
     @property
     def settled_s(self) -> float:
@@ -177,18 +187,18 @@ class Run:
     @property
     def process_position_mps(self) -> float:
         """Position process noise the run ended with."""
-        return self.summary["filter"]["process_position_mps"]
+        return self.document.filter.process_position_mps
 
     @property
     def began_with(self) -> WarmStart | None:
         """What the run was warm-started with, None where it was not."""
-        stored = self.summary["filter"]["warm_start"]
-        return WarmStart(np.array(stored["icrs_m"]), np.array(stored["covariance_m2"])) if stored else None
+        stored = self.document.filter.warm_start
+        return WarmStart(np.array(stored.icrs_m), np.array(stored.covariance_m2)) if stored else None
 
     @property
     def ended_with(self) -> WarmStart:
         """The filter's last ICRs and their covariance, to start another run from; large where not shown."""
-        covariance = np.array(self.summary["icr"]["final_covariance_m2"], np.float64)
+        covariance = np.array(self.document.icr.final_covariance_m2, np.float64)
         return WarmStart(np.array(self.table.icrs_at(-1)), covariance, self.track_width_m)
 
     @property
@@ -197,14 +207,12 @@ class Run:
 
         They hold configured and estimated scales; speeds divided by them are those that the wheels reported.
         """
-        wheels = self.summary["wheels"]
-        common = wheels.get("applied_scale", 1.0)
-        return float(wheels.get("applied_left_scale", common)), float(wheels.get("applied_right_scale", common))
+        return self.document.wheels.applied_left_scale, self.document.wheels.applied_right_scale
 
     @property
     def usable(self) -> bool:
-        """Whether the ICRs may be used; ``unusable_because`` of `summary` is the reason where not."""
-        return self.summary["usable"]
+        """Whether the ICRs may be used; ``unusable_because`` of `document` is the reason where not."""
+        return self.document.usable
 
     def write(
         self,
@@ -231,10 +239,10 @@ class Run:
         call_output("run_directory", "write_run", self, Path(path), states=states, plots=plots, figures=figures)
 
     def __repr__(self) -> str:
-        drive, icr = self.summary["drive"], self.summary["icr"]
-        icrs = ", ".join(f"{column} {icr_text(icr, column)}" for column in ICR_COLUMNS)
+        drive, icr = self.document.drive, self.document.icr
+        icrs = ", ".join(f"{column} {icr_text(icr.final[column], icr.final_std[column])}" for column in ICR_COLUMNS)
         return (
-            f"<Run {self.name!r}: {drive['distance_m']:.1f} m in {drive['duration_s']:.1f} s, "
+            f"<Run {self.name!r}: {drive.distance_m:.1f} m in {drive.duration_s:.1f} s, "
             f"{len(self.table):,} states, {icrs}, {len(self.warnings)} warnings>"
         )
 
@@ -246,10 +254,9 @@ class Run:
         )
 
 
-def icr_text(icr: IcrDocument, column: IcrColumn) -> str:
-    """Return a final ICR with its standard deviation, of the summary's section ``icr``."""
-    final, std = icr["final"][column], icr["final_std"][column]
-    return f"{final:+.3f} ± {std:.3f}" if final is not None else "not shown"
+def icr_text(value: float | None, std: float | None) -> str:
+    """Return an ICR with its standard deviation, ``not shown`` where there is none."""
+    return f"{value:+.3f} ± {std:.3f}" if value is not None else "not shown"
 
 
 def width_or_usual_m(track_width_m: float | None) -> float:

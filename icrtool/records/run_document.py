@@ -1,33 +1,55 @@
-"""The keys of run.json, which the summary of a run has too: their types, checked when a run is opened.
+"""run.json: what a run holds beside its columns. `icrtool.fit` makes it, and it is written and read as this record.
 
-Keys that nothing reads may be added in the same version.
+A key that a later version adds has a default, so that older runs can still be read.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Literal
 
 import msgspec
 
+from icrtool.config import Config
 from icrtool.records.events import JumpKind, SlipKind
-from icrtool.records.samples import Role
+from icrtool.records.measurements import Finding, HeadingFacts, IcrStart, Triple, WheelFacts
+from icrtool.records.plain_data import Record
+from icrtool.records.samples import InputFile, StreamChoice
+
+RUN_SCHEMA: Literal["icrtool/run/1"] = "icrtool/run/1"
+"""Version of what run.json holds."""
 
 Excited = Literal["shown", "weak", "not shown"]
 IcrColumn = Literal["y_icr_right_m", "y_icr_left_m", "x_icr_m"]
-Spans = list[tuple[int, int]]
-Triple = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
-Matrix = Annotated[list[Triple], msgspec.Meta(min_length=3, max_length=3)]
+Spans = tuple[tuple[int, int], ...]
+Three = msgspec.Meta(min_length=3, max_length=3)
+Matrix = Annotated[list[Annotated[list[float], Three]], Three]
 
 
-class MaybeByIcr(TypedDict):
+def check_together(one: object, *names: str) -> None:
+    """Refuse a record of which only some of the named numbers are known.
+
+    Raises
+    ------
+    ValueError
+        It is one.
+    """
+    if len({getattr(one, name) is None for name in names}) > 1:
+        raise ValueError(f"only some of {', '.join(names)} are known")
+
+
+class NumberByIcr(Record, frozen=True):
     """A number of each ICR, null where there is none."""
 
     y_icr_right_m: float | None
     y_icr_left_m: float | None
     x_icr_m: float | None
 
+    def __getitem__(self, column: IcrColumn) -> float | None:
+        number: float | None = getattr(self, column)
+        return number
 
-class SpansByIcr(TypedDict):
+
+class SpanByIcr(Record, frozen=True):
     """Begin and end of each ICR's convergence [s], null where it did not converge."""
 
     y_icr_right_m: tuple[float, float] | None
@@ -35,27 +57,24 @@ class SpansByIcr(TypedDict):
     x_icr_m: tuple[float, float] | None
 
 
-class InputDocument(TypedDict):
-    """A file that was read."""
+class VerdictByIcr(Record, frozen=True):
+    """Whether each ICR was shown."""
 
-    path: str
-    bytes: int
-    sha256: str
+    y_icr_right_m: Excited
+    y_icr_left_m: Excited
+    x_icr_m: Excited
 
+    def __getitem__(self, column: IcrColumn) -> Excited:
+        verdict: Excited = getattr(self, column)
+        return verdict
 
-class StreamDocument(TypedDict):
-    """A chosen topic."""
-
-    role: Role
-    topic: str
-    message_type: str
-    count: int
-    rate_hz: float | None
-    clock: str
-    why: str
+    @property
+    def all_shown(self) -> bool:
+        """Whether each of the three is."""
+        return self == VerdictByIcr("shown", "shown", "shown")
 
 
-class DriveDocument(TypedDict):
+class DriveDocument(Record, frozen=True):
     """Duration, distance and speed."""
 
     duration_s: float
@@ -64,56 +83,65 @@ class DriveDocument(TypedDict):
     speed_std_mps: float
 
 
-class IcrDocument(TypedDict):
-    """The ICRs and how they converged."""
+class IcrDocument(Record, frozen=True, kw_only=True):
+    """The ICRs and how they converged; null where not shown.
 
-    final: MaybeByIcr
-    final_std: MaybeByIcr
-    mean: MaybeByIcr
-    std: MaybeByIcr
-    convergence_s: MaybeByIcr
-    convergence_span_s: SpansByIcr
+    `mean`, `std`: over the states after convergence; `x_clock_std_m`: part of the clocks in the deviation of x.
+    """
+
+    final: NumberByIcr
+    final_std: NumberByIcr
+    mean: NumberByIcr
+    std: NumberByIcr
+    convergence_s: NumberByIcr
+    convergence_span_s: SpanByIcr
     separation_multiplier: float | None
     separation_multiplier_std: float | None
     final_covariance_m2: Matrix
-    x_clock_std_m: NotRequired[float]
+    x_clock_std_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_together(self, "separation_multiplier", "separation_multiplier_std")
+        for name in NumberByIcr.__struct_fields__:
+            if len({getattr(one, name) is None for one in (self.final, self.final_std, self.mean, self.std)}) > 1:
+                raise ValueError(f"only some of final, final_std, mean and std are known of {name}")
 
 
-class EndErrorDocument(TypedDict):
+class EndErrorDocument(Record, frozen=True):
     """How far from the filter's last position an odometry ends."""
 
     end_error_m: float
 
 
-class OdometryDocument(TypedDict):
+class OdometryDocument(Record, frozen=True):
     """Wheels-only paths."""
 
     icr: EndErrorDocument
     no_slip: EndErrorDocument | None
 
 
-class ChangeDocument(TypedDict):
+class ChangeDocument(Record, frozen=True):
     """A terrain change."""
 
     t_s: float
 
 
-class TerrainDocument(TypedDict):
+class TerrainDocument(Record, frozen=True):
     """Terrain changes at which the ICR covariance was inflated."""
 
-    changes: list[ChangeDocument]
+    changes: tuple[ChangeDocument, ...]
 
 
-class SegmentDocument(TypedDict):
+class SegmentDocument(Record, frozen=True):
     """The ICRs between two changes."""
 
     begin_s: float
     end_s: float
-    mean: MaybeByIcr
-    std: MaybeByIcr
+    mean: NumberByIcr
+    std: NumberByIcr
 
 
-class EventDocument(TypedDict):
+class EventDocument(Record, frozen=True):
     """A slip event."""
 
     kind: SlipKind
@@ -128,25 +156,14 @@ class EventDocument(TypedDict):
     confidence: float
 
 
-EVENT_COLUMNS = tuple(EventDocument.__annotations__)
+EVENT_COLUMNS = EventDocument.__struct_fields__
 """The columns of events.csv; seconds count from the first recorded state."""
 
 
-class ClassDocument(TypedDict):
-    """The fixes of one class."""
-
-    fixes: int
-    rejected: int
-    down_weighted: int
-    sold_as_fixed: int
-
-
-class ReferenceJumpDocument(TypedDict):
+class ReferenceJumpDocument(Record, frozen=True):
     """A discontinuity of the reference, as `icrtool.records.events.ReferenceJump`."""
 
     kind: JumpKind
-    begin_s: float
-    end_s: float
     begin_ns: int
     end_ns: int
     north_m: float
@@ -157,9 +174,23 @@ class ReferenceJumpDocument(TypedDict):
     moved_east_m: float
     why: str
     undecided: bool
+    begin_s: float
+    end_s: float
 
 
-class GnssDocument(TypedDict):
+class ClassDocument(Record, frozen=True, kw_only=True):
+    """The fixes of one class; `std_m`: median of what they state, `step_std_m`: white noise from step to step."""
+
+    fixes: int
+    used: int
+    rejected: int
+    down_weighted: int
+    sold_as_fixed: int
+    std_m: float | None
+    step_std_m: float | None
+
+
+class GnssDocument(Record, frozen=True):
     """The position fixes."""
 
     used: int
@@ -169,169 +200,165 @@ class GnssDocument(TypedDict):
     recoveries: int
     mean_difference_m: float | None
     max_difference_m: float | None
-    datum: list[float] | None
+    datum: Triple | None
     delay_s: float | None
     delay_std_s: float | None
     classes: dict[str, ClassDocument]
 
+    def __post_init__(self) -> None:
+        check_together(self, "mean_difference_m", "max_difference_m")
+        check_together(self, "delay_s", "delay_std_s")
 
-class HeadingDocument(TypedDict):
-    """The heading.
 
-    `source`: orientation, dual_antenna_message, antenna_pair, gyro_course, wheels_course or fused; `parts`: of an
-    estimated one; `std_deg`: its median standard deviation as the filter is given it (null for a stated one).
-    """
+class HeadingDocument(HeadingFacts, frozen=True, kw_only=True):
+    """The heading: what the alignment found, and how the filter used it."""
 
-    source: str
-    parts: str | None
-    std_deg: float | None
-    offset_deg: float | None
-    offset_std_deg: float | None
-    offset_name: str | None
-    applied_offset_deg: float
     delay_s: float | None
     delay_std_s: float | None
     applied_delay_s: float
     used: int
     rejected: int
 
+    def __post_init__(self) -> None:
+        check_together(self, "delay_s", "delay_std_s")
+        check_together(self, "offset_deg", "offset_std_deg")
 
-class WarmStartDocument(TypedDict):
+
+class WarmStartDocument(Record, frozen=True):
     """What a run began with."""
 
-    icrs_m: Triple
+    icrs_m: Annotated[list[float], Three]
     covariance_m2: Matrix
 
 
-class IcrStartDocument(TypedDict):
-    """ICRs that the filter started from, and their standard deviations."""
+class FilterDocument(Record, frozen=True, kw_only=True):
+    """What the filter was run with, and the statistics of its innovations; see `icrtool.records.measurements`."""
 
-    icrs_m: Triple
-    std_m: Triple
-
-
-class FilterDocument(TypedDict):
-    """What the filter was run with."""
-
+    preset: str
     process_position_mps: float
     process_heading_degps: float
     reference_delay_s: float
     heading_correlation_s: float
     heading_from_position: bool
     heading_is_estimated: bool
-    heading_is_measured: NotRequired[bool]
-    turn_wander_rad: NotRequired[float | None]
+    heading_is_measured: bool = False
+    turn_wander_rad: float | None = None
     antenna_m: tuple[float, float]
+    antenna_is_known: bool = False
+    states: int
     warm_start: WarmStartDocument | None
-    icr_start: IcrStartDocument | None
+    icr_start: IcrStart | None
     nis_gnss_mean: float | None
+    gnss_rejected: int
     nis_heading_mean: float | None
-    antenna_is_known: NotRequired[bool]
+    heading_rejected: int
 
 
-class VerdictsByIcr(TypedDict):
-    """Whether each ICR was shown."""
-
-    y_icr_right_m: Excited
-    y_icr_left_m: Excited
-    x_icr_m: Excited
-
-
-class ExcitationDocument(TypedDict):
+class ExcitationDocument(Record, frozen=True):
     """What the drive could show of the ICRs."""
 
-    verdict: VerdictsByIcr
+    std_m: NumberByIcr
+    verdict: VerdictByIcr
     turned_right_deg: float
     turned_left_deg: float
     spun_right_deg: float
     spun_left_deg: float
-    sentences: list[str]
+    sentences: tuple[str, ...]
 
 
-class FindingDocument(TypedDict):
-    """An estimate of the alignment."""
-
-    value: float | None
-    std: float | None
-    applied: float
-    why: str
-
-
-class ParameterDocument(TypedDict):
+class ParameterDocument(Record, frozen=True):
     """A parameter of a motion model."""
 
     value: float
     std: float
+    verdict: Literal["shown", "not shown"] = "shown"
 
 
-class ControllerDocument(TypedDict):
-    """What a controller is given: its multiplier and the wheels' radii as factors of the configured one."""
+class ControllerNumbers(Record, frozen=True):
+    """What a differential-drive controller is given, with one standard deviation each.
+
+    Attributes
+    ----------
+    multiplier : (y_r - y_l) / b, beside the radius factors
+    left_radius, right_radius : wheel radius over the configured one, configured scales included
+    """
 
     multiplier: float
     multiplier_std: float
     left_radius: float
+    left_radius_std: float
     right_radius: float
-    left_radius_std: NotRequired[float]
-    right_radius_std: NotRequired[float]
+    right_radius_std: float
 
 
-class GeometryDocument(TypedDict):
+class GeometryDocument(Record, frozen=True, kw_only=True):
     """The ICRs that `controller` belongs to, with one standard deviation each; null where not shown."""
 
-    y_icr_right_m: float | None
-    y_icr_right_m_std: float | None
-    y_icr_left_m: float | None
-    y_icr_left_m_std: float | None
-    x_icr_m: float | None
-    x_icr_m_std: float | None
+    y_icr_right_m: float | None = None
+    y_icr_right_m_std: float | None = None
+    y_icr_left_m: float | None = None
+    y_icr_left_m_std: float | None = None
+    x_icr_m: float | None = None
+    x_icr_m_std: float | None = None
     covariance_m2: Matrix
 
 
-class RecommendedDocument(TypedDict):
-    """The motion model."""
+class RecommendedDocument(Record, frozen=True):
+    """The motion model fitted for one robot: parameters with covariance, ICRs, and what a controller is given."""
 
     label: str
     model: str
+    terms: tuple[str, ...]
     parameters: dict[str, ParameterDocument]
-    controller: ControllerDocument
+    covariance: list[list[float]]
+    not_shown: tuple[str, ...]
+    geometry: dict[str, float]
+    geometry_std: dict[str, float]
+    controller: ControllerNumbers
 
 
-class MotionDocument(TypedDict):
-    """What a run holds of the robot's motion, beside its filter."""
-
-    recommended: RecommendedDocument | None
-    geometry: GeometryDocument | None
-    controller: ControllerDocument | None
-
-
-class RunDocument(TypedDict):
-    """run.json; `recommended`, `geometry`, `controller`: of a run that `icrtool.fit` made."""
+class RunDocument(Record, frozen=True, kw_only=True):
+    """run.json; `recommended`, `geometry`, `controller`: the robot's motion, of a run that `icrtool.fit` made."""
 
     schema: Literal["icrtool/run/1"]
-    log: str
     tool_version: str
-    inputs: list[InputDocument]
-    config: dict[str, Any]
-    streams: list[StreamDocument]
-    warnings: list[str]
-    alignment: dict[str, FindingDocument]
+    log: str
+    inputs: tuple[InputFile, ...]
+    config: Config
+    streams: tuple[StreamChoice, ...]
+    warnings: tuple[str, ...]
+    alignment: dict[str, Finding]
+    drive: DriveDocument
     usable: bool
     unusable_because: str | None
-    drive: DriveDocument
     icr: IcrDocument
     odometry: OdometryDocument
     terrain: TerrainDocument
-    segments: list[SegmentDocument]
+    segments: tuple[SegmentDocument, ...]
     gnss: GnssDocument
     heading: HeadingDocument
-    wheels: dict[str, Any]
-    events: list[EventDocument]
-    reference_jumps: list[ReferenceJumpDocument]
+    wheels: WheelFacts
+    events: tuple[EventDocument, ...]
+    reference_jumps: tuple[ReferenceJumpDocument, ...] = ()
     outages_ns: Spans
     rtk_losses_ns: Spans
     wheel_gaps_ns: Spans
     filter: FilterDocument
     excitation: ExcitationDocument
-    recommended: NotRequired[RecommendedDocument | None]
-    geometry: NotRequired[GeometryDocument | None]
-    controller: NotRequired[ControllerDocument | None]
+    recommended: RecommendedDocument | None = None
+    geometry: GeometryDocument | None = None
+    controller: ControllerNumbers | None = None
+
+    def __post_init__(self) -> None:
+        if self.usable != (self.unusable_because is None):
+            raise ValueError("usable and unusable_because contradict each other")
+
+    @property
+    def content(self) -> tuple[str, ...]:
+        """SHA-256 of each file of the log."""
+        return tuple(file.sha256 for file in self.inputs)
+
+    def icr_of_drive(self, column: IcrColumn) -> tuple[float, float] | None:
+        """Return an ICR of `geometry` and its standard deviation, None where it is not shown."""
+        value, std = (getattr(self.geometry, name, None) for name in (column, f"{column}_std"))
+        return None if value is None or std is None else (value, std)

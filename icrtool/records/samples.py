@@ -182,19 +182,24 @@ class StreamChoice:
     Attributes
     ----------
     topic : topic name; a left/right pair reads ``/left + /right``
-    rate_hz : 1 / median interval
+    rate_hz : 1 / median interval; None where not known
     clock : ``header`` or ``log``: which stamps are used
-    jitter_ms : standard deviation of the interval between samples
+    jitter_ms : standard deviation of the interval between samples, None where not known
     """
 
     role: Role
     topic: str
     message_type: str
     count: int
-    rate_hz: float
+    rate_hz: float | None
     clock: Literal["header", "log"]
-    jitter_ms: float
+    jitter_ms: float | None
     why: str
+
+    @property
+    def samples_text(self) -> str:
+        """Number of samples, and their rate where it is known."""
+        return f"{self.count} samples" + (f" at {self.rate_hz:.4g} Hz" if self.rate_hz is not None else "")
 
     @property
     def is_twist(self) -> bool:
@@ -202,13 +207,13 @@ class StreamChoice:
         return self.role == "wheels" and any(word in self.message_type for word in ("Odometry", "Twist", "ScoutStatus"))
 
 
-def rate_and_jitter(stamps: Ints) -> tuple[float, float]:
-    """Return 1 / median interval [Hz] and the standard deviation of the intervals [ms]; NaN below two stamps."""
+def rate_and_jitter(stamps: Ints) -> tuple[float | None, float | None]:
+    """Return 1 / median interval [Hz] and the standard deviation of the intervals [ms]; None below two stamps."""
     if len(stamps) < 2:
-        return float("nan"), float("nan")
+        return None, None
     interval = np.diff(stamps)
     median = float(np.median(interval))
-    return (1e9 / median if median > 0 else float("inf")), float(interval.std()) / 1e6
+    return (1e9 / median if median > 0 else None), float(interval.std()) / 1e6
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,7 +105,7 @@ class RobotLog:
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><td>{escape(stream.role)}</td><td>{escape(stream.topic)}</td><td>{escape(stream.message_type)}</td>"
-            f"<td>{stream.count:,}</td><td>{stream.rate_hz:.1f} Hz</td></tr>"
+            f"<td>{stream.count:,}</td><td>{'' if stream.rate_hz is None else f'{stream.rate_hz:.1f} Hz'}</td></tr>"
             for stream in self.streams
         )
         heads = "".join(f"<th>{head}</th>" for head in ("stream", "topic", "type", "samples", "rate"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from ruamel.yaml import YAML
 
 from icrtool.cli.export import CONTROLLERS
 from icrtool.output.exports import controllers as export
+from support.documents import with_summary
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
@@ -59,13 +61,11 @@ def test_an_unknown_target_is_wrong_usage(icrtool) -> None:
 
 
 def test_a_run_that_is_not_usable_is_exported_by_force_only(icrtool, runs: Path) -> None:
-    from dataclasses import replace
-
     from icrtool.output.stored_run import open_run
 
     run = open_run(runs / "icrtool-runs" / "mower")
-    spoilt = {"usable": False, "unusable_because": "42 % of the headings rejected"}
-    replace(run, summary=run.summary | spoilt).write(runs / "unusable", plots=())
+    spoilt = with_summary(run, usable=False, unusable_because="42 % of the headings rejected")
+    spoilt.write(runs / "unusable", plots=())
     status, out, err = icrtool("export", "--for", "clearpath", "unusable")
     assert (status, out) == (1, "")
     assert "42 % of the headings rejected" in err
@@ -102,14 +102,10 @@ def test_foxglove_needs_a_file_and_gets_a_layout_beside_it(icrtool, tmp_path: Pa
 
 
 def test_the_paths_of_a_run_that_is_not_usable_are_exported_with_a_warning(icrtool, runs: Path) -> None:
-    from dataclasses import replace
-
     from icrtool.output.stored_run import open_run
 
     run = open_run(runs / "icrtool-runs" / "mower")
-    replace(run, summary=run.summary | {"usable": False, "unusable_because": "it hopped"}).write(
-        runs / "hopping", plots=()
-    )
+    with_summary(run, usable=False, unusable_because="it hopped").write(runs / "hopping", plots=())
     status, out, err = icrtool("export", "--for", "evo", "hopping")
     assert (status, out.count("\n")) == (0, len(run.table))
     assert "it hopped" in err
@@ -123,8 +119,6 @@ def test_a_calibration_file_has_no_paths(icrtool, tmp_path: Path) -> None:
 
 
 def test_a_calibration_that_is_not_fit_for_use_is_exported_by_force_only(icrtool, runs: Path) -> None:
-    from dataclasses import replace
-
     import icrtool as library
 
     good = library.calibrate(library.open_run(runs / "icrtool-runs" / "mower"))

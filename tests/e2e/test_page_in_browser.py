@@ -36,6 +36,7 @@ from icrtool.records.samples import GyroSamples
 from icrtool.records.text import LogText
 from support.barn import TRACK_WIDTH_M, configured, simulate
 from support.browser import Browser, Page, browser, chromium
+from support.documents import with_summary
 from support.recordings import table_errors
 
 HOSTILE = "</script><script>window.hostile=1</script><img src=x onerror='window.hostile=1'>\"'"
@@ -309,11 +310,11 @@ def test_the_moment_follows_the_keyboard(page: Page) -> None:
 
 def test_hostile_names_stay_text(chrome: Browser, run: Run, report: DropoutReport, tmp_path: Path) -> None:
     streams = [{**one, "topic": HOSTILE, "why": HOSTILE} for one in run.summary["streams"]]
-    summary = {**run.summary, "log": HOSTILE, "warnings": [HOSTILE], "streams": streams}
+    hostile = with_summary(run, log=HOSTILE, warnings=[HOSTILE], streams=streams)
     document = report_document(report)
     document["models"] = [{**one, "label": HOSTILE} for one in document["models"]]
     file = tmp_path / "hostile.html"
-    file.write_text(run_page(replace(run, summary=summary), document, {}), encoding="utf-8")
+    file.write_text(run_page(hostile, document, {}), encoding="utf-8")
     page = chrome.page()
     page.open(file)
     page.evaluate("icrtoolPage.openLoop(100)")

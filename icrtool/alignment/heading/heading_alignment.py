@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.track import Track
+from icrtool.records.measurements import HeadingFacts
+from icrtool.records.plain_data import known
 from icrtool.records.tables import RobotLog
 
 FEWEST_WINDOWS = 8
@@ -146,19 +148,25 @@ class HeadingAlignment:
         """Offset of the log's heading that is still to be corrected."""
         return 0.0 if self.is_estimated else self.applied_offset_rad
 
-    def summary(self) -> dict[str, Any]:
-        """Return the numbers for run.json, angles in degrees, NaN for what is not known."""
-        angles = ("offset", "offset_std", "scatter", "applied_offset", "applied_std", "std")
-        return {
-            "source": self.source,
-            "parts": self.parts or None,
-            "windows": self.windows,
-            "applied_mirror": self.applied_mirror,
-            **{f"{name}_deg": math.degrees(getattr(self, f"{name}_rad")) for name in angles},
-            **self.name.summary(),
-            "agreement": self.agreement,
-            "mirrored_agreement": self.mirrored_agreement,
-        }
+    def facts(self) -> HeadingFacts:
+        """Return what run.json holds, angles in degrees."""
+        return HeadingFacts(
+            source=self.source,
+            parts=self.parts or None,
+            windows=self.windows,
+            applied_mirror=self.applied_mirror,
+            offset_deg=known(math.degrees(self.offset_rad)),
+            offset_std_deg=known(math.degrees(self.offset_std_rad)),
+            scatter_deg=known(math.degrees(self.scatter_rad)),
+            applied_offset_deg=math.degrees(self.applied_offset_rad),
+            applied_std_deg=math.degrees(self.applied_std_rad),
+            std_deg=known(math.degrees(self.std_rad)),
+            offset_name=self.name.text or None,
+            magnetic_declination_deg=self.name.declination_deg,
+            utm_convergence_deg=self.name.convergence_deg,
+            agreement=known(self.agreement),
+            mirrored_agreement=known(self.mirrored_agreement),
+        )
 
 
 def align_heading(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 from icrtool.records.samples import Datum
 
@@ -32,14 +31,6 @@ class OffsetName:
     text: str
     declination_deg: float | None
     convergence_deg: float | None
-
-    def summary(self) -> dict[str, Any]:
-        """Return the numbers for run.json."""
-        return {
-            "offset_name": self.text or None,
-            "magnetic_declination_deg": self.declination_deg,
-            "utm_convergence_deg": self.convergence_deg,
-        }
 
 
 NO_NAME = OffsetName("", None, None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,8 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
 from icrtool.kernels.track import Track
+from icrtool.records.measurements import WheelFacts
+from icrtool.records.plain_data import known
 from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import RobotLog
 
@@ -77,17 +78,22 @@ class WheelAlignment:
         """Mean of what both sides were multiplied with."""
         return (self.applied[0] + self.applied[1]) / 2
 
-    def summary(self) -> dict[str, Any]:
-        """Return the numbers for run.json; ``applied_left_scale`` and its like hold the configured scale."""
-        return {
-            "scale": self.scale,
-            "scale_std": self.scale_std,
-            "applied_scale": self.applied_scale,
-            "applied_left_scale": self.applied[0] * self.configured[0],
-            "applied_right_scale": self.applied[1] * self.configured[1],
-            "held_share": self.held_share,
-            "filtered": self.filtered or None,
-        }
+    def facts(self, fit: AlignmentFit | None) -> WheelFacts:
+        """Return what run.json holds; `fit` is that of the windows, None where the drive is too short."""
+        count = len(fit.windows.begin) if fit is not None else 0
+        groups = () if fit is None else (fit.windows.group, fit.windows.turn_group)
+        return WheelFacts(
+            scale=known(self.scale),
+            scale_std=known(self.scale_std),
+            applied_scale=self.applied_scale,
+            applied_left_scale=self.applied[0] * self.configured[0],
+            applied_right_scale=self.applied[1] * self.configured[1],
+            held_share=known(self.held_share),
+            filtered=self.filtered or None,
+            windows=count,
+            stretches=len(np.union1d(*groups)) if groups else 0,
+            residual_m=None if fit is None else known(math.hypot(*fit.fit.scale[[0, count]].tolist())),
+        )
 
 
 def configured_scales(config: Config) -> tuple[float, float]:

@@ -34,7 +34,7 @@ def suite_of(name: str, outcome: Outcome) -> Suite:
     """Return the acceptance limits of a report, or of a log that has none."""
     if isinstance(outcome, IcrToolError):
         return Suite(name, error=str(outcome))
-    return Suite(run_title(outcome.run_summary), outcome.verdicts)
+    return Suite(run_title(outcome.run_document), outcome.verdicts)
 
 
 def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-report") -> None:
@@ -83,7 +83,7 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
 
 def format_markdown(report: DropoutReport) -> str:
     """Return one report as Markdown: the verdicts, then the sentences and tables that are printed."""
-    title, verdicts = run_title(report.run_summary), [one.line() for one in report.verdicts]
+    title, verdicts = run_title(report.run_document), [one.line() for one in report.verdicts]
     lines = [f"## {escaped_markdown(title)}", ""]
     if verdicts:
         word = "All acceptance limits are met." if report.passed else "**An acceptance limit is not met.**"
@@ -103,7 +103,7 @@ def format_markdown(report: DropoutReport) -> str:
 def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str]:
     """Return the table against the baseline: number, difference and its 95 % interval."""
     shown = shown_horizons(report.horizons_m)
-    changes = [f"- {escaped_markdown(change)}" for change in baseline.changes(report.run_summary)]
+    changes = [f"- {escaped_markdown(change)}" for change in baseline.changes(report.run_document)]
     lines = [
         "",
         f"Against the baseline ({escaped_markdown(baseline.log)}, icrtool {escaped_markdown(baseline.tool_version)}):",
@@ -111,7 +111,7 @@ def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str
     ]
     head = ("difference to the baseline", *(f"{report.horizons_m[h]:g} m" for h in shown))
     rows = []
-    same = baseline.is_of(report.run_summary)
+    same = baseline.is_of(report.run_document)
     for result in report.results:
         for label, metric, column in (
             ("95 %", "p95", result.summary.p95),

@@ -12,12 +12,13 @@ import numpy as np
 from icrtool import __version__
 from icrtool.calibration.controller_numbers import POSE_AFTER_M, export_warnings, factor_to_old
 from icrtool.calibration.error_growth import TWIST_OVER_M
-from icrtool.calibration.record import Calibration, ControllerErrors, ControllerNumbers
+from icrtool.calibration.record import Calibration, ControllerErrors
 from icrtool.errors import DataError
 from icrtool.output.exports.twist_model import format_twist
 from icrtool.output.files.json_file import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import controller_error_text
+from icrtool.records.run_document import ControllerNumbers
 
 Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]
 TARGETS: tuple[Target, ...] = get_args(Target)

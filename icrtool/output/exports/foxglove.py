@@ -39,6 +39,7 @@ from icrtool.output.exports.paths import (
     rows_apart,
 )
 from icrtool.output.files.own_files import EXPORTED_MCAP
+from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.samples import FIXED_FIX
 
@@ -112,11 +113,11 @@ def write_foxglove(run: Run, path: Path) -> None:
     ]
     topics = [serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
     topics += [_whole_path(path, store) for path in paths]
-    slip = ({**event, "x_m": event["east_m"], "y_m": event["north_m"]} for event in run.summary["events"])
+    slip = ({**plain(event), "x_m": event.east_m, "y_m": event.north_m} for event in run.document.events)
     topics += [_event_topic("/events", slip, store), _event_topic("/outages", _outages(run), store)]
     about = {
         "tool_version": __version__, "log": run.name, "robot": run.config.robot.name or "", "usable": str(run.usable),
-        "unusable_because": run.summary["unusable_because"] or "",
+        "unusable_because": run.document.unusable_because or "",
         "datum": "" if globe is None else " ".join(f"{value!r}" for value in globe),
     }  # fmt: skip
     write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about, library=LIBRARY)

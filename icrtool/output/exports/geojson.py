@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,7 @@ def format_geojson(run: Run) -> str:
     ]
     about = {
         "log": run.name, "robot": run.config.robot.name, "usable": run.usable,
-        "unusable_because": run.summary["unusable_because"], "tool_version": __version__,
+        "unusable_because": run.document.unusable_because, "tool_version": __version__,
     }  # fmt: skip
     document = {"type": "FeatureCollection", "name": run.name, "icrtool": about, "features": features}
     return orjson.dumps(plain(document)).decode()
@@ -144,7 +144,7 @@ _USES = {UNSEEN: "not in the run", GATED: "rejected"}
 
 def event_features(run: Run, globe: Globe) -> Iterator[dict[str, Any]]:
     """Yield a point for each slip event."""
-    events: Sequence[Mapping[str, Any]] = run.summary["events"]
+    events: list[dict[str, Any]] = plain(run.document.events)
     if not events:
         return
     columns = {name: [event[name] for event in events] for name in events[0] if name not in ("north_m", "east_m")}

@@ -37,7 +37,7 @@ def format_kml(run: Run) -> str:
     ET.register_namespace("gx", GX)
     root = ET.Element(f"{{{KML}}}kml")
     document = _child(root, "Document")
-    _child(document, "name", run_title(run.summary))
+    _child(document, "name", run_title(run.document))
     _child(document, "description", _about(run))
     for name, color in COLORS.items():
         style = _child(document, "Style")
@@ -71,8 +71,8 @@ def format_kml(run: Run) -> str:
 
 def _about(run: Run) -> str:
     begin, _ = utc_text(run.table.stamp_ns[[0, -1]])
-    driven = f"{begin}: {driven_text(run.summary['drive'])}"
-    return driven if run.usable else f"{driven}. Not usable: {run.summary['unusable_because']}"
+    driven = f"{begin}: {driven_text(run.document.drive)}"
+    return driven if run.usable else f"{driven}. Not usable: {run.document.unusable_because}"
 
 
 def _child(parent: ET.Element, tag: str, text: str | None = None) -> ET.Element:

@@ -97,7 +97,7 @@ def paths_of(run: Run) -> tuple[ExportPath, ...]:
 
 def globe_of(run: Run) -> Globe | None:
     """Return the datum of a run; None where its positions were metric and none was configured."""
-    if (datum := run.summary["gnss"]["datum"]) is not None:
+    if (datum := run.document.gnss.datum) is not None:
         return Globe(*datum)
     return Globe(*run.config.frames.datum, 0.0) if run.config.frames.datum is not None else None
 

@@ -72,7 +72,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
     most = int(report.counts.trials.max())
     keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
     figure = new_figure(
-        title, f"{run_title(report.run_summary)}: up to {most:,} trials a distance; bands: 95 % intervals",
+        title, f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals",
         height_in=4.6 + keys_in, margins_in=(0.75, 0.25, 0.65, 0.95 + keys_in),
     )  # fmt: skip
     axes = figure.subplots()
@@ -111,7 +111,7 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
     distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
     figure = new_figure(
         f"95 % of the trials end within {errors} m after {distances} m",
-        f"{run_title(report.run_summary)}: open-loop error, {MODEL_WORDS.get(model.name, model.label)}",
+        f"{run_title(report.run_document)}: open-loop error, {MODEL_WORDS.get(model.name, model.label)}",
         height_in=1.55 + LOW_PANEL_IN * len(places), margins_in=(0.75, 0.25, 0.85, 0.9), hspace=0.38,
     )  # fmt: skip
     panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
@@ -144,7 +144,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     p95 = [float(result.summary.p95[h]) for result in results]
     figure = new_figure(
         f"After {horizon_m:g} m 95 % of the trials end within {min(p95):.2f} to {max(p95):.2f} m, by model",
-        f"{run_title(report.run_summary)}: open-loop error of {int(report.counts.trials[h]):,} trials",
+        f"{run_title(report.run_document)}: open-loop error of {int(report.counts.trials[h]):,} trials",
         height_in=1.5 + PANEL_HEIGHT_IN * len(results), margins_in=(0.75, 0.2, 0.85, 0.9), hspace=0.45,
     )  # fmt: skip
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]

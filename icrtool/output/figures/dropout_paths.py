@@ -80,7 +80,7 @@ def dropout_examples(report: DropoutReport) -> Figure:
     errors = " and ".join(error_text(one.errors_m[one.model]) for one in examples)
     what = "about half a turn (left), as straight as the drive has it (right)"
     figure = new_figure(
-        f"Typical trials of {examples[0].horizon_m:g} m end {errors} off", f"{run_title(report.run_summary)}: {what}",
+        f"Typical trials of {examples[0].horizon_m:g} m end {errors} off", f"{run_title(report.run_document)}: {what}",
         height_in=4.7, margins_in=(0.75, 0.2, 1.0, 0.9), wspace=0.34,
     )  # fmt: skip
     panels = figure.subplots(1, len(examples), squeeze=False)[0]
@@ -109,7 +109,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
     which = f"{_word(report, model)}, the {len(worst)} worst trials, none overlapping"
     figure = new_figure(
         f"The worst trial of {worst[0].horizon_m:g} m ends {error_text(worst[0].errors_m[model])} off",
-        f"{run_title(report.run_summary)}: {which}",
+        f"{run_title(report.run_document)}: {which}",
         width_in=WORST_WIDTH_IN, height_in=1.0 + rows * (WORST_CELL_IN + 0.5), margins_in=(0.15, 0.15, 0.98, 0.5),
         wspace=0.12, hspace=0.27,
     )  # fmt: skip
@@ -196,7 +196,7 @@ def dropout_outages(report: DropoutReport) -> Figure:
     easts = np.concatenate([report.reference_east_m, *(one.east_m for one in outages)])
     width_in = WIDTH_IN - 0.95
     box_in = fitted_box_in(norths, easts, width_in)
-    figure = new_figure(_outages_text(outages), run_title(report.run_summary), height_in=box_in + 1.65)
+    figure = new_figure(_outages_text(outages), run_title(report.run_document), height_in=box_in + 1.65)
     axes = figure.subplots()
     cell = look_down(axes, norths, easts, width_in / box_in, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
@@ -240,12 +240,10 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
             label="where each ends",
         )  # fmt: skip
     end_s = drive.t_s + drive.horizon_m / max(drive.speed_mean_mps, SLOWEST_MPS)
-    jumps = [
-        one for one in report.run_summary["reference_jumps"] if drive.t_s <= one["end_s"] and one["begin_s"] <= end_s
-    ]
+    jumps = [one for one in report.run_document.reference_jumps if drive.t_s <= one.end_s and one.begin_s <= end_s]
     if jumps:
         axes.plot(
-            [one["east_m"] - drive.east_m for one in jumps], [one["north_m"] - drive.north_m for one in jumps],
+            [one.east_m - drive.east_m for one in jumps], [one.north_m - drive.north_m for one in jumps],
             label="step of the reference", **JUMP_LOOK,
         )  # fmt: skip
 

@@ -49,13 +49,13 @@ def gnss_difference(run: Run) -> Figure:
 
     Of many fixes, the range and the median in each of `BINS` equal times are drawn.
     """
-    facts = run.summary["gnss"]
-    mean, most = facts["mean_difference_m"], facts["max_difference_m"]
-    of, word = facts["used"] + facts["rejected"], position_word(run.summary)
+    facts = run.document.gnss
+    mean, most = facts.mean_difference_m, facts.max_difference_m
+    of, word = facts.used + facts.rejected, position_word(run.document)
     apart = f"{error_text(mean)} from the {word} on average, " if mean is not None else ""
     figure = new_figure(
-        f"Filter {apart}{100 * facts['rejected'] / max(of, 1):.0f} % rejected",
-        f"{run_title(run.summary)}: distance between filter and {word}, {of:,} of them", height_in=3.9,
+        f"Filter {apart}{100 * facts.rejected / max(of, 1):.0f} % rejected",
+        f"{run_title(run.document)}: distance between filter and {word}, {of:,} of them", height_in=3.9,
     )  # fmt: skip
     axes = figure.subplots()
     unit, seconds = time_unit(float(run.table.t_s[-1]))

@@ -66,13 +66,13 @@ def icr_estimates(run: Run) -> Figure:
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
     spans = _spans_s(run)
-    finals = ((ICR_WORDS[column], run.summary["icr"]["final"][column]) for column in ICR_COLUMNS)
+    finals = ((ICR_WORDS[column], run.document.icr.final[column]) for column in ICR_COLUMNS)
     ends = ", ".join(
         f"{word} {signed(value)} m" if value is not None else f"{word} not shown" for word, value in finals
     )
     learning = "; left: learning, right: after it" if len(spans) > 1 else ""
     figure = new_figure(
-        f"The ICRs end at {ends}", f"{run_title(run.summary)}: estimates of the filter{learning}",
+        f"The ICRs end at {ends}", f"{run_title(run.document)}: estimates of the filter{learning}",
         height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3,
     )  # fmt: skip
     panels = figure.subplots(
@@ -95,12 +95,13 @@ def icr_clusters(run: Run) -> Figure:
     """Return histograms of the three ICR estimates [m] after convergence, in percent of the time."""
     settled = run.settled_s
     after = run.table.t_s >= settled
-    mean, std = run.summary["icr"]["mean"], run.summary["icr"]["std"]
+    mean, std = run.document.icr.mean, run.document.icr.std
     spread = (f"{ICR_WORDS[column]} ±{std[column]:.3f} m" for column in ICR_COLUMNS if mean[column] is not None)
-    known = any(value is not None for value in mean.values())
+    known = any(mean[column] is not None for column in ICR_COLUMNS)
     figure = new_figure(
         f"The ICRs scatter by {', '.join(spread)}" if known else "No ICR is shown",
-        f"{run_title(run.summary)}: estimates from {settled:.1f} s on", height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.9),
+        f"{run_title(run.document)}: estimates from {settled:.1f} s on",
+        height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.9),
     )  # fmt: skip
     panels = figure.subplots(1, 3, sharey=True)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
@@ -150,9 +151,9 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     axes.locator_params(axis="y", nbins=5)
     for change in run.changes_s:
         axes.axvline(change / unit, zorder=2.6, label="terrain change", **CHANGE.keywords())
-    for segment in run.summary["segments"]:
-        if (mean := segment["mean"][column]) is not None:
-            stretch = segment["begin_s"] / unit, segment["end_s"] / unit
+    for segment in run.document.segments:
+        if (mean := segment.mean[column]) is not None:
+            stretch = segment.begin_s / unit, segment.end_s / unit
             axes.plot(stretch, (mean, mean), zorder=2.5, label="mean between", **SEGMENT.keywords())
     shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit, label="no usable GNSS")
     _mark_clipped(axes, t, value)
@@ -188,7 +189,7 @@ def _convergence_text(run: Run, column: IcrColumn) -> str:
 
 
 def _final_text(run: Run, column: IcrColumn) -> str:
-    final, std = run.summary["icr"]["final"][column], run.summary["icr"]["final_std"][column]
+    final, std = run.document.icr.final[column], run.document.icr.final_std[column]
     return f"final {signed(final)} ± {std:.3f} m" if final is not None else "not shown by this drive"
 
 
@@ -203,7 +204,7 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
         axes, edges, 100 * share / max(weight.sum(), 1e-9), color=BAR_COLOR, label=f"estimates, bins of {width:g} m"
     )
     axes.set_xlim(low, high)
-    mean, std = run.summary["icr"]["mean"][column], run.summary["icr"]["std"][column]
+    mean, std = run.document.icr.mean[column], run.document.icr.std[column]
     title = "not shown"
     if mean is not None:
         axes.axvline(mean, label="mean", **MEAN.keywords())

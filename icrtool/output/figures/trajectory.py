@@ -91,7 +91,7 @@ def trajectory(run: Run) -> Figure:
     width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
     figure = new_figure(
-        _end_errors_text(run.summary["odometry"]), f"{run_title(run.summary)}: {driven_text(run.summary['drive'])}",
+        _end_errors_text(run.document.odometry), f"{run_title(run.document)}: {driven_text(run.document.drive)}",
         height_in=box_in + MARGINS_IN[2] + MARGINS_IN[3], margins_in=MARGINS_IN,
     )  # fmt: skip
     axes = figure.subplots()
@@ -112,9 +112,9 @@ def trajectory(run: Run) -> Figure:
 
 
 def _end_errors_text(odometry: OdometryDocument) -> str:
-    ends = {"the final ICRs": odometry["icr"], "no slip": odometry["no_slip"]}
+    ends = {"the final ICRs": odometry.icr, "no slip": odometry.no_slip}
     return "Wheels alone end " + ", ".join(
-        f"{distance_text(end['end_error_m'])} off with {name}" for name, end in ends.items() if end is not None
+        f"{distance_text(end.end_error_m)} off with {name}" for name, end in ends.items() if end is not None
     )
 
 
@@ -146,7 +146,7 @@ def _draw_odometry(axes: Axes, path: OdometryPath, cell_m: float, pen: Pen, name
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:
     """Draw the fixes in view: those used, by class, and those rejected."""
-    fixes, word, gnss = run.sensors.fixes, position_word(run.summary), run.gnss
+    fixes, word, gnss = run.sensors.fixes, position_word(run.document), run.gnss
     several = len(np.unique(fixes.fix_class)) > 1
     groups = [
         (gnss.used & (fixes.fix_class == value), look, f"{word}, {CLASSES[value]}" if several else word)

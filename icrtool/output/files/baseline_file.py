@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -58,18 +58,17 @@ class Baseline:
         """Return the logs of the baseline that are not among some others, by name."""
         return sorted(set(self.reports) - set(logs))
 
-    def find(self, name: str, inputs: Sequence[Mapping[str, Any]]) -> BaselineReport | None:
+    def find(self, name: str, content: Collection[str]) -> BaselineReport | None:
         """Return the report of a log: that of the same content, else of the same name; None where there is none.
 
-        A baseline that is one report file is that of any log.
+        `content` is the SHA-256 of each of its files. A baseline that is one report file is that of any log.
 
         Raises
         ------
         ConfigError
             The report cannot be read.
         """
-        content = {file["sha256"] for file in inputs}
-        found = next((log for log, files in self.sha256.items() if content and content <= set(files)), None)
+        found = next((log for log, files in self.sha256.items() if content and set(content) <= set(files)), None)
         if found is None and self.path.is_file():
             found = next(iter(self.reports))
         found = found if found is not None else name if name in self.reports else None

@@ -81,7 +81,7 @@ def schema_of(file: Path, inside: Path | None = None) -> str:
     return schema if isinstance(schema, str) else ""
 
 
-def json_bytes(document: Mapping[str, Any]) -> bytes:
+def json_bytes(document: msgspec.Struct | Mapping[str, Any]) -> bytes:
     """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
     text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
     # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.

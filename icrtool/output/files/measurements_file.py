@@ -9,7 +9,7 @@ import math
 from dataclasses import fields, replace
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, cast
+from typing import Any
 from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Ints
 from icrtool.records.events import ReferenceJump, SlipEvent
-from icrtool.records.measurements import Fixes, IcrStart, SensorData
+from icrtool.records.measurements import Fixes, SensorData
 from icrtool.records.regular_file import open_regular
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
@@ -86,9 +86,7 @@ def read_measurements(
     OSError
         The file cannot be read.
     """
-    facts = document["filter"]
-    events, jumps = (cast("list[dict[str, Any]]", document[key]) for key in ("events", "reference_jumps"))
-    start = facts["icr_start"]
+    facts = document.filter
     try:
         with open_regular(directory / MEASUREMENTS_FILE, directory) as file, ZipFile(file) as stored:
             if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
@@ -99,21 +97,24 @@ def read_measurements(
         fixes = Fixes(**_columns(columns, "fixes", _names(Fixes)))
         headings = HeadingSamples(**_columns(columns, "headings", _names(HeadingSamples)))
         sensors = SensorData(
-            name=document["log"],
+            name=document.log,
             wheels=WheelSamples(stamps, left, right),
             fixes=fixes,
             headings=headings,
             gyro=_gyro(columns) if "gyro_topic" in columns else None,
-            heading_from_position=facts["heading_from_position"],
-            heading_correlation_s=facts["heading_correlation_s"],
-            antenna_m=(facts["antenna_m"][0], facts["antenna_m"][1]),
-            losses_ns=spans_of(document["rtk_losses_ns"]),
-            events=tuple(SlipEvent(*(event[name] for name in SlipEvent._fields)) for event in events),
-            jumps=tuple(ReferenceJump(*(jump[name] for name in ReferenceJump._fields)) for jump in jumps),
-            icr_start=None if start is None else IcrStart(_triple(start["icrs_m"]), _triple(start["std_m"])),
-            heading_is_estimated=facts["heading_is_estimated"],
-            heading_is_measured=facts.get("heading_is_measured", False),
-            turn_wander_rad=math.inf if (wander := facts.get("turn_wander_rad")) is None else wander,
+            heading_from_position=facts.heading_from_position,
+            heading_correlation_s=facts.heading_correlation_s,
+            antenna_m=facts.antenna_m,
+            losses_ns=spans_of(document.rtk_losses_ns),
+            events=tuple(SlipEvent(*(getattr(one, name) for name in SlipEvent._fields)) for one in document.events),
+            jumps=tuple(
+                ReferenceJump(*(getattr(one, name) for name in ReferenceJump._fields))
+                for one in document.reference_jumps
+            ),
+            icr_start=facts.icr_start,
+            heading_is_estimated=facts.heading_is_estimated,
+            heading_is_measured=facts.heading_is_measured,
+            turn_wander_rad=math.inf if facts.turn_wander_rad is None else facts.turn_wander_rad,
             attitude=_attitude(columns) if "attitude_stamp_ns" in columns else None,
         )
         outcomes = [
@@ -135,11 +136,6 @@ def _array(stored: ZipFile, member: ZipInfo) -> NDArray[Any]:
 def spans_of(pairs: object) -> Ints:
     """Return the spans of a run.json as an array (k, 2) [ns]."""
     return np.array(pairs, np.int64).reshape(-1, 2)
-
-
-def _triple(numbers: list[float]) -> tuple[float, float, float]:
-    one, two, three = numbers
-    return one, two, three
 
 
 def _names(record: type) -> tuple[str, ...]:

@@ -57,13 +57,13 @@ def answer_of(summary: RunDocument, report: Mapping[str, Any]) -> dict[str, Any]
     }
 
 
-def _reaches(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[tuple[float, list[tuple[str, str, str]]]]:
+def _reaches(summary: RunDocument, report: Mapping[str, Any]) -> list[tuple[float, list[tuple[str, str, str]]]]:
     budgets = []
     for row in report["budgets"]:
         known: dict[str, Any] = {key: math.nan if value is None else value for key, value in row.items()}
         budgets.append(BudgetDistance(**known))
     given = [(one["name"], one["label"], one["fitted"]) for one in report["calibrations"]]
-    events = len(summary["events"])
+    events = len(summary.events)
     sizes = dict.fromkeys(one.budget_m for one in budgets)
     return [(size, rows) for size in sizes if (rows := reach_rows(budgets, given, size, events))]
 
@@ -86,21 +86,21 @@ def _export(calibration: Calibration | None) -> str:
         return ""
 
 
-def _checks(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Check]:
+def _checks(summary: RunDocument, report: Mapping[str, Any]) -> list[Check]:
     """Return the reasons, the gravest first."""
     grades: dict[Grade, int] = {"bad": 0, "care": 1, "good": 2, "fact": 3}
-    shown = set(summary["excitation"]["verdict"].values()) == {"shown"}
-    found: list[Check] = [("good" if shown else "care", f"The drive: {excitation_text(summary['excitation'])}.")]
+    shown = summary.excitation.verdict.all_shown
+    found: list[Check] = [("good" if shown else "care", f"The drive: {excitation_text(summary.excitation)}.")]
     found += [("good" if one["passed"] else "bad", f"Acceptance limit: {one['verdict']}.") for one in report["gates"]]
     found += [*_incidents(summary, report), *_trials(report)]
     return sorted(found, key=lambda one: grades[one[0]])
 
 
-def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Check]:
+def _incidents(summary: RunDocument, report: Mapping[str, Any]) -> list[Check]:
     """Return what happened on the drive: warnings, slip, outages, rejected fixes, jumps."""
-    gnss, events = summary["gnss"], summary["events"]
+    gnss, events = summary.gnss, summary.events
     found: list[Check] = []
-    if warnings := len(summary["warnings"]):
+    if warnings := len(summary.warnings):
         found.append(("care", f"{counted(warnings, 'warning')} about the log."))
     if events:
         what = "the ICRs are not learned there" + ("" if report["without_events"] else ", but trials across them count")
@@ -109,10 +109,10 @@ def _incidents(summary: Mapping[str, Any], report: Mapping[str, Any]) -> list[Ch
         worst = max(real, key=lambda one: one["end_error_m"] or 0.0)
         error = f"{error_text(worst['end_error_m'])} off after {worst['distance_m']:.1f} m"
         found.append(("fact", f"{counted(len(real), 'real outage')}: in the worst the filter was {error}."))
-    if of := gnss["used"] + gnss["rejected"]:
-        share = 100 * gnss["rejected"] / of
-        found.append(("fact", f"{gnss['rejected']:,} of {of:,} positions ({share:.0f} %) were rejected."))
-    if jumps := jump_count(summary["reference_jumps"]):
+    if of := gnss.used + gnss.rejected:
+        share = 100 * gnss.rejected / of
+        found.append(("fact", f"{gnss.rejected:,} of {of:,} positions ({share:.0f} %) were rejected."))
+    if jumps := jump_count(summary.reference_jumps):
         counts = "trials across them count" if report["with_jumps"] else "no trial crosses a jump"
         found.append(("care", f"{jumps}: {counts}."))
     return found

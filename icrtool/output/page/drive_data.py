@@ -274,9 +274,9 @@ def _calibrated(recording_of: Callable[[str], Recording], report: Mapping[str, A
 
 def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:
     return [
-        {"kind": one["kind"], "begin_s": one["begin_s"], "end_s": one["end_s"], "severity": one["severity"],
-         "north": one["north_m"] - origin[0], "east": one["east_m"] - origin[1]}
-        for one in run.summary["events"]
+        {"kind": one.kind, "begin_s": one.begin_s, "end_s": one.end_s, "severity": one.severity,
+         "north": one.north_m - origin[0], "east": one.east_m - origin[1]}
+        for one in run.document.events
     ]  # fmt: skip
 
 

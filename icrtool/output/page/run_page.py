@@ -30,6 +30,7 @@ from icrtool.output.text_format import duration_text, error_text, position_word,
 from icrtool.records.plain_data import plain
 from icrtool.records.regular_file import read_regular
 from icrtool.records.run import ICR_WORDS, Run
+from icrtool.records.run_document import RunDocument
 
 SCRIPTS = (
     "vendor/uPlot.iife.min.js",
@@ -85,16 +86,17 @@ def run_page(
     if not coordinates:
         pictures = _without_place(run, pictures)
         run, document = without_place(run, document)
-    summary = run.summary
+    summary = run.document
     compared = with_smoothed_reference(run) if document.setdefault("smoothed", False) else run
     return render(
         "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
-        title=summary["log"], summary=summary, report=document, answer=answer_of(summary, document),
+        title=summary.log, summary=summary, report=document, answer=answer_of(summary, document),
         pictures=pictures, twins=TWINS, icr_words=ICR_WORDS, position_word=position_word(summary),
-        warnings=[one.removeprefix(f"{summary['log']}: ") for one in summary["warnings"]],
-        streams=[{**one, "role": role_word(summary, one["role"])} for one in summary["streams"]],
+        warnings=[one.removeprefix(f"{summary.log}: ") for one in summary.warnings],
+        streams=[(role_word(summary, one.role), one) for one in summary.streams],
         begun=_utc(int(run.table.stamp_ns[0])),
-        errors=_error_rows(document), worst=_worst_rows(document, summary), config=_config_lines(summary["config"]),
+        errors=_error_rows(document), worst=_worst_rows(document, summary),
+        config=_config_lines(summary.config.effective()),
         coordinates=coordinates, samples=len(run.table), worst_label=_worst_label(document),
         main_rows=main_rows(document),
     )  # fmt: skip
@@ -142,7 +144,7 @@ def draw_pictures(run: Run) -> dict[str, Picture]:
 
 def _without_place(run: Run, pictures: Mapping[str, Picture]) -> dict[str, Picture]:
     """Return the pictures that do not show coordinates; relative to a datum that is left out they show no place."""
-    metric = run.summary["gnss"]["datum"] is None
+    metric = run.document.gnss.datum is None
     return {name: one for name, one in pictures.items() if not (metric and one.with_place)}
 
 
@@ -164,7 +166,7 @@ def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _worst_rows(report: Mapping[str, Any], summary: RunDocument) -> list[dict[str, Any]]:
     """Return the worst trials, each with what happened meanwhile: jumps of the position, outages, slip."""
     found: list[dict[str, Any]] = []
     for one in report["worst"]:
@@ -172,13 +174,11 @@ def _worst_rows(report: Mapping[str, Any], summary: Mapping[str, Any]) -> list[d
         end_s = one["t_s"] + (one["horizon_m"] / speed if speed else 0.0)
         end_ns = one["stamp_ns"] + round(1e9 * (end_s - one["t_s"]))
         sizes = [
-            jump["size_m"]
-            for jump in summary["reference_jumps"]
-            if jump["begin_ns"] < end_ns and jump["end_ns"] > one["stamp_ns"]
+            jump.size_m for jump in summary.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > one["stamp_ns"]
         ]
         real = [out for out in report["outages"] if out["kind"] == "real"]
         lost = [out for out in real if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
-        slips = [slip["kind"] for slip in summary["events"] if slip["begin_s"] < end_s and slip["end_s"] > one["t_s"]]
+        slips = [slip.kind for slip in summary.events if slip.begin_s < end_s and slip.end_s > one["t_s"]]
         notes = [f"the position steps by {error_text(max(sizes))}"] if sizes else []
         notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]
         notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]

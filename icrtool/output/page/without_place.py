@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
+
+import msgspec
 
 from icrtool.records.run import Run
 
@@ -26,19 +29,16 @@ def without_place(run: Run, report: Mapping[str, Any]) -> tuple[Run, dict[str, A
     def moved(one: Mapping[str, Any]) -> dict[str, Any]:
         return {**one, "north_m": one["north_m"] - north, "east_m": one["east_m"] - east}
 
-    summary, heading = run.summary, run.summary["heading"]
-    cause = heading.get("offset_name")
-    config = {**summary["config"], "frames": {**summary["config"]["frames"], "datum": None}}
-    hidden = dict.fromkeys(("magnetic_declination_deg", "utm_convergence_deg", "offset_name"))
-    datum = summary["gnss"]["datum"]
-    shown: Any = {
-        **summary,
-        "config": config,
-        "warnings": [one.replace(cause, f"its cause is {HIDDEN}") if cause else one for one in summary["warnings"]],
-        "gnss": {**summary["gnss"], "datum": None if datum is None else [HIDDEN]},
-        "heading": {**heading, **hidden},
-        "events": [moved(one) for one in summary["events"]],
-    }
+    changed, document = msgspec.structs.replace, run.document
+    cause, datum = document.heading.offset_name, document.gnss.datum
+    shown = changed(
+        document,
+        config=replace(document.config, frames=replace(document.config.frames, datum=None)),
+        warnings=tuple(one.replace(cause, f"its cause is {HIDDEN}") if cause else one for one in document.warnings),
+        gnss=changed(document.gnss, datum=None if datum is None else (math.nan, math.nan, math.nan)),
+        heading=changed(document.heading, offset_name=None, magnetic_declination_deg=None, utm_convergence_deg=None),
+        events=tuple(changed(one, north_m=one.north_m - north, east_m=one.east_m - east) for one in document.events),
+    )
     sensors, fixes = run.sensors, run.sensors.fixes
     at_origin = replace(
         run,
@@ -48,7 +48,7 @@ def without_place(run: Run, report: Mapping[str, Any]) -> tuple[Run, dict[str, A
             fixes=replace(fixes, north_m=fixes.north_m - north, east_m=fixes.east_m - east),
             events=tuple(one._replace(north_m=one.north_m - north, east_m=one.east_m - east) for one in sensors.events),
         ),
-        summary=shown,
+        document=shown,
     )
     drives = {name: [moved(one) for one in report[name]] for name in ("worst", "examples")}
     return at_origin, {**report, **drives}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shlex
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from icrtool.calibration.one_log import LogCalibration
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.observability import lacking_turns
-from icrtool.motion.models import TERMS
+from icrtool.motion.models import ICRS, TERMS
 from icrtool.output.tables.calibration import setting_blocks
 from icrtool.output.tables.dropout import shown_horizons
 from icrtool.output.text_blocks import Block, Line, Look, Table, Text
@@ -30,8 +30,8 @@ from icrtool.output.text_format import (
     unusable_lines,
 )
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
-from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
-from icrtool.records.run_document import RunDocument
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
+from icrtool.records.run_document import ControllerNumbers, RunDocument
 from icrtool.records.text import counted, shortened
 
 WIDTH, LABEL = 80, 12
@@ -61,19 +61,19 @@ def brief_run(run: Run, directory: str, examine: str) -> Text:
     directory : of the run
     examine : command that names what is wrong in the log
     """
-    summary = run.summary
+    summary = run.document
     title = Line(_title(summary, _turned_text(summary)), "title")
     blocks: list[Block] = [*unusable_lines(summary), title, *_state_lines(summary)]
-    if summary["usable"]:
+    if summary.usable:
         blocks += [
-            Line(line, "as is") for line in (*_controller_lines(run), _icr_line(run.summary.get("geometry") or {}))
+            Line(line, "as is") for line in (*_controller_lines(run), _icr_line(map(summary.icr_of_drive, ICR_COLUMNS)))
         ]
     blocks += _check_lines(summary)
     if corrected := corrections(summary):
         blocks.append(labelled_line("corrected", "; ".join(corrected)))
     blocks.append(labelled_line("inputs", "; ".join(_inputs(summary))))
     blocks.append(labelled_line("written to", directory))
-    if summary["usable"]:
+    if summary.usable:
         blocks.append(copied("next", shlex.join(["icrtool", "dropout-report", directory])))
     else:
         drive = to_drive(summary)
@@ -95,7 +95,7 @@ def brief_dropout(report: DropoutReport, place: str) -> Text:
     ----------
     place : page or directory of the report
     """
-    summary = report.run_summary
+    summary = report.run_document
     blocks: list[Block] = [*unusable_lines(summary), Line(_title(summary, _trials_text(report)), "title")]
     if not report.usable and (drive := to_drive(summary)):
         blocks.append(labelled_line("next", drive))
@@ -116,9 +116,9 @@ def brief_dropout(report: DropoutReport, place: str) -> Text:
 
 
 def _turned_text(summary: RunDocument) -> str:
-    excitation = summary["excitation"]
-    turned = f"{excitation['turned_right_deg']:,.0f}° right, {excitation['turned_left_deg']:,.0f}° left"
-    return f"{duration_text(summary['drive']['duration_s'])}, turned {turned}"
+    excitation = summary.excitation
+    turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
+    return f"{duration_text(summary.drive.duration_s)}, turned {turned}"
 
 
 def _trials_text(report: DropoutReport) -> str:
@@ -129,15 +129,15 @@ def _trials_text(report: DropoutReport) -> str:
 
 
 def _title(summary: RunDocument, more: str) -> str:
-    facts = f"{distance_text(summary['drive']['distance_m'])}, {more}"
+    facts = f"{distance_text(summary.drive.distance_m)}, {more}"
     title = run_title(summary)
     return f"{shortened(title, max(WIDTH - len(facts) - 3, LABEL))}   {facts}"
 
 
 def _state_lines(summary: RunDocument) -> list[Line]:
     """Return that a run can be used, and its gravest warning."""
-    head = gravest(summary["warnings"], summary["log"])
-    if summary["usable"]:
+    head = gravest(summary.warnings, summary.log)
+    if summary.usable:
         return [Line(_cut(f"{'USABLE':{LABEL}}{head}"), "good")]
     return [Line(_cut(f"{'':{LABEL}}{head}"), "as is")] if head else []
 
@@ -152,30 +152,27 @@ def gravest(warnings: Sequence[str], log: str) -> str:
 def _controller_lines(run: Run) -> Iterator[str]:
     if run.track_width_m is None:
         yield f"{'controller':{LABEL}}no multiplier: robot.track_width_m is not known (--robot, --set)"
-    elif not (numbers := run.summary.get("controller")):
-        geometry: Mapping[str, Any] = run.summary.get("geometry") or {}
-        unknown = [ICR_WORDS[name] for name in ("y_icr_right_m", "y_icr_left_m") if geometry.get(name) is None]
+    elif not (numbers := run.document.controller):
+        unknown = [ICR_WORDS[name] for name in ICR_COLUMNS[:2] if run.document.icr_of_drive(name) is None]
         yield f"{'controller':{LABEL}}no multiplier: {' and '.join(unknown) or 'the ICRs'} could not be found"
     else:
         yield from _number_lines(numbers, run.track_width_m)
 
 
-def _number_lines(numbers: Mapping[str, Any], width_m: float) -> Iterator[str]:
-    """Yield what a controller is given, from the keys of `icrtool.calibration.record.ControllerNumbers`."""
-    multiplier = f"{numbers['multiplier']:.3f} ± {numbers['multiplier_std']:.3f}"
-    radii = f"{numbers['left_radius']:.3f}, {numbers['right_radius']:.3f}"
-    std = max(numbers.get("left_radius_std") or 0.0, numbers.get("right_radius_std") or 0.0)
+def _number_lines(numbers: ControllerNumbers, width_m: float) -> Iterator[str]:
+    """Yield what a controller is given."""
+    multiplier = f"{numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}"
+    radii = f"{numbers.left_radius:.3f}, {numbers.right_radius:.3f}"
+    std = max(numbers.left_radius_std, numbers.right_radius_std)
     yield f"{'controller':{LABEL}}wheel_separation_multiplier  {multiplier}"
     yield f"{'':{LABEL}}left, right wheel radius     {radii} ± {std:.3f} of the configured"
     yield f"{'':{LABEL}}= (right - left) / {width_m:g} m; without slip: ±{width_m / 2:.3g} m"
 
 
-def _icr_line(geometry: Mapping[str, Any]) -> str:
-    parts = []
-    for column in ICR_COLUMNS:
-        value, std = geometry.get(column), geometry.get(f"{column}_std")
-        found = f"{value:+.3f} ± {std:.3f}" if value is not None else "not shown"
-        parts.append(f"{ICR_WORDS[column].removeprefix('y ')} {found}")
+def _icr_line(icrs: Iterable[tuple[float, float] | None]) -> str:
+    """Return the three ICRs, each with its standard deviation."""
+    rows = zip(ICR_WORDS.values(), icrs, strict=True)
+    parts = [f"{word.removeprefix('y ')} {icr_text(*(found or (None, None)))}" for word, found in rows]
     return f"{'ICRs [m]':{LABEL}}{'  '.join(parts)}"
 
 
@@ -184,47 +181,47 @@ def run_checks(summary: RunDocument) -> list[Check]:
     found: list[Check] = []
     if agreement := filter_agreement(summary):
         found.append((agreement.endswith("agrees"), "EKF", agreement))
-    excitation, gnss, heading = summary["excitation"], summary["gnss"], summary["heading"]
-    verdicts: Mapping[Any, Any] = excitation["verdict"]
+    excitation, gnss, heading = summary.excitation, summary.gnss, summary.heading
     # what was lacking stands beside the ICRs; what to drive, alone
     lacks = to_drive(summary).rpartition(": ")[2]
-    if set(verdicts.values()) == {"shown"}:
+    if excitation.verdict.all_shown:
         found.append((not lacks, "excitation", lacks or "all three ICRs shown: enough turns for each"))
     else:
-        weak = [(one, ICR_WORDS[name]) for name, one in verdicts.items() if one != "shown"]
+        verdicts = ((excitation.verdict[name], ICR_WORDS[name]) for name in ICR_COLUMNS)
+        weak = [(one, word) for one, word in verdicts if one != "shown"]
         words = "; ".join(
             f"{', '.join(name for one, name in weak if one == verdict)} {verdict}"
             for verdict in dict.fromkeys(one for one, _ in weak)
         )
         found.append((False, "excitation", f"{words}{f': {lacks}' if lacks else ''}"))
-    if of := gnss["used"] + gnss["rejected"]:
-        good = gnss["rejected"] < NOTED_SHARE * of
+    if of := gnss.used + gnss.rejected:
+        good = gnss.rejected < NOTED_SHARE * of
         word = "fixes" if position_word(summary) == "GNSS fixes" else "positions"
-        found.append((good, word, f"{gnss['rejected']:,} of {of:,} rejected"))
-    if jumps := jump_count(summary["reference_jumps"]):
+        found.append((good, word, f"{gnss.rejected:,} of {of:,} rejected"))
+    if jumps := jump_count(summary.reference_jumps):
         found.append((False, "reference", jumps))
-    if heading["offset_deg"] is not None:
-        value = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f}°"
+    if heading.offset_deg is not None:
+        value = f"{round(heading.offset_deg, 1) + 0.0:+.1f} ± {heading.offset_std_deg:.1f}°"
         found.append((True, "heading", f"{value} from the course over ground"))
-    if spans := summary["outages_ns"]:
+    if spans := summary.outages_ns:
         away = duration_text(sum(end - begin for begin, end in spans) / 1e9)
         found.append((False, "outages", f"{len(spans)}, {away} in all"))
-    if events := summary["events"]:
+    if events := summary.events:
         found.append((False, "slip events", f"{event_kinds(events)}; left out of the fit"))
     return found
 
 
 def corrections(summary: RunDocument) -> list[str]:
     """Return what the alignment corrected, a few words each."""
-    applied = {name: one["applied"] for name, one in summary["alignment"].items()}
+    applied = {name: one.applied for name, one in summary.alignment.items()}
     scale, left, right = (applied.get(name) or 1.0 for name in ("wheel_scale", "left_scale", "right_scale"))
     found = [f"wheels {100 * scale:.1f} %"] if abs(scale - 1.0) > NOTED_SCALE else []
     if abs(left - right) > NOTED_SCALE:
         side, share = ("left", (right - left) / right) if left < right else ("right", (left - right) / left)
         found.append(f"{side} {100 * share:.1f} % less")
-    if abs(offset := summary["heading"]["applied_offset_deg"]) >= SMALLEST_OFFSET_DEG:
+    if abs(offset := summary.heading.applied_offset_deg) >= SMALLEST_OFFSET_DEG:
         found.append(f"heading {0.0 - offset:+.1f}°")
-    delays = (("position", summary["filter"]["reference_delay_s"]), ("heading", summary["heading"]["applied_delay_s"]))
+    delays = (("position", summary.filter.reference_delay_s), ("heading", summary.heading.applied_delay_s))
     found += [f"{word} {'lag' if delay > 0 else 'lead'} {abs(delay):.2f} s" for word, delay in delays if delay]
     return found
 
@@ -232,17 +229,17 @@ def corrections(summary: RunDocument) -> list[str]:
 def _inputs(summary: RunDocument) -> list[str]:
     """Return the topics, each once, with what was taken from it."""
     roles: dict[str, list[str]] = {}
-    for stream in summary["streams"]:
-        topics = " + ".join(dict.fromkeys(stream["topic"].split(" + ")))
-        roles.setdefault(topics, []).append("position" if stream["role"] == "gnss" else stream["role"])
+    for stream in summary.streams:
+        topics = " + ".join(dict.fromkeys(stream.topic.split(" + ")))
+        roles.setdefault(topics, []).append("position" if stream.role == "gnss" else stream.role)
     return [f"{topic} ({', '.join(taken)})" for topic, taken in roles.items()]
 
 
 def to_drive(summary: RunDocument) -> str:
     """Return what to drive to find the ICRs that a run does not show; empty where turns would not help."""
-    excitation = summary["excitation"]
-    right, left = np.radians([excitation["turned_right_deg"], excitation["turned_left_deg"]]).tolist()
-    advised = (one for one in excitation["sentences"] if "drive two full turns" in one)
+    excitation = summary.excitation
+    right, left = np.radians([excitation.turned_right_deg, excitation.turned_left_deg]).tolist()
+    advised = (one for one in excitation.sentences if "drive two full turns" in one)
     return lacking_turns(right, left) or next(advised, "")
 
 
@@ -285,13 +282,13 @@ def reach_rows(
 def _reach_blocks(report: DropoutReport) -> list[Block]:
     """Return how far the robot stays within each budget."""
     blocks: list[Block] = []
-    width_m = report.run_summary["config"]["robot"]["track_width_m"]
+    width_m = report.run_document.config.robot.track_width_m
     unknown = [("   no slip", "not known", "needs robot.track_width_m (--robot, --set)")] if width_m is None else []
     given = [(one.name, one.label, one.fitted_text) for one in report.calibrations]
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows = [
             (f"   {shortened(label, 28)}", text, note)
-            for label, text, note in reach_rows(report.budgets, given, budget_m, len(report.run_summary["events"]))
+            for label, text, note in reach_rows(report.budgets, given, budget_m, len(report.run_document.events))
         ]
         blocks += [Line(f"How far within {budget_m:g} m (95 %)?", "title"), Table("lrl", rows + unknown)]
     return blocks or ["How far?  No trial is as long as the shortest horizon."]
@@ -308,12 +305,12 @@ def trust(summary: RunDocument, *, passed: bool, events_left_out: bool) -> tuple
     passed : every acceptance limit is met
     events_left_out : no trial crosses a slip event
     """
-    if not summary["usable"]:
-        return "bad", f"no: {summary['unusable_because']}"
+    if not summary.usable:
+        return "bad", f"no: {summary.unusable_because}"
     if not passed:
         return "bad", "no: an acceptance limit is not met"
     reasons = [f"{what} {text}" for good, what, text in run_checks(summary) if not good and what != "slip events"]
-    if events := summary["events"]:
+    if events := summary.events:
         crossed = "left out" if events_left_out else "trials across them count"
         reasons.append(f"{counted(len(events), 'slip event')}, {crossed}")
     return ("care", f"yes, with care: {'; '.join(reasons)}") if reasons else ("good", "yes")
@@ -381,14 +378,13 @@ def brief_calibration(result: CalibrationResult | None, sensors: LogCalibration 
         calibration, table = result.calibration, result.table
         geometry, covariance = calibration.geometry()
         std = np.sqrt(np.diag(covariance)).tolist()
-        named = dict(zip(geometry._fields, geometry, strict=True))
-        named |= {f"{name}_std": one for name, one in zip(geometry._fields, std, strict=True)}
+        icrs = zip(geometry[:ICRS], std, strict=False)
         distance_m = sum(log.distance_m for log in calibration.logs)
         robot = calibration.robot["name"] or "robot"
         title = f"{robot}: {counted(len(calibration.logs), 'log')}, {distance_text(distance_m)}"
         blocks += [Line(title, "title")]
-        numbers = calibration.controller_numbers()._asdict()
-        blocks += [Line(line, "as is") for line in (*_number_lines(numbers, calibration.width_m), _icr_line(named))]
+        numbers = calibration.controller_numbers()
+        blocks += [Line(line, "as is") for line in (*_number_lines(numbers, calibration.width_m), _icr_line(icrs))]
         rows = [
             (f"   {REACH_LABELS.get(row.name, row.label)}", reached.short_text, NOTES.get(row.name, ""))
             for row in sorted(table.scores, key=lambda row: (*REACH_ROWS, row.name).index(row.name))

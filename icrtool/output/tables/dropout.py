@@ -43,13 +43,13 @@ Rows = list[list[str]]
 def format_dropout(report: DropoutReport) -> Text:
     """Return the table of a report: errors by model and horizon, budgets, no trials, outages, verdicts; no line end."""
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
-    driven = driven_text(report.run_summary["drive"])
+    driven = driven_text(report.run_document.drive)
     starts = f"a trial from each {STARTS_TEXT[report.starts]}state of {report.states:,}"
     rows = [*_error_rows(report), *_reference_rows(report), *_ratio_rows(report), *_count_rows(report)]
     head = ("distance without GNSS", "", *_horizon_texts(report))
     blocks: list[Block] = [
-        *unusable_lines(report.run_summary),
-        Line(run_title(report.run_summary), "title"),
+        *unusable_lines(report.run_document),
+        Line(run_title(report.run_document), "title"),
         f"{driven}; without GNSS, wheel speeds only, {starts}{reference}",
         "",
     ]
@@ -100,7 +100,7 @@ def headline(report: DropoutReport) -> list[str]:
     ]
     if (calibration := report.calibration) is not None:
         alone = controller_error_text(calibration.controller)
-        numbers = controller_text(calibration.controller_numbers()._asdict())
+        numbers = controller_text(calibration.controller_numbers())
         found.append(f"Controller: {numbers}{f'; {alone}' if alone else ''}.")
     return found
 
@@ -181,7 +181,7 @@ class NoTrial(NamedTuple):
 def no_trial(report: DropoutReport) -> tuple[NoTrial, ...]:
     """Return the reasons why starts gave no trial."""
     counts, cost = report.counts, report.event_cost
-    driven = distance_text(report.run_summary["drive"]["distance_m"])
+    driven = distance_text(report.run_document.drive.distance_m)
     slip = cost.trials if cost is not None else np.zeros_like(counts.short)
     return (
         NoTrial("too_little_way_left", "not counted: log ends", f"less than that is left of the {driven} driven",
@@ -207,9 +207,9 @@ def _count_lines(report: DropoutReport) -> list[str]:
 
 def _event_lines(report: DropoutReport) -> list[str]:
     """Return what slip events cost, at the longest horizon with trials on both sides."""
-    cost, icr, events = report.event_cost, report.result("icr"), report.run_summary["events"]
+    cost, icr, events = report.event_cost, report.result("icr"), report.run_document.events
     if cost is None and events:
-        lasted = duration_text(sum(event["end_s"] - event["begin_s"] for event in events))
+        lasted = duration_text(sum(event.end_s - event.begin_s for event in events))
         return [f"trials cross {counted(len(events), 'slip event')}, {lasted} in all: --without-events leaves them out"]
     if cost is None or icr is None:
         return []

@@ -36,8 +36,8 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
         date = "at an unknown date (its stamps do not count from 1970)"
     rows = [("recorded", f"{date}, {duration_text((end - begin) / 1e9)}")]
     if run is not None:
-        drive = run.summary["drive"]
-        rows.append(("driven", f"{driven_text(drive)}, {drive['speed_mean_mps']:.2f} m/s on average"))
+        drive = run.document.drive
+        rows.append(("driven", f"{driven_text(drive)}, {drive.speed_mean_mps:.2f} m/s on average"))
     return rows + _extent_rows(log)
 
 
@@ -120,9 +120,9 @@ def verdict(run: Run | None, problem: IcrToolError | None, log: str) -> str:
     if run is None:
         return f"cannot be fitted: {problem.beside(log)}" if problem is not None else "cannot be fitted"
     if not run.usable:
-        return f"not usable: {run.summary['unusable_because']}"
-    verdicts = run.summary["excitation"]["verdict"].values()
-    return f"can be fitted, {'all ICRs are shown' if set(verdicts) == {'shown'} else 'not all ICRs are shown'}"
+        return f"not usable: {run.document.unusable_because}"
+    shown = run.document.excitation.verdict.all_shown
+    return f"can be fitted, {'all ICRs are shown' if shown else 'not all ICRs are shown'}"
 
 
 def next_command(log: str, options: Sequence[str], run: Run | None) -> str | None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.output.text_blocks import LABEL, TEXT_WIDTH, Block, Line, Table, Text, labelled
@@ -16,7 +13,6 @@ from icrtool.output.text_format import (
     event_kinds,
     excitation_text,
     filter_agreement,
-    icr_value_text,
     jump_count,
     position_word,
     role_word,
@@ -24,7 +20,7 @@ from icrtool.output.text_format import (
     unusable_lines,
 )
 from icrtool.records.measurements import RESPONSE_S
-from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.run_document import ClassDocument
 from icrtool.records.text import counted
 
@@ -50,14 +46,14 @@ def format_run(run: Run) -> Text:
 
     Warnings are not in it: they belong to stderr.
     """
-    drive = run.summary["drive"]
-    speed = f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s (mean ± std)"
+    drive = run.document.drive
+    speed = f"{drive.speed_mean_mps:.2f} ± {drive.speed_std_mps:.2f} m/s (mean ± std)"
     learned = [*_controller_rows(run), *_filter_rows(run), excitation_row(run)]
     measured = [*_position_rows(run), *_heading_rows(run), *_delay_rows(run), *event_rows(run)]
     return Text(
         [
-            *unusable_lines(run.summary),
-            Line(run_title(run.summary), "title"),
+            *unusable_lines(run.document),
+            Line(run_title(run.document), "title"),
             "",
             _stream_table(run),
             "",
@@ -74,17 +70,17 @@ def format_run(run: Run) -> Text:
 
 def excitation_row(run: Run) -> Row:
     """Return what the drive could show of the ICRs; advice is among the warnings."""
-    return "excitation", excitation_text(run.summary["excitation"])
+    return "excitation", excitation_text(run.document.excitation)
 
 
 def _stream_table(run: Run) -> Table:
     head = ("stream".ljust(LABEL), "topic", "type", "rate", "samples", "clock")
     rows = []
-    for stream in run.summary["streams"]:
-        type_name = stream["message_type"].replace("/msg/", "/")
-        hz = stream["rate_hz"]
-        rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream['count']:,}"
-        rows.append((role_word(run.summary, stream["role"]), stream["topic"], type_name, rate, count, stream["clock"]))
+    for stream in run.document.streams:
+        type_name = stream.message_type.replace("/msg/", "/")
+        hz = stream.rate_hz
+        rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream.count:,}"
+        rows.append((role_word(run.document, stream.role), stream.topic, type_name, rate, count, stream.clock))
     widths = [max(len(row[column]) for row in (head, *rows)) for column in range(6)]
     # Long names are cut: the topic keeps its end, the type its begin.
     space = TEXT_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
@@ -95,12 +91,11 @@ def _stream_table(run: Run) -> Table:
 
 def _icr_table(run: Run) -> Table:
     """Return the ICRs of the drive, and how those of the filter converged."""
-    icr, verdicts = run.summary["icr"], run.summary["excitation"]["verdict"]
-    geometry: Mapping[str, Any] = run.summary.get("geometry") or {}
+    icr, verdicts = run.document.icr, run.document.excitation.verdict
     rows = []
     for column in ICR_COLUMNS:
-        found = icr_value_text(geometry, column)
-        mean, std, time_s = icr["mean"][column], icr["std"][column], icr["convergence_s"][column]
+        found = icr_text(*(run.document.icr_of_drive(column) or (None, None)))
+        mean, std, time_s = icr.mean[column], icr.std[column], icr.convergence_s[column]
         if mean is None:
             rows.append((ICR_WORDS[column], found, "", "", ""))
             continue
@@ -113,12 +108,12 @@ def _icr_table(run: Run) -> Table:
 
 def _controller_rows(run: Run) -> list[Row]:
     """Return what a controller is given; it belongs to the ICRs in the table above."""
-    numbers, width = run.summary.get("controller"), run.track_width_m
+    numbers, width = run.document.controller, run.track_width_m
     if width is None:
         return [("controller", "left out, and no-slip odometry too: robot.track_width_m is not known")]
     if numbers is None:
         return [("controller", "no multiplier: y right and y left are not shown")] if run.usable else []
-    verdicts = run.summary["excitation"]["verdict"]
+    verdicts = run.document.excitation.verdict
     shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
     note = "" if shown else "; y right and y left are not shown well enough to use it"
     return [("controller", f"{controller_text(numbers)}; (y right - y left) / b, b = {width:g} m{note}")]
@@ -126,45 +121,45 @@ def _controller_rows(run: Run) -> list[Row]:
 
 def _filter_rows(run: Run) -> list[Row]:
     """Return where the filter's ICRs ended, as a check of those in the table."""
-    agreement = filter_agreement(run.summary)
+    agreement = filter_agreement(run.document)
     return [("EKF", agreement)] if agreement else []
 
 
 def _terrain_table(run: Run) -> list[Block]:
     """Return the ICRs between the terrain changes."""
     rows = []
-    for number, segment in enumerate(run.summary["segments"], start=1):
-        mean, std = segment["mean"], segment["std"]
+    for number, segment in enumerate(run.document.segments, start=1):
+        mean, std = segment.mean, segment.std
         icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
-        rows.append((f"  {number}", f"{segment['begin_s']:.1f} s", *icrs))
+        rows.append((f"  {number}", f"{segment.begin_s:.1f} s", *icrs))
     head = ("segment".ljust(LABEL), "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
     return ["", Table("lrl", rows, head)] if rows else []
 
 
 def _position_rows(run: Run) -> list[Row]:
-    gnss = run.summary["gnss"]
-    word = position_word(run.summary)
+    gnss = run.document.gnss
+    word = position_word(run.document)
     lines = []
-    if (difference := gnss["mean_difference_m"]) is not None and (largest := gnss["max_difference_m"]) is not None:
+    if (difference := gnss.mean_difference_m) is not None and (largest := gnss.max_difference_m) is not None:
         mean, most = error_text(difference), error_text(largest)
         raised = run.process_position_mps != configured_noise(run.config).position_mps
         why = "; follows them closely, because the position noise was raised" if raised else ""
         lines.append(("position", f"filter to {word}: mean {mean}, max {most}{why}"))
-    reasons = {"gate": gnss["rejected_by_gate"], **gnss["rejected_by_reason"]}
+    reasons = {"gate": gnss.rejected_by_gate, **gnss.rejected_by_reason}
     why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
     lines.append(
         (
             "fixes" if lines else "position",
-            f"{gnss['used']:,} used, {gnss['rejected']:,} rejected{f' ({why})' if why else ''}",
+            f"{gnss.used:,} used, {gnss.rejected:,} rejected{f' ({why})' if why else ''}",
         )
     )
-    lines += _class_rows(gnss["classes"], jump_count(run.summary["reference_jumps"]))
-    if gnss["recoveries"]:
-        times = "once" if gnss["recoveries"] == 1 else f"{gnss['recoveries']:,} times"
+    lines += _class_rows(gnss.classes, jump_count(run.document.reference_jumps))
+    if gnss.recoveries:
+        times = "once" if gnss.recoveries == 1 else f"{gnss.recoveries:,} times"
         lines.append(("", f"re-acquired after rejection: {times}"))
     if outages := len(run.outages_ns):
         away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
-        lost = len(run.summary["rtk_losses_ns"])
+        lost = len(run.document.rtk_losses_ns)
         cause = f" ({lost} by loss of RTK)" if lost else ""
         lines.append(("", f"{counted(outages, 'outage')}{cause}, {away} in all"))
     return lines
@@ -174,49 +169,48 @@ def _class_rows(classes: dict[str, ClassDocument], jumps: str) -> list[Row]:
     """Return what classes the fixes were of, where they were not all of one, and what was done to them."""
     lines = []
     for name, one in classes.items() if len(classes) > 1 else ():
-        done = [f"{one['rejected']:,} rejected"] if one["rejected"] else []
-        done += [f"{one['down_weighted']:,} down-weighted"] if one["down_weighted"] else []
-        done += [f"{one['sold_as_fixed']:,} wrongly reported as fixed"] if one["sold_as_fixed"] else []
-        lines.append(("", f"{name} {one['fixes']:,}{': ' if done else ''}{', '.join(done)}"))
+        done = [f"{one.rejected:,} rejected"] if one.rejected else []
+        done += [f"{one.down_weighted:,} down-weighted"] if one.down_weighted else []
+        done += [f"{one.sold_as_fixed:,} wrongly reported as fixed"] if one.sold_as_fixed else []
+        lines.append(("", f"{name} {one.fixes:,}{': ' if done else ''}{', '.join(done)}"))
     if jumps:
         lines.append(("", jumps))
     return lines
 
 
 def _heading_rows(run: Run) -> list[Row]:
-    heading = run.summary["heading"]
-    source = heading.get("source")
-    lines = [f"{source.replace('_', ' ')}: {heading['parts']}"] if heading.get("parts") else []
-    if heading["offset_deg"] is not None:
+    heading = run.document.heading
+    lines = [f"{heading.source.replace('_', ' ')}: {heading.parts}"] if heading.parts else []
+    if heading.offset_deg is not None:
         # Adding zero takes the sign off a rounded -0.0.
-        value = f"{round(heading['offset_deg'], 1) + 0.0:+.1f} ± {heading['offset_std_deg']:.1f} deg"
+        value = f"{round(heading.offset_deg, 1) + 0.0:+.1f} ± {heading.offset_std_deg:.1f} deg"
         offset = f"{value} from the course over ground"
-        if heading["offset_name"]:
-            offset += f" ({heading['offset_name']})"
-        applied = heading["applied_offset_deg"]
+        if heading.offset_name:
+            offset += f" ({heading.offset_name})"
+        applied = heading.applied_offset_deg
         lines.append(f"{offset}; corrected by {0.0 - applied:+.1f} deg" if applied else f"{offset}; not corrected")
     elif not lines:
         lines = ["could not be compared with the course over ground: too little straight driving"]
-    used, rejected = heading["used"], heading["rejected"]
+    used, rejected = heading.used, heading.rejected
     counts = f"{used:,} used, {rejected:,} rejected{f' (gate {rejected:,})' if rejected else ''}"
     return [*(("" if number else "heading", line) for number, line in enumerate(lines)), ("headings", counts)]
 
 
 def _delay_rows(run: Run) -> list[Row]:
     """Return which streams seem to lag or lead the wheels."""
-    if run.summary["filter"]["reference_delay_s"] or run.summary["heading"]["applied_delay_s"]:
+    if run.document.filter.reference_delay_s or run.document.heading.applied_delay_s:
         return []
     found = []
-    for word, facts in (("headings", run.summary["heading"]), ("fixes", run.summary["gnss"])):
-        delay, std = facts["delay_s"], facts["delay_std_s"]
+    for word, facts in (("headings", run.document.heading), ("fixes", run.document.gnss)):
+        delay, std = facts.delay_s, facts.delay_std_s
         if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, SIGNIFICANT_SIGMAS * std):
             found.append(f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {abs(delay):.2f} ± {std:.2f} s")
-    multiplier = run.summary["icr"]["separation_multiplier"]
+    multiplier = run.document.icr.separation_multiplier
     slips = multiplier is None or multiplier > SLIPPING_MULTIPLIER
     cause = "slip of the wheels" if slips else f"the robot's response to its wheels, up to {RESPONSE_S:g} s,"
     lines = [*found, f"not corrected: {cause} has the same effect"] if found else []
-    speed = run.summary["drive"]["speed_mean_mps"]
-    if run.summary["gnss"]["delay_s"] is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
+    speed = run.document.drive.speed_mean_mps
+    if run.document.gnss.delay_s is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
         shift = error_text(TYPICAL_DELAY_S * speed)
         lines.append(f"of the fixes: not shown by this drive; a lag of {TYPICAL_DELAY_S:g} s would move x by {shift}")
     return [("" if number else "delays", line) for number, line in enumerate(lines)]
@@ -224,13 +218,13 @@ def _delay_rows(run: Run) -> list[Row]:
 
 def event_rows(run: Run) -> list[Row]:
     """Return how many slip events of each kind there were, and the worst: the one that missed most distance."""
-    events = run.summary["events"]
+    events = run.document.events
     if not events:
         return []
-    worst = max(events, key=lambda event: (event["end_s"] - event["begin_s"]) * event["severity"])
-    lasted = duration_text(worst["end_s"] - worst["begin_s"])
-    missed = f"{100 * worst['severity']:.0f} % of the wheels' motion missed"
-    worst_text = f"worst: {worst['kind']} from {worst['begin_s']:.1f} s for {lasted}, {missed}"
+    worst = max(events, key=lambda event: (event.end_s - event.begin_s) * event.severity)
+    lasted = duration_text(worst.end_s - worst.begin_s)
+    missed = f"{100 * worst.severity:.0f} % of the wheels' motion missed"
+    worst_text = f"worst: {worst.kind} from {worst.begin_s:.1f} s for {lasted}, {missed}"
     return [("slip", f"{event_kinds(events)}; the ICRs are not learned there"), ("", worst_text)]
 
 

@@ -20,6 +20,7 @@ from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import ConfigError
 from icrtool.kernels.within_budget import never_falling, within_budget
 from icrtool.records.run import Run
+from support.documents import with_summary
 
 METRICS = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}
 
@@ -193,7 +194,7 @@ def test_a_limit_on_the_distance_within_a_budget(report: DropoutReport) -> None:
 
 
 def test_every_limit_fails_on_a_run_that_is_not_usable(run: Run) -> None:
-    bad = replace(run, summary={**run.summary, "usable": False, "unusable_because": "the robot did not move"})
+    bad = with_summary(run, usable=False, unusable_because="the robot did not move")
     gates = ["icr.p95@5m <= 100", "recommended.within@0.5m >= 0.1"]
     report = dropout_report(bad, horizons_m=[5.0], gates=gates)
     assert [result.name for result in report.results] == ["icr", "no_slip", "icr_final"]

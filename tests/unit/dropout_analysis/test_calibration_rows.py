@@ -24,6 +24,7 @@ from icrtool.motion.trials import cut_trials
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.run import Run
+from support.documents import with_summary
 
 HORIZONS = (5.0, 10.0, 20.0)
 
@@ -31,7 +32,7 @@ HORIZONS = (5.0, 10.0, 20.0)
 @pytest.fixture(scope="module")
 def drive(make_run: Callable[..., Run]) -> Run:
     run = make_run(duration_s=150.0, troubles=False)
-    return replace(run, summary={**run.summary, "inputs": [{"path": "a", "bytes": 1, "sha256": "a"}]})
+    return with_summary(run, inputs=[{"path": "a", "bytes": 1, "sha256": "a"}])
 
 
 @pytest.fixture(scope="module")

@@ -19,6 +19,7 @@ from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
 from icrtool.logs.read_log import read_log
 from icrtool.records.run import STATE_COLUMNS, Run, WarmStart, track_of
 from support.barn import OUTAGE_S, START_NS, configured, simulate
+from support.documents import with_summary
 from support.matrix_filter import step_state
 
 SPEEDS = ("v_left_mps", "v_right_mps")
@@ -160,8 +161,7 @@ def test_a_warm_started_run_is_made_again_from_its_own_start(clean: Run) -> None
     )
     (cold_outage,), (outage,) = (force_outages(run, plan_outages(run, 5.0, (2.0,))) for run in (clean, warm))
     assert outage.end_error_m != pytest.approx(cold_outage.end_error_m, rel=0.01)
-    began_cold = {**warm.summary, "filter": {**warm.summary["filter"], "warm_start": None}}
-    cold = replace(warm, summary=began_cold)
+    cold = with_summary(warm, filter={"warm_start": None})
     with pytest.raises(DataError, match="cannot be made again"):
         force_outages(cold, plan_outages(warm, 5.0, (20.0,)))
 

@@ -11,6 +11,7 @@ from icrtool.dropout_analysis.trials import Model, dropout
 from icrtool.kernels.open_loop.trials import FrozenIcrs
 from icrtool.records.run import Run
 from support.barn import ICRS_M, RATE_HZ
+from support.documents import with_summary
 
 HORIZONS_M = [1.0, 5.0, 20.0]
 PERFECT = [Model("icr", "true ICRs", FrozenIcrs.constant(*ICRS_M))]
@@ -36,8 +37,8 @@ def with_noise(run: Run, stds: tuple[float, float, float], factor: float = 1.0) 
     for (name, column), std in zip(true_path(run).items(), stds, strict=True):
         columns[name] = column + factor * std * rng.standard_normal(len(column))
         columns[f"std_{name}"] = np.full(len(column), std)
-    noise = {**run.summary["filter"], "nis_gnss_mean": 2.0 * factor**2, "nis_heading_mean": factor**2}
-    return replace(run, table=replace(run.table, **columns), summary={**run.summary, "filter": noise})
+    noisy = with_summary(run, filter={"nis_gnss_mean": 2.0 * factor**2, "nis_heading_mean": factor**2})
+    return replace(noisy, table=replace(run.table, **columns))
 
 
 @pytest.fixture(scope="module")

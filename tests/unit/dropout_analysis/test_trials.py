@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.config import DropoutConfig
 from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.starts import first_learned
 from icrtool.dropout_analysis.trials import Model, dropout, models_of
@@ -21,6 +20,7 @@ from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
 from icrtool.kernels.open_loop.trials import FrozenIcrs
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 from support.contract import SUMMARY_COLUMNS
+from support.documents import with_summary
 
 EQUAL_M = 1e-9
 """What the fast algorithm promises against direct integration."""
@@ -167,8 +167,7 @@ def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: Run) -> None:
 
 def test_horizons_default_to_the_configured_ones(run: Run) -> None:
     assert run.config.dropout.horizons_m == tuple(float(d) for d in range(1, 21))
-    config = replace(run.config, dropout=DropoutConfig(horizons_m=(4.0, 2.0)))
-    assert dropout(replace(run, config=config)).horizons_m.tolist() == [2.0, 4.0]
+    assert dropout(with_summary(run, config={"dropout": {"horizons_m": [4.0, 2.0]}})).horizons_m.tolist() == [2.0, 4.0]
 
 
 @pytest.mark.parametrize("horizons", [[], [0.0], [-1.0], [math.inf], [math.nan]])
@@ -253,7 +252,7 @@ def test_icrs_are_learned_when_their_standard_deviations_have_fallen(run: Run, m
     assert first_learned(changed(run, **known)) == 0
     assert first_learned(changed(run, **{name: 10 * std for name, std in known.items()})) is None
     start = {"icrs_m": [0.7, -0.7, 0.0], "covariance_m2": (1e-4 * np.eye(3)).tolist()}
-    warm = replace(run, summary={**run.summary, "filter": {**run.summary["filter"], "warm_start": start}})
+    warm = with_summary(run, filter={"warm_start": start})
     assert first_learned(warm) == 0
 
 

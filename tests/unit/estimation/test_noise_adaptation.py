@@ -18,6 +18,7 @@ from icrtool.kernels.filter.measurement_codes import GATED
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum
 from icrtool.records.tables import RobotLog
+from support.documents import with_summary
 from support.drives import ICRS, make_log
 
 WIDTH = "robot.track_width_m=0.6"
@@ -54,8 +55,7 @@ def test_what_is_configured_is_not_searched_for() -> None:
 
 
 def cost_of(run: Run, noise: ProcessNoise) -> float:
-    summary = {**run.summary, "filter": {**run.summary["filter"], "process_position_mps": noise.position_mps}}
-    setup = set_up_again(replace(run, summary=summary))
+    setup = set_up_again(with_summary(run, filter={"process_position_mps": noise.position_mps}))
     return innovation_cost(run_ekf(*setup))
 
 

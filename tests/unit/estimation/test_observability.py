@@ -45,11 +45,3 @@ def test_a_circle_asks_for_the_other_way() -> None:
 def test_more_way_tells_more(varied) -> None:
     longer = excitation_of(fit(simulate(0, seconds=240.0, offset_deg=0.0, lever=(0.0, 0.0), scales=(1.0, 1.0)), CONFIG))
     assert all(longer.std_m[name] < std for name, std in varied.std_m.items())
-
-
-def test_the_summary_is_plain_data(varied) -> None:
-    import json
-
-    document = varied.summary()
-    assert json.loads(json.dumps(document)) == document
-    assert set(document["verdict"]) == {"y_icr_right_m", "y_icr_left_m", "x_icr_m"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icrtool.calibration.fit import motion_of
+from icrtool.calibration.fit import with_motion
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.run import Run
@@ -47,7 +47,7 @@ def test_the_controllers_multiplier_of_a_small_robot_is_known_to_half_a_percent(
     icrs: tuple[float, float, float],
 ) -> None:
     for seed in range(3):
-        controller = motion_of(run_of(seed, icrs, 0.0))["controller"]
+        controller = with_motion(run_of(seed, icrs, 0.0)).controller
         assert controller is not None
-        assert controller["multiplier_std"] < 0.005
-        assert abs(controller["multiplier"] - (icrs[0] - icrs[1]) / 0.2) < 3.0 * controller["multiplier_std"]
+        assert controller.multiplier_std < 0.005
+        assert abs(controller.multiplier - (icrs[0] - icrs[1]) / 0.2) < 3.0 * controller.multiplier_std

@@ -15,6 +15,7 @@ from icrtool.output.tables.run import format_run
 from icrtool.records.run import Run
 from icrtool.records.samples import NO_HEADINGS, Datum, GyroAxes
 from icrtool.records.tables import RobotLog
+from support.documents import with_summary
 from support.drives import make_log
 
 CONFIG = load_config(sets=["robot.track_width_m=0.8"])
@@ -78,7 +79,7 @@ def test_a_log_that_is_not_usable_has_no_next_command() -> None:
     log = make_log(1, 120.0)
     run = fit(log, CONFIG)
     assert next_command("log", [], run) == "icrtool dropout-report log"
-    unusable = replace(run, summary={**run.summary, "usable": False, "unusable_because": "why"})
+    unusable = with_summary(run, usable=False, unusable_because="why")
     assert next_command("log", [], unusable) is None
     assert verdict(unusable, None) == "not usable: why"
 

@@ -18,11 +18,12 @@ from icrtool.fleet.roll_up import PooledCalibration, pooled_calibrations, runs_o
 from icrtool.fleet.row import File, Row
 from icrtool.output.files.calibration_file import open_calibration
 from icrtool.records.run import Run
+from support.documents import with_summary
 
 
 def write(run: Run, directory: Path, sha: str) -> None:
     """Write a run as that of another file."""
-    named = replace(run, summary=run.summary | {"inputs": [{"path": sha, "bytes": 1, "sha256": sha}]})
+    named = with_summary(run, inputs=[{"path": sha, "bytes": 1, "sha256": sha}])
     named.write(directory, plots=())
 
 

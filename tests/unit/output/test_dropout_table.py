@@ -7,8 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import msgspec
 import pytest
 
+from icrtool.config import Config
 from icrtool.dropout_analysis.acceptance_limits import BudgetDistance, budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.example_trials import worst_trials
 from icrtool.dropout_analysis.real_outages import real_outages
@@ -145,8 +147,8 @@ def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[
 
 
 def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutReport, tmp_path: Path) -> None:
-    strange = {**content.run_summary, "log": 'a <b> & "c" \x01', "config": {"robot": {"name": None}}}
-    odd = replace(content, run_summary=strange, verdicts=content.verdicts[1:])
+    strange = msgspec.structs.replace(content.run_document, log='a <b> & "c" \x01', config=Config())
+    odd = replace(content, run_document=strange, verdicts=content.verdicts[1:])
     error = RunError("runs/x", "edited", "fit <again> & again")
     write_junit(tmp_path / "j.xml", [suite_of(*one) for one in [("barn", content), ("odd", odd), ("runs/x", error)]])
     root = ET.parse(tmp_path / "j.xml").getroot()

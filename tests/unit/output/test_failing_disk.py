@@ -33,6 +33,7 @@ from icrtool.output.files.truth_file import log_and_truth
 from icrtool.output.study_directory import write_study
 from icrtool.records.run import Run
 from icrtool.simulation.studies import default_request, run_study
+from support.documents import with_summary
 
 Writer = Callable[[Path, str], object]
 """Writes something to a place; the text is in its content."""
@@ -61,10 +62,10 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
     table = calibration.summary()
 
     def named(text: str) -> Run:
-        return replace(run, name=text, summary=run.summary | {"log": text})
+        return with_summary(run, log=text)
 
     def dropout(place: Path, text: str) -> None:
-        replace(report, name=text, run_summary=run.summary | {"log": text}).write(place, plots=())
+        replace(report, name=text, run_document=named(text).document).write(place, plots=())
 
     def log(place: Path, text: str, *, directory: bool = False) -> None:
         with log_and_truth(place, force=True) as (fresh, truth):

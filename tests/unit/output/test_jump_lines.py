@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from icrtool.output.text_format import MOST_LINES, jump_lines
+from icrtool.records.run_document import ReferenceJumpDocument
 
 
-def jump(begin_s: float, size_m: float, *, undecided: bool = False) -> dict[str, object]:
-    return {
-        "kind": "position", "begin_s": begin_s, "end_s": begin_s + 0.1, "begin_ns": round(begin_s * 1e9),
-        "size_m": size_m, "turn_deg": 0.0, "why": "a reason", "undecided": undecided,
-    }  # fmt: skip
+def jump(begin_s: float, size_m: float, *, undecided: bool = False) -> ReferenceJumpDocument:
+    begin_ns = round(begin_s * 1e9)
+    return ReferenceJumpDocument(
+        "position", begin_ns, begin_ns + 10**8, 0.0, 0.0, size_m, 0.0, 0.0, 0.0, "a reason", undecided,
+        begin_s, begin_s + 0.1,
+    )  # fmt: skip
 
 
 def test_each_jump_has_a_line_in_order_of_time_with_what_follows() -> None:

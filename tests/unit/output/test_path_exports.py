@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -29,6 +28,7 @@ from icrtool.output.exports.paths import paths_of
 from icrtool.output.exports.trajectories import format_trajectory
 from icrtool.records.run import Run, track_of
 from support.barn import BAD_FIXES, OUTAGE_S
+from support.documents import with_summary
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -47,7 +47,7 @@ EVENT = {
 
 @pytest.fixture(scope="module")
 def slipping(run: Run) -> Run:
-    return replace(run, summary=run.summary | {"events": [EVENT]})
+    return with_summary(run, events=[EVENT])
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def test_the_kml_has_the_structure_of_its_schema(slipping: Run) -> None:
 
 
 def test_a_hostile_name_stays_text_in_the_kml(run: Run) -> None:
-    named = replace(run, summary=run.summary | {"log": "<b>&]]>\x1b\x00"})
+    named = with_summary(run, log="<b>&]]>\x1b\x00")
     document = ET.fromstring(format_kml(named)).find(f"{{{KML}}}Document")
     assert document is not None
     assert str(document.findtext(f"{{{KML}}}name")).startswith("<b>&]]>??")
@@ -219,8 +219,8 @@ def test_a_metric_run_is_not_put_on_the_globe_unless_its_datum_is_configured(met
     for export in (format_kml, format_geojson):
         with pytest.raises(DataError, match=r"frames\.datum"):
             export(metric)
-    frames = replace(metric.config.frames, datum=(48.0, 11.0))
-    placed = json.loads(format_geojson(replace(metric, config=replace(metric.config, frames=frames))))
+    frames = metric.summary["config"]["frames"] | {"datum": [48.0, 11.0]}
+    placed = json.loads(format_geojson(with_summary(metric, config={"frames": frames})))
     longitude, latitude = placed["features"][0]["geometry"]["coordinates"][0]
     assert (round(longitude, 4), round(latitude, 4)) == (11.0, 48.0)
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 
@@ -9,6 +8,7 @@ from icrtool.output.tables.run import format_run
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import distance_text, duration_text, error_text, signed
 from icrtool.records.run import Run
+from support.documents import with_summary
 
 
 def line_of(text: str, begin: str) -> str:
@@ -59,7 +59,7 @@ def test_no_line_is_too_wide_coloured_or_ends_in_blanks(run: Run) -> None:
         {**stream, "topic": "/robot/namespace" * 9, "message_type": "some_vendor_msgs/msg/VeryLongNameOfAMessageIndeed"}
         for stream in run.summary["streams"]
     ]
-    wide = replace(run, summary={**run.summary, "streams": long_names})
+    wide = with_summary(run, streams=long_names)
     for text in (format_run(run), format_run(wide)):
         assert max(map(len, text.splitlines())) <= TEXT_WIDTH
         assert "\x1b" not in text
@@ -113,9 +113,9 @@ def test_lengths_read_well() -> None:
 
 
 def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_would_do(run: Run) -> None:
-    steady = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": None}})
+    steady = with_summary(run, gnss={"delay_s": None, "delay_std_s": None})
     speed = run.summary["drive"]["speed_mean_mps"]
     said = f"not shown by this drive; a lag of 0.1 s would move x by {error_text(0.1 * speed)}"
     assert said in format_run(steady)
-    known = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "delay_s": 0.02, "delay_std_s": 0.01}})
+    known = with_summary(run, gnss={"delay_s": 0.02, "delay_std_s": 0.01})
     assert said not in format_run(known)

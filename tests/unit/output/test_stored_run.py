@@ -28,6 +28,7 @@ from icrtool.output.tables.run import format_run
 from icrtool.records.run import Run
 from icrtool.records.samples import GyroSamples
 from support.barn import configured, simulate
+from support.documents import with_summary
 
 
 @pytest.fixture(scope="module")
@@ -282,7 +283,7 @@ def test_no_run_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
 
 def with_inputs(run: Run, *paths: Path) -> Run:
     inputs: list[dict[str, Any]] = [{"path": str(path), "bytes": 1, "sha256": "0"} for path in paths]
-    return replace(run, summary={**run.summary, "inputs": inputs})
+    return with_summary(run, inputs=inputs)
 
 
 def test_a_log_is_its_file_or_its_bag_directory(run: Run, tmp_path: Path) -> None:

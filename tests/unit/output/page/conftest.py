@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.records.run import Run
+from support.documents import with_summary
 
 HOSTILE = "</script><script>window.hostile=1</script><img src=x onerror='window.hostile=1'>\"'&\u202e"
 """A name that would be HTML, script and attribute at once, and that reverses what follows."""
@@ -22,15 +21,15 @@ def report(run: Run) -> DropoutReport:
 @pytest.fixture(scope="session")
 def hostile_run(run: Run) -> Run:
     """The same run, with hostile text wherever a log can put some."""
-    summary = dict(run.summary)
-    robot = {**summary["config"]["robot"], "name": HOSTILE}
-    summary |= {
-        "log": HOSTILE,
-        "warnings": [HOSTILE],
-        "config": {**summary["config"], "robot": robot},
-        "streams": [{**one, "topic": HOSTILE, "message_type": HOSTILE, "why": HOSTILE} for one in summary["streams"]],
-        "inputs": [{"path": HOSTILE, "bytes": 1, "sha256": HOSTILE}],
-        "unusable_because": HOSTILE,
-        "usable": False,
-    }
-    return replace(run, name=HOSTILE, summary=summary)
+    return with_summary(
+        run,
+        log=HOSTILE,
+        warnings=[HOSTILE],
+        config={"robot": run.summary["config"]["robot"] | {"name": HOSTILE}},
+        streams=[
+            stream | {"topic": HOSTILE, "message_type": HOSTILE, "why": HOSTILE} for stream in run.summary["streams"]
+        ],
+        inputs=[{"path": HOSTILE, "bytes": 1, "sha256": HOSTILE}],
+        unusable_because=HOSTILE,
+        usable=False,
+    )

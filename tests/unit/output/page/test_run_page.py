@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -26,7 +27,9 @@ from icrtool.output.page.run_page import draw_pictures, run_page, write_page
 from icrtool.output.tables.brief import brief_dropout
 from icrtool.records.events import ReferenceJump
 from icrtool.records.run import Run
+from icrtool.records.run_document import EventDocument
 from support.barn import configured, simulate
+from support.documents import with_summary
 
 HOSTILE_PART = "window.hostile=1"
 VENDOR = Path(__file__).resolve().parents[4] / "icrtool" / "output" / "page" / "static" / "vendor"
@@ -87,12 +90,11 @@ def test_the_answer_is_that_of_the_report(page: str, run: Run, report: DropoutRe
 
 def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutReport) -> None:
     budgets = [one._replace(without_events_m=20.0, beyond_without_events=True) for one in report.budgets]
-    event = {"kind": "skid", "begin_s": 1.0, "end_s": 2.0, "severity": 0.5, "north_m": 0.0, "east_m": 0.0,
-             "distance_m": 0.1}  # fmt: skip
-    summary = {**run.summary, "events": [event, event]}
-    slipped = replace(report, budgets=budgets, run_summary=summary)
+    event = EventDocument("skid", 1.0, 2.0, 10**9, 2 * 10**9, 0.0, 0.0, 0.1, 0.5, 1.0)
+    document = msgspec.structs.replace(run.document, events=(event, event))
+    slipped = replace(report, budgets=budgets, run_document=document)
     printed = str(brief_dropout(slipped, "report.html"))
-    ((budget_m, rows),) = answer_of(summary, report_document(slipped))["reaches"]
+    ((budget_m, rows),) = answer_of(document, report_document(slipped))["reaches"]
     assert budget_m == report.budgets[0].budget_m
     assert rows[-1][:2] == ("without its 2 slip events", "more than 20 m")
     lines = printed[printed.index("How far") :].splitlines()[1 : 1 + len(rows)]
@@ -103,7 +105,7 @@ def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutRep
 
 
 def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> None:
-    warned = replace(run, summary={**run.summary, "warnings": ["the left wheel sings", "so does the right one"]})
+    warned = with_summary(run, warnings=["the left wheel sings", "so does the right one"])
     text = "".join(Elements(run_page(warned, report_document(report), {})).text)
     assert "the left wheel sings" in text
     assert "2 warnings" in text
@@ -112,7 +114,7 @@ def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> No
 def test_a_worst_trial_in_which_the_reference_jumped_is_marked(run: Run, report: DropoutReport) -> None:
     at = report.worst[0].stamp_ns + 10**9
     jump = ReferenceJump("position", at, at + 10**8, 0.0, 0.0, 7.25, 0.0, 7.25, 0.0, "", undecided=True)
-    jumping = replace(run, summary={**run.summary, "reference_jumps": [jump._asdict()]})
+    jumping = with_summary(run, reference_jumps=[jump._asdict() | {"begin_s": 0.0, "end_s": 0.1}])
     found = [run_page(one, report_document(report), {}) for one in (run, jumping)]
     texts = [" ".join("".join(Elements(page).text).split()) for page in found]
     assert ["steps by 7.25 m" in text for text in texts] == [False, True]
@@ -197,15 +199,16 @@ def test_json_in_a_page_cannot_end_its_element(page: str, run: Run, report: Drop
 
 
 def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutReport) -> None:
-    gnss = {**run.summary["gnss"], "datum": [40.123456, -77.654321, 312.5]}
-    heading = {**run.summary["heading"], "magnetic_declination_deg": -87.6543,
-               "offset_name": "magnetic declination here is -87.65°"}  # fmt: skip
-    frames = {**run.summary["config"]["frames"], "datum": [40.123456, -77.654321]}
-    summary = {**run.summary, "gnss": gnss, "heading": heading,
-               "config": {**run.summary["config"], "frames": frames},
-               "warnings": ["the heading is off: magnetic declination here is -87.65°"]}  # fmt: skip
+    cause = "magnetic declination here is -87.65°"
+    placed = with_summary(
+        run,
+        gnss={"datum": [40.123456, -77.654321, 312.5]},
+        heading={"magnetic_declination_deg": -87.6543, "offset_name": cause},
+        config={"frames": run.summary["config"]["frames"] | {"datum": [40.123456, -77.654321]}},
+        warnings=[f"the heading is off: {cause}"],
+    )
     table = replace(run.table, north_m=run.table.north_m + 4_440_123.0, east_m=run.table.east_m + 612_345.0)
-    there = replace(run, summary=summary, table=table)
+    there = replace(placed, table=table)
     document = report_document(report)
     for one in document["worst"]:
         one["north_m"] += 4_440_123.0
@@ -219,7 +222,7 @@ def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutRe
 
 
 def test_a_picture_whose_axes_show_a_map_grid_is_left_out_without_coordinates(run: Run, report: DropoutReport) -> None:
-    metric = replace(run, summary={**run.summary, "gnss": {**run.summary["gnss"], "datum": None}})
+    metric = with_summary(run, gnss={"datum": None})
     pictures = pictures_of([("worst", b"place"), ("summary", b"models")])
     page = run_page(metric, report_document(report), pictures, coordinates=False)
     assert base64.b64encode(b"models").decode() in page
