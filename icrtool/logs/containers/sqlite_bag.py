@@ -1,15 +1,18 @@
-"""rosbag2's sqlite3 storage: one ``.db3`` file, whole or damaged, with or without a write-ahead log beside it."""
+"""rosbag2's sqlite3 storage: one ``.db3`` file, with or without a write-ahead log beside it.
+
+Of a damaged file that is read which SQLite reads before the damage; ``sqlite3 .recover`` may bring back the rest.
+"""
 
 from __future__ import annotations
 
 import os
 import sqlite3
-import struct
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from threading import Event
-from typing import Any, BinaryIO
+from typing import BinaryIO
 from urllib.parse import quote
 
 import numpy as np
@@ -49,12 +52,6 @@ _UNKNOWN_ROWS = 1 << 40
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """The errors of sqlite3; the latter where its message contains a damaged name."""
 
-Row = tuple[Any, Any, Any, Any, int, int]
-"""Topic ids, log times [ns], sizes, messages; last row number, count of sound messages.
-
-SQLite does not enforce the type of a column.
-"""
-
 
 class SqliteBag:
     """One ``.db3`` file.
@@ -72,6 +69,7 @@ class SqliteBag:
     def __init__(self, path: Path, message_compression: str = "") -> None:
         self._path = path
         self.problems = Problems(path.name)
+        self._advice = f"`sqlite3 {path.name} .recover | sqlite3 recovered.db3` may bring back more"
         self._made_beside: Path | None = None
         self._last_row = 0
         self._steps_left = 0
@@ -89,7 +87,8 @@ class SqliteBag:
         except _DAMAGE as err:
             if self._interruption is not None:
                 raise self._interruption from None
-            found = "; ".join([str(err), *self.problems])
+            is_damaged = getattr(err, "sqlite_errorcode", None) == sqlite3.SQLITE_CORRUPT
+            found = "; ".join([str(err), *self.problems, *([self._advice] if is_damaged else [])])
             raise LogError(path, "not a readable rosbag2 database", found) from err
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:
@@ -124,6 +123,8 @@ class SqliteBag:
             return
         self._interruption = None
         blocks: Iterator[Block] = made_ahead(self._stored(wanted, cut), self._end_query)
+        if lost := self._cut_inside_page():
+            blocks = _without_last(blocks, lost)
         if self._message_compression:
             blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
@@ -258,93 +259,68 @@ class SqliteBag:
         return (first - 1, last) if first is not None else (0, 0)
 
     def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
-        """Yield the messages in the order they were stored; reading continues behind damaged pages."""
-        batch = self._batch_query(wanted, cut)
-        after, stop = self._rows_within(cut)
-        count, step = _FIRST_ROWS, 1
-        while after < stop:
-            try:
-                block, last = batch(after, count)
-            except _DAMAGE as err:
-                if self._interruption is not None:
-                    raise self._interruption from None
-                if count == 1:
-                    self.problems.add(f"damaged ({err}); what could be read of it was read")
-                    after, step = after + step, 2 * step
-                count = max(count // 2, 1)
-                continue
-            if last is None:
-                return
-            step = 1
-            if block is None and count > 1:
-                count //= 2
-                continue
-            self._last_row = after = max(after + 1, last)
-            if block is None:
-                self.problems.add(
-                    f"rows without a time, or without a message of up to {_LARGEST_MESSAGE_BYTES} bytes, left out"
-                )
-                continue
-            yield with_possible_times(block, self.problems)
-            by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
-            count = max(1, min(4 * count, _MOST_ROWS, by_size))
-
-    def _rows_cut_off(self) -> frozenset[int]:
-        """Return the rows across the end of a file that ends inside a page: SQLite reads zeros behind the end.
-
-        Notes
-        -----
-        A message longer than a page whose last part is there is not found; the messages that icrtool uses are shorter.
-        """
-        size = self._path.stat().st_size
-        with self._path.open("rb") as stream:
-            # The field has two bytes, and 1 stands for 65536.
-            page_bytes = int.from_bytes(stream.read(18)[16:], "big")
-            page_bytes = page_bytes if page_bytes > 1 else 1 << 16
-            if size % page_bytes == 0:
-                return frozenset()
-            stream.seek(size - size % page_bytes)
-            page = stream.read()
-        self.problems.add(f"{CUT_OFF}; what could be read of it was read")
-        return frozenset(row for row, end in _table_rows(page) if end > len(page))
-
-    def _batch_query(self, wanted: frozenset[int], cut: Cut) -> Callable[[int, int], tuple[Block | None, int | None]]:
-        """Return a function of a row and a count that reads up to that many messages behind the row.
-
-        It returns them (None where they cannot be joined) and their last row (None where no row is left).
+        """Yield the messages in the order they were stored, up to the first row that SQLite cannot read.
 
         Notes
         -----
         SQLite joins the messages of a batch itself, without one Python object for each and without the interpreter
-        lock. Rows that it cannot join (a column may hold any type) are read in batches of one.
+        lock. Rows that hold no message, which the first query finds, are left out by the second.
         """
         # The ids are integers from the database itself; as parameters they could exceed SQLite's limit of variables.
-        topics, lost = _numbers(wanted), _numbers(self._rows_cut_off())
-        within = ""
+        within = f"topic_id IN ({_numbers(wanted)})"
         if cut != WHOLE:
-            within = (
-                f"AND (timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns} OR topic_id IN ({_numbers(cut.whole)}))"
-            )
-        # The type and the length of a message are known without reading it.
-        sound = f"typeof(data) = 'blob' AND length(data) <= {_LARGEST_MESSAGE_BYTES}"
-        rows = (
-            f"SELECT topic_id AS topic, timestamp AS time, CASE WHEN {sound} THEN data END AS sound, rowid AS number "  # noqa: S608
-            f"FROM messages WHERE topic_id IN ({topics}) AND rowid NOT IN ({lost}) {within} AND rowid > ? "
-            "ORDER BY rowid LIMIT ?"
+            times = f"timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns}"
+            within += f" AND ({times} OR topic_id IN ({_numbers(cut.whole)}))"
+        # A column may hold any type. Type and length of a message are known without reading it.
+        sound = "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
+        sound += f" AND length(data) <= {_LARGEST_MESSAGE_BYTES}"
+        joined, of_sound = (
+            "SELECT group_concat(topic), group_concat(time), group_concat(length(data)), "  # noqa: S608
+            "CAST(group_concat(data, '') AS BLOB), max(number), count(*) - count(data) FROM (SELECT topic_id AS topic, "
+            f"timestamp AS time, CASE WHEN {sound} THEN data END AS data, rowid AS number FROM messages "
+            f"WHERE {rows} AND rowid > ? ORDER BY rowid LIMIT ?)"
+            for rows in (within, f"{within} AND {sound} AND rowid <= ?")
         )
-        joined = (
-            "SELECT group_concat(topic), group_concat(time), group_concat(length(sound)), "  # noqa: S608
-            f"CAST(group_concat(sound, '') AS BLOB), max(number), count(sound) FROM ({rows})"
-        )
+        after, stop = self._rows_within(cut)
+        count = _FIRST_ROWS
+        while after < stop:
+            try:
+                *texts, content, last, without = self._query(joined, (after, count)).fetchone()
+                if without:
+                    *texts, content, _, _ = self._query(of_sound, (last, after, count)).fetchone()
+            except _DAMAGE as err:
+                if self._interruption is not None:
+                    raise self._interruption from None
+                if count == 1:
+                    self.problems.add(f"damaged ({err}); what SQLite reads before was read; {self._advice}")
+                    return
+                count //= 2  # those before the damage; or together they are too long
+                continue
+            if last is None:
+                return
+            self._last_row = after = max(after + 1, last)
+            if without:
+                self.problems.add(
+                    f"rows without a time, or without a message of up to {_LARGEST_MESSAGE_BYTES} bytes, left out"
+                )
+            if content is None:
+                continue
+            block = _unpacked(texts, content)
+            yield with_possible_times(block, self.problems)
+            by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
+            count = max(1, min(4 * count, _MOST_ROWS, by_size))
 
-        def batch(after: int, count: int) -> tuple[Block | None, int | None]:
-            row = self._query(joined if count > 1 else rows, (after, count)).fetchone()
-            if row is not None and count == 1:
-                topic, time, data, number = row
-                row = (topic, time, len(data or b""), data, number, 1)
-            return (None, None) if row is None or row[4] is None else (_packed(row), row[4])
-
-        return batch
+    def _cut_inside_page(self) -> int:
+        """Return the bytes of a page where the file ends inside one, else 0; and report an end that is missing."""
+        size = self._path.stat().st_size
+        with self._path.open("rb") as stream:
+            head = stream.read(32)
+        # The field has two bytes, and 1 stands for 65536.
+        page_bytes = int.from_bytes(head[16:18], "big")
+        page_bytes = page_bytes if page_bytes > 1 else 1 << 16
+        if size % page_bytes or size < page_bytes * int.from_bytes(head[28:32], "big"):
+            self.problems.add(f"{CUT_OFF}; what SQLite reads of it was read; {self._advice}")
+        return page_bytes if size % page_bytes else 0
 
 
 def _numbers(numbers: Iterable[int]) -> str:
@@ -358,40 +334,28 @@ def _allow(action: int, first: str | None, second: str | None, _: str | None, vi
     return sqlite3.SQLITE_OK if reads or calls or action == sqlite3.SQLITE_SELECT else sqlite3.SQLITE_DENY
 
 
-def _packed(row: Row) -> Block | None:
-    """Return the messages of a joined row, None where some of them are not bytes or have no time."""
-    *texts, data, _, count = row
-    if data is None:
-        return None
-    try:
-        topics, times, sizes = (np.fromstring(str(text), np.int64, sep=",") for text in texts)
-    except ValueError:
-        return None
+def _unpacked(texts: Sequence[str], content: bytes) -> Block:
+    """Return joined messages as a block; `texts` are topic ids, times and sizes with commas between."""
+    topics, times, sizes = (np.fromstring(text, np.int64, sep=",") for text in texts)
     end = np.cumsum(sizes)
-    if not len(topics) == len(times) == len(sizes) == count or not isinstance(data, bytes) or end[-1] != len(data):
-        return None
-    return Block(np.frombuffer(data, np.uint8), topics, times, end - sizes, end)
+    return Block(np.frombuffer(content, np.uint8), topics, times, end - sizes, end)
 
 
-def _table_rows(page: bytes) -> Iterator[tuple[int, int]]:
-    """Yield row number and end of the rows on a leaf page of a table (https://sqlite.org/fileformat.html, 1.6)."""
-    if page[:1] != b"\x0d":
-        return
-    count = min(int.from_bytes(page[3:5], "big"), (len(page) - 8) // 2)
-    for (place,) in struct.iter_unpack(">H", page[8 : 8 + 2 * max(count, 0)]):
-        length, at = _variable_integer(page, place)
-        row, at = _variable_integer(page, at)
-        yield row, at + length
-
-
-def _variable_integer(page: bytes, at: int) -> tuple[int, int]:
-    """Return SQLite's integer of one to nine bytes at an offset, and the offset behind it."""
-    value = 0
-    for byte in page[at : at + 8]:
-        value, at = value << 7 | byte & 0x7F, at + 1
-        if byte < 0x80:
-            return value, at
-    return value << 8 | int.from_bytes(page[at : at + 1], "big"), at + 1
+def _without_last(blocks: Iterable[Block], lost: int) -> Iterator[Block]:
+    """Yield blocks without the messages in their last bytes: SQLite reads zeros behind the end of a page cut off."""
+    held: deque[Block] = deque()
+    size = 0
+    for block in blocks:
+        held.append(block)
+        size += len(block.data)
+        while size - len(held[0].data) >= lost:
+            size -= len(held[0].data)
+            yield held.popleft()
+    for block in held:
+        _, *columns = block
+        whole = block.end <= size - lost
+        yield Block(block.data, *(column[whole] for column in columns))
+        size -= len(block.data)
 
 
 def is_sqlite(stream: BinaryIO) -> bool:

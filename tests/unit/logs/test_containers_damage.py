@@ -601,7 +601,7 @@ def test_db3_cut_off_anywhere_gives_what_stands_before_the_cut(tmp_path):
 
 @pytest.mark.parametrize("pages", [1, 5])
 @pytest.mark.parametrize("rubbish", ["zeros", "noise"])
-def test_db3_with_damaged_pages_gives_what_stands_before_and_behind_them(tmp_path, pages, rubbish):
+def test_db3_with_damaged_pages_gives_what_stands_before_them_and_names_the_tool_for_the_rest(tmp_path, pages, rubbish):
     messages = make_messages(count=3000, length=200)
     path = write_directory(tmp_path / "log", messages) / "log.db3"
     whole = path.read_bytes()
@@ -609,11 +609,34 @@ def test_db3_with_damaged_pages_gives_what_stands_before_and_behind_them(tmp_pat
     middle = whole.index(messages[1500][2][:150]) // 4096 * 4096
     path.write_bytes(patched(whole, middle, noise))
     found, problems = read_log(path)
-    assert [message for message in messages if message in found] == found
-    assert len(found) > len(messages) - 16 * 2 * (pages + 1) - 64
-    assert messages[-1] in found
+    assert found == messages[: len(found)]
+    assert 1500 - 4096 // 200 < len(found) <= 1500
     (problem,) = problems
     assert problem.startswith("log.db3: damaged (")
+    assert "`sqlite3 log.db3 .recover | sqlite3 recovered.db3`" in problem
+
+
+def test_db3_whose_list_of_topics_is_damaged_is_refused_and_names_the_tool(tmp_path):
+    path = write_directory(tmp_path / "log", make_messages(count=300, length=200)) / "log.db3"
+    database = sqlite3.connect(path)
+    (page,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'topics'").fetchone()
+    database.close()
+    path.write_bytes(patched(path.read_bytes(), 4096 * (page - 1), bytes(4096)))
+    with pytest.raises(LogError, match=r"log\.db3: not a readable rosbag2 database; .*`sqlite3 log\.db3 \.recover"):
+        open_log(path)
+
+
+@pytest.mark.parametrize("end", [0, 1, 2000], ids=["at a page", "behind a page", "inside a page"])
+def test_db3_cut_off_says_so_and_loses_a_page_at_most(tmp_path, end):
+    messages = make_messages(count=2000, length=200)
+    whole = (write_directory(tmp_path / "log", messages) / "log.db3").read_bytes()
+    place = whole.index(messages[1500][2][:150]) // 4096 * 4096
+    path = tmp_path / "cut.db3"
+    path.write_bytes(whole[: place + end])
+    found, problems = read_log(path)
+    assert found == messages[: len(found)]
+    assert len(found) > 1500 - 3 * 21
+    assert problems[0].startswith("cut.db3: cut off; what SQLite reads of it was read; `sqlite3 cut.db3 .recover")
 
 
 def test_db3_rows_that_hold_no_message_are_left_out_and_said(tmp_path):
