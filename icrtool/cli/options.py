@@ -156,14 +156,16 @@ def report(command: Command) -> Command:
     ) -> object:  # fmt: skip
         from icrtool.fleet.one_log import ReportOptions
 
-        asked = ReportOptions(plots, gates, budgets, ladder, strict, page, allow_unusable, figures)
+        # one that is all blank stays, and is refused as no limit
+        limits = tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
+        asked = ReportOptions(plots, limits, budgets, ladder, strict, page, allow_unusable, figures)
         return command(asked=asked, junit=junit, markdown=markdown, **others)
 
     return add_options(
         cast("Command", with_options),
         budgets,
         click.option("--gate", "gates", metavar="LIMIT", multiple=True,
-                     help="Acceptance limit: exit status 3 if it is not met; repeatable."),
+                     help="Acceptance limit, or several, one a line: exit status 3 if one is not met; repeatable."),
         click.option("--baseline", metavar="REPORT.json|DIR", type=FILE,
                      help="Earlier report, run or batch to compare with; a limit may then read "
                      "\"icr.p95@10m <= 1.1 * baseline\"."),
