@@ -1,0 +1,51 @@
+"""Print what of constraints.txt icrtool needs to be built and used, with hashes: pinned_requirements.py [EXTRA...].
+
+pip finds out which packages these are on this system; it takes names and hashes together only from a whole list.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def needed(extras: list[str]) -> list[str]:
+    """Return the requirements of the package, of its build, and of the extras."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    groups = project["project"]["optional-dependencies"]
+    if unknown := set(extras) - set(groups):
+        sys.exit(f"{', '.join(sorted(unknown))}: no such extra of icrtool; there are {', '.join(sorted(groups))}")
+    wanted = [*project["build-system"]["requires"], *project["project"]["dependencies"]]
+    return wanted + [one for extra in extras for one in groups[extra]]
+
+
+def resolved(requirements: list[str], pins: str) -> set[str]:
+    """Return the names of all packages that pip would install for `requirements`."""
+    with tempfile.TemporaryDirectory() as scratch:
+        wanted, pinned, report = (Path(scratch) / name for name in ("wanted", "pinned", "report"))
+        wanted.write_text("\n".join(requirements), encoding="utf-8")
+        pinned.write_text(re.sub(r" *\\$|^ +--hash.*$", "", pins, flags=re.MULTILINE), encoding="utf-8")
+        pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--dry-run"]
+        subprocess.run(
+            [*pip, "--ignore-installed", "--report", report, "-c", pinned, "-r", wanted], check=True, stdout=sys.stderr
+        )
+        found = json.loads(report.read_bytes())["install"]
+    return {re.sub(r"[-_.]+", "-", one["metadata"]["name"]).lower() for one in found}
+
+
+def main() -> None:
+    """Print a line for each package, with its hashes."""
+    pins = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    names = resolved(needed(sys.argv[1:]), pins)
+    print("\n".join(one for one in re.split(r"\n(?=\S)", pins.strip()) if one.split("==")[0] in names))
+
+
+if __name__ == "__main__":
+    main()
