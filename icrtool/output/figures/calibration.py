@@ -31,8 +31,10 @@ AFTER: dict[str, Any] = BEFORE | {"label": "after: calibrated", "marker": "o", "
 @styled
 def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     """Return residuals of displacements and of heading changes over windows, before and after."""
+    first, last = (float(np.median(np.hypot(*part))) for part in (residuals.before, residuals.after))
+    windows = f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals"
     figure = new_figure(
-        name, f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals",
+        f"Windows of the drive are off by {last:.3f} m calibrated, {first:.3f} m before", f"{name}: {windows}",
         height_in=4.2, margins_in=(0.75, 0.2, 0.7, 1.0), wspace=0.32,
     )  # fmt: skip
     place, turn = figure.subplots(1, 2)

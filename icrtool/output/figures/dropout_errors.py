@@ -67,7 +67,9 @@ def dropout_summary(report: DropoutReport) -> Figure:
     reached = [one for one in report.budgets if one.model in {model.name for model in models}]
     best = next((one for one in reached if one.model == models[0].name), None)
     pens = _pens(report)
-    title = f"Within {best.budget_m:g} m (95 %) for {best.reach_text}" if best is not None else "Error over distance"
+    title = (
+        f"Within {best.budget_m:g} m (95 %) for {best.reach_text}" if best is not None else _largest(report, models[0])
+    )
     # Beside the models: the mean of the first, budget, outages.
     most = int(report.counts.trials.max())
     keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
@@ -96,6 +98,15 @@ def dropout_summary(report: DropoutReport) -> Figure:
         _mark_reaches(axes, marked, pens, low)
     add_legend(figure, ncols=KEY_COLUMNS)
     return figure
+
+
+def _largest(report: DropoutReport, model: ModelResult) -> str:
+    """Return the error at the last horizon that has trials; of a run that is not usable no distance is stated."""
+    known = np.flatnonzero(np.isfinite(model.summary.p95))
+    if not len(known):
+        return "Error over distance: no trial was long enough"
+    error = f"{error_text(float(model.summary.p95[known[-1]]))} off (95 %) after {report.horizons_m[known[-1]]:g} m"
+    return error if report.usable else f"Do not use: {error}"
 
 
 @styled

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.patches import Circle
 
 from icrtool.calibration.forecast import Forecast
+from icrtool.kernels.within_budget import within_budget
 from icrtool.output.figures.style import CHANGE, FILTER, HALF_WIDTH, ICR, MEAN, new_figure, styled
 
 if TYPE_CHECKING:
@@ -21,10 +22,14 @@ def forecast_figure(
     forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, gyro: Forecast | None = None
 ) -> Figure:
     """Return the figure of a forecast; a dashed line for each budget, and where the calibration's errors end."""
+    reached = within_budget(forecast.distance_m, forecast.p95_m, budgets_m[0]) if budgets_m else None
+    answer = f"{forecast.p95_m[-1]:.2f} m off (95 %) at the end of {forecast.distance_m[-1]:.0f} m"
+    if reached is not None:
+        answer = f"Within {budgets_m[0]:g} m (95 %) for {reached[0]:.1f} m, {answer}"
     by = "wheels alone" if gyro is None else "wheels alone, and with gyro"
-    subtitle = f"Forecast error without GNSS from the start: {by}, by the calibration"
+    subtitle = f"{title}: forecast error without GNSS from the start: {by}, by the calibration"
     figure = new_figure(
-        title, subtitle, width_in=9.0, height_in=4.2, margins_in=(0.7, 0.25, 0.75, 0.95), wspace=0.28
+        answer, subtitle, width_in=9.0, height_in=4.2, margins_in=(0.7, 0.25, 0.75, 0.95), wspace=0.28
     )  # fmt: skip
     grown, path = figure.subplots(1, 2)
     for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):

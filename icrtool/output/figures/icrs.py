@@ -59,6 +59,16 @@ LEAST_MARGIN_S = 10.0
 BINS = 30
 
 
+def _answer(run: Run) -> str:
+    """Return where the estimates ended, and which of them the drive does not show."""
+    finals = {ICR_WORDS[column]: run.document.icr.final[column] for column in ICR_COLUMNS}
+    ends = ", ".join(f"{word} {signed(value)} m" for word, value in finals.items() if value is not None)
+    unknown = ", ".join(word for word, value in finals.items() if value is None)
+    if not ends:
+        return f"This drive does not show its ICRs: {unknown}"
+    return f"The ICRs end at {ends}{f'; not shown: {unknown}' if unknown else ''}"
+
+
 @styled
 def icr_estimates(run: Run) -> Figure:
     """Return the three ICR estimates over time with ±2σ, their 10-90 % convergence, b/2 where known, and GNSS outages.
@@ -66,13 +76,9 @@ def icr_estimates(run: Run) -> Figure:
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
     spans = _spans_s(run)
-    finals = ((ICR_WORDS[column], run.document.icr.final[column]) for column in ICR_COLUMNS)
-    ends = ", ".join(
-        f"{word} {signed(value)} m" if value is not None else f"{word} not shown" for word, value in finals
-    )
     learning = "; left: learning, right: after it" if len(spans) > 1 else ""
     figure = new_figure(
-        f"The ICRs end at {ends}", f"{run_title(run.document)}: estimates of the filter{learning}",
+        _answer(run), f"{run_title(run.document)}: estimates of the filter{learning}",
         height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3,
     )  # fmt: skip
     panels = figure.subplots(

@@ -26,10 +26,10 @@ def transfer(document: Mapping[str, Any]) -> Figure:
     document : of `icrtool.output.tables.transfer.transfer_document`, or read from its JSON
     """
     names, rows = list(document["groups"]), [one for one in document.get("costs", ()) if _known(one["p95_m"])]
-    subtitle = "95 % error without GNSS; on the diagonal each trial is predicted by a fit that does not contain it"
+    subtitle = f"{' · '.join(names)}: on the diagonal each trial is predicted by a fit that does not contain it"
     figure = new_figure(
-        " · ".join(names), subtitle, width_in=9.6, height_in=2.8 + 0.45 * len(names) + 0.12 * len(rows),
-        margins_in=(1.3, 0.2, 0.8, 1.0), wspace=1.15,
+        _answer(document), subtitle, width_in=9.6, height_in=2.95 + 0.45 * len(names) + 0.12 * len(rows),
+        margins_in=(1.3, 0.2, 1.35, 0.75), wspace=1.15,
     )  # fmt: skip
     matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
     _draw_matrix(matrix, document, names)
@@ -47,6 +47,17 @@ def transfer(document: Mapping[str, Any]) -> Figure:
     return figure
 
 
+def _answer(document: Mapping[str, Any]) -> str:
+    """Return the errors with a calibration of another group, and with its own."""
+    cells = [one for one in document["transfer"] if one["horizon_m"] == CHOICE_HORIZON_M and _known(one["p95_m"])]
+    own = [one["p95_m"] for one in cells if one["calibrated_on"] == one["tested_on"]]
+    other = [one["p95_m"] for one in cells if one["calibrated_on"] != one["tested_on"]]
+    if not (own and other):
+        return f"No group has a trial of {CHOICE_HORIZON_M:g} m"
+    spans = [" to ".join(dict.fromkeys((f"{min(errors):.2f}", f"{max(errors):.2f}"))) for errors in (other, own)]
+    return f"{spans[0]} m off after {CHOICE_HORIZON_M:g} m (95 %) with another's calibration, {spans[1]} m with its own"
+
+
 def _draw_matrix(axes: Axes, document: Mapping[str, Any], names: list[str]) -> None:
     values = np.full((len(names), len(names)), np.nan)
     for cell in document["transfer"]:
@@ -58,10 +69,10 @@ def _draw_matrix(axes: Axes, document: Mapping[str, Any], names: list[str]) -> N
         text = f"{values[row, column]:.2f} m" if np.isfinite(values[row, column]) else "–"
         axes.text(column, row, text, ha="center", va="center", fontsize=8.5)
     short = [drawable(name, LONGEST_NAME) for name in names]
-    axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="right")
+    axes.xaxis.tick_top()
+    axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="left")
     axes.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
-    axes.set_xlabel(f"tested on, after {CHOICE_HORIZON_M:g} m")
-    axes.set_ylabel("calibrated on")
+    axes.set_xlabel(f"95 % error after {CHOICE_HORIZON_M:g} m:\ncalibrated on the row, tested on the column")
     axes.grid(visible=False)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
+from icrtool.motion.models import TERMS
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.checksums import CHECKSUM_FILE, read_sums
@@ -29,7 +30,7 @@ from icrtool.output.tables.dropout import shown_horizons
 from icrtool.output.text_format import duration_text, error_text, position_word, role_word
 from icrtool.records.plain_data import plain
 from icrtool.records.regular_file import read_regular
-from icrtool.records.run import ICR_WORDS, Run
+from icrtool.records.run import ICR_WORDS, Run, check_type
 from icrtool.records.run_document import RunDocument
 
 SCRIPTS = (
@@ -66,6 +67,7 @@ def write_page(
     OutputError
         The file cannot be written.
     """
+    check_type(run, Run, "icrtool.open_run(directory) reads one")
     pictures = pictures_of_run(plots if plots is not None else run.directory)
     page = run_page(run, report_document(report), pictures, coordinates=coordinates)
     write_file(Path(path), page, inside, ours=is_page if inside is not None else None)
@@ -98,7 +100,7 @@ def run_page(
         errors=_error_rows(document), worst=_worst_rows(document, summary),
         config=_config_lines(summary.config.effective()),
         coordinates=coordinates, samples=len(run.table), worst_label=_worst_label(document),
-        main_rows=main_rows(document),
+        main_rows=main_rows(document), meanings={name: term.meaning for name, term in TERMS.items()},
     )  # fmt: skip
 
 

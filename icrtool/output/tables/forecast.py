@@ -9,6 +9,7 @@ from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.within_budget import within_budget
+from icrtool.motion.models import TERMS
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text, fitted_model_text
 from icrtool.records.text import counted
@@ -88,5 +89,6 @@ def format_forecast(
         blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
     if total > (longest := measured_to_m(calibration)):
         blocks.append(f"errors were measured up to {longest:g} m; what is beyond is extrapolated")
-    blocks += [f"not shown by the calibration's driving: {name}" for name in calibration.fitted.not_shown]
+    if unknown := "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown):
+        blocks.append(f"not found by the calibration, too small or not driven: {unknown}")
     return Text([*blocks, *calibration.warnings])

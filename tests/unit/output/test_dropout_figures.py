@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
@@ -151,6 +152,11 @@ def test_the_summary_has_a_handful_of_entries_and_none_of_the_tables_alone(
     entries = [text for text in entries if text]
     assert len(entries) <= 7
     assert not any(text.startswith(("ICR", "icr", "recommended_gyro", "final")) for text in entries)
+
+
+def test_a_run_that_is_not_usable_is_named_so_in_the_title(report: DropoutReport) -> None:
+    title = dropout_summary(replace(report, usable=False, budgets=())).texts[0].get_text()
+    assert re.fullmatch(r"Do not use: [\d.]+ m off \(95 %\) after \d+ m", title)
 
 
 def test_a_distance_beyond_all_trials_is_not_marked(report: DropoutReport) -> None:

@@ -15,7 +15,9 @@ from icrtool.kernels.filter.measurement_codes import GATED
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.gnss_difference import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style
+from icrtool.output.figures.transfer import transfer
 from icrtool.output.page.pictures import drawn_pictures
+from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.events import ReferenceJump
 from icrtool.records.run import Run
 from support.barn import configured, simulate
@@ -236,6 +238,32 @@ def test_line_styles_differ_in_grey() -> None:
     ]
     assert min(np.diff(sorted(grey))) > 0.09
     assert len({str(pen.dash) for pen in (FILTER, ICR, NO_SLIP)}) == 3
+
+
+def test_the_picture_of_a_comparison_answers_with_both_errors_and_its_words_stand_apart() -> None:
+    names, at = ["grass", "a very long name of a group", "asphalt"], {"horizon_m": CHOICE_HORIZON_M}
+    cells = [
+        at | {"calibrated_on": row, "tested_on": column, "p95_m": 0.4 if row == column else 0.9}
+        for row in names for column in names
+    ]  # fmt: skip
+    costs = [one | {"p95_low_m": 0.1, "p95_high_m": 1.2} for one in cells if one["p95_m"] == 0.9]
+    figure = transfer({"groups": dict.fromkeys(names), "transfer": cells, "costs": costs})
+    figure.draw_without_rendering()
+    assert "0.90 m off after 10 m (95 %) with another's calibration, 0.40 m with its own" in figure.texts[0].get_text()
+    matrix = figure.axes[0]
+    words = [*figure.texts, matrix.xaxis.label, *matrix.get_yticklabels()]
+    boxes = [(one.get_text(), one.get_window_extent()) for one in words]
+    columns = [(one.label2.get_text(), one.label2.get_window_extent()) for one in matrix.xaxis.get_major_ticks()]
+    for number, (text, box) in enumerate(boxes):
+        assert figure.bbox.contains(*box.min), text
+        # of the slanted names of the columns the boxes overlap, the words do not
+        for other, other_box in (*boxes[number + 1 :], *columns):
+            assert not box.overlaps(other_box), f"{text!r} covers {other!r}"
+
+
+def test_a_drive_that_shows_no_icrs_says_so_in_the_title(make_run: Callable[..., Run]) -> None:
+    parked = make_run(speed_mps=0.008, turn_mps=0.0, duration_s=20.0)
+    assert drawn("icr_estimates", parked).texts[0].get_text().startswith("This drive does not show its ICRs: y right")
 
 
 def test_a_users_settings_change_nothing(tmp_path, run: Run) -> None:
