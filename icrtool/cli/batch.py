@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 import re
 import shutil
 import sys
 import textwrap
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,9 +21,7 @@ from icrtool.cli.stages import signal_word
 from icrtool.records.text import LogText, counted, escaped, shortened
 
 if TYPE_CHECKING:
-    from distributed import Client
-
-    from icrtool.fleet.batch import BatchOptions, Lost
+    from icrtool.fleet.batch import BatchOptions
     from icrtool.fleet.one_log import ReportOptions, Request
     from icrtool.fleet.roll_up import PooledCalibration
     from icrtool.fleet.row import Row
@@ -102,10 +98,12 @@ def run_all(
 ) -> list[Row]:  # fmt: skip
     """Process all logs, and return a row of each, in the order of the requests."""
     from icrtool.fleet.batch import run_batch
+    from icrtool.fleet.one_log import path_of
+    from icrtool.fleet.processes import executor_of
 
     rows: list[Row] = []
     with (
-        executor_of(requests, jobs, scheduler, worker_timeout_s) as (executor, lost),
+        executor_of([path_of(one.path) for one in requests], jobs, scheduler, worker_timeout_s) as (executor, lost),
         closing(view),
         closing(run_batch(requests, executor, batch, view.stage, lost)) as coming,
     ):
@@ -153,66 +151,6 @@ def print_results(
         click.echo(summary_of(rows, output))
         if calibrations:
             click.echo(f"\n{calibrations_text(calibrations, tables=False)}", nl=False)
-
-
-@contextmanager
-def executor_of(
-    requests: Sequence[Request], jobs: int | None, scheduler: str | None, worker_timeout_s: float
-) -> Iterator[tuple[Executor, Lost]]:
-    """Give what runs the logs (threads that own a process each, or a Dask cluster), and whether that is lost."""
-    from icrtool.errors import ConfigError
-    from icrtool.fleet.batch import local_executor
-    from icrtool.fleet.processes import close_all
-
-    if scheduler is None:
-        try:
-            with local_executor(requests, jobs) as executor:
-                yield executor, str
-        finally:
-            close_all()
-        return
-    try:
-        from distributed import Client
-    except ImportError as err:
-        raise ConfigError("--scheduler", "needs Dask", "pip install 'icrtool[cluster]'") from err
-    for name in ("distributed", "distributed.client", "distributed.utils", "tornado", "asyncio"):
-        # They log tracebacks where a scheduler is lost; the rows of the logs state it.
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    try:
-        client = Client(scheduler, timeout=10)
-    except (OSError, ValueError) as err:
-        raise ConfigError(f"--scheduler {scheduler}", "no Dask scheduler answers there", str(err)) from err
-    with client:
-        # Its shutdown would wait for logs that a lost cluster never ends; all others are done by then.
-        yield client.get_executor(), _ClusterWatch(client, worker_timeout_s)
-
-
-class _ClusterWatch:
-    """Whether a cluster is lost: it has no scheduler, or no worker, for some time; then it is given up for good."""
-
-    def __init__(self, client: Client, worker_timeout_s: float) -> None:
-        self._client = client
-        self._timeout_s = worker_timeout_s
-        self._fine_s = time.monotonic()
-        self._lost = ""
-
-    def __call__(self) -> str:
-        """Return why it is lost; empty while it is not."""
-        why = self._lost or self._trouble()
-        if not why:
-            self._fine_s = time.monotonic()
-        elif not self._lost and (self._client.status == "closed" or time.monotonic() - self._fine_s > self._timeout_s):
-            self._lost = why
-        return self._lost
-
-    def _trouble(self) -> str:
-        if self._client.status != "running":
-            return "the scheduler of the cluster is gone"
-        try:
-            workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        except (OSError, TimeoutError):
-            return "the scheduler of the cluster is gone"
-        return "" if workers else f"the cluster had no worker for {self._timeout_s:g} s"
 
 
 class View:

@@ -20,8 +20,8 @@ from icrtool.records.unfinished import remove_unfinished
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a program that Ctrl-C ended."""
 
-GRACE_S = 0.3
-"""Time in which the main thread may end the process after a signal [s]."""
+GRACE_S = 0.5
+"""Time in which the main thread may end the process, and the processes of a batch, after a signal [s]."""
 
 OVER = 0
 """Stands for the end of the block where the number of a signal is read."""

@@ -18,7 +18,7 @@ from icrtool.errors import ConfigError, OutputError
 from icrtool.fleet.fleet_files import ROWS, check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
-from icrtool.fleet.processes import close_all, process_apart
+from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
 from icrtool.fleet.row import File, Row, as_text
 from icrtool.logs.containers.split_files import files_of_log
@@ -26,17 +26,8 @@ from icrtool.records.regular_file import read_regular
 
 RUNS = "runs"
 
-PROCESS_BYTES = 400 << 20
-"""Memory of a process with a small log."""
-
-LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
-"""Memory of a log: so many times its size, at most that of 10 h at 100 Hz."""
-
 POLL_S = 1.0
 """Time between two looks at a cluster."""
-
-Lost = Callable[[], str]
-"""Returns why no log can be processed any more (a scheduler that is gone); empty while they can."""
 
 Watch = Callable[[str, str], None]
 """Called with the name of a log and its stage."""
@@ -156,20 +147,6 @@ def run_batch(
             yield replace(row, reason=f"{row.reason} (tried twice)") if row.status == "failed" else row
 
 
-def local_executor(requests: Sequence[Request], jobs: int | None) -> ThreadPoolExecutor:
-    """Return an executor on this machine: a thread for each of `jobs` processes, by default as `default_jobs`."""
-    return ThreadPoolExecutor(jobs if jobs is not None else default_jobs(requests), thread_name_prefix="log")
-
-
-def default_jobs(requests: Sequence[Request]) -> int:
-    """Return the number of cores, or of the largest logs that the free memory holds at once."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    largest = max((_size(path_of(request.path)) for request in requests), default=0)
-    each = PROCESS_BYTES + min(LOG_FACTOR * largest, LOG_BYTES)
-    free = _free_bytes()
-    return max(1, min(cores, len(requests), int(free // each) if free is not None else cores))
-
-
 def _all_of(
     requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None, lost: Lost
 ) -> Generator[tuple[Request, Row], None, None]:
@@ -255,16 +232,3 @@ def _same_files(stored: Sequence[File], path: Path) -> bool:
     except OSError:
         return False
     return True
-
-
-def _size(path: Path) -> int:
-    return sum(file.stat().st_size for file in files_of_log(path) if file.is_file())
-
-
-def _free_bytes() -> int | None:
-    """Return the memory that is free for processes; None where the system does not state it."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration, ValueError):
-        return None

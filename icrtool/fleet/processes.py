@@ -11,6 +11,7 @@ while it starts, ends all logs of their pools (pebble 5.2), and the second ends 
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import queue
 import signal
@@ -19,18 +20,24 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 import msgspec
 
+from icrtool.errors import ConfigError
 from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
 from icrtool.fleet.row import Row
+from icrtool.logs.containers.split_files import files_of_log
 from icrtool.records.memory import give_back_freed
 from icrtool.records.unfinished import remove_unfinished
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 GRACE_S = 0.3
 """Time in which a process may remove what it is writing before it is killed [s]."""
@@ -50,6 +57,15 @@ NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
 COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.processes")
 
 Lines = queue.SimpleQueue[bytes]
+
+Lost = Callable[[], str]
+"""Returns why no log can be processed any more (a scheduler that is gone); empty while they can."""
+
+PROCESS_BYTES = 400 << 20
+"""Memory of a process with a small log."""
+
+LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
+"""Memory of a log: so many times its size, at most that of 10 h at 100 Hz."""
 
 _ANSWER: msgspec.json.Decoder[str | Row] = msgspec.json.Decoder(str | Row)
 """Made at import: msgspec crashes where several threads are the first to use a type."""
@@ -83,8 +99,99 @@ def close_all() -> None:
     _idle.clear()
     for worker in list(_all):
         worker.ask_to_end()
+    end_s = time.monotonic() + GRACE_S
     for worker in list(_all):
-        worker.close()
+        worker.close(max(end_s - time.monotonic(), 0.0))
+
+
+@contextmanager
+def executor_of(
+    logs: Sequence[Path], jobs: int | None, scheduler: str | None, worker_timeout_s: float
+) -> Iterator[tuple[Executor, Lost]]:
+    """Give what runs `process_apart` for logs, threads or a Dask cluster, and what reports whether that is lost.
+
+    Parameters
+    ----------
+    jobs : logs at the same time on this machine; default: as `default_jobs`
+    scheduler : address of the cluster; None: this machine
+    worker_timeout_s : a cluster that has no scheduler or no worker for so long is lost
+
+    Raises
+    ------
+    ConfigError
+        There is no such cluster, or no Dask.
+    """
+    if scheduler is None:
+        try:
+            with ThreadPoolExecutor(jobs if jobs is not None else default_jobs(logs), "log") as executor:
+                yield executor, str
+        finally:
+            close_all()
+        return
+    try:
+        from distributed import Client
+    except ImportError as err:
+        raise ConfigError("--scheduler", "needs Dask", "pip install 'icrtool[cluster]'") from err
+    for name in ("distributed", "distributed.client", "distributed.utils", "tornado", "asyncio"):
+        # They log tracebacks where a scheduler is lost; the rows of the logs state it.
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    try:
+        client = Client(scheduler, timeout=10)
+    except (OSError, ValueError) as err:
+        raise ConfigError(f"--scheduler {scheduler}", "no Dask scheduler answers there", str(err)) from err
+    with client:
+        # Its shutdown would wait for logs that a lost cluster never ends; all others are done by then.
+        yield client.get_executor(), _ClusterWatch(client, worker_timeout_s)
+
+
+class _ClusterWatch:
+    """Whether a cluster is lost: it has no scheduler, or no worker, for some time; then it is given up for good."""
+
+    def __init__(self, client: Client, worker_timeout_s: float) -> None:
+        self._client = client
+        self._timeout_s = worker_timeout_s
+        self._fine_s = time.monotonic()
+        self._lost = ""
+
+    def __call__(self) -> str:
+        """Return why it is lost; empty while it is not."""
+        why = self._lost or self._trouble()
+        if not why:
+            self._fine_s = time.monotonic()
+        elif not self._lost and (self._client.status == "closed" or time.monotonic() - self._fine_s > self._timeout_s):
+            self._lost = why
+        return self._lost
+
+    def _trouble(self) -> str:
+        if self._client.status != "running":
+            return "the scheduler of the cluster is gone"
+        try:
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        except (OSError, TimeoutError):
+            return "the scheduler of the cluster is gone"
+        return "" if workers else f"the cluster had no worker for {self._timeout_s:g} s"
+
+
+def default_jobs(logs: Sequence[Path]) -> int:
+    """Return the number of cores, or of the largest logs that the free memory holds at once."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    largest = max(map(_size, logs), default=0)
+    each = PROCESS_BYTES + min(LOG_FACTOR * largest, LOG_BYTES)
+    free = _free_bytes()
+    return max(1, min(cores, len(logs), int(free // each) if free is not None else cores))
+
+
+def _size(path: Path) -> int:
+    return sum(file.stat().st_size for file in files_of_log(path) if file.is_file())
+
+
+def _free_bytes() -> int | None:
+    """Return the memory that is free for processes; None where the system does not state it."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration, ValueError):
+        return None
 
 
 class Worker:
@@ -135,12 +242,12 @@ class Worker:
             with suppress(OSError):  # its other end is gone
                 self._process.stdin.close()
 
-    def close(self) -> None:
-        """End the process, whatever it does."""
+    def close(self, grace_s: float = GRACE_S) -> None:
+        """End the process, after some time whatever it does."""
         _all.discard(self)
         self.ask_to_end()
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(GRACE_S)
+            self._process.wait(grace_s)
         self._process.kill()
         self._process.wait()
         self._errors.close()

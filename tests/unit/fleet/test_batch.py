@@ -15,9 +15,10 @@ import pytest
 
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet import processes
-from icrtool.fleet.batch import BatchOptions, default_jobs, finished, plan, run_batch
+from icrtool.fleet.batch import BatchOptions, finished, plan, run_batch
 from icrtool.fleet.fleet_files import write_fleet
 from icrtool.fleet.one_log import ReportOptions, Request
+from icrtool.fleet.processes import default_jobs
 from icrtool.fleet.row import Row
 
 # A worker whose logs behave as they are named; the row is kept as `icrtool.fleet.one_log.process` keeps it.
@@ -237,12 +238,12 @@ def test_what_cannot_be_planned_is_refused_at_once(season: Path, tmp_path: Path)
 
 def test_memory_bounds_how_many_logs_run_at_once(season: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     add(season, *"abcdefgh")
-    requests = plan([season], season.parent / "out", BatchOptions())
+    logs = sorted(season.iterdir())
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(8)), raising=False)
     for free, jobs in ((None, 8), (100 << 30, 8), (2 << 30, 5), (1, 1)):
-        monkeypatch.setattr("icrtool.fleet.batch._free_bytes", lambda free=free: free)
-        assert default_jobs(requests) == jobs
-    assert default_jobs(requests[:3]) <= 3
+        monkeypatch.setattr("icrtool.fleet.processes._free_bytes", lambda free=free: free)
+        assert default_jobs(logs) == jobs
+    assert default_jobs(logs[:3]) <= 3
 
 
 def test_tables_hold_a_row_per_log_and_null_where_nothing_is_known(season: Path, tmp_path: Path) -> None:
