@@ -132,3 +132,18 @@ def window_residuals(
     residual = (moved - turned) / root
     by = np.insert(by, len(by) - 1, 1j * turned, axis=0) / root
     return np.concatenate([residual.real, residual.imag]), np.concatenate([by.real, by.imag], axis=1).T
+
+
+def turn_residuals(path: PathKnots, start: Ints, end: Ints, turned: Floats, root: Floats) -> tuple[Floats, Floats]:
+    """Return residuals (w,) of the turns of windows, (turn - turn_ref) / sqrt(length), and derivatives (w, k + 2).
+
+    These are as those of `window_residuals`.
+
+    Parameters
+    ----------
+    start, end : (w,) knots of each window; turned : (w,) turn of the reference [rad]; root : (w,) [m^0.5]
+    """
+    by = np.zeros((len(path.heading_by) + 2, len(start)))
+    by[:-2] = path.heading_by[:, end] - path.heading_by[:, start]
+    by[-1] = path.turn_rate[end] - path.turn_rate[start]
+    return (path.heading[end] - path.heading[start] - turned) / root, (by / root).T

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.elimination import Parts, normal_equations
 from icrtool.kernels.robust import (
+    Linearised,
     RobustFit,
     robust_least_squares,
     robust_weights,
@@ -28,7 +29,7 @@ from icrtool.kernels.robust import (
     soft_l1_weights,
     student_covariance,
 )
-from icrtool.kernels.window_residuals import OMEGA, path_at, window_residuals
+from icrtool.kernels.window_residuals import OMEGA, path_at, turn_residuals, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows, size_of
 
@@ -46,7 +47,10 @@ REWEIGHTS = 2
 FEWEST_TO_SUBTRACT = 4
 """Of fewer recordings each is too large a part of all: the others are fitted anew."""
 
-FEWEST_RESIDUALS = 20
+KINDS = (0, 0, 1)
+"""Residuals of a window: forward and right, whose spread is one, and turn."""
+
+FEWEST_RESIDUALS = 10 * len(KINDS)
 """Fewer that are left beside a fold give no parameters."""
 
 
@@ -136,20 +140,23 @@ class PooledFit(FittedModel):
             return None
         if fold.whole and len(pool.windows) < FEWEST_TO_SUBTRACT:
             found = self.refit_without(i)
-            covariance = self._covariance(self.curvature, np.linalg.inv(found.curvature))
+            covariance = self._covariance(np.linalg.inv(found.curvature)[:k, :k])
             fitted = replace(found.fitted, covariance=covariance)
             return fitted, own_constants(pool.windows[i], fitted, pool.widths_m[i])
         of_wheels = None if self.wheels is None else self.wheels.without(fold)
         wheels = None if of_wheels is None else of_wheels[0]
-        if fold.whole:
-            gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
-            covariance = self._covariance(self.curvature, np.linalg.inv(self.curvature - curvature))
-            steps = self._steps(gradient, curvature)
-            fitted = FittedModel(self.model, self.parameters + steps, covariance, wheels)
-            own = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
-            return fitted, LogConstants(*own.tolist())
         shown = None if self.wide is None else self.wide.without(fold)
         model = self.model if shown is None else replace(self.model, stds=()).as_shown(shown[0])
+        if fold.whole:
+            gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
+            # the priors may be others without the recording
+            pull = model.prior_std**-2.0 - self.model.prior_std**-2.0
+            gradient, curvature = gradient - pull * (self.parameters - model.prior_mean), curvature - np.diag(pull)
+            covariance = self._covariance(np.linalg.inv(self.curvature - curvature))
+            steps = self._steps(gradient, curvature)
+            fitted = FittedModel(model, self.parameters + steps, covariance, wheels)
+            own = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
+            return fitted, LogConstants(*own.tolist())
         x, covariance = self._reweighted(clear, model)
         return FittedModel(model, x[:k], covariance, wheels), LogConstants(*self._own(x, i).tolist())
 
@@ -172,28 +179,31 @@ class PooledFit(FittedModel):
         A Newton step, then two of a new fit's reweighted steps, with residuals that follow the parameters to first
         order: over some metres they do so nearly exactly.
         """
-        at, (mean, std) = self.solution, self.pool.prior(model)
+        at, (mean, std), pool = self.solution, self.pool.prior(model), self.pool
         residuals, jacobian, pull = at.residuals[clear], at.jacobian[clear], std**-2.0
-        x, information = at.x + self._steps(*self._derivatives(~clear)), at.information
-        for _ in range(REWEIGHTS):
-            left = residuals + jacobian @ (x - at.x)
-            weights = robust_weights(left, scale_by_kind(left), self.pool.overlap)
-            information, gradient = normal_equations(left, jacobian, weights)
-            information += np.diag(pull)
-            x = x - np.linalg.solve(information, gradient + pull * (x - mean))
-        return x, self._covariance(at.information, np.linalg.inv(information))
 
-    def _covariance(self, whole: Floats, inverse: NDArray[Any]) -> Floats:
-        """Return the covariance (k, k) without a fold, from the information with it and the inverse without it.
+        def near(x: Floats) -> Linearised:
+            left = residuals + jacobian @ (x - at.x)
+            scale, prior = scale_by_kind(left, pool.kind[clear]), np.diag(pull)
+            return Linearised(residuals=left, jacobian=jacobian, scale=scale, prior=prior, overlap=pool.overlap)
+
+        x = at.x + self._steps(*self._derivatives(~clear))
+        for _ in range(REWEIGHTS):
+            here = near(x)
+            gradient = jacobian.T @ (here.weights * here.residuals) + pull * (x - mean)
+            x = x - np.linalg.solve(here.information, gradient)
+        k = len(self.parameters)
+        return x, student_covariance(near(x), [pool.group[clear]])[:k, :k]
+
+    def _covariance(self, inverse: NDArray[Any]) -> Floats:
+        """Return the covariance (k, k) without a recording, from the inverse of its curvature.
 
         Notes
         -----
-        A parameter's variance exceeds that of independent residuals by as much as with the fold. Of a single recording
-        its constants are in both matrices too, behind the model's parameters.
+        A parameter's variance exceeds that of independent residuals by as much as with the recording.
         """
-        k = len(self.parameters)
-        grown = np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(whole))[:k])
-        return np.asarray(inverse[:k, :k] * np.outer(grown, grown), np.float64)
+        grown = np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(self.curvature)))
+        return np.asarray(inverse * np.outer(grown, grown), np.float64)
 
     def _steps(self, gradient: Floats, curvature: Floats) -> Floats:
         """Return the steps (..., k) of the parameters without residuals of some gradient and curvature.
@@ -242,13 +252,16 @@ def own_constants(windows: Windows, fitted: FittedModel, width_m: float) -> LogC
         residuals, by = part(fitted.parameters, constants)
         return residuals, by[:, len(fitted.parameters) :]
 
-    zero = np.zeros(len(std))
+    zero, kind = np.zeros(len(std)), np.repeat(KINDS, len(windows.start))
     overlap = len(windows.start) / 5.0
-    return LogConstants(*robust_least_squares(evaluate, zero, zero, std, overlap=overlap).x.tolist())
+    return LogConstants(*robust_least_squares(evaluate, zero, zero, std, kind=kind, overlap=overlap).x.tolist())
 
 
 class WindowResiduals:
-    """Residuals of all windows of one recording for one model, (d - d_ref) / sqrt(length), and their derivatives.
+    """Residuals of all windows of one recording for one model, by sqrt(length), and their derivatives.
+
+    Displacements alone do not separate a turn from side slip, and show little of a spin on the spot: turns are
+    residuals, too, weighted by their own spread.
 
     Parameters
     ----------
@@ -273,7 +286,7 @@ class WindowResiduals:
         self._root = np.sqrt(windows.length_m)
 
     def __call__(self, parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
-        """Return residuals (2 w,), forward then right [m per root metre], and derivatives (2 w, k + c).
+        """Return residuals (3 w,), forward, right [m^0.5], then turn [rad/m^0.5], and derivatives (3 w, k + c).
 
         Parameters
         ----------
@@ -292,9 +305,12 @@ class WindowResiduals:
         at = windows.knot_t + delay
         terms = len(axes)
         path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, at)
-        residual, jacobian = window_residuals(path, windows.start, windows.end, windows.reference, offset, self._root)
+        start, end = windows.start, windows.end
+        moved, moved_by = window_residuals(path, start, end, windows.reference, offset, self._root)
+        turned, turned_by = turn_residuals(path, start, end, windows.turned, self._root)
         # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
-        return residual, jacobian[:, [*range(k), terms, terms + 1, *range(k, terms)]]
+        jacobian = np.concatenate([moved_by, turned_by])[:, [*range(k), terms, terms + 1, *range(k, terms)]]
+        return np.concatenate([moved, turned]), jacobian
 
 
 class Pool:
@@ -308,22 +324,24 @@ class Pool:
     ----------
     recording, start_m, end_m, length_m : (m,) of the window of each residual
     first : (recordings + 1,) first residual of each, and the number of all
+    kind : (m,) of `KINDS`
     group : (m,) stretches of distance whose residuals depend on one another
     overlap : how many windows cover a place on average
     """
 
     def __init__(self, windows: Sequence[Windows], widths_m: Sequence[float]) -> None:
         self.windows, self.widths_m = windows, widths_m
-        both = [np.tile([w.start_m, w.end_m, w.length_m], 2) for w in windows]
-        self.start_m, self.end_m, self.length_m = np.concatenate(both, axis=1)
-        sizes = [one.shape[1] for one in both]
+        by_window = [np.tile([w.start_m, w.end_m, w.length_m], len(KINDS)) for w in windows]
+        self.start_m, self.end_m, self.length_m = np.concatenate(by_window, axis=1)
+        self.kind = np.concatenate([np.repeat(KINDS, len(w.start)) for w in windows])
+        sizes = [one.shape[1] for one in by_window]
         self.first = np.cumsum([0, *sizes])
         self.recording = np.repeat(np.arange(len(windows)), sizes)
         stretch_m = STRETCH_M * np.array([size_of(one) for one in widths_m])
         stretch = np.column_stack([self.recording, np.floor(self.start_m / stretch_m[self.recording])])
         self.group = np.unique(stretch, axis=0, return_inverse=True)[1].reshape(-1)
         covered_m = float(stretch_m[np.unique(stretch, axis=0)[:, 0].astype(np.int64)].sum())
-        self.overlap = max(float(self.length_m.sum()) / 2.0 / covered_m, 1.0)
+        self.overlap = max(float(self.length_m.sum()) / len(KINDS) / covered_m, 1.0)
 
     def prior(self, model: MotionModel) -> tuple[Floats, Floats]:
         """Return mean and standard deviation of all parameters, model first, then the constants of each recording."""
@@ -373,8 +391,8 @@ class Pool:
             return residuals, jacobian
 
         found = robust_least_squares(
-            evaluate, mean, mean, std, parts=Parts(self.first, own if count > 1 else 0), overlap=self.overlap,
-            settled=SETTLED,
+            evaluate, mean, mean, std, kind=self.kind, parts=Parts(self.first, own if count > 1 else 0),
+            overlap=self.overlap, settled=SETTLED,
         )  # fmt: skip
         levels = [self.group, *([self.recording] if count > 1 else [])]
         covariance = student_covariance(found, levels)[:k, :k]
