@@ -144,7 +144,7 @@ def _print(found: Found, config: Config, given: Sequence[str], *, everything: bo
 
 def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:
     """Return what a log holds as plain data; ``run`` as in run.json, null where the log cannot be fitted."""
-    from icrtool.logs.survey_document import streams_document, survey_document
+    from icrtool.logs.describe import streams_document, survey_document
     from icrtool.output.tables.overview import next_command, verdict
 
     return {

@@ -1,15 +1,17 @@
-"""The text of ``icrtool info -v``."""
+"""What ``icrtool info`` states of a log before it is fitted: as text, and as JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.read_log import Survey
 from icrtool.logs.streams.heading_sources import HeadingSource
-from icrtool.logs.streams.source import PositionSource
+from icrtool.logs.streams.sources import PositionSource
 from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.records.samples import ROLE_WORDS, Role, StreamChoice, rate_and_jitter
 from icrtool.records.tables import RobotLog
@@ -113,3 +115,43 @@ def _candidates(sources: Sources, chosen: str | None) -> list[str]:
         verdict = f"{refused}: {source.problem}" if source.problem else source.why
         lines.append(f"  {mark} {source.topic} ({source.message_type}; {clock}): {verdict}")
     return lines
+
+
+def survey_document(survey: Survey) -> dict[str, Any]:
+    """Return the files of a log, its topics, and the candidates of each role with the reason for or against each."""
+    tables = {table.topic: table for table in survey.tables}
+    topics = []
+    for channel in {channel.topic: channel for channel in survey.channels}.values():
+        table = tables.get(channel.topic)
+        rate_hz = rate_and_jitter(table.log_time_ns)[0] if table is not None else None
+        topics.append(
+            {
+                "topic": str(channel.topic),
+                "message_type": str(channel.message_type),
+                "messages": len(table) if table is not None else channel.count,
+                "rate_hz": rate_hz,
+                "unreadable": table.unreadable if table is not None else 0,
+                "not_read_because": survey.candidates.unread.get(channel.topic),
+            }
+        )
+    return {
+        "inputs": [asdict(file) for file in survey.inputs],
+        "topics": topics,
+        "candidates": {
+            role: [
+                {
+                    "topic": str(one.topic),
+                    "message_type": str(one.message_type),
+                    "why": one.why,
+                    "problem": one.problem or None,
+                }
+                for one in sources
+            ]
+            for role, sources in survey.candidates.by_role().items()
+        },
+    }
+
+
+def streams_document(log: RobotLog) -> list[dict[str, Any]]:
+    """Return the topic that each role uses, and why."""
+    return [asdict(stream) for stream in log.streams]

@@ -21,9 +21,8 @@ from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.collectors import Collector, collector_for
 from icrtool.logs.messages.topic_table import TopicTable, merge_tables
-from icrtool.logs.streams.gyro import GYRO_FIELDS, GYRO_TYPE, find_gyro, find_gyros
-from icrtool.logs.streams.heading_sources import Convention, HeadingSource
-from icrtool.logs.streams.joint_names import ignored_joints
+from icrtool.logs.streams.heading_sources import HeadingSource
+from icrtool.logs.streams.inertial import GYRO_FIELDS, GYRO_TYPE, Convention, find_gyro, find_gyros
 from icrtool.logs.streams.select import (
     Candidates,
     Choice,
@@ -33,13 +32,11 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
-from icrtool.logs.streams.source import PositionSource
-from icrtool.logs.streams.stamps import StampedRows, clock_notes, usable_rows
-from icrtool.logs.streams.static_transforms import FIELDS, antenna_place, is_static
-from icrtool.logs.streams.transform_pose import transform_channels, transform_pose
+from icrtool.logs.streams.sources import PositionSource, StampedRows, clock_notes, usable_rows
+from icrtool.logs.streams.transforms import FIELDS, antenna_place, is_static, transform_channels, transform_pose
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.logs.streams.wheel_sources import WheelMotion
-from icrtool.logs.streams.wheel_speeds import wheel_samples
+from icrtool.logs.streams.wheel_speeds import ignored_joints, wheel_samples
 from icrtool.logs.table_file import is_table, read_table
 from icrtool.records.samples import (
     NO_HEADINGS,

@@ -20,9 +20,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.logs.writing.containers import write_bag, write_db3, write_mcap
+from icrtool.logs.writing.log import write_bag, write_db3, write_mcap
 from icrtool.logs.writing.messages import (
     TopicMessages,
+    WriteOptions,
     _plan_heading,
     _plan_joint_states,
     _plan_position,
@@ -30,7 +31,6 @@ from icrtool.logs.writing.messages import (
     load_typestore,
     serialise_topic,
 )
-from icrtool.logs.writing.records import WriteOptions
 from tests.e2e.test_bad_input import OPTIONS, drive
 
 Command = Callable[..., tuple[int, str, str]]

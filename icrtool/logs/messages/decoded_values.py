@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+import orjson
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Ints
@@ -114,6 +116,20 @@ class ValueDecoder:
             ]
             readable = np.array([one is not None for one in found], np.bool_)
             yield some, DecodedValues(self.slots, [one for one in found if one is not None], readable, self.paths)
+
+
+def parse_json(data: bytes) -> dict[str, Any] | None:
+    """Return a message, None where it cannot be read. NaN and Infinity, which Python writes, are numbers."""
+    try:
+        value = orjson.loads(data)
+    except ValueError:
+        if b"NaN" not in data and b"Infinity" not in data:
+            return None
+        try:
+            value = json.loads(data)
+        except (ValueError, RecursionError):
+            return None
+    return value if isinstance(value, dict) else None
 
 
 def value_at(value: object, steps: Sequence[Step]) -> object:

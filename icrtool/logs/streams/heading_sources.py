@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
@@ -14,8 +13,8 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.nmea import HDT, NMEA_SENTENCE
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
+from icrtool.logs.streams.inertial import Convention, frame_convention, nose_yaw
 from icrtool.logs.streams.metric_positions import GOAL_WORDS, XBOT_FUSED
-from icrtool.logs.streams.orientation import nose_yaw
 from icrtool.logs.streams.position_sources import (
     INS_SOLVED,
     INS_SOLVED_CODES,
@@ -23,9 +22,7 @@ from icrtool.logs.streams.position_sources import (
     SOLVED_CODES,
     solved,
 )
-from icrtool.logs.streams.source import NO_ROWS, Source, of_topic
-
-Convention = Literal["enu", "ned"]
+from icrtool.logs.streams.sources import NO_ROWS, Source, of_topic
 
 _INS_WORDS = re.compile(r"\bins\b|vectornav|novatel|sbg|microstrain|xsens|gnss|gps|global|map|filtered", re.IGNORECASE)
 _RAW_WORDS = re.compile(r"raw", re.IGNORECASE)
@@ -90,14 +87,6 @@ Entry = tuple[tuple[str, ...], Reader]
 
 def _quaternion(table: TopicTable, path: str) -> Floats:
     return np.array([table.column(f"{path}.{axis}") for axis in "xyzw"], np.float64).T
-
-
-def frame_convention(table: TopicTable) -> tuple[Convention, str]:
-    """Return the convention of a message's frame, and how it is known."""
-    frame = table.text("header.frame_id")
-    if frame.lower().endswith("_ned") or frame.lower() == "ned":
-        return "ned", f"frame {frame} (REP-145)"
-    return "enu", "REP-103"
 
 
 def _constant(yaw: Floats, usable: Bools) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.fix_class import XBOT_FLAGS, class_by_code
-from icrtool.logs.streams.source import PositionEntry, PositionSource, of_topic
+from icrtool.logs.streams.sources import PositionEntry, PositionSource, of_topic
 
 REFERENCE_WORDS = re.compile(
     r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"

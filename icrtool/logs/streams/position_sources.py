@@ -21,7 +21,7 @@ from icrtool.logs.streams.fix_class import (
     class_by_type,
 )
 from icrtool.logs.streams.metric_positions import ABSOLUTE_POSE, metric
-from icrtool.logs.streams.source import NEVER_MOVES, PositionEntry, PositionSource, of_topic
+from icrtool.logs.streams.sources import NEVER_MOVES, PositionEntry, PositionSource, of_topic
 
 RADIUS_95_IN_STD = 2.45
 """err_horz is a 95 % radius: this many standard deviations of a circular normal distribution."""

@@ -18,8 +18,7 @@ from icrtool.logs.messages.definitions import number_fields
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.heading_sources import HEADING_TYPES
 from icrtool.logs.streams.position_sources import POSITION_TYPES
-from icrtool.logs.streams.source import of_topic
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.sources import StampedRows, of_topic, stamp_rows
 from icrtool.logs.streams.wheel_names import WHEEL_WORDS, right_twin
 from icrtool.logs.streams.wheel_sources import (
     COMMAND_NOTE,

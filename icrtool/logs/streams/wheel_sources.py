@@ -14,10 +14,10 @@ from icrtool.config import Config
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.containers.channel import some_of
-from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
+from icrtool.logs.messages.collectors import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.metric_positions import REFERENCE_WORDS
-from icrtool.logs.streams.source import NEVER_MOVES, Source, of_topic
+from icrtool.logs.streams.sources import NEVER_MOVES, Source, of_topic
 from icrtool.logs.streams.wheel_names import wheel_joints
 
 Unit = Literal["rad", "m", "counts", "unknown"]

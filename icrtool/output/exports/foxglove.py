@@ -18,7 +18,7 @@ from icrtool import __version__
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.kinematics import body_velocity
-from icrtool.logs.writing.containers import write_mcap
+from icrtool.logs.writing.log import write_mcap
 from icrtool.logs.writing.messages import (
     TopicMessages,
     TopicPlan,

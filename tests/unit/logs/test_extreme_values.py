@@ -10,8 +10,7 @@ import pytest
 from icrtool.config import load_config
 from icrtool.errors import IcrToolError
 from icrtool.kernels.arrays import Floats
-from icrtool.logs.messages.growing_column import LARGEST, GrowingColumn
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.topic_table import LARGEST, GrowingColumn, TopicTable
 from icrtool.logs.streams.heading_sources import HEADING_TYPES
 from icrtool.logs.streams.position_sources import POSITION_TYPES
 from icrtool.logs.streams.wheel_sources import WHEEL_TYPES

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from icrtool.logs.messages.growing_column import GrowingColumn
+from icrtool.logs.messages.topic_table import GrowingColumn
 
 
 def joined(parts: list[NDArray[Any]], lacking: float) -> NDArray[Any]:

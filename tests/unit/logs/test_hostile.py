@@ -33,7 +33,7 @@ from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import read_log, survey_log
-from icrtool.logs.streams.stamps import stamp_rows
+from icrtool.logs.streams.sources import stamp_rows
 from icrtool.records.text import LogText
 
 SEPARATOR = "=" * 80 + "\n"
@@ -431,14 +431,14 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool.fleet import manifest
     from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, open_log, sqlite_bag, unpack
-    from icrtool.logs.messages import decoded_values, decoder, json_messages, protobuf, schema
+    from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf, schema
     from icrtool.logs.streams import wheel_sources
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
     rows = [line for line in promised.splitlines() if line.startswith("|")][2:]
     stated = [int(number.replace(",", "")) for row in rows for number in re.findall(r"(?<!\w)\d[\d,]*(?= |;)", row)]
-    assert json_messages.LONGEST_SCHEMA == protobuf.LONGEST_DESCRIPTORS
+    assert definitions.LONGEST_SCHEMA == protobuf.LONGEST_DESCRIPTORS
     assert stated == [
         decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, decompress.FREE_BYTES,
         unpack._MOST_ENTRIES, unpack._LARGEST_READ_BYTES, unpack._LARGEST_EXTRA_BYTES,

@@ -27,7 +27,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from icrtool.logs.messages.dynamic_joints import DYNAMIC_JOINT_STATE
+from icrtool.logs.messages.collectors import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.nmea import NMEA_SENTENCE
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import Survey, survey_log

@@ -12,8 +12,7 @@ from icrtool.errors import DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource
 from icrtool.logs.streams.position_sources import POSITION_TYPES
-from icrtool.logs.streams.source import PositionSource
-from icrtool.logs.streams.stamps import increasing, stamp_rows
+from icrtool.logs.streams.sources import PositionSource, increasing, stamp_rows
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 50_000_000
 ROUNDING_DEG = 1e-12

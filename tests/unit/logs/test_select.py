@@ -13,7 +13,6 @@ from icrtool.errors import ConfigError, MissingStreamError
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import Survey, assemble
-from icrtool.logs.streams.joint_names import ignored_joints
 from icrtool.logs.streams.select import (
     Candidates,
     Choice,
@@ -23,6 +22,7 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
+from icrtool.logs.streams.wheel_speeds import ignored_joints
 from icrtool.records.text import LogText
 
 COUNT = 50

@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.logs.read_log import survey_log
-from icrtool.logs.streams.static_transforms import _in_roots, antenna_place
+from icrtool.logs.streams.transforms import _in_roots, antenna_place
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 HALF = np.sqrt(0.5)

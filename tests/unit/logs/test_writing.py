@@ -15,7 +15,7 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, OutputError
 from icrtool.logs.messages.definitions import bundled_definitions, standard_definitions
 from icrtool.logs.read_log import read_log
-from icrtool.logs.writing import containers as write_containers
+from icrtool.logs.writing import log as writing_log
 from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
 from icrtool.logs.writing.messages import load_typestore, serialise_topics
 
@@ -316,13 +316,13 @@ def test_the_same_columns_make_the_same_bytes(tmp_path, container):
 @pytest.mark.parametrize("container", ["mcap", "bag", "db3"])
 @pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), sqlite3.OperationalError("disk is full")])
 def test_a_disk_that_fills_up_leaves_nothing_behind(tmp_path, monkeypatch, container, failure):
-    whole = write_containers._in_time_order
+    whole = writing_log._in_time_order
 
     def broken_after_ten(topics):
         yield from itertools.islice(whole(topics), 10)
         raise failure
 
-    monkeypatch.setattr(write_containers, "_in_time_order", broken_after_ten)
+    monkeypatch.setattr(writing_log, "_in_time_order", broken_after_ten)
     options = replace(OPTIONS, container=container)
     with pytest.raises(OutputError, match=r"cannot be written; (No space left on device|disk is full)"):
         write_log(tmp_path / log_name(options), make_columns(), options)

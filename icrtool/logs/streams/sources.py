@@ -1,15 +1,15 @@
-"""The clock of a topic: the stamp in the message's header, or the time at which it was logged."""
+"""What every topic that may feed a role has: its clock, how suitable it is, and why it cannot be used."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Bools, Ints
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, SetBack, TopicTable
 from icrtool.records.samples import Role
 
@@ -182,3 +182,62 @@ def increasing(stamps: Ints) -> tuple[Ints | slice, int, int]:
     ordered = stamps[order]
     keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)
     return order[keep], backwards, len(stamps) - int(np.count_nonzero(keep))
+
+
+NEVER_MOVES = 60.0
+"""Subtracted from the score of what never moves: another topic that moves is preferred."""
+
+NO_ROWS: Bools = np.zeros(0, np.bool_)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """A topic, or a pair of topics, that may feed a role; of one that cannot be read the subclass holds no values.
+
+    Attributes
+    ----------
+    score : how suitable the type is; why : the reason as text
+    problem : why it cannot be used, empty when it can
+    """
+
+    topic: str
+    message_type: str
+    stamps: StampedRows
+    score: float = 0.0
+    why: str = ""
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionSource(Source):
+    """Positions of one topic.
+
+    Attributes
+    ----------
+    geodetic : (n, 3) latitude, longitude [deg], ellipsoidal height [m]; None where metric
+    metric : (n, 2) north, east [m] in the topic's own frame; None where geodetic
+    variance : (n, 3) north, east, covariance of both [m^2]; NaN where not stated
+    usable : (n,) rows to use; `rejected` counts the others by reason
+    stated_class : uint8 (n,) how the position was solved, None where no message states it
+    """
+
+    geodetic: Floats | None = None
+    metric: Floats | None = None
+    variance: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    usable: Bools = field(default_factory=lambda: NO_ROWS)
+    rejected: dict[str, int] = field(default_factory=dict)
+    stated_class: Bytes | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no row can be used, even where the topic is configured."""
+        return not self.usable.any()
+
+
+PositionEntry = tuple[tuple[str, ...], Callable[[TopicTable], PositionSource]]
+"""The fields of a message type to take, and how to read them."""
+
+
+def of_topic(table: TopicTable, stamp: str = "header.stamp") -> dict[str, Any]:
+    """Return what a source has of its topic; `stamp` is the field of its stamps."""
+    return {"topic": table.topic, "message_type": table.message_type, "stamps": stamp_rows(table, stamp)}
