@@ -272,6 +272,8 @@ def test_the_chart_of_errors_draws_the_main_models_and_folds_the_others(chrome: 
     drawn = page.evaluate(names.format("error-keys"))
     assert {*DRAWN_AT_FIRST} <= {*drawn} <= {*DRAWN_AT_FIRST, "whole model + gyro", "whole model + heading"}
     assert page.evaluate(names.format("error-others")) == []
+    assert drawn[0] == "whole model"
+    assert drawn[-1] == "no slip"
     folded = page.evaluate("icrtoolPage.data.errors.models.filter((one) => !one.main).map((one) => one.label)")
     others = "[...document.querySelectorAll('#error-others li')].map((one) => one.textContent.trim())"
     assert page.evaluate(others) == folded != []
@@ -430,6 +432,27 @@ def test_a_failed_log_is_a_line_on_a_phone(chrome: Browser, tmp_path: Path) -> N
     assert bad <= 1.2 * good
     assert page.evaluate("document.querySelector('#table .reason').getBoundingClientRect().left") < 390
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_a_phone_shows_multiplier_and_distance_of_the_robot_without_scrolling(chrome: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    robot = {
+        "robot": "husky-a200", "group": "", "logs": ["a", "b"], "left_out": [], "reason": "", "multiplier": 1.6691,
+        "multiplier_std": 0.0108, "icrs_m": [0.8, -0.9, 0.0], "within_m": 14.2, "within_beyond": False,
+    }  # fmt: skip
+    logs = [
+        {**LOG, "usable": False, "status": "done"},
+        {**LOG, "errors": LOG["errors"] | {"recommended_p95_20m_m": 0.3}},
+    ]
+    file.write_text(fleet_page({**FLEET, "logs": logs, "calibrations": [robot]}, tmp_path), encoding="utf-8")
+    page = chrome.page(width=390, height=844)
+    page.open(file)
+    for text in ("1.669", "14.2"):
+        right = "[...document.querySelectorAll('#robots td')].find((one) => one.textContent.includes('{}'))"
+        assert page.evaluate(f"{right.format(text)}.getBoundingClientRect().right") <= 390
+    cells = page.evaluate("[...document.querySelectorAll('#table td')].map((one) => one.textContent)")
+    assert {"not usable", "more than 8.0\u00a0m"} <= set(cells)
+    assert "1 cannot" in page.evaluate("document.querySelector('header').textContent")
 
 
 def test_the_table_of_a_fleet_sorts_and_filters(chrome: Browser, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import controller_rows, format_export
-from icrtool.output.tables.brief import reach_rows, trust
+from icrtool.output.tables.brief import reach_rows, to_drive, trust
 from icrtool.output.text_format import controller_error_text, error_text, event_kinds, excitation_text, jump_count
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.run_document import RunDocument
@@ -35,6 +35,7 @@ def answer_of(summary: RunDocument, report: Mapping[str, Any]) -> dict[str, Any]
     Returns
     -------
     dict
+        ``drive``: what to drive where a run that is not usable lacks turns;
         ``grade`` and ``verdict``: may the numbers be used, in one word and in one sentence; ``checks``: why;
         ``reaches``: budget [m], and label, distance and note of each model as `icrtool dropout-report` prints them;
         ``numbers``: name and value of what a controller is given, ``with_numbers``: the error with these alone,
@@ -46,6 +47,7 @@ def answer_of(summary: RunDocument, report: Mapping[str, Any]) -> dict[str, Any]
         summary, passed=report["passed"], events_left_out=report["without_events"] is not None
     )  # fmt: skip
     return {
+        "drive": "" if summary.usable else to_drive(summary),
         "grade": grade,
         "verdict": f"{sentence[:1].upper()}{sentence[1:]}.",
         "checks": _checks(summary, report),

@@ -6,7 +6,7 @@ open-loop path that the page integrates ends where the library's does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -99,9 +99,17 @@ def main_rows(report: Mapping[str, Any]) -> set[str]:
     return given.union(MAIN_ROWS) & names if MAIN_ROWS[0] in names else names
 
 
+def in_order(models: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return models of a report, those of `MAIN_ROWS` first and in its order, after calibrations."""
+    places = {name: place for place, name in enumerate(MAIN_ROWS)}
+    return sorted(
+        models, key=lambda one: -1 if one["name"].startswith("calibration") else places.get(one["name"], len(places))
+    )
+
+
 def errors_data(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return the errors over distance by model, and those of the reference alone."""
-    models, main = report["models"], main_rows(report)
+    models, main = in_order(report["models"]), main_rows(report)
     reference = report["reference_error"]
     return {
         "horizons_m": [row["horizon_m"] for row in models[0]["by_horizon"]] if models else [],

@@ -19,6 +19,9 @@ PLOTS = "plots"
 HORIZON_M = 10.0
 """At this distance the table shows the errors of each model."""
 
+LAST_HORIZON_M = 20.0
+"""The longest distance whose errors a row has."""
+
 MODELS = MODEL_WORDS
 
 
@@ -56,10 +59,12 @@ def fleet_page(document: Mapping[str, Any], folder: Path) -> str:
     logs = list(document["logs"])
     budgets = _budgets(logs)
     lines = [Line(log, _link(log["run"], folder), _search_text(log), tuple(_cells(log, budgets))) for log in logs]
+    choices = {key: sorted({log[key] for log in logs} - {""}) for key in ("status", "robot", "group")}
     return render(
         "fleet.html", ("fleet.js",), None, title=folder.absolute().name, lines=lines, columns=_columns(budgets),
         counts=document["counts"], gates_failed=document["gates_failed"], made_with=document["tool_version"],
-        choices={key: sorted({log[key] for log in logs} - {""}) for key in ("status", "robot", "group")},
+        choices=choices, named=[key for key in ("robot", "group") if len(choices[key]) > 1],
+        unusable=sum(log["status"] == "done" and not log.get("usable", True) for log in logs),
         horizon_m=HORIZON_M, calibrations=document.get("calibrations", []),
         pictures=list(pictures_in(folder / PLOTS, folder).values()),
         reasons=Counter(_reason(log) for log in logs if log["status"] == "failed").most_common(),
@@ -92,8 +97,10 @@ def _search_text(log: Mapping[str, Any]) -> str:
 
 def _cells(log: Mapping[str, Any], budgets: Sequence[str]) -> Iterator[Cell]:
     icr, errors = log["icr"], log["errors"]
-    for name in (*budgets, *(f"{model}_p95_{HORIZON_M:g}m_m" for model in MODELS)):
-        yield _cell(errors.get(name), error_text)
+    for name in budgets:
+        yield _within(errors, name)
+    for model in MODELS:
+        yield _cell(errors.get(f"{model}_p95_{HORIZON_M:g}m_m"), error_text)
     yield _with_std(log["multiplier"], log["multiplier_std"], "")
     for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m"):
         yield _with_std(icr.get(name), icr.get(f"std_{name}"), "+")
@@ -103,6 +110,14 @@ def _cells(log: Mapping[str, Any], budgets: Sequence[str]) -> Iterator[Cell]:
     gates = sum(not verdict["passed"] for verdict in log["verdicts"])
     for count in (log["events"], log["warnings"], gates):
         yield Cell("" if count is None else f"{count}", count)
+
+
+def _within(errors: Mapping[str, float | None], name: str) -> Cell:
+    """Return a distance within a budget; where the last error of the table is within it too, more than the distance."""
+    model, _, size = name.partition("_within_")
+    last = errors.get(f"{model}_p95_{LAST_HORIZON_M:g}m_m")
+    beyond = last is not None and last <= float(size.removesuffix("m_m"))
+    return _cell(errors.get(name), lambda metres: f"{'more than ' if beyond else ''}{metres:.1f} m")
 
 
 def _cell(value: float | None, text: Any) -> Cell:  # noqa: ANN401 - one of the functions of text_format

@@ -21,7 +21,7 @@ from icrtool.output.files.checksums import CHECKSUM_FILE, read_sums
 from icrtool.output.files.json_file import schema_of
 from icrtool.output.files.own_files import is_page
 from icrtool.output.page.answer import answer_of
-from icrtool.output.page.drive_data import drive_data, main_rows
+from icrtool.output.page.drive_data import drive_data, in_order, main_rows
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
@@ -158,12 +158,11 @@ def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return the errors by model at the horizons of the table: those nearest to 1, 5, 10 and 20 m."""
     horizons = [row["horizon_m"] for row in report["trials"]]
     shown = shown_horizons(np.array(horizons))
-    models = sorted(report["models"], key=lambda one: one["name"] != "recommended")
     return {
         "heads": _heads([horizons[h] for h in shown]),
         "trials": [report["trials"][h]["trials"] for h in shown],
         "why_none": [report["trials"][h]["why_none"] for h in shown],
-        "models": [{**one, "rows": [one["by_horizon"][h] for h in shown]} for one in models],
+        "models": [{**one, "rows": [one["by_horizon"][h] for h in shown]} for one in in_order(report["models"])],
         "reference": [report["reference_error"][h] for h in shown] if report["reference_error"] else [],
     }
 

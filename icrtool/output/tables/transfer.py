@@ -8,7 +8,7 @@ from typing import Any
 from icrtool.calibration.transfer import Cell, Pair, Transfer
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.text_blocks import Block, Table, Text
-from icrtool.output.text_format import digits_of, with_std
+from icrtool.output.text_format import with_interval, with_std
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
 TRANSFER_SCHEMA = "icrtool/compare/1"
@@ -73,8 +73,9 @@ def format_transfer(transfer: Transfer) -> Text:
         for horizon, change in pair.errors.items():
             if math.isfinite(change.p95_m):
                 route = ", the same route" if pair.paired else ""
-                blocks.append(f"error of a fit to other trials after {horizon:g} m{route}: 95 % {_change(change[:3])}; "
-                              f"expected {_change(change[3:])}")  # fmt: skip
+                p95, expected = with_interval(*change[:3]), with_interval(*change[3:])
+                what = f"error of a fit to other trials after {horizon:g} m{route}"
+                blocks.append(f"{what}: 95 % {p95}; expected {expected}")
         blocks.append("")
     return Text([*blocks, *_matrix_blocks(transfer)])
 
@@ -111,18 +112,10 @@ def verdict(transfer: Transfer, pair: Pair) -> str:
     cost = transfer.cell(pair.first, pair.second, CHOICE_HORIZON_M).cost
     if cost is None or not math.isfinite(cost.p95_m):
         return f"The multiplier of {pair.second} differs from that of {pair.first} {change}."
-    sentence = f"costs {_change(cost[:3])} at 95 % after {CHOICE_HORIZON_M:g} m on {pair.second}"
+    sentence = f"costs {with_interval(*cost[:3])} at 95 % after {CHOICE_HORIZON_M:g} m on {pair.second}"
     if cost.p95_low_m <= 0.0 <= cost.p95_high_m:
         sentence += ", which may be chance"
     return (
         f"The multiplier of {pair.second} differs from that of {pair.first} {change}; a calibration of {pair.first} "
         f"{sentence}."
     )
-
-
-def _change(values: tuple[float, ...]) -> str:
-    value, low, high = values
-    if not math.isfinite(low + high):
-        return f"{value:+.2f} m (too short for an interval)"
-    digits = digits_of((high - low) / 4)
-    return f"{value:+.{digits}f} m ({low:+.{digits}f} to {high:+.{digits}f})"

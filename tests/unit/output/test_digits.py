@@ -2,7 +2,7 @@
 
 import pytest
 
-from icrtool.output.text_format import digits_of, with_std
+from icrtool.output.text_format import digits_of, with_interval, with_std
 
 
 @pytest.mark.parametrize(
@@ -12,11 +12,18 @@ from icrtool.output.text_format import digits_of, with_std
         (0.0044, 0.0132, "+0.004 ± 0.013"),
         (-0.25, 0.31, "-0.25 ± 0.31"),
         (12.0, 3.0, "+12.00 ± 3.00"),
+        (-0.0004, 0.03, "+0.00 ± 0.03"),
         (0.0, 1e-9, "+0.00000 ± 0.00000"),
     ],
 )
 def test_a_spread_is_never_rounded_to_one_digit_less_than_it_needs(value: float, std: float, text: str) -> None:
     assert with_std(value, std) == text
+
+
+def test_an_interval_has_the_digits_it_needs_and_no_negative_zero() -> None:
+    assert with_interval(-0.1213, -0.16, -0.0004) == "-0.12 m (-0.16 to +0.00)"
+    assert with_interval(0.0011, -0.0052, 0.0071) == "+0.001 m (-0.005 to +0.007)"
+    assert with_interval(0.5, float("nan"), 0.7) == "+0.50 m (too short for an interval)"
 
 
 @pytest.mark.parametrize("std", [0.0, float("nan"), float("inf")])

@@ -125,6 +125,13 @@ def test_a_run_that_is_not_usable_begins_with_that(hostile_run: Run, report: Dro
     assert page.index("Do not use") < page.index("How far without GNSS")
 
 
+def test_a_run_with_too_few_turns_states_what_to_drive(run: Run, report: DropoutReport) -> None:
+    excitation = run.summary["excitation"] | {"turned_right_deg": 0.0, "turned_left_deg": 9.0}
+    straight = with_summary(run, usable=False, unusable_because="it turns too little", excitation=excitation)
+    page = run_page(straight, report_document(report), {})
+    assert "Hardly any turns" in page[page.index("Do not use") : page.index("How far without GNSS")]
+
+
 def test_the_numbers_of_the_drawings_are_those_of_the_run(page: str, run: Run) -> None:
     data, table = data_of(page), run.table
     step = numbers(data["series"]["step"])
