@@ -35,16 +35,6 @@ sed -E -e '/^ +--hash/d' -e 's/ *\\$//' constraints.txt >"$scratch/pins.txt"
 "$tools/uv" tool install --quiet --python "$python" --constraints "$scratch/pins.txt" "$wheel"
 
 echo "check-wheel: run"
-cp -R sample_logs "$scratch/sample_logs"
-[[ $demo_log == sample_logs/* ]] || cp "$demo_log" "$scratch/"
-[[ $demo_log == sample_logs/* ]] || demo_log=$(basename "$demo_log")
-cd "$scratch"
 "$UV_TOOL_DIR/icrtool/bin/python" -I -c 'import icrtool, sys; sys.exit(not icrtool.__file__.startswith(sys.prefix))'
-"$UV_TOOL_BIN_DIR/icrtool" --help >/dev/null
-"$UV_TOOL_BIN_DIR/icrtool" fit "$demo_log" ${demo_options[@]+"${demo_options[@]}"} -o run
-"$UV_TOOL_BIN_DIR/icrtool" dropout-report run
-for result in run/run.json run/states.csv run/plots/trajectory.png run/plots/icr_estimates.png \
-    run/dropout/summary.csv run/dropout/plots/summary.png run/report.html; do
-    [[ -s $result ]] || { echo "check-wheel: $result is missing" >&2; exit 1; }
-done
+scripts/try-command.sh "$UV_TOOL_BIN_DIR/icrtool" "$demo_log" ${demo_options[@]+"${demo_options[@]}"}
 echo "check-wheel: the wheel works"

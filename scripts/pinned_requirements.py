@@ -1,6 +1,7 @@
 """Print what of constraints.txt icrtool needs to be built and used, with hashes: pinned_requirements.py [EXTRA...].
 
-pip finds out which packages these are on this system; it takes names and hashes together only from a whole list.
+With ``--only PACKAGE...`` it is what these packages need. pip finds out which packages that is on this system; it
+takes hashes only for a whole list.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def resolved(requirements: list[str], pins: str) -> set[str]:
 def main() -> None:
     """Print a line for each package, with its hashes."""
     pins = (ROOT / "constraints.txt").read_text(encoding="utf-8")
-    names = resolved(needed(sys.argv[1:]), pins)
+    words = sys.argv[1:]
+    names = resolved(words[1:] if words[:1] == ["--only"] else needed(words), pins)
     print("\n".join(one for one in re.split(r"\n(?=\S)", pins.strip()) if one.split("==")[0] in names))
 
 
