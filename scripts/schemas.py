@@ -8,27 +8,21 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NotRequired, TypedDict, get_type_hints
+from typing import Any, Literal, TypedDict, get_type_hints
 
 import msgspec
 import numpy as np
 
 from icrtool.calibration.error_differences import ErrorEstimate
-from icrtool.calibration.record import (
-    CalibrationLog,
-    ControllerErrors,
-    ErrorSources,
-    HeldOutScore,
-    PooledScore,
-)
 from icrtool.calibration.transfer import Difference
 from icrtool.config import Config
 from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import Row
 from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.motion.models import TrackGeometry
+from icrtool.records.calibration_document import CalibrationDocument, CalibrationLog
 from icrtool.records.dropout import BudgetDistance, Gate, UsedCalibration
-from icrtool.records.run_document import ControllerNumbers, DriveDocument, IcrDocument, RunDocument
+from icrtool.records.run_document import DriveDocument, IcrDocument, RunDocument
 from icrtool.records.samples import InputFile
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference" / "schemas"
@@ -53,28 +47,6 @@ def _nullable(hint: object) -> object:
         return Number
     return Numbers if getattr(hint, "__origin__", None) is np.ndarray else hint
 
-
-Parameter = plain("Parameter", {"value": float, "std": float, "verdict": Literal["shown", "not shown"]})
-FITTED = {"terms": list[str], "parameters": dict[str, Parameter], "covariance": list[list[float]]}
-Fitted = plain("Fitted", FITTED)
-Sources = record(ErrorSources)
-GyroModel = plain("GyroModel", {"model": str, "error_sources": Sources | None} | FITTED)
-Robot = plain("Robot", {
-    "name": str | None, "track_width_m": float, "wheel_radius_m": NotRequired[Number],
-    "left_scale": NotRequired[float], "right_scale": NotRequired[float],
-})  # fmt: skip
-Errors = {key: NotRequired[hint] for key, hint in get_type_hints(record(ControllerErrors)).items()}
-CALIBRATION = FITTED | {
-    "schema": Literal["icrtool/calibration/1"], "tool_version": str, "robot": Robot, "frame": str,
-    "recommended": str, "model": str, "not_shown": list[str], "geometry": record(TrackGeometry),
-    "geometry_std": record(TrackGeometry, "GeometryStd"),
-    "controller": record(ControllerNumbers, "Controller", **Errors), "gyro": GyroModel | None,
-    "models": dict[str, Fitted], "logs": list[record(CalibrationLog)], "held_out": list[record(HeldOutScore)],
-    "held_out_pooled": NotRequired[list[record(PooledScore)]],
-    "error_sources": Sources | None, "warnings": list[str],
-}  # fmt: skip
-CalibrationDocument = plain("CalibrationDocument", CALIBRATION | {"created": str})
-Recommended = plain("Recommended", CALIBRATION)
 
 SUMMARY = {
     "horizon_m": float, "trials": int, "expected_error_m": Number, "p50_m": Number, "p95_m": Number, "max_m": Number,
@@ -103,7 +75,7 @@ Learned = plain("Learned", {
     "model": str, "learned_s": Number, "learned_at_distance_m": Number, "before": list[Summary], "after": list[Summary],
 })  # fmt: skip
 EventCost = plain("EventCost", {"events": int, "with_events": dict[str, list[Summary]]})
-Used = record(UsedCalibration, calibration=CalibrationDocument, fitted=str)
+Used = record(UsedCalibration, fitted=str)
 Split = plain("Split", {"straight": bool, "horizon_m": float, "trials": int, "expected_m": dict[str, Number]})
 Score = plain("Score", {
     "name": str, "label": str, "fitted": str, "heading": str, "trials": list[int], "expected_error_m": Numbers,
@@ -146,12 +118,12 @@ DropoutDocument = plain("DropoutDocument", {
     "without_events": EventCost | None,
     "tolerance_m": float, "bootstrap": Bootstrap, "models": list[ModelRows], "trials": list[TrialCount],
     "reference_error": list[OwnError], "by_learning": Learned | None, "calibrations": list[Used],
-    "recommended": Recommended | None, "budgets": list[record(BudgetDistance)], "by_turning": list[Split],
+    "recommended": CalibrationDocument | None, "budgets": list[record(BudgetDistance)], "by_turning": list[Split],
     "ladder": Ladder, "gates": list[GateDocument], "passed": bool, "baseline": BaselineDocument | None,
     "outages": list[Outage], "worst": list[Trial], "examples": list[Trial],
 })  # fmt: skip
 
-Group = plain("Group", {"model": str, "logs": list[record(CalibrationLog)], "geometry": record(TrackGeometry)})
+Group = plain("Group", {"model": str, "logs": list[CalibrationLog], "geometry": record(TrackGeometry)})
 PLACE = {"calibrated_on": str, "tested_on": str, "horizon_m": float}
 PairDocument = plain("PairDocument", {
     "first": str, "second": str, "parameters": list[record(Difference, significant=bool)],

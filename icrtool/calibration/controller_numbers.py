@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import UNSET
 
 from icrtool.calibration.error_growth import TWIST_OVER_M, nonnegative
 from icrtool.calibration.held_out import HeldOut, left_out
-from icrtool.calibration.record import Calibration, ControllerErrors
+from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.models import CONTROLLER, NO_SLIP, RECOMMENDED, TERMS, FittedModel
 from icrtool.motion.recording import LogConstants, Recording, Windows
 from icrtool.motion.trials import predicted_path
+from icrtool.records.calibration_document import ControllerErrors
 from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.plain_data import known
 
 POSE_AFTER_M = CHOICE_HORIZON_M
 SMALLEST_VARIANCE = 1e-6
@@ -58,10 +61,10 @@ def not_shown_sentences(fitted: FittedModel) -> list[str]:
 
 def factor_to_old(calibration: Calibration) -> float | None:
     """Return the multiplier over the one that the log's odometry was made with, None where that is not known."""
-    old_width_m = calibration.robot.get("twist_width_m")
-    if old_width_m is None:
+    old_width_m = calibration.robot.twist_width_m
+    if old_width_m is UNSET:
         return None
-    return calibration.controller_numbers().multiplier * calibration.width_m / float(old_width_m)
+    return calibration.controller_numbers().multiplier * calibration.width_m / old_width_m
 
 
 def controller_errors(cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut) -> ControllerErrors | None:
@@ -84,8 +87,8 @@ def controller_errors(cut: Sequence[tuple[int, Recording, Windows]], table: Held
         twist_variance=_variances(near[:, :3] / near[:, 3:4]),
         turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
         way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
-        p95_m=float(table.score(CONTROLLER).together.p95[h]),
-        full_p95_m=float(table.score(RECOMMENDED).together.p95[h]),
+        p95_m=known(float(table.score(CONTROLLER).together.p95[h])),
+        full_p95_m=known(float(table.score(RECOMMENDED).together.p95[h])),
     )
 
 

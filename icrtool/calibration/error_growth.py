@@ -18,13 +18,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from icrtool.calibration.held_out import HeldOut, left_out
-from icrtool.calibration.record import ErrorSources
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import OMEGA, displacements, path_at
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Windows, cut_windows, totals_of
+from icrtool.records.calibration_document import ErrorSources
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
 TWIST_OVER_M = 1.0
@@ -47,7 +47,7 @@ those of robots differ. A few windows never show that errors are smaller than no
 
 Values = TypeVar("Values", Floats, Complexes)
 
-SOURCES = ErrorSources._fields.index("p95_factor")
+SOURCES = ErrorSources.__struct_fields__.index("p95_factor")
 
 
 class Spread(NamedTuple):

@@ -83,7 +83,7 @@ def with_motion(run: Run) -> RunDocument:
         geometry, covariance = fits[FIVE].geometry(recording.width_m)
     else:
         return run.document
-    robot = robot_of(run) | {"track_width_m": recording.width_m}
+    robot = robot_of(run, recording.width_m)
     found = None
     if run.usable and run.track_width_m is not None and RECOMMENDED in fits:
         found = fitted_document(fits[RECOMMENDED], geometry, covariance, robot)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from icrtool.calibration.error_growth import SOURCES, PathErrors, Spread, mean_error, path_errors, radius
@@ -179,5 +180,5 @@ def _errors(
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
     found: PathErrors = path_errors(steps, begin_s, end_s, fitted, calibration.width_m)
-    spread = found.of_sources.combined(np.array(sources[:SOURCES])).plus(found.of_parameters)
+    spread = found.of_sources.combined(np.array(msgspec.structs.astuple(sources)[:SOURCES])).plus(found.of_parameters)
     return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius(spread, 0.95)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from os import PathLike
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 
 from icrtool.calibration.pooled import CalibrationResult, LeftOut, calibrate_recordings
 from icrtool.calibration.record import Calibration
@@ -15,6 +16,7 @@ from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Complexes
 from icrtool.motion.recording import Recording, cut_windows
+from icrtool.records.calibration_document import CalibratedRobot
 from icrtool.records.run import MAKE_RUN, Run, check_type
 
 SAME_SHARE, SAME_SPEED = 0.98, 1e-6
@@ -49,7 +51,9 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
     alone: tuple[str, ...] = ()
     for run in runs:
         check_type(run, Run, MAKE_RUN)
-        one = _Taken(turning_recording_of(run), _positions(run), robot_of(run), use_warnings(run, alone=False))
+        recording = turning_recording_of(run)
+        robot = robot_of(run, recording.width_m)
+        one = _Taken(recording, _positions(run), robot, use_warnings(run, alone=False))
         if why := _why_left_out(run, one, taken, allow_unusable=allow_unusable):
             left_out.append(LeftOut(run.name, why))
             continue
@@ -64,7 +68,7 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
         if len(left_out) == 1:
             raise DataError(*left_out[0], "--allow-unusable takes a run that is not usable")
         raise DataError("runs", f"none of {len(left_out)} can be used", "; ".join(map(str, left_out)))
-    if len(found := {robot["wheel_radius_m"] for robot in robots}) > 1:
+    if len(found := {robot.wheel_radius_m for robot in robots}) > 1:
         why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
     result = calibrate_recordings(recordings, robots[0])
@@ -84,7 +88,7 @@ class _Taken(NamedTuple):
 
     recording: Recording
     positions: Complexes
-    robot: dict[str, Any]
+    robot: CalibratedRobot
     warnings: tuple[str, ...]
 
 
@@ -127,14 +131,16 @@ def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unus
     return ""
 
 
-def robot_of(run: Run) -> dict[str, Any]:
-    """Return what a calibration holds of the robot of a run, except its track width."""
-    robot: dict[str, Any] = {"name": run.config.robot.name, "wheel_radius_m": run.config.robot.wheel_radius_m}
-    if run.config.robot.encoder_counts_per_rev is not None:
-        robot["encoder_counts_per_rev"] = run.config.robot.encoder_counts_per_rev
-    if run.config.wheels.twist_width_m is not None and _from_twists(run):
-        robot["twist_width_m"] = run.config.wheels.twist_width_m
-    return robot
+def robot_of(run: Run, width_m: float) -> CalibratedRobot:
+    """Return what a calibration holds of the robot of a run, of track width `width_m`."""
+    robot = run.config.robot
+    return CalibratedRobot(
+        name=robot.name,
+        wheel_radius_m=robot.wheel_radius_m,
+        encoder_counts_per_rev=robot.encoder_counts_per_rev or UNSET,
+        twist_width_m=(run.config.wheels.twist_width_m or UNSET) if _from_twists(run) else UNSET,
+        track_width_m=width_m,
+    )
 
 
 def _from_twists(run: Run) -> bool:

@@ -122,7 +122,7 @@ def _calibration(run: Run, found: HeldOut) -> Calibration | None:
     """Return the calibration of a run from the table that compares its models; an attitude is no gyro."""
     if run.track_width_m is None:
         return None
-    return replace(calibration_from(found, robot_of(run)), warnings=use_warnings(run))
+    return replace(calibration_from(found, robot_of(run, found.recordings[0].width_m)), warnings=use_warnings(run))
 
 
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:

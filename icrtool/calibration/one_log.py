@@ -16,9 +16,10 @@ import numpy as np
 from icrtool.calibration.run_recording import known_antenna_m
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
+from icrtool.records.calibration_document import CALIBRATION_SCHEMA
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.plain_data import plain
-from icrtool.records.run import CALIBRATION_SCHEMA, Run
+from icrtool.records.run import Run
 from icrtool.records.samples import InputFile
 
 Verdict = Literal["shown", "weak", "not shown", "not separable", "given"]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,12 +13,13 @@ from icrtool import __version__
 from icrtool.calibration.controller_numbers import controller_errors
 from icrtool.calibration.error_growth import cut_error_windows, measure_error_sources
 from icrtool.calibration.held_out import GYRO, HeldOut, errors_without, hold_out
-from icrtool.calibration.record import Calibration, CalibrationLog, HeldOutScore, PooledScore
+from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.motion.fit import Fold, Prediction, own_constants
 from icrtool.motion.models import MODELS, RECOMMENDED
 from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import ErrorsOf
+from icrtool.records.calibration_document import CalibratedRobot, CalibrationLog, HeldOutScore, PooledScore
 
 
 class LeftOut(NamedTuple):
@@ -40,13 +41,13 @@ class CalibrationResult(NamedTuple):
     left_out: tuple[LeftOut, ...] = ()
 
 
-def calibrate_recordings(recordings: Sequence[Recording], robot: Mapping[str, Any] | None = None) -> CalibrationResult:
+def calibrate_recordings(recordings: Sequence[Recording], robot: CalibratedRobot | None = None) -> CalibrationResult:
     """Fit the motion models to all recordings, and test each on what it was not fitted to.
 
     Parameters
     ----------
     recordings : one or many, of one robot
-    robot : what else its calibration holds of it: name, wheel_radius_m
+    robot : as its calibration holds it; default: of no name
 
     Raises
     ------
@@ -66,7 +67,7 @@ def calibrate_recordings(recordings: Sequence[Recording], robot: Mapping[str, An
     return CalibrationResult(calibration_from(table, robot), table, _notes(recordings))
 
 
-def calibration_from(table: HeldOut, robot: Mapping[str, Any] | None = None) -> Calibration:
+def calibration_from(table: HeldOut, robot: CalibratedRobot | None = None) -> Calibration:
     """Return the calibration of the recordings that a held-out table is of."""
     recordings, best = table.recordings, table.fits[RECOMMENDED]
     constants = [best.constants(i) for i in range(len(recordings))]
@@ -79,7 +80,7 @@ def calibration_from(table: HeldOut, robot: Mapping[str, Any] | None = None) -> 
     )  # fmt: skip
     cut = cut_error_windows(recordings)
     return Calibration(
-        robot={"name": None, "wheel_radius_m": None, **(robot or {}), "track_width_m": recordings[0].width_m},
+        robot=robot if robot is not None else CalibratedRobot(track_width_m=recordings[0].width_m),
         fitted=best.fitted,
         others={name: table.fits[name].fitted for name in MODELS},
         gyro=table.fits[f"{RECOMMENDED}{GYRO}"].fitted if table.has_gyro else None,

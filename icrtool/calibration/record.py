@@ -11,104 +11,33 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import UNSET
 
 from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.models import FIVE, FittedModel, TrackGeometry, wheel_motion
+from icrtool.records.calibration_document import (
+    CALIBRATION_SCHEMA,
+    CalibratedRobot,
+    CalibrationDocument,
+    CalibrationLog,
+    ControllerDocument,
+    ControllerErrors,
+    ErrorSources,
+    FittedDocument,
+    GyroDocument,
+    HeldOutScore,
+    PooledScore,
+)
 from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
-from icrtool.records.run import CALIBRATION_SCHEMA, WarmStart
+from icrtool.records.run import WarmStart
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
-
-
-class HeldOutScore(NamedTuple):
-    """Errors of one model at one horizon on a log, or block of one, that it was not fitted to."""
-
-    model: str
-    horizon_m: float
-    p95_m: float
-    expected_m: float
-    log: str
-
-
-class PooledScore(NamedTuple):
-    """Errors of one model at one horizon, of the held-out trials of all logs, or blocks of one, together."""
-
-    model: str
-    horizon_m: float
-    p95_m: float
-    expected_m: float
-
-
-class CalibrationLog(NamedTuple):
-    """A log that a calibration was fitted to, and its own constants.
-
-    Attributes
-    ----------
-    heading_offset_deg : what its reference's heading is off; wheels_delay_s : its wheels against its poses, positive
-        for later
-    begin_ns : stamp of its first state; 0 where it is not known
-    """
-
-    name: str
-    path: str
-    sha256: str
-    distance_m: float
-    heading_offset_deg: float
-    wheels_delay_s: float
-    begin_ns: int = 0
-
-
-class ControllerErrors(NamedTuple):
-    """Errors of what a controller can express, on distance it was not fitted to.
-
-    Attributes
-    ----------
-    pose_variance : (3,) of x forward, y left, yaw [m^2, m^2, rad^2] after 10 m
-    twist_variance : (3,) of velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
-    turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
-    p95_m, full_p95_m : after 10 m, of the controller's model and of the whole one; NaN without a trial of 10 m
-    """
-
-    pose_variance: tuple[float, float, float]
-    twist_variance: tuple[float, float, float]
-    turn_noise: tuple[float, float]
-    way_noise: tuple[float, float]
-    p95_m: float
-    full_p95_m: float
-
-
-class ErrorSources(NamedTuple):
-    """Variances of what a model leaves out, and what its quantiles are scaled by.
-
-    Attributes
-    ----------
-    heading_start_rad2 : of the heading at the start
-    heading_rate_rad2pm2 : of a turn per metre that stays the same along the path
-    turn_share : of the share by which every turn is off
-    heading_wander_rad2pm : of the heading, for each metre
-    speed_share : of the share by which the distance is off
-    distance_wander_m2pm : of the distance, for each metre
-    heading_noise_rad2, position_noise_m2 : of the reference alone, beside the others
-    p95_factor, expected_factor : measured over predicted
-    measured_to_m : length of the longest windows; a longer forecast extrapolates
-    """
-
-    heading_start_rad2: float
-    heading_rate_rad2pm2: float
-    turn_share: float
-    heading_wander_rad2pm: float
-    speed_share: float
-    distance_wander_m2pm: float
-    heading_noise_rad2: float
-    position_noise_m2: float
-    p95_factor: float
-    expected_factor: float
-    measured_to_m: float = 20.0
 
 
 class Odometry(NamedTuple):
@@ -126,8 +55,6 @@ class Calibration:
 
     Attributes
     ----------
-    robot : name (or None), track_width_m, wheel_radius_m (or None), encoder_counts_per_rev where configured; older
-        files: left_scale, right_scale as configured
     fitted : the recommended model; others : every model that was fitted, by name
     gyro : the recommended model with a gyro, None where a log has none
     logs : what it was fitted to
@@ -141,7 +68,7 @@ class Calibration:
     name : stem of its file; empty for one just made
     """
 
-    robot: Mapping[str, Any]
+    robot: CalibratedRobot
     fitted: FittedModel
     others: Mapping[str, FittedModel]
     gyro: FittedModel | None
@@ -164,7 +91,7 @@ class Calibration:
     @property
     def width_m(self) -> float:
         """Track width b [m]."""
-        return float(self.robot["track_width_m"])
+        return self.robot.track_width_m
 
     def geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs [m], multiplier and radius factors, from one fit, and their covariance (6, 6)."""
@@ -225,8 +152,8 @@ class Calibration:
         with the numbers that the calibration was fitted with.
         """
         known = RobotConfig(
-            wheel_radius_m=self.robot.get("wheel_radius_m"),
-            encoder_counts_per_rev=self.robot.get("encoder_counts_per_rev"),
+            wheel_radius_m=self.robot.wheel_radius_m,
+            encoder_counts_per_rev=self.robot.encoder_counts_per_rev or None,
         )
         wheels = with_wheel_speeds(log, Config(robot=known)).wheels
         v_x, v_y, omega = self.twist(wheels.v_left_mps, wheels.v_right_mps)
@@ -258,70 +185,68 @@ class Calibration:
         OutputError
             Something that is not a calibration is there, or it cannot be written.
         """
-        file: Path = call_output("files.calibration_file", "write_calibration", self.summary(), Path(path))
+        file: Path = call_output("files.calibration_file", "write_calibration", self.document(), Path(path))
         return file
 
     def __repr__(self) -> str:
         p95, _ = self.held_out_m("recommended", 10.0)
         logs = counted(len(self.logs), "log")
         return (
-            f"<Calibration of {self.robot['name'] or 'a robot'}: {self.recommended} from {logs}, "
+            f"<Calibration of {self.robot.name or 'a robot'}: {self.recommended} from {logs}, "
             f"95 % within {p95:.2f} m after 10 m, held out>"
         )
 
-    def summary(self) -> dict[str, Any]:
-        """Return plain data for the calibration file."""
-        fitted = plain(fitted_document(self.fitted, *self.geometry(), self.robot))
-        del fitted["label"]
-        return {
-            "schema": CALIBRATION_SCHEMA,
-            "tool_version": self.tool_version,
-            "created": self.created,
-            "robot": dict(self.robot),
-            "frame": "x forward, y right, turn rate clockwise; wheel speeds at the configured radius",
-            "recommended": self.recommended,
-            **fitted,
-            "gyro": None
+    def document(self) -> CalibrationDocument:
+        """Return what the calibration file holds."""
+        geometry, covariance = self.geometry()
+        own = fitted_document(self.fitted, geometry, covariance, self.robot)
+        errors = {} if self.controller is None else msgspec.structs.asdict(self.controller)
+        return CalibrationDocument(
+            schema=CALIBRATION_SCHEMA,
+            tool_version=self.tool_version,
+            created=self.created,
+            robot=self.robot,
+            recommended=self.recommended,
+            model=own.model,
+            terms=own.terms,
+            parameters=own.parameters,
+            covariance=own.covariance,
+            not_shown=own.not_shown,
+            geometry=own.geometry,
+            geometry_std=own.geometry_std,
+            controller=ControllerDocument(**msgspec.structs.asdict(own.controller), **errors),
+            gyro=None
             if self.gyro is None
-            else {
-                "model": self.gyro.model.name,
-                **_plain(self.gyro),
-                "error_sources": _sources(self.gyro_sources),
-            },
-            "models": {name: _plain(one) for name, one in self.others.items()},
-            "logs": [log._asdict() for log in self.logs],
-            "held_out": [score._asdict() for score in self.held_out],
-            "held_out_pooled": [score._asdict() for score in self.pooled],
-            "controller": plain(
-                plain(self.controller_numbers()) | ({} if self.controller is None else self.controller._asdict())
-            ),
-            "error_sources": _sources(self.sources),
-            "warnings": list(self.warnings),
-        }
+            else GyroDocument(self.gyro.model.name, *_parameters(self.gyro), self.gyro_sources),
+            models={name: FittedDocument(*_parameters(one)) for name, one in self.others.items()},
+            logs=self.logs,
+            held_out=self.held_out,
+            held_out_pooled=self.pooled,
+            error_sources=self.sources,
+            warnings=self.warnings,
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the calibration file holds, as plain data."""
+        found: dict[str, Any] = plain(self.document())
+        return found
 
 
 def fitted_document(
-    fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]
+    fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: CalibratedRobot
 ) -> RecommendedDocument:
     """Return a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
-    own, std = _plain(fitted), np.sqrt(np.diag(covariance)).tolist()
+    std = np.sqrt(np.diag(covariance)).tolist()
     return RecommendedDocument(
-        label=fitted.model.label,
-        model=fitted.model.name,
-        terms=fitted.model.terms,
-        parameters={name: ParameterDocument(**one) for name, one in own["parameters"].items()},
-        covariance=own["covariance"],
-        not_shown=fitted.not_shown,
-        geometry=geometry._asdict(),
-        geometry_std=dict(zip(geometry._fields, std, strict=True)),
-        controller=controller_numbers(geometry, covariance, robot),
-    )
+        fitted.model.label, fitted.model.name, *_parameters(fitted), fitted.not_shown, geometry._asdict(),
+        dict(zip(geometry._fields, std, strict=True)), controller_numbers(geometry, covariance, robot),
+    )  # fmt: skip
 
 
-def controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Mapping[str, Any]) -> ControllerNumbers:
+def controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: CalibratedRobot) -> ControllerNumbers:
     """Return multiplier and radius factors with one standard deviation each."""
     std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    left, right = float(robot.get("left_scale", 1.0)), float(robot.get("right_scale", 1.0))
+    left, right = (1.0 if scale is UNSET else scale for scale in (robot.left_scale, robot.right_scale))
     return ControllerNumbers(
         geometry.multiplier, std["multiplier"],
         left * geometry.radius_left, left * std["radius_left"],
@@ -329,18 +254,9 @@ def controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Mappi
     )  # fmt: skip
 
 
-def _sources(sources: ErrorSources | None) -> dict[str, float] | None:
-    return None if sources is None else sources._asdict()
-
-
-def _plain(one: FittedModel) -> dict[str, Any]:
+def _parameters(one: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
+    """Return terms, parameters and covariance of a model."""
     rows = zip(one.model.terms, one.parameters.tolist(), one.std.tolist(), strict=True)
     unseen = one.not_shown
-    return {
-        "terms": list(one.model.terms),
-        "parameters": {
-            name: {"value": value, "std": std, "verdict": "not shown" if name in unseen else "shown"}
-            for name, value, std in rows
-        },
-        "covariance": one.covariance.tolist(),
-    }
+    found = {name: ParameterDocument(at, std, "not shown" if name in unseen else "shown") for name, at, std in rows}
+    return one.model.terms, found, one.covariance.tolist()

@@ -157,7 +157,7 @@ def compare_calibrations(
 def _of_one_robot(one: Calibration, other: Calibration) -> bool:
     """Return whether the parameters of two calibrations refer to the same track width and wheel radius."""
     same_width = math.isclose(one.width_m, other.width_m, rel_tol=1e-3)
-    return same_width and one.robot.get("wheel_radius_m") == other.robot.get("wheel_radius_m")
+    return same_width and one.robot.wheel_radius_m == other.robot.wheel_radius_m
 
 
 class _Tested(NamedTuple):

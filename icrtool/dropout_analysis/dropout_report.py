@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
+import msgspec
+
 from icrtool.calibration.model_comparison import ComparedModels, compare_models
 from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
@@ -163,7 +165,8 @@ def _calibration_rows(
         label = "calibration" if len(calibrations) == 1 else stem
         if recording is None:
             continue
-        kept, seen = one.summary() | {"models": {}, "held_out": []}, one.fitted_to(recording.sha256)
+        kept = msgspec.structs.replace(one.document(), models={}, held_out=())
+        seen = one.fitted_to(recording.sha256)
         rows = [(name, label, one.recommended, False)]
         if one.gyro is not None and recording.track.gyro is not None:
             rows.append((f"{name}_gyro", f"{label} + gyro", one.gyro.model.name, True))

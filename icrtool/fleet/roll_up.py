@@ -160,7 +160,7 @@ def _pooled(
     try:
         result = calibrate_runs(usable(), allow_unusable=allow_unusable)
         make_folders(directory / CALIBRATIONS, directory)
-        write_calibration(result.calibration.summary(), directory / file, directory)
+        write_calibration(result.calibration.document(), directory / file, directory)
     except IcrToolError as err:
         left_out = tuple(log for log in one.logs if log not in used)
         return replace(one, left_out=left_out, reason=str(err))

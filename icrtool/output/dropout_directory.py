@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from icrtool import __version__
@@ -143,7 +144,7 @@ def report_document(report: DropoutReport) -> dict[str, Any]:
         "calibrations": [one._asdict() | {"fitted": one.fitted_text} for one in report.calibrations],
         # Without when it was made: the same run, the same file.
         "recommended": report.calibration
-        and {key: value for key, value in report.calibration.summary().items() if key != "created"},
+        and msgspec.structs.replace(report.calibration.document(), created=msgspec.UNSET),
         "budgets": [one._asdict() for one in report.budgets],
         "by_turning": [one._asdict() for one in report.by_turning],
         "ladder": comparison_document(report),

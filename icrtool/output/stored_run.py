@@ -29,12 +29,9 @@ from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_
 from icrtool.records.run import Run
 from icrtool.records.run_document import RUN_SCHEMA, RunDocument
 from icrtool.records.tables import States
-from icrtool.records.text import LONGEST_NAME, LogText, escaped, shortened
+from icrtool.records.text import LONGEST_NAME, escaped_texts, shortened
 
 FIT_AGAIN = "fit the log again"
-
-LONGEST_STORED = 1000
-"""Characters of a text of run.json that are used: a warning of ours has a few hundred."""
 
 NAMES = ("topic", "message_type")
 """Keys of run.json whose texts stand there as in the log."""
@@ -148,19 +145,7 @@ def _read_document(directory: Path) -> dict[str, Any]:
             directory, f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}", FIT_AGAIN
         )
     # What a log wrote there is printed from here on.
-    return {key: value if key == "inputs" else _escaped(value) for key, value in document.items()}
-
-
-def _escaped(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return plain data with all its texts escaped."""
-    if isinstance(value, dict):
-        return {
-            escaped(key): LogText(item) if key in NAMES and isinstance(item, str) else _escaped(item)
-            for key, item in value.items()
-        }
-    if isinstance(value, list):
-        return [_escaped(item) for item in value]
-    return shortened(escaped(value), LONGEST_STORED) if isinstance(value, str) else value
+    return {key: value if key == "inputs" else escaped_texts(value, NAMES) for key, value in document.items()}
 
 
 def _read_states(directory: Path, names: Mapping[str, StatesFormat], sums: Mapping[str, str]) -> States | None:

@@ -15,8 +15,8 @@ from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import counted
 
 if TYPE_CHECKING:
-    from icrtool.calibration.record import ControllerErrors
     from icrtool.motion.models import FittedModel
+    from icrtool.records.calibration_document import ControllerErrors
     from icrtool.records.run_document import (
         ControllerNumbers,
         DriveDocument,
@@ -204,7 +204,7 @@ def controller_text(numbers: ControllerNumbers) -> str:
 
 def controller_error_text(errors: ControllerErrors | None) -> str:
     """Return the held-out error of a controller beside that of the whole model; empty where it was not measured."""
-    if errors is None or not math.isfinite(errors.p95_m):
+    if errors is None or errors.p95_m is None or errors.full_p95_m is None:
         return ""
     return (
         f"with these numbers alone the error after {CHOICE_HORIZON_M:g} m is {error_text(errors.p95_m)} (95 %, held "

@@ -6,13 +6,13 @@ No kernel is here: a process that only draws them need not load numba.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.kernels.open_loop.trials import Histogram, Intervals, OpenLoopPath, Summary
+from icrtool.records.calibration_document import CalibrationDocument
 
 OutageKind = Literal["forced", "real"]
 
@@ -177,7 +177,7 @@ class UsedCalibration(NamedTuple):
     fitted_to_this: bool
     created: str
     with_gyro: bool = False
-    calibration: Mapping[str, Any] = {}
+    calibration: CalibrationDocument | None = None
 
     @property
     def fitted_text(self) -> str:

@@ -23,14 +23,14 @@ def known(value: float) -> float | None:
 def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
     """Return a value as JSON gives it back: lists, dicts, text, numbers; None for what is not a finite number.
 
-    Of a dataclass the fields that are compared count: the others are no content.
+    Of a dataclass the fields that are compared count: the others are no content; nor is what is not set.
     """
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.asdict(value)
     elif is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value) if field.compare}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items() if item is not msgspec.UNSET}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 
     from icrtool.records.run_document import IcrColumn, RunDocument
 
-CALIBRATION_SCHEMA = "icrtool/calibration/1"
-"""Version of calibration files."""
-
 ICR_COLUMNS: tuple[IcrColumn, ...] = ("y_icr_right_m", "y_icr_left_m", "x_icr_m")
 ICR_WORDS: dict[str, str] = dict(zip(ICR_COLUMNS, ("y right", "y left", "x"), strict=True))
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Self
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, Self
 
 LONGEST_NAME = 80
 """Characters of a name that are printed; of a longer one the beginning and the end are."""
 
 LONGEST_TEXT = 512
 """Characters of a text from a log that are used (a topic of ROS has up to 255): long ones take time to look through."""
+
+LONGEST_STORED = 1000
+"""Characters of a text of a file of ours that are used: a warning has a few hundred."""
 
 LONGEST_MESSAGE = 4000
 """Characters of an error or a warning that are printed."""
@@ -70,6 +73,23 @@ def escaped(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def escaped_texts(value: Any, names: Collection[str] = ()) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return what a JSON file holds with all its texts escaped, and of at most `LONGEST_STORED` characters.
+
+    Parameters
+    ----------
+    names : keys whose texts stand there as in the log: they become `LogText`
+    """
+    if isinstance(value, dict):
+        return {
+            escaped(key): LogText(item) if key in names and isinstance(item, str) else escaped_texts(item, names)
+            for key, item in value.items()
+        }
+    if isinstance(value, list):
+        return [escaped_texts(item, names) for item in value]
+    return shortened(escaped(value), LONGEST_STORED) if isinstance(value, str) else value
 
 
 def table_cell(text: str) -> str:

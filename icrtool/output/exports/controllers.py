@@ -7,17 +7,19 @@ import textwrap
 from datetime import UTC, datetime
 from typing import Literal, get_args
 
+import msgspec
 import numpy as np
 
 from icrtool import __version__
 from icrtool.calibration.controller_numbers import POSE_AFTER_M, export_warnings, factor_to_old
 from icrtool.calibration.error_growth import TWIST_OVER_M
-from icrtool.calibration.record import Calibration, ControllerErrors
+from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.output.exports.twist_model import format_twist
 from icrtool.output.files.json_file import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import controller_error_text
+from icrtool.records.calibration_document import ControllerErrors
 from icrtool.records.run_document import ControllerNumbers
 
 Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]
@@ -85,9 +87,9 @@ def _json(calibration: Calibration, errors: ControllerErrors) -> str:
         "log": calibration.log_names(),
         "begin_ns": _begin_ns(calibration),
         "distance_m": _distance_m(calibration),
-        "robot": robot["name"],
+        "robot": robot.name,
         "track_width_m": calibration.width_m,
-        "wheel_radius_m": robot["wheel_radius_m"],
+        "wheel_radius_m": robot.wheel_radius_m,
         "model": calibration.recommended,
         "created": calibration.created,
         "separation_multiplier": numbers.multiplier,
@@ -98,9 +100,9 @@ def _json(calibration: Calibration, errors: ControllerErrors) -> str:
         "right_radius_multiplier_std": numbers.right_radius_std,
         "icrs_m": geometry[:3],
         "icr_std_m": np.sqrt(np.diag(covariance)[:3]),
-        **errors._asdict(),
+        **msgspec.structs.asdict(errors),
         "warnings": export_warnings(calibration),
-        "twist_width_m": robot.get("twist_width_m"),
+        "twist_width_m": robot.twist_width_m or None,
     }
     return json_bytes(document).decode().rstrip("\n")
 
@@ -131,7 +133,7 @@ def _nav2(errors: ControllerErrors) -> list[str]:
 
 def _controller(calibration: Calibration, errors: ControllerErrors, indent: int) -> list[str]:
     """Return the parameters of a diff_drive_controller."""
-    radius = calibration.robot["wheel_radius_m"]
+    radius = calibration.robot.wheel_radius_m
     lines = [f"wheel_separation: {_number(calibration.width_m)}"]
     if radius is not None:
         lines.append(f"wheel_radius: {_number(radius)}")
@@ -160,7 +162,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     geometry, covariance = calibration.geometry()
     right, left, x = geometry[:3]
     std_right, std_left, std_x = np.sqrt(np.diag(covariance)[:3])
-    robot = f", {_one_line(name)}" if (name := calibration.robot["name"]) else ""
+    robot = f", {_one_line(name)}" if (name := calibration.robot.name) else ""
     # That of a report has no date: the same run, the same file.
     fitted = f", fitted {calibration.created[:10]}" if calibration.created else ""
     origin = (
@@ -178,7 +180,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     )
     sentences = [origin, icrs, held_out, lost]
     if (factor := factor_to_old(calibration)) is not None:
-        old = calibration.robot["twist_width_m"] / calibration.width_m
+        old = calibration.controller_numbers().multiplier / factor
         sentences.append(
             f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
             f"{factor:.4f} times the old"

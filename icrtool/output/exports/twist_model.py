@@ -13,6 +13,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
 from icrtool.motion.models import TERMS, Term, wheel_motion
 from icrtool.output.files.json_file import json_bytes
+from icrtool.records.plain_data import plain
 
 TWIST_SCHEMA = "icrtool/twist/1"
 
@@ -38,7 +39,7 @@ def format_twist(calibration: Calibration) -> str:
         "schema": TWIST_SCHEMA,
         "tool_version": __version__,
         "created": calibration.created,
-        "robot": dict(calibration.robot),
+        "robot": plain(calibration.robot),
         "frame": "REP-103: x forward, y left, yaw counter-clockwise",
         "inputs": "v_left, v_right [m/s]: wheel speeds at the configured radius, forward positive",
         "outputs": "v_x, v_y [m/s], yaw_rate [rad/s]",
@@ -62,7 +63,7 @@ def format_twist(calibration: Calibration) -> str:
             "std": dict(zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), stds[:3], strict=True)),
         },
         "held_out": {"horizon_m": POSE_AFTER_M, "p95_m": p95, "expected_m": expected},
-        "logs": [log._asdict() for log in calibration.logs],
+        "logs": plain(calibration.logs),
         "warnings": list(calibration.warnings),
     }  # fmt: skip
     return json_bytes(document).decode().rstrip("\n")

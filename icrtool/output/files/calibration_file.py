@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationDocument
 from icrtool.records.regular_file import read_regular
-from icrtool.records.run import CALIBRATION_SCHEMA
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
@@ -32,19 +32,21 @@ def open_calibration(file: Path | str) -> Calibration:
     RunError
         It cannot be read, or is not a calibration.
     """
-    from icrtool.calibration.stored import calibration_of
+    from icrtool.calibration.stored import read_calibration
 
     path = Path(file)
     try:
-        return replace(calibration_of(json.loads(read_regular(path))), name=path.stem)
+        return replace(read_calibration(json.loads(read_regular(path))), name=path.stem)
     except OSError as err:
         raise RunError(path, "cannot be read", err.strerror or str(err)) from err
-    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as err:
+    except (ValueError, LookupError, ArithmeticError, RecursionError) as err:
         why = "not a calibration with a motion model"
         raise RunError(path, why, "make one with icrtool calibrate -o") from err
 
 
-def write_calibration(document: Mapping[str, Any], place: Path, inside: Path | None = None) -> Path:
+def write_calibration(
+    document: CalibrationDocument | Mapping[str, Any], place: Path, inside: Path | None = None
+) -> Path:
     """Write plain data of a calibration: into `place` where that is a folder, else as `place`.
 
     Parameters

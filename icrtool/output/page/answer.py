@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.stored import calibration_of
+from icrtool.calibration.stored import read_calibration
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import controller_rows, format_export
 from icrtool.output.tables.brief import reach_rows, to_drive, trust
@@ -42,7 +42,7 @@ def answer_of(summary: RunDocument, report: Mapping[str, Any]) -> dict[str, Any]
         ``export``: configuration of a diff_drive_controller, ``model``: the recommended one; empty where there is none.
     """
     found = report["recommended"]
-    calibration = calibration_of({**found, "created": ""}) if found is not None else None
+    calibration = read_calibration(found) if found is not None else None
     grade, sentence = trust(
         summary, passed=report["passed"], events_left_out=report["without_events"] is not None
     )  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 
 from icrtool.calibration.pooled import calibrated
 from icrtool.calibration.run_recording import turning_recording_of
-from icrtool.calibration.stored import calibration_of
+from icrtool.calibration.stored import read_calibration
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
@@ -276,7 +276,7 @@ def _calibrated(recording_of: Callable[[str], Recording], report: Mapping[str, A
         turned, document = one["with_gyro"], one["calibration"]
         if recording is not None and document and not (turned and recording.track.gyro is None):
             with suppress(DataError):
-                model = calibrated(calibration_of({"created": "", **document}), recording, with_gyro=turned)
+                model = calibrated(read_calibration(document), recording, with_gyro=turned)
                 yield ModelPath(one["name"], one["label"], *predicted_path(recording, *model)(recording.track.t[rows]))
 
 

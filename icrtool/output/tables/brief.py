@@ -380,7 +380,7 @@ def brief_calibration(result: CalibrationResult | None, sensors: LogCalibration 
         std = np.sqrt(np.diag(covariance)).tolist()
         icrs = zip(geometry[:ICRS], std, strict=False)
         distance_m = sum(log.distance_m for log in calibration.logs)
-        robot = calibration.robot["name"] or "robot"
+        robot = calibration.robot.name or "robot"
         title = f"{robot}: {counted(len(calibration.logs), 'log')}, {distance_text(distance_m)}"
         blocks += [Line(title, "title")]
         numbers = calibration.controller_numbers()

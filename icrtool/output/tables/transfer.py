@@ -10,6 +10,7 @@ from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import with_interval, with_std
 from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.plain_data import plain
 
 TRANSFER_SCHEMA = "icrtool/compare/1"
 
@@ -24,7 +25,7 @@ def transfer_document(transfer: Transfer) -> dict[str, Any]:
         "groups": {
             name: {
                 "model": one.recommended,
-                "logs": [log._asdict() for log in one.logs],
+                "logs": plain(one.logs),
                 "geometry": one.geometry()[0]._asdict(),
             }
             for name, one in transfer.calibrations.items()

@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.optimize import nnls
@@ -15,7 +16,7 @@ from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonneg
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
 from icrtool.calibration.pooled import calibrate_recordings, predictor
 from icrtool.calibration.record import Calibration, ErrorSources
-from icrtool.calibration.stored import calibration_of
+from icrtool.calibration.stored import read_calibration
 from icrtool.errors import DataError, IcrToolError
 from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
 from icrtool.motion.trials import cut_trials
@@ -43,7 +44,7 @@ def calibration() -> Calibration:
 def only(calibration: Calibration, **variances: float) -> Calibration:
     """Return a calibration with exact parameters and the given sources of error alone."""
     exact = replace(calibration.fitted, covariance=0.0 * calibration.fitted.covariance)
-    sources = ErrorSources(*np.zeros(SOURCES), 1.0, 1.0)._replace(**variances)
+    sources = msgspec.structs.replace(ErrorSources(*[0.0] * SOURCES, 1.0, 1.0), **variances)
     return replace(calibration, fitted=exact, sources=sources)
 
 
@@ -128,8 +129,8 @@ def test_a_budget_is_reached_between_metres(calibration: Calibration) -> None:
 
 def test_the_sources_come_back_from_a_file_and_an_older_file_has_none(calibration: Calibration) -> None:
     document = calibration.summary()
-    assert calibration_of(document).sources == calibration.sources
-    older = calibration_of({key: value for key, value in document.items() if key != "error_sources"})
+    assert read_calibration(document).sources == calibration.sources
+    older = read_calibration({key: value for key, value in document.items() if key != "error_sources"})
     with pytest.raises(DataError, match="calibrate again"):
         forecast_plan(older, np.zeros(2), np.array([0.0, 9.0]))
 
@@ -202,7 +203,7 @@ def test_a_gyro_narrows_the_forecast_and_holds() -> None:
     logs = [make_recording(SIX, parameters, k, 150.0, gyro=True, name=f"log {k}") for k in range(3)]
     found = calibrate_recordings(logs).calibration
     assert found.gyro_sources is not None
-    assert calibration_of(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
+    assert read_calibration(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
     new = make_recording(SIX, parameters, 9, 300.0, gyro=True, name="new")
     trials = cut_trials(new, HORIZONS_M)
     errors = predictor(found, new, with_gyro=True)(trials).position

@@ -23,6 +23,7 @@ from icrtool.motion.recording import Recording, Windows, cut_windows
 from icrtool.motion.trials import Trials, cut_trials, predicted_path
 from icrtool.output.files.calibration_file import open_calibration, write_calibration
 from icrtool.output.tables.held_out import format_result
+from icrtool.records.calibration_document import CalibratedRobot
 from icrtool.records.dropout import MeasuredHeading
 from support.drives import make_log
 from support.recordings import WIDTH_M, make_recording, table_errors, trials_from_all
@@ -37,7 +38,9 @@ def logs(count: int = 3, *, gyro: bool = False) -> list[Recording]:
 
 @pytest.fixture(scope="module")
 def result() -> CalibrationResult:
-    return calibrate_recordings(logs(gyro=True), {"name": "made", "wheel_radius_m": 0.1})
+    return calibrate_recordings(
+        logs(gyro=True), CalibratedRobot(name="made", wheel_radius_m=0.1, track_width_m=WIDTH_M)
+    )
 
 
 def test_the_parameters_that_made_the_logs_come_back(result: CalibrationResult) -> None:
@@ -137,7 +140,7 @@ def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
 
 @pytest.mark.parametrize(("unit", "metres"), [("rad", 0.165), ("counts", 2.0 * np.pi * 0.165 / 4096.0)])
 def test_odometry_takes_wheels_in_the_unit_of_the_log(result: CalibrationResult, unit: str, metres: float) -> None:
-    robot = {**result.calibration.robot, "wheel_radius_m": 0.165, "encoder_counts_per_rev": 4096.0}
+    robot = CalibratedRobot(wheel_radius_m=0.165, encoder_counts_per_rev=4096.0, track_width_m=WIDTH_M)
     calibration, log = replace(result.calibration, robot=robot), make_log(0, 30.0)
     sent = replace(log.wheels, left=log.wheels.left / metres, right=log.wheels.right / metres, unit=unit)
     for found, expected in zip(calibration.odometry(replace(log, wheels=sent)), calibration.odometry(log), strict=True):
@@ -217,7 +220,7 @@ def test_a_run_with_configured_scales_gives_the_same_calibration(scales: tuple[f
     assert runs[1].table.v_left_mps == pytest.approx(scales[0] / runs[0].wheel_scales[0] * runs[0].table.v_left_mps)
     for one, other in zip(*(recording_of(run).track[2:4] for run in runs), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
-    robots = [robot_of(run) for run in runs]
+    robots = [robot_of(run, 0.6) for run in runs]
     assert robots[0] == robots[1]
 
 

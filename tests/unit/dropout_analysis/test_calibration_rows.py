@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -44,7 +45,7 @@ def own(drive: Run) -> Calibration:
 def report(drive: Run, own: Calibration, tmp_path_factory: pytest.TempPathFactory) -> DropoutReport:
     """With the run's own calibration and one that says it is of other logs, both read back from files."""
     folder = tmp_path_factory.mktemp("calibrations")
-    other = replace(own, logs=(own.logs[0]._replace(sha256="b"),), others=own.others)
+    other = replace(own, logs=(msgspec.structs.replace(own.logs[0], sha256="b"),), others=own.others)
     files = [own.write(folder / "own.json"), other.write(folder / "last.season.json")]
     calibrations = [icrtool.open_calibration(file) for file in files]
     gates = ["calibration:last.season.p95@10m <= 9", "recommended.expected@5m <= 0", "controller.p95@10m <= 9"]
@@ -138,7 +139,8 @@ def test_files_and_figures_hold_every_row(report: DropoutReport, tmp_path: Path)
 def test_one_calibration_has_the_plain_name_and_no_comparison_no_recommended_row(drive: Run, own: Calibration) -> None:
     report = dropout_report(drive, horizons_m=[5.0], calibrations=[own], comparison=False)
     assert [result.name for result in report.results] == ["icr", "no_slip", "icr_final", "calibration"]
+    wide = msgspec.structs.replace(own.robot, track_width_m=1.0)
     with pytest.raises(ConfigError, match="width"):
-        dropout_report(drive, calibrations=[replace(own, robot={**own.robot, "track_width_m": 1.0})])
+        dropout_report(drive, calibrations=[replace(own, robot=wide)])
     with pytest.raises(ConfigError, match="recommended"):
         dropout_report(drive, horizons_m=[5.0], comparison=False, gates=["recommended.p95@5m < 1"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
@@ -80,7 +81,7 @@ def test_comments_say_log_date_doubt_and_what_is_lost(calibration: Calibration, 
 
 def test_a_log_with_a_wild_name_stays_a_comment(calibration: Calibration) -> None:
     (log,) = calibration.logs
-    wild = replace(calibration, logs=(log._replace(name="a\nwheel_separation: 3\n\t# b"),))
+    wild = replace(calibration, logs=(msgspec.structs.replace(log, name="a\nwheel_separation: 3\n\t# b"),))
     assert load(wild, "clearpath") == load(calibration, "clearpath")
 
 
@@ -139,8 +140,13 @@ def test_a_controller_drives_as_its_model_was_tested(calibration: Calibration) -
 
 def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> None:
     assert unfit_reasons(calibration) == ()
-    far = tuple(one._replace(p95_m=14.8) if one.model == "recommended" else one for one in calibration.pooled)
-    worse = tuple(one._replace(expected_m=99.0) if one.model == "recommended" else one for one in calibration.pooled)
+    far = tuple(
+        msgspec.structs.replace(one, p95_m=14.8) if one.model == "recommended" else one for one in calibration.pooled
+    )
+    worse = tuple(
+        msgspec.structs.replace(one, expected_m=99.0) if one.model == "recommended" else one
+        for one in calibration.pooled
+    )
     for pooled, word in ((far, "14.8 m"), (worse, "no slip")):
         spoilt = replace(calibration, pooled=pooled)
         (reason,) = unfit_reasons(spoilt)
@@ -149,7 +155,8 @@ def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> Non
 
 
 def test_the_factor_to_the_multiplier_that_made_the_odometry_is_given(calibration: Calibration) -> None:
-    made = replace(calibration, robot={**calibration.robot, "twist_width_m": 1.5 * calibration.width_m})
+    robot = msgspec.structs.replace(calibration.robot, twist_width_m=1.5 * calibration.width_m)
+    made = replace(calibration, robot=robot)
     assert factor_to_old(made) == pytest.approx(made.controller_numbers().multiplier / 1.5)
     assert "wheel_separation_multiplier 1.5000" in " ".join(format_export(made, "clearpath").split("\n# "))
     assert factor_to_old(calibration) is None

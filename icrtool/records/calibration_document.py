@@ -1,0 +1,180 @@
+"""The calibration file: a robot's motion model, its parameters with covariance, and how it was tested."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from icrtool.config import Positive
+from icrtool.records.plain_data import Record
+from icrtool.records.run_document import ControllerNumbers, ParameterDocument
+
+CALIBRATION_SCHEMA: Literal["icrtool/calibration/1"] = "icrtool/calibration/1"
+"""Version of calibration files."""
+
+FRAME = "x forward, y right, turn rate clockwise; wheel speeds at the configured radius"
+
+WIDEST_M = 20.0
+"""Bound of `robot.track_width_m` in a configuration."""
+
+Scale = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
+
+
+class CalibratedRobot(Record, frozen=True, kw_only=True):
+    """The robot; `left_scale` and `right_scale`, as configured, stand in older files alone."""
+
+    name: str | None = None
+    wheel_radius_m: Scale | None = None
+    encoder_counts_per_rev: Positive | UnsetType = UNSET
+    twist_width_m: Positive | UnsetType = UNSET
+    left_scale: Scale | UnsetType = UNSET
+    right_scale: Scale | UnsetType = UNSET
+    track_width_m: Annotated[float, msgspec.Meta(ge=0.001, le=WIDEST_M)]
+
+
+class HeldOutScore(Record, frozen=True):
+    """Errors of one model at one horizon on a log, or block of one, that it was not fitted to."""
+
+    model: str
+    horizon_m: float
+    p95_m: float
+    expected_m: float
+    log: str
+
+
+class PooledScore(Record, frozen=True):
+    """Errors of one model at one horizon, of the held-out trials of all logs, or blocks of one, together."""
+
+    model: str
+    horizon_m: float
+    p95_m: float
+    expected_m: float
+
+
+class CalibrationLog(Record, frozen=True):
+    """A log that a calibration was fitted to, and its own constants.
+
+    Attributes
+    ----------
+    heading_offset_deg : what its reference's heading is off; wheels_delay_s : its wheels against its poses, positive
+        for later
+    begin_ns : stamp of its first state; 0 where it is not known
+    """
+
+    name: str
+    path: str
+    sha256: str
+    distance_m: float
+    heading_offset_deg: float
+    wheels_delay_s: float
+    begin_ns: int = 0
+
+
+class ControllerErrors(Record, frozen=True):
+    """Errors of what a controller can express, on distance it was not fitted to.
+
+    Attributes
+    ----------
+    pose_variance : (3,) of x forward, y left, yaw [m^2, m^2, rad^2] after 10 m
+    twist_variance : (3,) of velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
+    turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
+    p95_m, full_p95_m : after 10 m, of the controller's model and of the whole one; None without a trial of 10 m
+    """
+
+    pose_variance: tuple[float, float, float]
+    twist_variance: tuple[float, float, float]
+    turn_noise: tuple[float, float]
+    way_noise: tuple[float, float]
+    p95_m: float | None
+    full_p95_m: float | None
+
+
+class ControllerDocument(ControllerNumbers, frozen=True, kw_only=True):
+    """What a controller is given, and its `ControllerErrors` where they were measured."""
+
+    pose_variance: tuple[float, float, float] | UnsetType = UNSET
+    twist_variance: tuple[float, float, float] | UnsetType = UNSET
+    turn_noise: tuple[float, float] | UnsetType = UNSET
+    way_noise: tuple[float, float] | UnsetType = UNSET
+    p95_m: float | UnsetType | None = UNSET
+    full_p95_m: float | UnsetType | None = UNSET
+
+
+class ErrorSources(Record, frozen=True):
+    """Variances of what a model leaves out, and what its quantiles are scaled by.
+
+    Attributes
+    ----------
+    heading_start_rad2 : of the heading at the start
+    heading_rate_rad2pm2 : of a turn per metre that stays the same along the path
+    turn_share : of the share by which every turn is off
+    heading_wander_rad2pm : of the heading, for each metre
+    speed_share : of the share by which the distance is off
+    distance_wander_m2pm : of the distance, for each metre
+    heading_noise_rad2, position_noise_m2 : of the reference alone, beside the others
+    p95_factor, expected_factor : measured over predicted
+    measured_to_m : length of the longest windows; a longer forecast extrapolates
+    """
+
+    heading_start_rad2: Share
+    heading_rate_rad2pm2: Share
+    turn_share: Share
+    heading_wander_rad2pm: Share
+    speed_share: Share
+    distance_wander_m2pm: Share
+    heading_noise_rad2: Share
+    position_noise_m2: Share
+    p95_factor: Share
+    expected_factor: Share
+    measured_to_m: Share = 20.0
+
+
+class FittedDocument(Record, frozen=True):
+    """A motion model that was fitted: its terms, their parameters, and the covariance of those."""
+
+    terms: tuple[str, ...]
+    parameters: dict[str, ParameterDocument]
+    covariance: list[list[float]]
+
+
+class GyroDocument(Record, frozen=True):
+    """The recommended model with a gyro."""
+
+    model: str
+    terms: tuple[str, ...]
+    parameters: dict[str, ParameterDocument]
+    covariance: list[list[float]]
+    error_sources: ErrorSources | None = None
+
+
+class CalibrationDocument(Record, frozen=True, kw_only=True):
+    """A calibration file.
+
+    `created`: date and time, UTC, ISO 8601; not in a report's ``recommended``, which is the same whenever it is made.
+    `held_out_pooled`, `error_sources`: empty and null in files of earlier versions.
+    """
+
+    schema: Literal["icrtool/calibration/1"]
+    tool_version: str
+    created: str | UnsetType = UNSET
+    robot: CalibratedRobot
+    frame: str = FRAME
+    recommended: str
+    model: str
+    terms: tuple[str, ...]
+    parameters: dict[str, ParameterDocument]
+    covariance: list[list[float]]
+    not_shown: tuple[str, ...]
+    geometry: dict[str, float]
+    geometry_std: dict[str, float]
+    controller: ControllerDocument
+    gyro: GyroDocument | None
+    models: dict[str, FittedDocument]
+    logs: tuple[CalibrationLog, ...]
+    held_out: tuple[HeldOutScore, ...]
+    held_out_pooled: tuple[PooledScore, ...] = ()
+    error_sources: ErrorSources | None = None
+    warnings: tuple[str, ...]
