@@ -440,10 +440,10 @@ def test_a_phone_shows_multiplier_and_distance_of_the_robot_without_scrolling(ch
         "robot": "husky-a200", "group": "", "logs": ["a", "b"], "left_out": [], "reason": "", "multiplier": 1.6691,
         "multiplier_std": 0.0108, "icrs_m": [0.8, -0.9, 0.0], "within_m": 14.2, "within_beyond": False,
     }  # fmt: skip
-    logs = [
-        {**LOG, "usable": False, "status": "done"},
-        {**LOG, "errors": LOG["errors"] | {"recommended_p95_20m_m": 0.3}},
-    ]
+    # 0.3 m after 20 m, and 0.5 m before that at 8 m, and nowhere
+    errors = LOG["errors"] | {"recommended_p95_20m_m": 0.3}
+    far = {**LOG, "errors": errors | {"recommended_within_0.5m_m": 20.0}}
+    logs = [{**LOG, "usable": False, "status": "done"}, {**LOG, "errors": errors}, far]
     file.write_text(fleet_page({**FLEET, "logs": logs, "calibrations": [robot]}, tmp_path), encoding="utf-8")
     page = chrome.page(width=390, height=844)
     page.open(file)
@@ -451,7 +451,7 @@ def test_a_phone_shows_multiplier_and_distance_of_the_robot_without_scrolling(ch
         right = "[...document.querySelectorAll('#robots td')].find((one) => one.textContent.includes('{}'))"
         assert page.evaluate(f"{right.format(text)}.getBoundingClientRect().right") <= 390
     cells = page.evaluate("[...document.querySelectorAll('#table td')].map((one) => one.textContent)")
-    assert {"not usable", "more than 8.0\u00a0m"} <= set(cells)
+    assert {"not usable", "8.0\u00a0m", ">\u00a020.0\u00a0m"} <= {one.replace("> ", ">\u00a0") for one in cells}
     assert "1 cannot" in page.evaluate("document.querySelector('header').textContent")
 
 

@@ -113,11 +113,11 @@ def _cells(log: Mapping[str, Any], budgets: Sequence[str]) -> Iterator[Cell]:
 
 
 def _within(errors: Mapping[str, float | None], name: str) -> Cell:
-    """Return a distance within a budget; where the last error of the table is within it too, more than the distance."""
+    """Return a distance within a budget; the last one is a lower bound where the error there is within it too."""
     model, _, size = name.partition("_within_")
-    last = errors.get(f"{model}_p95_{LAST_HORIZON_M:g}m_m")
-    beyond = last is not None and last <= float(size.removesuffix("m_m"))
-    return _cell(errors.get(name), lambda metres: f"{'more than ' if beyond else ''}{metres:.1f} m")
+    last, reached = errors.get(f"{model}_p95_{LAST_HORIZON_M:g}m_m"), errors.get(name)
+    beyond = reached == LAST_HORIZON_M and last is not None and last <= float(size.removesuffix("m_m"))
+    return _cell(reached, lambda metres: f"{'> ' if beyond else ''}{metres:.1f} m")
 
 
 def _cell(value: float | None, text: Any) -> Cell:  # noqa: ANN401 - one of the functions of text_format
