@@ -32,10 +32,9 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
-from icrtool.logs.streams.sources import PositionSource, StampedRows, clock_notes, usable_rows
+from icrtool.logs.streams.sources import PositionSource, StampedRows, WheelMotion, clock_notes, usable_rows
 from icrtool.logs.streams.transforms import FIELDS, antenna_place, is_static, transform_channels, transform_pose
 from icrtool.logs.streams.wheel_pairs import topic_of_side
-from icrtool.logs.streams.wheel_sources import WheelMotion
 from icrtool.logs.streams.wheel_speeds import ignored_joints, wheel_samples
 from icrtool.logs.table_file import is_table, read_table
 from icrtool.records.samples import (

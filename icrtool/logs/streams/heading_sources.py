@@ -14,12 +14,13 @@ from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.nmea import HDT, NMEA_SENTENCE
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.inertial import Convention, frame_convention, nose_yaw
-from icrtool.logs.streams.metric_positions import GOAL_WORDS, XBOT_FUSED
 from icrtool.logs.streams.position_sources import (
+    GOAL_WORDS,
     INS_SOLVED,
     INS_SOLVED_CODES,
     SOLVED,
     SOLVED_CODES,
+    XBOT_FUSED,
     solved,
 )
 from icrtool.logs.streams.sources import NO_ROWS, Source, of_topic
@@ -80,8 +81,7 @@ class HeadingSource(Source):
         return np.pi - np.mod(np.pi - heading, 2 * np.pi)
 
 
-Reader = Callable[[TopicTable], HeadingSource]
-Entry = tuple[tuple[str, ...], Reader]
+HeadingEntry = tuple[tuple[str, ...], Callable[[TopicTable], HeadingSource]]
 """The fields of a message type to take, and how to read them."""
 
 
@@ -95,7 +95,7 @@ def _constant(yaw: Floats, usable: Bools) -> bool:
 
 def _orientation(
     path: str, covariance: str, place: int, score: float, what: str, *, stuffed: bool = False, rate: str = ""
-) -> Entry:
+) -> HeadingEntry:
     """Return the entry of an orientation; `place` is the index of the yaw variance in the covariance.
 
     `rate`: field of the turn rate of a gyro in the same message.
@@ -195,7 +195,7 @@ def _relposned(table: TopicTable) -> HeadingSource:
 def _degrees(
     path: str, deviation: str, score: float, what: str, status: str = "",
     accepted: frozenset[str] | frozenset[int] = frozenset[int](),
-) -> Entry:  # fmt: skip
+) -> HeadingEntry:  # fmt: skip
     """Return the entry of degrees clockwise from north; `accepted` are the values of `status` that mean a solution."""
 
     def read(table: TopicTable) -> HeadingSource:
@@ -211,7 +211,7 @@ def _degrees(
     return (*HEADER, *(name for name in (path, deviation, status) if name)), read
 
 
-def _septentrio(deviation: str, mode: str, score: float, what: str) -> Entry:
+def _septentrio(deviation: str, mode: str, score: float, what: str) -> HeadingEntry:
     """Return the entry of a Septentrio attitude: ENU unless `use_ros_axis_orientation` was off, which none states."""
     fields, read_degrees = _degrees("heading", deviation, score, what)
 
@@ -262,7 +262,7 @@ _AZIMUTH = ((*HEADER, "azimuth", "variance", "unit", "orientation", "reference")
 _DUAL = _degrees("heading", "heading_sigma", 90.0, "NovAtel dual antenna heading", "solution_status", SOLVED)
 _INS = "NovAtel INS azimuth"
 
-HEADING_TYPES: dict[str, Entry] = {
+HEADING_TYPES: dict[str, HeadingEntry] = {
     "sensor_msgs/Imu": _orientation(
         "orientation", "orientation_covariance", 8, 100.0, "orientation of the inertial unit", rate="angular_velocity.z"
     ),

@@ -1,36 +1,144 @@
-"""Messages that hold the robot's position: geodetic fixes, and the table of all message types that hold one."""
+"""Messages that hold the robot's position: geodetic fixes, and poses that are metric already, in their own frame."""
 
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Bytes, Floats
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.nmea import GGA, GST, NMEA_SENTENCE, RMC
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
-from icrtool.logs.streams.fix_class import (
+from icrtool.logs.streams.fixes import (
     GPSFIX_STATUS,
     NMEA_QUALITY,
     UBLOX_CARRIER,
+    XBOT_FLAGS,
+    axis_variance,
     class_by_carrier,
     class_by_code,
     class_by_mode,
     class_by_status,
     class_by_type,
+    enu_variance,
+    equal_variance,
+    geodetic_source,
+    nowhere,
+    place_in,
+    without_fix,
 )
-from icrtool.logs.streams.metric_positions import ABSOLUTE_POSE, metric
-from icrtool.logs.streams.sources import NEVER_MOVES, PositionEntry, PositionSource, of_topic
+from icrtool.logs.streams.sources import PositionEntry, PositionSource, of_topic
+
+REFERENCE_WORDS = re.compile(
+    r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"
+    r"prism|leica|utm|global|navsat|\bins\b|vectornav|novatel|sbg|ublox",
+    re.IGNORECASE,
+)
+"""In names of odometry and pose topics, or of their frames: a reference, not the robot's own dead reckoning."""
+
+REFERENCE_FRAMES = {"world", "earth", "ecef", "local_enu", "enu", "camera_init"}
+"""Names of frames that are no such words; FAST-LIO and LOAM call their map ``camera_init``."""
+
+GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
+
+LEAST_AREA_M, FLAT, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
+"""A drive this wide (standard deviation) shows its plane where it is no thicker than a tenth of that."""
+
+LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
+"""Of the earth; UTM coordinates far from the equator may be as large, but have a height near 0."""
+
+XBOT_FUSED, XBOT_DEAD_RECKONING = 100, 8
+"""Source and flag of xbot_msgs/AbsolutePose: fused with the wheels; not by satellites."""
+
+
+def metric(pose: str, covariance: str, score: float, what: str, *, odometry: bool = False) -> PositionEntry:
+    """Return the entry of a pose: x is taken as east and y as north, in the topic's own frame."""
+
+    def read(table: TopicTable) -> PositionSource:
+        x, y = (table.column(f"{pose}position.{axis}").astype(np.float64) for axis in "xy")
+        variance = np.full((len(table), 3), np.nan)
+        if covariance:
+            var_x, var_y, cov = (table.floats(f"{covariance}[{i}]") for i in (0, 7, 1))
+            positive = (var_x > 0) & (var_y > 0)
+            variance[positive] = np.column_stack([var_y, var_x, cov])[positive]
+        usable = np.isfinite(x) & np.isfinite(y)
+        frame = table.text("header.frame_id").lstrip("/")
+        named = bool(REFERENCE_WORDS.search(f"{table.topic} {frame}")) or frame in REFERENCE_FRAMES
+        problem = "" if usable.any() else "no finite position"
+        places = np.column_stack([x, y, table.floats(f"{pose}position.z")])[usable]
+        if len(places) and LEAST_RADIUS_M < np.linalg.norm(np.median(places, axis=0)) < LARGEST_RADIUS_M:
+            problem = "its positions are counted from the centre of the earth (ECEF), which is not read"
+        elif not _is_level(places):
+            problem = "its positions lie in a plane that stands upright: z is not up, as in a camera's optical frame"
+        if GOAL_WORDS.search(table.topic):
+            problem = problem or "its name is that of a goal, not of a measurement"
+        elif not named and (odometry or "odom" in table.topic.lower()):
+            problem = (
+                problem
+                or "its name and frame do not show a position reference: it may be the wheels' dead reckoning; "
+                "topics.gnss names it if it is a reference"
+            )
+        count = int(np.count_nonzero(~usable))
+        return PositionSource(
+            **of_topic(table), metric=np.column_stack([y, x]), variance=variance, usable=usable,
+            rejected={"not finite": count} if count else {}, score=score, why=what, problem=problem,
+        )  # fmt: skip
+
+    variances = tuple(f"{covariance}[{i}]" for i in (0, 1, 7) if covariance)
+    return (*HEADER, *(f"{pose}position.{axis}" for axis in "xyz"), *variances), read
+
+
+def _is_level(places_m: Floats) -> bool:
+    """Return whether a drive (n, 3) that has an area lies in a plane whose normal is within 45 deg of z."""
+    some = places_m[:: max(1, len(places_m) // MOST_PLACES)]
+    if len(some) < 3 or not (np.abs(some) < LARGEST_PLACE_M).all():
+        return True
+    # single jumps are no place
+    kept = np.clip(some, *np.percentile(some, [2.5, 97.5], axis=0))
+    _, size, axes = np.linalg.svd(kept - kept.mean(axis=0), full_matrices=False)
+    _, across_m, off_m = size / math.sqrt(len(some))
+    return bool(across_m < LEAST_AREA_M or off_m > FLAT * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
+
+
+_POSE_FIELDS, _read_pose = metric("pose.pose.", "pose.covariance", 90.0, "GNSS position of OpenMower")
+
+
+def _absolute_pose(table: TopicTable) -> PositionSource:
+    """Return the positions of OpenMower, x east and y north of its datum; its own filter's are refused."""
+    pose = _read_pose(table)
+    flags, source = table.integers("flags"), table.integers("source")
+    std = table.floats("position_accuracy")
+    stated = np.where((std > 0)[:, None], np.column_stack([std**2, std**2, np.zeros(len(std))]), np.nan)
+    usable = pose.usable
+    rejected = dict(pose.rejected)
+    if flags is not None:
+        dead = (flags & XBOT_DEAD_RECKONING) != 0
+        rejected |= {"no fix": int(np.count_nonzero(dead & usable))} if dead.any() else {}
+        usable = usable & ~dead
+    problem = pose.problem or ("" if usable.any() else "no usable fix")
+    if source is not None and len(source) and np.median(source) == XBOT_FUSED:
+        problem = "its positions are fused with the wheels; a reference must be independent of them"
+    return replace(
+        pose,
+        variance=np.where(np.isfinite(pose.variance), pose.variance, stated),
+        usable=usable,
+        rejected=rejected,
+        stated_class=class_by_code(None if flags is None else flags & 7, XBOT_FLAGS),
+        problem=problem,
+    )
+
+
+ABSOLUTE_POSE: PositionEntry = ((*_POSE_FIELDS, "source", "flags", "position_accuracy"), _absolute_pose)
+
 
 RADIUS_95_IN_STD = 2.45
 """err_horz is a 95 % radius: this many standard deviations of a circular normal distribution."""
 
 DEGREES = 180.0 / math.pi
-STATUS_UNKNOWN = -2
 SEPTENTRIO_UNKNOWN = 65535
-HIGHEST_M = 20_000.0
-"""A height beyond this means "unknown"; it is replaced by the median of the others."""
 
 SOLVED, SOLVED_CODES = frozenset({"SOL_COMPUTED"}), frozenset({0})
 INS_SOLVED = frozenset({"INS_SOLUTION_GOOD", "INS_SOLUTION_FREE", "INS_ALIGNMENT_COMPLETE"})
@@ -45,120 +153,28 @@ H_ACC, LAT_HP, LON_HP, HEIGHT_HP = (
 )
 """u-blox fields as ROS 1 and as ROS 2 spell them."""
 
-FARTHEST_M = 200_000.0
-"""No robot drives further from the middle of its fixes."""
 
 UBX_FLAGS = ("gnss_fix_ok", "invalid_llh", "gps_fix.fix_type", "carr_soln.status")
 UBX_NO_FIX = (0, 1, 5)
 """GpsFix of u-blox: none, dead reckoning only, time only."""
 
-STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
-"""A receiver whose fixes stay within this is that of a base station, or of a robot that stands."""
-
-GOOD_STD_M = 0.3
-"""A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference."""
-
-
-def _geodetic(
-    table: TopicTable, geodetic: Floats, variance: Floats, no_fix: Bools, score: float, what: str,
-    stated_class: Bytes | None = None,
-) -> PositionSource:  # fmt: skip
-    """Return a source of latitude, longitude, height; rows without a fix, not finite, or at 0, 0 are not usable."""
-    rejected: dict[str, int] = {}
-    usable = np.ones(len(table), np.bool_)
-    latitude, longitude = geodetic[:, 0], geodetic[:, 1]
-    with np.errstate(invalid="ignore"):
-        possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 360.0)
-    reasons = (
-        ("no fix", no_fix),
-        ("not finite", ~np.isfinite(latitude) | ~np.isfinite(longitude)),
-        ("not a place on earth", ~possible),
-        ("at 0, 0", (latitude == 0) & (longitude == 0)),
-        ("far from the others", _far_away(geodetic, possible & ~no_fix & np.isfinite(geodetic[:, :2]).all(axis=1))),
-    )
-    for reason, bad in reasons:
-        count = int(np.count_nonzero(bad & usable))
-        if count:
-            rejected[reason] = count
-        usable &= ~bad
-    height = geodetic[:, 2]
-    plausible = np.abs(height) < HIGHEST_M
-    known = plausible & usable
-    filled = np.where(plausible, height, float(np.median(height[known])) if known.any() else 0.0)
-    std = (
-        float(np.sqrt(np.nanmedian(variance[usable, :2]))) if np.isfinite(variance[usable, :2]).any() else float("nan")
-    )
-    if std > GOOD_STD_M:
-        score -= 35.0
-    what, score = (f"{what} that never moves", score - NEVER_MOVES) if _is_still(geodetic[usable]) else (what, score)
-    stated = f", states ±{std:.2g} m" if np.isfinite(std) else ", states no accuracy"
-    problem = (
-        "" if usable.any() else f"no usable fix ({', '.join(f'{why} {count}' for why, count in rejected.items())})"
-    )
-    return PositionSource(
-        **of_topic(table), geodetic=np.column_stack([latitude, longitude, filled]), variance=variance, usable=usable,
-        rejected=rejected, score=score, why=f"{what}{stated}", problem=problem,
-        stated_class=stated_class,
-    )  # fmt: skip
-
-
-def _far_away(geodetic: Floats, known: Bools) -> Bools:
-    """Return the known fixes (n,) of another place: a receiver that was switched on may send where it was last."""
-    far, places_deg = np.zeros(len(known), np.bool_), geodetic[known, :2]
-    if len(places_deg):
-        away_deg = places_deg - places_deg[0]
-        away_deg[:, 1] = np.mod(away_deg[:, 1] + 180.0, 360.0) - 180.0  # not across the date line
-        away_deg -= np.median(away_deg, axis=0)
-        away_deg[:, 1] *= math.cos(math.radians(float(np.median(places_deg[:, 0]))))
-        far[known] = (np.abs(away_deg) * METRES_PER_DEGREE > FARTHEST_M).any(axis=1)
-    return far
-
-
-def _is_still(geodetic: Floats) -> bool:
-    """Return whether 95 % of the fixes (n, 3) lie within `STILL_M`, whatever the latitude."""
-    if len(geodetic) < 2:
-        return False
-    ends = np.percentile(geodetic[:, :2], [2.5, 97.5], axis=0)
-    return bool((np.diff(ends, axis=0) * METRES_PER_DEGREE < (STILL_M, STILL_M)).all())
-
-
-def _place(table: TopicTable, latitude: str, longitude: str, height: str) -> Floats:
-    """Return latitude and longitude, which the type must have, and height, as recorded (n, 3)."""
-    return np.column_stack([table.column(latitude), table.column(longitude), table.floats(height)]).astype(np.float64)
-
-
-def _enu_variance(table: TopicTable) -> Floats:
-    """Return north, east, covariance of the row-major 3 x 3 ENU covariance; NaN where it is unknown."""
-    variance = np.column_stack([table.floats(f"position_covariance[{i}]") for i in (4, 0, 1)])
-    # COVARIANCE_TYPE_UNKNOWN: drivers leave the numbers at 0, or write arbitrary ones.
-    unknown = table.floats("position_covariance_type") == 0
-    variance[unknown | ~(variance[:, 0] > 0) | ~(variance[:, 1] > 0)] = np.nan
-    return variance
-
-
-def _without_fix(table: TopicTable) -> Bools:
-    """Return the rows (n,) with a negative status: -1 no fix, -2 unknown (the default of ROS 2).
-
-    A driver that never changes the default states no status: no row is returned.
-    """
-    status = table.floats("status.status")
-    return np.zeros(len(table), np.bool_) if np.all(status == STATUS_UNKNOWN) else np.asarray(status < 0)
-
 
 def _geopose(table: TopicTable) -> PositionSource:
-    geodetic = _place(table, *(f"{_GEO}{name}" for name in ("latitude", "longitude", "altitude")))
+    geodetic = place_in(table, *(f"{_GEO}{name}" for name in ("latitude", "longitude", "altitude")))
     unknown = np.full((len(table), 3), np.nan)
-    return _geodetic(table, geodetic, unknown, _nowhere(table), 80.0, "position of an autopilot or navigation filter")
+    return geodetic_source(
+        table, geodetic, unknown, nowhere(table), 80.0, "position of an autopilot or navigation filter"
+    )
 
 
 def _navsatfix(table: TopicTable) -> PositionSource:
-    geodetic = _place(table, "latitude", "longitude", "altitude")
+    geodetic = place_in(table, "latitude", "longitude", "altitude")
     fix_class = class_by_status(table)
-    return _geodetic(table, geodetic, _enu_variance(table), _without_fix(table), 100.0, "GNSS fix", fix_class)
+    return geodetic_source(table, geodetic, enu_variance(table), without_fix(table), 100.0, "GNSS fix", fix_class)
 
 
 def _gpsfix(table: TopicTable) -> PositionSource:
-    variance = _enu_variance(table)
+    variance = enu_variance(table)
     unknown = ~np.isfinite(variance[:, 0])
     radius = table.floats("err_horz")
     with np.errstate(over="ignore"):
@@ -166,42 +182,27 @@ def _gpsfix(table: TopicTable) -> PositionSource:
     for column in (0, 1):
         variance[:, column] = np.where(unknown, from_radius, variance[:, column])
     variance[unknown, 2] = np.where(np.isfinite(from_radius[unknown]), 0.0, np.nan)
-    geodetic = _place(table, "latitude", "longitude", "altitude")
+    geodetic = place_in(table, "latitude", "longitude", "altitude")
     fix_class = class_by_status(table, GPSFIX_STATUS)
-    return _geodetic(table, geodetic, variance, _without_fix(table), 92.0, "GNSS fix", fix_class)
-
-
-def _accuracy(std: Floats) -> Floats:
-    """Return the variances (n, 3) of an accuracy (n,) [m] that is equal in all directions."""
-    return _deviations(std, std)
-
-
-def _deviations(north: Floats, east: Floats) -> Floats:
-    positive = (north > 0) & (east > 0)
-    with np.errstate(over="ignore"):
-        return np.where(positive[:, None], np.column_stack([north**2, east**2, np.zeros(len(north))]), np.nan)
-
-
-def _nowhere(table: TopicTable) -> Bools:
-    return np.zeros(len(table), np.bool_)
+    return geodetic_source(table, geodetic, variance, without_fix(table), 92.0, "GNSS fix", fix_class)
 
 
 def _navpvt(table: TopicTable) -> PositionSource:
-    geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
+    geodetic = place_in(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
     flags = table.integers("flags")
-    no_fix = _nowhere(table) if flags is None else (flags & 1) == 0
-    variance, fix_class = _accuracy(table.floats(*H_ACC) * 1e-3), class_by_carrier(flags)
-    return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", fix_class)
+    no_fix = nowhere(table) if flags is None else (flags & 1) == 0
+    variance, fix_class = equal_variance(table.floats(*H_ACC) * 1e-3), class_by_carrier(flags)
+    return geodetic_source(table, geodetic, variance, no_fix, 85.0, "u-blox position", fix_class)
 
 
 def _ubx_navpvt(table: TopicTable) -> PositionSource:
     """Return the positions of ublox_dgnss, which spreads the flags over fields."""
-    geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
+    geodetic = place_in(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
     no_fix = (table.floats("gnss_fix_ok") == 0) | (table.floats("invalid_llh") == 1)
     no_fix |= np.isin(table.floats("gps_fix.fix_type"), UBX_NO_FIX)
-    variance = _accuracy(table.floats("h_acc") * 1e-3)
+    variance = equal_variance(table.floats("h_acc") * 1e-3)
     fix_class = class_by_code(table.integers("carr_soln.status"), UBLOX_CARRIER)
-    return _geodetic(table, geodetic, variance, no_fix, 85.0, "u-blox position", fix_class)
+    return geodetic_source(table, geodetic, variance, no_fix, 85.0, "u-blox position", fix_class)
 
 
 def _nmea(table: TopicTable) -> PositionSource:
@@ -220,36 +221,36 @@ def _nmea(table: TopicTable) -> PositionSource:
     quality = fixes.column("quality")
     fix_class = class_by_code(quality, NMEA_QUALITY)
     no_fix = np.isin(quality, [*NMEA_QUALITY], invert=True)
-    geodetic = _place(fixes, "latitude", "longitude", "altitude")
-    return _geodetic(fixes, geodetic, _deviations(*std.T), no_fix, 84.0, f"GNSS fix ({name})", fix_class)
+    geodetic = place_in(fixes, "latitude", "longitude", "altitude")
+    return geodetic_source(fixes, geodetic, axis_variance(*std.T), no_fix, 84.0, f"GNSS fix ({name})", fix_class)
 
 
 def _navhpposllh(table: TopicTable) -> PositionSource:
-    geodetic = _place(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
+    geodetic = place_in(table, "lat", "lon", "height") * (1e-7, 1e-7, 1e-3)
     for column, (names, unit) in enumerate(((LAT_HP, 1e-9), (LON_HP, 1e-9), (HEIGHT_HP, 1e-4))):
         geodetic[:, column] += np.nan_to_num(table.floats(*names)) * unit
     flags = table.integers("invalid_llh", "invalidLlh", "flags")
-    invalid = _nowhere(table) if flags is None else (flags & 1) == 1
-    variance = _accuracy(table.floats(*H_ACC) * 1e-4)
-    return _geodetic(table, geodetic, variance, invalid, 86.0, "u-blox high precision position")
+    invalid = nowhere(table) if flags is None else (flags & 1) == 1
+    variance = equal_variance(table.floats(*H_ACC) * 1e-4)
+    return geodetic_source(table, geodetic, variance, invalid, 86.0, "u-blox high precision position")
 
 
 def _septentrio(mode: str, what: str, score: float, *accuracies: str) -> PositionEntry:
     """Return the entry of a Septentrio block: angles in rad; low bits of the mode 0: no solution."""
 
     def read(table: TopicTable) -> PositionSource:
-        geodetic = _place(table, "latitude", "longitude", "height")
+        geodetic = place_in(table, "latitude", "longitude", "height")
         geodetic[:, :2] *= DEGREES
         modes, error = table.integers(mode), table.integers("error")
-        no_fix = _nowhere(table) if modes is None else (modes & 0x0F) == 0
+        no_fix = nowhere(table) if modes is None else (modes & 0x0F) == 0
         if error is not None:
             no_fix = no_fix | (error != 0)
         # PVTGeodetic: one number in 0.01 m, 65535 for unknown. INSNavGeod: metres by axis, hugely negative for unknown.
         accuracy = table.floats("h_accuracy")
-        variance = _accuracy(np.where(accuracy < SEPTENTRIO_UNKNOWN, accuracy * 0.01, np.nan))
+        variance = equal_variance(np.where(accuracy < SEPTENTRIO_UNKNOWN, accuracy * 0.01, np.nan))
         if "latitude_std_dev" in table.columns:
-            variance = _deviations(table.floats("latitude_std_dev"), table.floats("longitude_std_dev"))
-        return _geodetic(table, geodetic, variance, no_fix, score, what, class_by_mode(modes))
+            variance = axis_variance(table.floats("latitude_std_dev"), table.floats("longitude_std_dev"))
+        return geodetic_source(table, geodetic, variance, no_fix, score, what, class_by_mode(modes))
 
     return (*HEADER, "latitude", "longitude", "height", mode, "error", *accuracies), read
 
@@ -270,11 +271,11 @@ def _novatel(
     """Return the entry of a NovAtel log; a height above mean sea level comes with the undulation of the geoid."""
 
     def read(table: TopicTable) -> PositionSource:
-        geodetic = _place(table, *place)
+        geodetic = place_in(table, *place)
         geodetic[:, 2] += np.nan_to_num(table.floats("undulation"))
-        variance = _deviations(*(table.floats(name) for name in deviations))
+        variance = axis_variance(*(table.floats(name) for name in deviations))
         fix_class = class_by_type(table, kind)
-        return _geodetic(table, geodetic, variance, ~solved(table, status, accepted), score, what, fix_class)
+        return geodetic_source(table, geodetic, variance, ~solved(table, status, accepted), score, what, fix_class)
 
     return (*HEADER, status, kind, *place, "undulation", *deviations), read
 

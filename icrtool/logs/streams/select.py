@@ -15,9 +15,9 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource
 from icrtool.logs.streams.inertial import GYRO_FIELDS, GYRO_TYPE
 from icrtool.logs.streams.position_sources import POSITION_TYPES
-from icrtool.logs.streams.sources import PositionSource, of_topic
+from icrtool.logs.streams.sources import PositionSource, WheelMotion, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion
+from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
 from icrtool.logs.streams.wheel_speeds import check_joints
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean

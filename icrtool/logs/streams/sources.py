@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, SetBack, TopicTable
@@ -241,3 +242,65 @@ PositionEntry = tuple[tuple[str, ...], Callable[[TopicTable], PositionSource]]
 def of_topic(table: TopicTable, stamp: str = "header.stamp") -> dict[str, Any]:
     """Return what a source has of its topic; `stamp` is the field of its stamps."""
     return {"topic": table.topic, "message_type": table.message_type, "stamps": stamp_rows(table, stamp)}
+
+
+Unit = Literal["rad", "m", "counts", "unknown"]
+
+Pair = tuple[Floats, Floats]
+"""Of the left and of the right side, (n,) each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WheelMotion(Source):
+    """The motion of the wheels in a topic, or in a pair of topics.
+
+    Attributes
+    ----------
+    position : travelled since some start, in `unit`; None where not recorded
+    speed : in `unit` per second; None where not recorded
+    twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only that of the body is recorded
+    joints : the joints that its messages list by name, where they do
+    note : what a user must know of it
+    """
+
+    position: Pair | None = None
+    speed: Pair | None = None
+    unit: Unit = "rad"
+    twist: Floats | None = None
+    joints: tuple[str, ...] = ()
+    note: str = ""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no row can be used, even where the topic is configured."""
+        return self.twist is None and self.position is None and self.speed is None
+
+
+Sides = tuple[Floats | None, Floats | None]
+
+
+def motion_of(motion: WheelMotion, position: Sides = (None, None), speed: Sides = (None, None)) -> WheelMotion:
+    """Return a motion with what left and right recorded; without what one side lacks, or has no finite value of."""
+    motion = replace(motion, position=_of_both(position), speed=_of_both(speed))
+    if motion.is_empty:
+        return replace(motion, problem=motion.problem or "has neither position nor speed of both sides")
+    changes = any(float(np.ptp(side[np.isfinite(side)])) > 0.0 for side in motion.position or ())
+    if changes or any(nonzero(values) for values in (*(motion.speed or ()), motion.twist) if values is not None):
+        return motion
+    return replace(motion, score=motion.score - NEVER_MOVES, why=f"{motion.why}, never moves")
+
+
+def _of_both(sides: Sides) -> Pair | None:
+    left, right = sides
+    if left is None or right is None or not (np.isfinite(left).any() and np.isfinite(right).any()):
+        return None
+    return left, right
+
+
+def nonzero(values: Floats) -> bool:
+    """Return whether any finite value is not 0."""
+    return bool(np.any(values[np.isfinite(values)] != 0.0))
+
+
+WheelEntry = tuple[tuple[str, ...], Callable[[TopicTable, Config], WheelMotion]]
+"""The fields of a message type to take, and how to read them."""

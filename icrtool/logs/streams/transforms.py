@@ -13,8 +13,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
-from icrtool.logs.streams.metric_positions import REFERENCE_FRAMES, REFERENCE_WORDS
-from icrtool.logs.streams.position_sources import POSITION_TYPES
+from icrtool.logs.streams.position_sources import POSITION_TYPES, REFERENCE_FRAMES, REFERENCE_WORDS
 from icrtool.records.text import LogText
 
 TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")

@@ -18,17 +18,9 @@ from icrtool.logs.messages.definitions import number_fields
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.heading_sources import HEADING_TYPES
 from icrtool.logs.streams.position_sources import POSITION_TYPES
-from icrtool.logs.streams.sources import StampedRows, of_topic, stamp_rows
-from icrtool.logs.streams.wheel_names import WHEEL_WORDS, right_twin
-from icrtool.logs.streams.wheel_sources import (
-    COMMAND_NOTE,
-    COMMANDED,
-    MOST_WHEELS,
-    WHEEL_TYPES,
-    Unit,
-    WheelMotion,
-    motion_of,
-)
+from icrtool.logs.streams.sources import StampedRows, Unit, WheelMotion, motion_of, of_topic, stamp_rows
+from icrtool.logs.streams.wheel_joints import MOST_WHEELS, WHEEL_WORDS, right_twin
+from icrtool.logs.streams.wheel_sources import COMMAND_NOTE, COMMANDED, WHEEL_TYPES
 from icrtool.records.text import LogText
 
 _NUMBERS = ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32", "UInt64")

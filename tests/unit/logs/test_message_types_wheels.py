@@ -17,8 +17,9 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import survey_log
+from icrtool.logs.streams.sources import WheelMotion
 from icrtool.logs.streams.wheel_pairs import Side, pair_motion
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion
+from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 20_000_000
 CONFIG = load_config()

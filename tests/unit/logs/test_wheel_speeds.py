@@ -9,8 +9,8 @@ from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.sources import StampedRows
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES, WheelMotion, motion_of
+from icrtool.logs.streams.sources import StampedRows, WheelMotion, motion_of
+from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
 from icrtool.logs.streams.wheel_speeds import wheel_samples
 from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog

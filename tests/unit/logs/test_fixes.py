@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.fix_class import (
+from icrtool.logs.streams.fixes import (
     GPSFIX_STATUS,
     class_by_carrier,
     class_by_mode,

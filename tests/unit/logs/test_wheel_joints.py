@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from icrtool.logs.streams.wheel_names import right_twin, side_of, wheel_joints
+from icrtool.logs.streams.wheel_joints import right_twin, side_of, wheel_joints
 
 
 @pytest.mark.parametrize(
