@@ -19,7 +19,6 @@ from icrtool.estimation.filter_setup import (
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.filter.ekf_step import PLACES
 from icrtool.kernels.filter.filter_records import FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
@@ -123,7 +122,7 @@ def run_filter(
         outages_ns=_outages(table, gnss, sensors.losses_ns),
         gnss=gnss,
         heading=heading,
-        covariance=output.P[PLACES],
+        covariance=output.P,
         noise=noise,
         start_std_m=start_std_m,
         least_icr_m=least_icr_m,

@@ -8,7 +8,6 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit
 
 
-@njit
 def chord_rows(north: Floats, east: Floats, step_m: float) -> Ints:
     """Return the first row (c,) and each that is the first at least a step away from the one before it.
 
@@ -16,11 +15,16 @@ def chord_rows(north: Floats, east: Floats, step_m: float) -> Ints:
     ----------
     north, east : (n,) [m], at least one
     """
-    rows, count = np.empty(len(north), np.int64), 1
-    rows[0] = 0
+    rows = np.zeros(len(north), np.int64)
+    return rows[: _fill(north, east, step_m, rows)]
+
+
+@njit
+def _fill(north: Floats, east: Floats, step_m: float, rows: Ints) -> int:
+    count = 1
     for k in range(1, len(north)):
         a, b = north[k] - north[rows[count - 1]], east[k] - east[rows[count - 1]]
         if a * a + b * b >= step_m * step_m:
             rows[count] = k
             count += 1
-    return rows[:count]
+    return count

@@ -16,7 +16,6 @@ from icrtool.estimation.filter_setup import configured_noise, process_variance, 
 from icrtool.kernels.arcs import model_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter.ekf import run_ekf
-from icrtool.kernels.filter.ekf_step import PLACES
 from icrtool.kernels.kinematics import GUARDED
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import Icrs, RobotLog
@@ -155,7 +154,7 @@ def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...
         std=np.sqrt(np.maximum(out.variance, 0.0)),
         truth=truth[first:],
         stops=stops,
-        P=out.P_at_stops[:, PLACES],
+        P=out.P_at_stops,
         motion=motion,
         gnss_nis=out.gnss_nis,
         heading_nis=out.heading_nis,

@@ -12,10 +12,14 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.filter.ekf import REFERENCE_STEP_S, empty_output
-from icrtool.kernels.filter.ekf_step import wrap
 from icrtool.kernels.filter.filter_records import FilterInputs, FilterOutput, FilterParameters
 from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
+
+
+def wrap(angle: float) -> float:
+    """Wrap an angle [rad] to (-pi, pi]."""
+    return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
 
 
 def step_state(x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0) -> Floats:
@@ -101,7 +105,7 @@ def run_ekf_plain(data: FilterInputs, t0: float, x0: Floats, P0: Floats, paramet
             out.distance[i - first] = travelled
         else:
             x, P = _measure(kind, i, t, x, P, data, parameters, runs[kind], out)
-    out.P[:] = P[np.triu_indices(6)]
+    out.P[:] = P
     return out
 
 

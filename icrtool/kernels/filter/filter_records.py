@@ -80,6 +80,59 @@ class FilterInputs(NamedTuple):
     turn_variance: Floats = np.zeros(0)
 
 
+CHANGE, FIX, HEADING, WHEELS = range(4)
+"""Kinds of events, in their order at equal stamps: terrain changes, fixes, headings, wheel samples."""
+
+DRIVES, SLIPS, IN_GAP = range(3)
+"""How the robot moves between two wheel samples."""
+
+
+class Block(NamedTuple):
+    """The events of some wheel samples in order of time, and what comes of them.
+
+    Attributes
+    ----------
+    t : (m,) [s]; kind : (m,) `CHANGE`, `FIX`, `HEADING` or `WHEELS`; row : (m,) of the array of its kind
+    wheels : (n, 4) what holds until each wheel sample: track speeds [m/s], `DRIVES`, `SLIPS` or `IN_GAP`, and further
+        growth of the heading's variance [rad^2/s]
+    fixes : (f, 4) north, east [m] and their variances [m^2]; headings : (h, 2) [rad], [rad^2]
+    of_fixes : (f, 5) becomes code, NIS, det S, and fix minus estimate after the update
+    of_headings : (h, 3) becomes code, NIS, innovation
+    states : (n, 13) becomes the recorded states, their variances, and the path length
+    """
+
+    t: Floats
+    kind: Ints
+    row: Ints
+    wheels: Floats
+    fixes: Floats
+    headings: Floats
+    of_fixes: Floats
+    of_headings: Floats
+    states: Floats
+
+
+class Space(NamedTuple):
+    """Memory of one run: its kernel allocates none.
+
+    Attributes
+    ----------
+    PH : (6,); G : (3, 4), as in `step_jacobian`; T, X : (6, 6)
+    fixed : (6,) all states are estimated
+    """
+
+    PH: Floats
+    G: Floats
+    T: Floats
+    X: Floats
+    fixed: Flags
+
+    @classmethod
+    def empty(cls) -> Space:
+        """Return the memory of a new run."""
+        return cls(np.empty(6), np.empty((3, 4)), np.empty((6, 6)), np.empty((6, 6)), np.zeros(6, np.bool_))
+
+
 class FilterOutput(NamedTuple):
     """Results of one run.
 
@@ -92,8 +145,8 @@ class FilterOutput(NamedTuple):
     gnss_code, heading_code : UNSEEN, USED, GATED or RECOVERED
     gnss_residual : (m, 2) fix minus estimate after the update [m]
     heading_innovation : (h,) [rad]
-    P : (21,) upper triangle of the covariance at the end, row by row
-    P_at_stops : (s, 21) likewise at the rows that were asked for
+    P : (6, 6) covariance at the end
+    P_at_stops : (s, 6, 6) likewise at the rows that were asked for
     """
 
     x: Floats
@@ -107,7 +160,7 @@ class FilterOutput(NamedTuple):
     heading_code: Codes
     heading_innovation: Floats
     P: Floats
-    P_at_stops: Floats = np.zeros((0, 21))
+    P_at_stops: Floats = np.zeros((0, 6, 6))
 
 
 class FilterState(NamedTuple):
@@ -115,14 +168,13 @@ class FilterState(NamedTuple):
 
     Attributes
     ----------
-    t : (1,) time reached [s]; distance : (1,) path length up to there [m]
-    place : (3,) next fix, next heading, next terrain change
+    reached : (2,) time [s], and path length up to there [m]
+    place : (3,) next terrain change, next fix, next heading
     rejected : (2, 4) rows of `rejected_run`, of GNSS and of heading
-    x : (6,); P : (21,) upper triangle of the covariance, row by row
+    x : (6,); P : (6, 6)
     """
 
-    t: Floats
-    distance: Floats
+    reached: Floats
     place: Ints
     rejected: Floats
     x: Floats
@@ -130,16 +182,15 @@ class FilterState(NamedTuple):
 
     def copy(self) -> FilterState:
         """Return a state that later rows do not change."""
-        t, distance, place, rejected, x, P = self
-        return FilterState(t.copy(), distance.copy(), place.copy(), rejected.copy(), x.copy(), P.copy())
+        return FilterState._make(column.copy() for column in self)
 
 
 class Nodes(NamedTuple):
-    """Events in order, for the smoother; (m, ...) each.
+    """Times of events in order, for the smoother; (m, ...) each.
 
     Attributes
     ----------
-    x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 21) likewise, upper triangles
+    x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 6, 6) likewise
     step : (m, 4) seconds since the node before, track speeds held over them [m/s], 1 in a gap or in slip
     row : int64 (m,), row of the state recorded here, -1 where none is
     """
@@ -150,3 +201,9 @@ class Nodes(NamedTuple):
     P: Floats
     step: Floats
     row: Ints
+
+    @classmethod
+    def empty(cls, count: int) -> Nodes:
+        """Return so many nodes, to be filled."""
+        x, P = (count, 6), (count, 6, 6)
+        return cls(np.empty(x), np.empty(P), np.empty(x), np.empty(P), np.empty((count, 4)), np.empty(count, np.int64))

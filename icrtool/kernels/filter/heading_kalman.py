@@ -16,6 +16,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.compiled import njit
+from icrtool.kernels.filter.kalman import correct, propagate, smooth_back, store
 
 HUBER_SIGMAS = 2.5
 
@@ -77,59 +78,53 @@ def filter_headings(events: HeadingEvents, model: HeadingModel) -> HeadingPasses
     out = HeadingPasses(
         np.empty((n, k)), np.empty((n, k, k)), np.empty((n, k)), np.empty((n, k, k)), np.empty(n), np.empty(n)
     )
-    _forward(events, model._replace(x=model.x.copy(), P=model.P.copy()), out)
+    _run(events, model, out)
     return out
 
 
 def heading_log_likelihood(events: HeadingEvents, model: HeadingModel) -> float:
     """Return the log likelihood of the innovations under Huber's density."""
     none = HeadingPasses(*(np.empty(shape) for shape in ((0, 0), (0, 0, 0), (0, 0), (0, 0, 0), 0, 0)))
-    return float(_forward(events, model._replace(x=model.x.copy(), P=model.P.copy()), none))
+    return _run(events, model, none)
+
+
+def _run(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> float:
+    """Run the filter, fill `out` where it has rows, and return the log likelihood."""
+    k = len(model.x)
+    start = model._replace(x=model.x.copy(), P=model.P.copy())
+    return float(_forward(events, start, out, np.zeros((1, k - 1)), np.empty(k), np.empty((k, k))))
 
 
 @njit
-def _store(x: Floats, P: Floats, states: Floats, covariances: Floats, i: int) -> None:
-    # Element by element: numba takes seconds to compile the assignment of an array to a row of a larger one.
-    for a in range(len(x)):
-        states[i, a] = x[a]
-        for b in range(len(x)):
-            covariances[i, a, b] = P[a, b]
-
-
-@njit
-def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> float:  # noqa: C901, PLR0912 - one event, in one place
+def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses, G: Floats, Ph: Floats, T: Floats) -> float:
     n, k = events.h.shape
     x, P = model.x, model.P
-    T, Ph, phi = np.empty((k, k)), np.empty(k), np.ones(k)
     stored, likelihood = len(out.innovation) > 0, 0.0
     for i in range(n):
         dt, turn = events.dt[i], events.turn[i]
-        # F is diag(phi) but for its first row (1, -dt, turn, 0, ...)
         x[0] += (1.0 + x[2]) * turn - x[1] * dt
+        G[0, 0], G[0, 1] = -dt, turn
+        propagate(G, P, T)
         for a in range(k):
             if model.decay[a] > 0.0:
-                phi[a] = math.exp(-model.decay[a] * dt)
-                x[a] *= phi[a]
-        for b in range(k):
-            for a in range(k):
-                T[a, b] = phi[a] * P[a, b]
-            T[0, b] = P[0, b] - dt * P[1, b] + turn * P[2, b]
-        for a in range(k):
-            for b in range(k):
-                P[a, b] = T[a, b] * phi[b]
-            P[a, 0] = T[a, 0] - dt * T[a, 1] + turn * T[a, 2]
-            P[a, a] += model.q[a] * (dt if model.decay[a] == 0.0 else (1.0 - phi[a] ** 2) / (2.0 * model.decay[a]))
+                phi = math.exp(-model.decay[a] * dt)
+                x[a] *= phi
+                for b in range(k):
+                    P[a, b] *= phi
+                    P[b, a] *= phi
+                P[a, a] += model.q[a] * (1.0 - phi * phi) / (2.0 * model.decay[a])
+            else:
+                P[a, a] += model.q[a] * dt
         P[0, 0] += events.extra[i]
         if stored:
-            _store(x, P, out.x_predicted, out.P_predicted, i)
+            store(x, P, out.x_predicted, out.P_predicted, i)
         S, y = events.r[i], events.z[i]
         for a in range(k):
-            y -= events.h[i, a] * x[a]
             Ph[a] = 0.0
             for b in range(k):
                 Ph[a] += P[a, b] * events.h[i, b]
-        for a in range(k):
             S += events.h[i, a] * Ph[a]
+            y -= events.h[i, a] * x[a]
         if events.angle[i]:
             y -= 2.0 * math.pi * round(y / (2.0 * math.pi))
         size = abs(y) / math.sqrt(S)
@@ -138,15 +133,9 @@ def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> 
         )
         if stored:
             out.innovation[i], out.variance[i] = y, S
-        S *= max(size / HUBER_SIGMAS, 1.0)
-        for a in range(k):
-            if not model.fixed[a]:
-                x[a] += Ph[a] / S * y
-            for b in range(k):
-                if not (model.fixed[a] and model.fixed[b]):
-                    P[a, b] -= Ph[a] * Ph[b] / S
+        correct(x, P, Ph, S if size < HUBER_SIGMAS else S * size / HUBER_SIGMAS, y, model.fixed)
         if stored:
-            _store(x, P, out.x, out.P, i)
+            store(x, P, out.x, out.P, i)
     return likelihood
 
 
@@ -159,23 +148,5 @@ def smooth_headings(events: HeadingEvents, model: HeadingModel, passes: HeadingP
     solved = np.asarray(np.linalg.solve(passes.P_predicted[1:], F @ passes.P[:-1]), np.float64)
     gains = np.ascontiguousarray(solved.transpose(0, 2, 1))
     x, P = passes.x.copy(), passes.P.copy()
-    _backward(gains, passes.x_predicted, passes.P_predicted, x, P)
+    smooth_back(gains, passes.x_predicted, passes.P_predicted, x, P, np.empty((k, k)))
     return x, P
-
-
-@njit
-def _backward(gains: Floats, x_predicted: Floats, P_predicted: Floats, x: Floats, P: Floats) -> None:
-    n, k = x.shape
-    T = np.empty((k, k))
-    for i in range(n - 2, -1, -1):
-        C = gains[i]
-        for a in range(k):
-            for b in range(k):
-                x[i, a] += C[a, b] * (x[i + 1, b] - x_predicted[i + 1, b])
-                T[a, b] = 0.0
-                for c in range(k):
-                    T[a, b] += C[a, c] * (P[i + 1, c, b] - P_predicted[i + 1, c, b])
-        for a in range(k):
-            for b in range(k):
-                for c in range(k):
-                    P[i, a, b] += T[a, c] * C[b, c]

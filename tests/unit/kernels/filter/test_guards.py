@@ -9,9 +9,9 @@ import pytest
 
 from icrtool.kernels.arcs import model_states
 from icrtool.kernels.filter.ekf import run_ekf
-from icrtool.kernels.filter.ekf_step import predict
 from icrtool.kernels.filter.filter_records import FilterInputs, FilterOutput, FilterParameters
-from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
+from icrtool.kernels.filter.kalman import propagate
+from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED, step_jacobian
 from support.matrix_filter import step_state
 
 DERIVATIVE_TOLERANCE = 1e-12
@@ -56,10 +56,12 @@ def filtered(
     return run_ekf(data, 0.0, x0, P0, parameters, stops)
 
 
-def full(upper: np.ndarray) -> np.ndarray:
-    P = np.zeros((6, 6))
-    P[np.triu_indices(6)] = upper
-    return P + np.triu(P, 1).T
+def predict(x: np.ndarray, P: np.ndarray, v_left: float, v_right: float, guard: int) -> None:
+    """Take an Euler step of 0.01 s, in place."""
+    G = np.empty((3, 4))
+    turn, _ = step_jacobian(x, v_left, v_right, 0.01, 0.0, guard, G)
+    propagate(G, P, np.empty((6, 6)))
+    x[:3] += G[1, 0], -G[0, 0], turn
 
 
 def test_the_covariance_at_a_stop_is_that_of_a_run_that_ends_there() -> None:
@@ -99,20 +101,20 @@ def test_a_guards_covariance_is_propagated_with_its_own_derivatives(guard, step,
     x = np.array([3.0, -2.0, 0.7, *icrs])
     F = np.column_stack([np.imag(step(x + 1j * 1e-30 * np.eye(6)[i], 0.31, 0.52, 0.01)) / 1e-30 for i in range(6)])
     A = np.random.default_rng(1).normal(size=(6, 6))
-    P = (A @ A.T)[np.triu_indices(6)]
+    P = A @ A.T
     moved = x.copy()
-    predict(moved, P, 0.31, 0.52, 0.01, 0.0, guard)
-    np.testing.assert_allclose(full(P), F @ A @ A.T @ F.T, atol=DERIVATIVE_TOLERANCE * 100)
+    predict(moved, P, 0.31, 0.52, guard)
+    np.testing.assert_allclose(P, F @ A @ A.T @ F.T, atol=DERIVATIVE_TOLERANCE * 100)
     np.testing.assert_allclose(moved, np.real(step(x, 0.31, 0.52, 0.01)), atol=DERIVATIVE_TOLERANCE)
 
 
 def test_printed_derivatives_are_those_of_the_proper_branch() -> None:
     """Eq. 28 with the difference of Eqs. 32-34 put in keep the proper sign for an inverted state."""
     x = np.array([0.0, 0.0, 0.0, -0.3, 0.4, 0.0])
-    P = np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])[np.triu_indices(6)]
-    predict(x, P, 0.5, 0.3, 0.01, 0.0, PRINTED)
+    P = np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    predict(x, P, 0.5, 0.3, PRINTED)
     # d psi / d y_r = -dt omega / W, as where y_r is right of y_l
-    assert full(P)[2, 3] == pytest.approx(-0.01 * (0.2 / 0.7) / 0.7, rel=1e-12)
+    assert P[2, 3] == pytest.approx(-0.01 * (0.2 / 0.7) / 0.7, rel=1e-12)
 
 
 def test_model_states_without_noise_are_euler_steps() -> None:

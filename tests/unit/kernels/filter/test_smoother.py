@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from icrtool.kernels.filter.ekf import REFERENCE_STEP_S, empty_nodes, empty_output, filter_rows, run_ekf, start_state
-from icrtool.kernels.filter.ekf_step import wrap
-from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters, Nodes
-from icrtool.kernels.filter.smoother import (
-    Smoothed,
-    most_events,
-    run_smoother,
-    smooth_chunk,
-    solve_positive,
-    square,
-    transition,
-)
+from icrtool.kernels.filter import ekf
+from icrtool.kernels.filter.ekf import REFERENCE_STEP_S, empty_output, filter_rows, run_ekf, start_state, wrap
+from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters, Nodes, Space
+from icrtool.kernels.filter.kalman import smooth_back, solve_positive
+from icrtool.kernels.filter.smoother import fill_gains, most_events, run_smoother
+from icrtool.kernels.kinematics import step_jacobian
 
 BATCH_TOLERANCE = 1e-7
 """Relative: the dense normal equations are conditioned like 1e8."""
 
-UPPER = np.triu_indices(6)
 LEVER = (0.2, -0.1)
 
 
@@ -58,18 +50,12 @@ X0 = np.array([0.0, 0.0, 0.1, 0.5, -0.5, 0.05])
 P0 = np.diag([1e-2, 1e-2, 1e-2, 0.09, 0.09, 0.04])
 
 
-def nodes_of(data: FilterInputs, settings: FilterParameters, rows: Callable[..., int] = filter_rows) -> Nodes:
+def nodes_of(data: FilterInputs, settings: FilterParameters) -> Nodes:
     end = len(data.wheel_t)
     state = start_state(data, 0.0, X0, P0)
-    nodes = empty_nodes(most_events(data, state.place, 0, end))
-    count = rows(data, 0, end, state, settings, empty_output(data, end), nodes)
+    nodes = Nodes.empty(most_events(data, state.place, 0, end))
+    count = filter_rows(data, 0, end, state, settings, empty_output(data, end), nodes)
     return Nodes(*(column[:count] for column in nodes))
-
-
-def full(upper: np.ndarray) -> np.ndarray:
-    matrix = np.empty((6, 6))
-    square(upper, matrix)
-    return matrix
 
 
 def test_smoothed_states_are_the_batch_solution() -> None:
@@ -88,18 +74,19 @@ def test_smoothed_states_are_the_batch_solution() -> None:
 
     t, j, h = 0.0, 0, 0
     for i in range(count):
-        predicted, P_predicted = nodes.x_predicted[i], full(nodes.P_predicted[i])
+        predicted, P_predicted = nodes.x_predicted[i], nodes.P_predicted[i]
         if i == 0:
             add({0: np.eye(6)}, X0, P0)
         else:
-            F = np.empty((6, 6))
-            transition(nodes.x[i - 1], nodes.step[i], settings.step_heading, settings.guard, F)
-            dt, gap = nodes.step[i, 0], nodes.step[i, 3]
+            F, G, (dt, v_left, v_right, gap) = np.eye(6), np.zeros((3, 4)), nodes.step[i]
+            if dt > 0.0 and not gap:
+                step_jacobian(nodes.x[i - 1], v_left, v_right, dt, settings.step_heading, settings.guard, G)
+            F[:3, 2:] += G
             Q = np.diag(settings.process_variance) * REFERENCE_STEP_S * dt
             Q[3:] *= np.abs(nodes.step[i, 1:3]).mean()
             Q += gap * dt * np.diag([4.0, 4.0, 1.0, 0.0, 0.0, 0.0])
             Q += 1e-14 * np.eye(6)  # nodes at one time differ by nothing: a batch wants that as a covariance
-            assert np.allclose(F @ full(nodes.P[i - 1]) @ F.T + Q, P_predicted, atol=1e-12)
+            assert np.allclose(F @ nodes.P[i - 1] @ F.T + Q, P_predicted, atol=1e-12)
             add({i: np.eye(6), i - 1: -F}, predicted - F @ nodes.x[i - 1], Q)
         t += nodes.step[i, 0]
         while j < len(data.gnss_t) and data.gnss_t[j] <= t + 1e-12:
@@ -153,20 +140,20 @@ def test_positive_systems_are_solved() -> None:
     X = B.copy()
     solve_positive(A.copy(), X)
     assert np.allclose(A @ X, B, atol=1e-9)
-    Y = B.copy()
-    solve_positive.py_func(A.copy(), Y)
-    assert np.allclose(X, Y, rtol=1e-12)
 
 
-def test_kernels_equal_their_python_source() -> None:
+def test_kernels_equal_their_python_source(monkeypatch: pytest.MonkeyPatch) -> None:
     data, settings = measurements(25), parameters()
-    nodes = nodes_of(data, settings)
-    plain = nodes_of(data, settings, filter_rows.py_func)  # type: ignore[attr-defined]
-    assert all(np.allclose(a, b, rtol=1e-12) for a, b in zip(nodes, plain, strict=True))
-    results = []
-    for kernel in (smooth_chunk, smooth_chunk.py_func):
-        out = Smoothed(np.empty((25, 6)), np.empty((25, 6)))
-        kernel(nodes, len(nodes.row), 0.5, settings.guard, np.full(31, np.nan), np.zeros(6), np.zeros((6, 6)), out)
-        results.append(out)
-    assert np.allclose(results[0].x, results[1].x, rtol=1e-12)
-    assert np.allclose(results[0].variance, results[1].variance, rtol=1e-9)
+    results = [nodes_of(data, settings)]
+    monkeypatch.setattr(ekf, "filter_block", ekf.filter_block.py_func)  # type: ignore[attr-defined]
+    results.append(nodes_of(data, settings))
+    assert all(np.allclose(a, b, rtol=1e-12) for a, b in zip(*results, strict=True))
+    nodes, gains = results[0], np.empty((2, len(results[0].row) - 1, 6, 6))
+    for kernel, found in zip((fill_gains, fill_gains.py_func), gains, strict=True):  # type: ignore[attr-defined]
+        kernel(nodes, 0.5, settings.guard, found, Space.empty())
+    assert np.allclose(*gains, rtol=1e-9, atol=1e-12)
+    smoothed = [(nodes.x.copy(), nodes.P.copy()) for _ in range(2)]
+    for kernel, (x, P) in zip((smooth_back, smooth_back.py_func), smoothed, strict=True):  # type: ignore[attr-defined]
+        kernel(gains[0], nodes.x_predicted, nodes.P_predicted, x, P, np.empty((6, 6)))
+    assert np.allclose(smoothed[0][0], smoothed[1][0], rtol=1e-12)
+    assert np.allclose(smoothed[0][1], smoothed[1][1], rtol=1e-9, atol=1e-12)
