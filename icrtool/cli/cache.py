@@ -40,18 +40,20 @@ def warm(*, quiet: bool) -> None:
         # Python keeps what it compiled of a module that is imported
         importlib.import_module(module.name)
     kernels = list(all_kernels())
-    place = kernels[0].stats.cache_path
+    place = Path(kernels[0].stats.cache_path or os.devnull)
+    wanted = Path(os.environ.get("NUMBA_CACHE_DIR") or place)
     try:
-        tempfile.TemporaryFile(dir=place or os.devnull).close()
-    except OSError as err:
-        what = os.environ.get("NUMBA_CACHE_DIR") or place or "kernel cache"
-        raise OutputError(what, "cannot be written", "set NUMBA_CACHE_DIR to a directory that can") from err
+        tempfile.TemporaryFile(dir=place).close()
+        # numba takes another place where it cannot use the one that it was given
+        place.relative_to(wanted)
+    except (OSError, ValueError) as err:
+        raise OutputError(wanted, "cannot be written", "set NUMBA_CACHE_DIR to a directory that can") from err
     call_all_kernels()
     if not quiet:
         compiled = sum(bool(one.stats.cache_misses) for one in kernels)
         click.echo(
             f"{compiled} of {len(kernels)} kernels compiled for {processor()}, in {time.perf_counter() - begin:.1f} s; "
-            f"kept in {os.environ.get('NUMBA_CACHE_DIR') or place}"
+            f"kept in {wanted}"
         )
 
 
