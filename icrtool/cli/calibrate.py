@@ -131,8 +131,11 @@ def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> Lo
     if verbose or not sys.stderr.isatty():
         options.warn(run.warnings, quiet=quiet)
     if verbose:
+        from icrtool.output.text_format import topics_text
+        from icrtool.records.samples import ROLE_WORDS
+
         for stream in run.document.streams:
-            click.echo(f"{stream.role}: {stream.topic}: {stream.why}", err=True)
+            click.echo(f"{ROLE_WORDS[stream.role]}: {topics_text(stream.topic)}: {stream.why}", err=True)
     return calibrate_log(run, x_icr_m=x_icr)
 
 

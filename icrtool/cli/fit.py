@@ -196,11 +196,11 @@ def fit_log(
     everything = verbose or not sys.stderr.isatty()
     options.warn((*(run.warnings if everything else ()), *_other_robot(warm_start, start, config), *notes), quiet=quiet)
     if verbose:
-        from icrtool.output.text_format import jump_lines
+        from icrtool.output.text_format import jump_lines, topics_text
         from icrtool.records.samples import ROLE_WORDS
 
         for stream in run.document.streams:
-            click.echo(f"{ROLE_WORDS[stream.role]}: {stream.topic}: {stream.why}", err=True)
+            click.echo(f"{ROLE_WORDS[stream.role]}: {topics_text(stream.topic)}: {stream.why}", err=True)
         for line in jump_lines(run.document.reference_jumps):
             click.echo(line, err=True)
     return run

@@ -58,6 +58,11 @@ def role_word(summary: RunDocument, role: Role) -> str:
     return ROLE_WORDS[role] if summary.gnss.datum is None else role
 
 
+def topics_text(topics: str) -> str:
+    """Return the topics of a stream, each once."""
+    return " + ".join(dict.fromkeys(topics.split(" + ")))
+
+
 def excitation_text(excitation: ExcitationDocument) -> str:
     """Return what a drive could show of the ICRs at best, and how it turned; from the key of a run's summary."""
     if excitation.verdict.all_shown:

@@ -26,6 +26,7 @@ from icrtool.output.text_format import (
     jump_count,
     position_word,
     run_title,
+    topics_text,
     turn_text,
     unusable_lines,
 )
@@ -230,7 +231,7 @@ def _inputs(summary: RunDocument) -> list[str]:
     """Return the topics, each once, with what was taken from it."""
     roles: dict[str, list[str]] = {}
     for stream in summary.streams:
-        topics = " + ".join(dict.fromkeys(stream.topic.split(" + ")))
+        topics = topics_text(stream.topic)
         roles.setdefault(topics, []).append("position" if stream.role == "gnss" else stream.role)
     return [f"{topic} ({', '.join(taken)})" for topic, taken in roles.items()]
 
@@ -394,7 +395,7 @@ def brief_calibration(result: CalibrationResult | None, sensors: LogCalibration 
         blocks += [Line(f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?", "title")]
         blocks += [Table("lrl", rows)]
         if unknown := [TERMS[name].meaning for name in calibration.fitted.not_shown]:
-            blocks.append(labelled_line("not found", f"{'; '.join(unknown)}: too small, or not driven; taken as usual"))
+            blocks.append(labelled_line("not found", f"too small, or not driven; taken as usual: {'; '.join(unknown)}"))
     if sensors is not None:
         blocks += setting_blocks(sensors)
     return Text(blocks)

@@ -8,6 +8,8 @@ import textwrap
 from icrtool.calibration.one_log import LogCalibration, Parameter
 from icrtool.output.text_blocks import Block, Line, Table, Text, labelled
 
+MEANINGS = "shown: found well enough to set; weak: found roughly; not shown, not separable: this drive cannot find it"
+
 OPTIONS_WIDTH = 76
 """Characters of options in a line of a terminal of 80 columns, beside indent and backslash."""
 
@@ -31,7 +33,9 @@ def format_calibration(calibration: LogCalibration) -> Text:
         for one in calibration.parameters
     ]
     blocks: list[Block] = [Line(calibration.name, "title"), "", *labelled(head), ""]
-    return Text([*blocks, Table("l", rows, ("parameter", "value ± std", "verdict")), "", *setting_blocks(calibration)])
+    return Text(
+        [*blocks, Table("l", rows, ("parameter", "value ± std", "verdict")), MEANINGS, "", *setting_blocks(calibration)]
+    )
 
 
 def value_text(one: Parameter) -> str:

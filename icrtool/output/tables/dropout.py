@@ -55,7 +55,13 @@ def format_dropout(report: DropoutReport) -> Text:
     ]
     if sentences := headline(report):
         blocks += [" ".join(sentences), ""]
-    blocks += [Table("llr", rows, head), "", *_calibration_lines(report), *_reference_lines(report)]
+    blocks += [
+        Table("llr", rows, head),
+        "",
+        *_calibration_lines(report),
+        *_fitted_lines(report),
+        *_reference_lines(report),
+    ]
     blocks += [*_learned_blocks(report), *_count_lines(report), *map(_turning_line, report.by_turning)]
     blocks += ["", *budget_lines(report.budgets)]
     if report.comparison is not None:
@@ -110,6 +116,12 @@ def _calibration_lines(report: DropoutReport) -> list[str]:
         f"{one.label}: {one.model} from {counted(one.logs, 'log')}, {one.created[:10]}, {one.fitted_text}"
         for one in report.calibrations
     ]
+
+
+def _fitted_lines(report: DropoutReport) -> list[str]:
+    """Return which rows are of numbers that the fit of the trial itself has seen."""
+    final = report.result("icr_final")
+    return [f"{final.label}: fitted to the whole drive, its trials too"] if final is not None else []
 
 
 def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
 from icrtool.logs.read_log import Survey
+from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.output.tables.brief import copied, gravest, labelled_line
 from icrtool.output.tables.run import Row, excitation_row
 from icrtool.output.text_blocks import Block, Text
@@ -110,7 +111,9 @@ def _topic_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
             text = next((f"{one.topic}: {one.problem or one.why}" for one in sources), "no topic could be used")
             yield ROLE_WORDS[role], text
     if survey is not None:
-        others = {channel.topic for channel in survey.channels} - {one for name in used for one in name.split(" + ")}
+        others = {channel.topic for channel in survey.channels} - {
+            topic_of_side(one) for name in used for one in name.split(" + ")
+        }
         if others:
             yield "others", f"{counted(len(others), 'topic')} (-v names them, and why they are not used)"
 

@@ -17,6 +17,7 @@ from icrtool.output.text_format import (
     position_word,
     role_word,
     run_title,
+    topics_text,
     unusable_lines,
 )
 from icrtool.records.measurements import RESPONSE_S
@@ -80,7 +81,9 @@ def _stream_table(run: Run) -> Table:
         type_name = stream.message_type.replace("/msg/", "/")
         hz = stream.rate_hz
         rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream.count:,}"
-        rows.append((role_word(run.document, stream.role), stream.topic, type_name, rate, count, stream.clock))
+        rows.append(
+            (role_word(run.document, stream.role), topics_text(stream.topic), type_name, rate, count, stream.clock)
+        )
     widths = [max(len(row[column]) for row in (head, *rows)) for column in range(6)]
     # Long names are cut: the topic keeps its end, the type its begin.
     space = TEXT_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
