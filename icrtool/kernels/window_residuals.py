@@ -116,8 +116,9 @@ def displacements(path: PathKnots, start: Ints, end: Ints) -> tuple[Complexes, C
 
 
 def window_residuals(
-    path: PathKnots, start: Ints, end: Ints, reference: Complexes, offset: float, root: Floats
-) -> tuple[Floats, Floats]:
+    path: PathKnots, start: Ints, end: Ints, reference: Complexes, offset: float, root: Floats,
+    shortened: Floats | float = 1.0,
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Return residuals (2 w,), (d - d_ref) / sqrt(length), forward then right, and their derivatives (2 w, k + 2).
 
     The derivatives are by the terms, by the heading offset [rad] and by a delay of the knots [s].
@@ -126,11 +127,12 @@ def window_residuals(
     ----------
     start, end : (w,) knots of each window; reference : complex (w,) displacement [m]; root : (w,) [m^0.5]
     offset : added to the reference's heading [rad]
+    shortened : (w,) share of its displacement that a path goes whose heading wanders, on average
     """
     moved, by = displacements(path, start, end)
     turned = np.exp(-1j * offset) * reference
-    residual = (moved - turned) / root
-    by = np.insert(by, len(by) - 1, 1j * turned, axis=0) / root
+    residual = (shortened * moved - turned) / root
+    by = np.insert(shortened * by, len(by) - 1, 1j * turned, axis=0) / root
     return np.concatenate([residual.real, residual.imag]), np.concatenate([by.real, by.imag], axis=1).T
 
 

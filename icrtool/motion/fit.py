@@ -29,26 +29,17 @@ from icrtool.kernels.robust import (
     soft_l1_weights,
     student_covariance,
 )
-from icrtool.kernels.window_residuals import OMEGA, path_at, turn_residuals, window_residuals
-from icrtool.motion.models import FittedModel, MotionModel, gyro_gains, model_columns, wheel_motion
+from icrtool.motion.models import FittedModel, MotionModel
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows, size_of
-
-CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
-"""Prior of `LogConstants` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
+from icrtool.motion.residuals import KINDS, WindowResiduals, constant_std
 
 SETTLED = 0.1
 """Delays have kinks, where a shorter last step is not found."""
-
-OF_WHEELS = 2
-"""So many of them, the first, are there without a gyro, too."""
 
 REWEIGHTS = 2
 
 FEWEST_TO_SUBTRACT = 4
 """Of fewer recordings each is too large a part of all: the others are fitted anew."""
-
-KINDS = (0, 0, 1)
-"""Residuals of a window: forward and right, whose spread is one, and turn."""
 
 FEWEST_RESIDUALS = 10 * len(KINDS)
 """Fewer that are left beside a fold give no parameters."""
@@ -239,11 +230,6 @@ class PooledFit(FittedModel):
         return jacobian.T @ (weights * residuals), curvature
 
 
-def constant_std(model: MotionModel) -> Floats:
-    """Return the prior of the constants of each recording that a model has."""
-    return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:OF_WHEELS]
-
-
 def own_constants(windows: Windows, fitted: FittedModel, width_m: float) -> LogConstants:
     """Return the constants of one recording for given parameters of the model."""
     part, std = WindowResiduals(windows, fitted.model, width_m, fitted.wheels), constant_std(fitted.model)
@@ -255,62 +241,6 @@ def own_constants(windows: Windows, fitted: FittedModel, width_m: float) -> LogC
     zero, kind = np.zeros(len(std)), np.repeat(KINDS, len(windows.start))
     overlap = len(windows.start) / 5.0
     return LogConstants(*robust_least_squares(evaluate, zero, zero, std, kind=kind, overlap=overlap).x.tolist())
-
-
-class WindowResiduals:
-    """Residuals of all windows of one recording for one model, by sqrt(length), and their derivatives.
-
-    Displacements alone do not separate a turn from side slip, and show little of a spin on the spot: turns are
-    residuals, too, weighted by their own spread.
-
-    Parameters
-    ----------
-    windows : of `icrtool.motion.recording.cut_windows`
-    model, width_m : what predicts, and the track width b [m]
-    wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
-    """
-
-    def __init__(self, windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None) -> None:
-        steps = windows.steps
-        motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
-        if wheels is not None:
-            motion = motion._replace(turn=wheels.twist(motion)[OMEGA])
-        self._windows = windows
-        self._fixed, self._axes, self._columns = model_columns(model, motion)
-        self._gains, self._gyro_change = np.zeros(0), steps.gyro_change()
-        if model.uses_gyro:
-            # the gyro's bias and time are two more columns of the turn rate
-            self._gains = gyro_gains(model)
-            self._axes = np.append(self._axes, [OMEGA, OMEGA])
-            self._columns = np.concatenate([self._columns, np.ones((2, len(steps.t)))])
-        self._root = np.sqrt(windows.length_m)
-
-    def __call__(self, parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
-        """Return residuals (3 w,), forward, right [m^0.5], then turn [rad/m^0.5], and derivatives (3 w, k + c).
-
-        Parameters
-        ----------
-        constants : (c,) `LogConstants`, those of a gyro only for a model with one
-        """
-        windows, steps, k = self._windows, self._windows.steps, len(parameters)
-        offset, delay = constants[:OF_WHEELS].tolist()
-        fixed, axes, columns, values = self._fixed, self._axes, self._columns, parameters
-        if len(self._gains):
-            bias, later = constants[OF_WHEELS:].tolist()
-            shift = later * self._gyro_change
-            fixed, columns, values = fixed.copy(), columns.copy(), np.concatenate([parameters, [bias, 0.0]])
-            fixed[OMEGA] += shift
-            columns[:k] += self._gains[:, None] * shift
-            columns[-1] = (1.0 + parameters @ self._gains) * self._gyro_change
-        at = windows.knot_t + delay
-        terms = len(axes)
-        path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, at)
-        start, end = windows.start, windows.end
-        moved, moved_by = window_residuals(path, start, end, windows.reference, offset, self._root)
-        turned, turned_by = turn_residuals(path, start, end, windows.turned, self._root)
-        # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
-        jacobian = np.concatenate([moved_by, turned_by])[:, [*range(k), terms, terms + 1, *range(k, terms)]]
-        return np.concatenate([moved, turned]), jacobian
 
 
 class Pool:

@@ -167,7 +167,7 @@ def kept_of(windows: Windows, kept: Bools) -> Windows:
 
 @pytest.mark.parametrize("horizon_m", [5.0, 20.0])
 def test_a_trial_is_predicted_without_what_is_near_it(horizon_m: float) -> None:
-    """Against fits made here to the windows that keep clear of the trial."""
+    """Against fits made here to the windows that keep clear of the trial, but for what slip shortens: 0.1 % of 5 m."""
     recording = logs(1)[0]
     table = hold_out([recording], (horizon_m,))
     distance, windows = recording.track.distance, cut_windows(recording)
@@ -186,7 +186,7 @@ def test_a_trial_is_predicted_without_what_is_near_it(horizon_m: float) -> None:
             table_errors(recording, one, predicted_path(recording, fitted, fitted.constants(0)))[0, 0]
             for fitted in (apart, whole)
         )
-        assert errors[row, 0] == pytest.approx(expected, rel=0.03, abs=3e-3)
+        assert errors[row, 0] == pytest.approx(expected, rel=0.03, abs=5e-3)
         differs.append(abs(in_sample - expected) > 0.03 * expected + 3e-3)
     assert any(differs)
 

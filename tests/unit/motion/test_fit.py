@@ -13,9 +13,10 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import LOSS_SIGMAS
 from icrtool.kernels.track import Track
-from icrtool.motion.fit import SETTLED, Fold, Pool, PooledFit, WindowResiduals, own_constants
+from icrtool.motion.fit import SETTLED, Fold, Pool, PooledFit, own_constants
 from icrtool.motion.models import FAMILY, TERMS, FittedModel, MotionModel, find_model, twist, wheel_motion
 from icrtool.motion.recording import LogConstants, Recording, cut_windows
+from icrtool.motion.residuals import WindowResiduals, shortening
 from icrtool.motion.trials import cut_trials, predicted_path
 from support.recordings import WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all
 
@@ -51,10 +52,11 @@ def test_a_prior_is_wide_where_the_drive_shows_more_than_it(gain: float, widened
 
 @pytest.mark.parametrize("name", ["eight", "six_gyro"])
 def test_derivatives_are_those_of_differences(name: str) -> None:
+    """Windows of one length: what slip shortens is held, as the scale of residuals is."""
     model = find_model(name)
     recording = make_recording(EIGHT, EIGHT.prior_mean, seconds=60.0, gyro=True)
     wheels = fitted(EIGHT, EIGHT.prior_mean + 0.01) if model.uses_gyro else None
-    residuals = WindowResiduals(cut_windows(recording), model, WIDTH_M, wheels)
+    residuals = WindowResiduals(cut_windows(recording, (5.0,)), model, WIDTH_M, wheels)
     x = np.concatenate(
         [draw_parameters(model, np.random.default_rng(1)), [0.02, 0.033, *([0.01, 0.027] if model.uses_gyro else [])]]
     )
@@ -230,6 +232,20 @@ def test_joined_steps_give_the_parameters_of_single_samples() -> None:
 def test_a_drive_too_short_is_an_error() -> None:
     with pytest.raises(DataError, match="windows"):
         cut_windows(make_recording(EIGHT, EIGHT.prior_mean, seconds=4.0))
+
+
+def test_a_heading_that_wanders_shortens_windows() -> None:
+    """Against displacements along headings of random steps, 0.02 rad^2 a metre, with noise of the reference."""
+    rng, step_m, variance = np.random.default_rng(3), 0.05, 0.02
+    turned, moved, length_m = [], [], np.repeat([5.0, 10.0], 4000)
+    for length in length_m:
+        heading = np.cumsum(rng.normal(0.0, np.sqrt(variance * step_m), int(length / step_m)))
+        turned.append(heading[-1] + rng.normal(0.0, 0.05))
+        moved.append(np.exp(1j * heading).mean())
+    found = shortening(np.array(turned), length_m)
+    for length in (5.0, 10.0):
+        mine = length_m == length
+        assert found[mine] == pytest.approx(np.mean(moved, where=mine).real, abs=0.004)
 
 
 def test_a_delay_of_the_wheels_is_found_and_used() -> None:
