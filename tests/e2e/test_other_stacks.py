@@ -21,9 +21,11 @@ from foxglove_schemas_protobuf.JointState_pb2 import JointState
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message
 from mcap.writer import Writer as McapWriter
+from mcap_protobuf.schema import build_file_descriptor_set
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from pymap3d import ned2geodetic
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -34,7 +36,7 @@ from rosbags.typesys.store import Typestore
 
 from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats
-from icrtool.logs.read_log import read_log
+from icrtool.logs.read_log import read_log, survey_log
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX
 from icrtool.records.tables import RobotLog
 from support.drives import ICRS, make_log
@@ -393,3 +395,34 @@ def test_poses_in_foxglove_s_schema_are_a_reference_of_position_and_heading(tmp_
     turned = log.heading.heading_rad - headings_at(FIX_STAMPS)
     assert np.abs(np.angle(np.exp(1j * turned))).max() < 1e-9
     assert [stream.clock for stream in log.streams] == ["header"] * 3
+
+
+@pytest.mark.parametrize("kind", ["protobuf", "json"])
+def test_wheels_in_two_fields_of_a_message_of_one_s_own_are_found(tmp_path: Path, kind: str) -> None:
+    file = descriptor_pb2.FileDescriptorProto(name="own.proto", package="own", syntax="proto3")
+    fields = ("left_speed", "right_speed", "voltage")
+    state = file.message_type.add(name="WheelState")
+    for number, name in enumerate(fields, 1):
+        state.field.add(name=name, number=number, type="TYPE_DOUBLE", label="LABEL_OPTIONAL")
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    own = message_factory.GetMessageClass(pool.FindMessageTypeByName("own.WheelState"))
+    schema = {"type": "object", "properties": {name: {"type": "number"} for name in fields}}
+    path = tmp_path / "own.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start()
+        described = (
+            json.dumps(schema).encode() if kind == "json" else build_file_descriptor_set(own).SerializeToString()
+        )
+        number = writer.register_schema("own.WheelState", "jsonschema" if kind == "json" else kind, described)
+        channel = writer.register_channel("/base/state", kind, number)
+        for stamp_ns, left, right in zip(WHEEL_STAMPS, DRIVE.wheels.v_left_mps, DRIVE.wheels.v_right_mps, strict=True):
+            values = dict(zip(fields, (left, right, 24.0), strict=True))
+            content = json.dumps(values).encode() if kind == "json" else own(**values).SerializeToString()
+            writer.add_message(channel, stamp_ns, content, stamp_ns)
+        writer.finish()
+    (motion,) = survey_log(path).candidates.wheels
+    assert motion.topic == "/base/state.left_speed + /base/state.right_speed"
+    assert motion.speed is not None
+    np.testing.assert_array_equal(motion.speed[0], DRIVE.wheels.v_left_mps)

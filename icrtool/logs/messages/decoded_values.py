@@ -22,6 +22,7 @@ LONGEST_MESSAGE_BYTES = 1 << 20
 """Of a message that is decoded by itself; those that icrtool uses have some hundred bytes."""
 
 _LARGEST_INTEGER = 1 << 62
+_FLOATS = ("float32", "float64")
 
 
 class MessageColumns(Protocol):
@@ -56,48 +57,40 @@ class MessageDecoder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DecodedValues:
-    """Messages as nested values: mappings by field name, sequences, numbers, texts.
+    """Values of messages.
 
     Attributes
     ----------
-    messages : the readable ones (n,)
-    paths : by column, the field that it is made of where that has another name
+    values : by column one of each readable message (n,): a number, a text, or a list of either
     """
 
     slots: Mapping[str, Slot]
-    messages: Sequence[object]
+    values: Mapping[str, Sequence[Any]]
     readable: Bools
-    paths: Mapping[str, str] = field(default_factory=dict)
 
     def numbers(self, path: str) -> NDArray[Any]:
         """Return a field of numbers; what a message lacks is NaN or 0."""
-        whole = self.slots[path].kind not in ("float32", "float64")
-        take, result = (_integer, np.int64) if whole else (_float, np.float64)
-        found = self._at(path)
-        if "[*]" not in path:
-            return np.array([take(value) for value in found], result)
-        return _padded([[take(value) for value in _listed(values)] for values in found], 0 if whole else np.nan, result)
+        lacking, result = (np.nan, np.float64) if self.slots[path].kind in _FLOATS else (0, np.int64)
+        if "[*]" in path:
+            return _padded(self.values[path], lacking, result)
+        return np.array(self.values[path], result)
 
     def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
         """Return the numbers of a text field's texts, -1 for none; new texts become known."""
-        found = self._at(path)
-        if "[*]" not in path:
-            return np.array(text_numbers([_text(value) for value in found], known), np.int64)
-        return _padded([text_numbers([_text(one) for one in _listed(values)], known) for values in found], -1, np.int64)
-
-    def _at(self, path: str) -> list[object]:
-        steps = steps_of(self.paths.get(path, path))
-        return [value_at(message, steps) for message in self.messages]
+        if "[*]" in path:
+            return _padded([text_numbers(texts, known) for texts in self.values[path]], -1, np.int64)
+        return np.array(text_numbers([*self.values[path]], known), np.int64)
 
 
 @dataclass(slots=True)
 class ValueDecoder:
-    """Decodes messages one by one.
+    """Decodes messages one by one; of each it keeps the wanted values alone, however much it holds.
 
     Attributes
     ----------
     paths : by column, the field that it is made of
-    parse : returns a message's nested values, None where it is not readable
+    parse : returns a message's nested values (mappings by field name, sequences, numbers, texts), None where it is not
+        readable
     """
 
     slots: Mapping[str, Slot]
@@ -107,15 +100,34 @@ class ValueDecoder:
     def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, DecodedValues]]:
         """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
         rows = np.flatnonzero(block.channel == number)
+        takers = {column: _taker(path, self.slots[column].kind) for column, path in self.paths.items()}
         for begin in range(0, len(rows), MESSAGES_AT_ONCE):
             some = rows[begin : begin + MESSAGES_AT_ONCE]
-            ends = zip(block.start[some].tolist(), block.end[some].tolist(), strict=True)
-            found = [
-                self.parse(block.data[start:end].tobytes()) if end - start <= LONGEST_MESSAGE_BYTES else None
-                for start, end in ends
-            ]
-            readable = np.array([one is not None for one in found], np.bool_)
-            yield some, DecodedValues(self.slots, [one for one in found if one is not None], readable, self.paths)
+            values: dict[str, list[Any]] = {column: [] for column in self.paths}
+            readable = np.zeros(len(some), np.bool_)
+            for place, (start, end) in enumerate(
+                zip(block.start[some].tolist(), block.end[some].tolist(), strict=True)
+            ):
+                if end - start > LONGEST_MESSAGE_BYTES:
+                    continue
+                message = self.parse(block.data[start:end].tobytes())
+                if message is not None:
+                    readable[place] = True
+                    for column, take in takers.items():
+                        values[column].append(take(message))
+            yield some, DecodedValues(self.slots, values, readable)
+
+
+def _taker(path: str, kind: str) -> Callable[[object], Any]:
+    """Return a function of a message that takes the value, or the list of values, at a path."""
+    steps = steps_of(path)
+    convert = _text if kind == "string" else _float if kind in _FLOATS else _integer
+
+    def take_all(message: object) -> list[Any]:
+        values = value_at(message, steps)
+        return [convert(one) for one in values] if isinstance(values, list) else []
+
+    return take_all if "[*]" in path else lambda message: convert(value_at(message, steps))
 
 
 def parse_json(data: bytes) -> dict[str, Any] | None:
@@ -146,10 +158,6 @@ def value_at(value: object, steps: Sequence[Step]) -> object:
     return value
 
 
-def _listed(values: object) -> list[Any]:
-    return values if isinstance(values, list) else []
-
-
 def _float(value: object) -> float:
     if not isinstance(value, (int, float)):
         return math.nan
@@ -169,7 +177,7 @@ def _text(value: object) -> bytes:
     return value.encode("utf-8", "replace")[:LONGEST_TEXT] if isinstance(value, str) else b""
 
 
-def _padded(rows: list[list[Any]], lacking: float, result: type[np.float64 | np.int64]) -> NDArray[Any]:
+def _padded(rows: Sequence[Sequence[Any]], lacking: float, result: type[np.float64 | np.int64]) -> NDArray[Any]:
     """Return rows of different lengths (n, longest)."""
     padded = np.full((len(rows), max(map(len, rows), default=0)), lacking, result)
     for row, values in zip(padded, rows, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -57,23 +58,20 @@ class SentenceDecoder:
     def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, DecodedValues]]:
         """Yield the rows (m,) of a block whose channel is `number`; a sentence with a wrong checksum is unreadable."""
         for rows, decoded in self.inner.decode(block, number):
-            messages = [parse_sentence(text) for text in decoded.texts("sentence")]
+            sentences = [parse_sentence(text) for text in decoded.texts("sentence")]
+            is_one = np.array([one is not None for one in sentences], np.bool_)
+            read = [one for one in sentences if one is not None]
+            values: dict[str, Sequence[Any]] = {
+                path: [one.get(path, 0 if slot.kind == "int32" else math.nan) for one in read]
+                for path, slot in _SLOTS.items()
+            }
             for path, slot in self.inner.slots.items():
                 if path != "sentence":
-                    values = decoded.texts(path) if slot.kind == "string" else decoded.numbers(path).tolist()
-                    _put(messages, path, values)
+                    column = np.array(decoded.texts(path), object) if slot.kind == "string" else decoded.numbers(path)
+                    values[path] = column[is_one].tolist()
             readable = decoded.readable.copy()
-            readable[readable] = np.array([one is not None for one in messages], np.bool_)
-            yield rows, DecodedValues(self.slots, [one for one in messages if one is not None], readable)
-
-
-def _put(messages: Sequence[dict[str, Any] | None], path: str, values: Sequence[Any]) -> None:
-    """Put the values of a field of the message beside those of its sentence."""
-    *outer, last = path.split(".")
-    for message, value in zip(messages, values, strict=True):
-        if message is not None:
-            place = reduce(lambda inside, name: inside.setdefault(name, {}), outer, message)
-            place[last] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+            readable[readable] = is_one
+            yield rows, DecodedValues(self.slots, values, readable)
 
 
 def parse_sentence(text: bytes) -> dict[str, Any] | None:

@@ -432,7 +432,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, open_log, sqlite_bag, unpack
     from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf, schema
-    from icrtool.logs.streams import wheel_sources
+    from icrtool.logs.streams import wheel_joints
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
@@ -445,7 +445,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         sqlite_bag._LARGEST_MESSAGE_BYTES, decoded_values.LONGEST_MESSAGE_BYTES, protobuf.LONGEST_DESCRIPTORS,
         schema.DEEPEST, schema.MOST_FIELDS,
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
-        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheel_sources.MOST_WHEELS,
+        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheel_joints.MOST_WHEELS,
         table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
     ]  # fmt: skip
 
