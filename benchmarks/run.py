@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import socket
 import subprocess
 import sys
 import tempfile
@@ -260,6 +261,48 @@ def batches(bench: Bench) -> None:
     bench.table.add(f"{name}, memory", [two["most_mb"]], alone["most_mb"], "with -j 1", unit="MB", goal="1/2")
 
 
+SERVER = "import sys; from moto.server import main; main(['-H', '127.0.0.1', '-p', sys.argv[1]])"
+
+
+def object_store(bench: Bench) -> None:
+    """Read the log from S3 on this machine's loopback, in a process of its own, against the file on disk."""
+    import s3fs
+
+    import icrtool
+
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    os.environ |= {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}", "AWS_ACCESS_KEY_ID": "bench",
+                   "AWS_SECRET_ACCESS_KEY": "bench", "AWS_DEFAULT_REGION": "us-east-1"}  # fmt: skip
+    quiet = subprocess.DEVNULL
+    server = subprocess.Popen([sys.executable, "-c", SERVER, port], stdout=quiet, stderr=quiet)
+    try:
+        while not _answers(int(port)):
+            time.sleep(0.1)
+        store = s3fs.S3FileSystem()
+        store.mkdir("field")
+        config = icrtool.load_config(robot="segway-rmp400")
+        for name, goal in {"hour.mcap": "1/1.5", "hour.bag": "1/1.5", "hour_db3": ""}.items():
+            log, address = bench.logs[name], f"s3://field/{name}"
+            store.put(str(log), address, recursive=log.is_dir())
+            disk, remote = [], []
+            for _ in range(bench.extent.repeats):
+                disk += seconds_of(lambda log=log: icrtool.read_log(log, config), 1)
+                remote += seconds_of(lambda address=address: icrtool.read_log(address, config), 1)
+            bench.table.add(f"ingest {name} from S3", remote, float(np.median(disk)), "from disk", goal=goal)
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def _answers(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port)).close()
+    except OSError:
+        return False
+    return True
+
+
 def open_loop(bench: Bench) -> None:
     """Compare the analysis without GNSS with direct integration."""
     open_loop_rows(bench.table, bench.extent.log_s / 3600, bench.extent.repeats)
@@ -296,6 +339,7 @@ def against_evo(bench: Bench) -> None:
 
 SECTIONS: dict[str, Callable[[Bench], None]] = {
     "ingest": ingest,
+    "s3": object_store,
     "filter": filter_speed,
     "open-loop": open_loop,
     "first": first_run,

@@ -16,6 +16,7 @@ from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.stages import Stages
 from icrtool.cli.terminal import show
 from icrtool.records.text import LogText, escaped
+from icrtool.records.urls import UrlPath
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -212,6 +213,8 @@ def runs_or_logs(place: Path) -> list[Path]:
     from icrtool.fleet.roll_up import is_fleet, runs_of_fleet
     from icrtool.output.run_directory import RUN_FILE, is_run_directory
 
+    if isinstance(place, UrlPath):
+        return [one.path for one in find_recordings([place])]
     if is_run_directory(place) or not place.is_dir():
         return [place]
     if is_fleet(place):

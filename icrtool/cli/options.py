@@ -13,6 +13,7 @@ import click
 
 from icrtool.cli.stages import Stages, signal_word
 from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
+from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -28,8 +29,26 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
 
-# Not checked by click: the reader reports an unreadable log with its own message and exit status 1.
-LOG = click.Path(path_type=Path, readable=False)
+
+class _Log(click.Path):
+    """A log, as a path or an address.
+
+    Not checked by click: the reader reports an unreadable log with its own message and exit status 1.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, readable=False)
+
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> Path:  # fmt: skip
+        """Return the path."""
+        place = place_of(os.fspath(value))
+        # click's own would lose a slash, and what stands behind a question mark.
+        return place if isinstance(place, UrlPath) else cast("Path", super().convert(value, param, ctx))
+
+
+LOG = _Log()
 LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
 

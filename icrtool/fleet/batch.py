@@ -14,15 +14,17 @@ import msgspec
 
 from icrtool import __version__
 from icrtool.config import Config, builtin_robots, load_config
-from icrtool.errors import ConfigError, OutputError
+from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import ROWS, check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
 from icrtool.fleet.row import File, Row, as_text
+from icrtool.logs.containers.remote_file import RemoteFile
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.records.regular_file import read_regular
+from icrtool.records.urls import UrlPath
 
 RUNS = "runs"
 
@@ -219,6 +221,8 @@ def _config(one: FoundRecording, known: About, options: BatchOptions) -> Config:
 
 def _same_files(stored: Sequence[File], path: Path) -> bool:
     """Return whether a log's files are those of an earlier batch; content is compared where their time differs."""
+    if isinstance(path, UrlPath):
+        return bool(stored) and _is_unchanged(stored[0], path)
     try:
         files = files_of_log(path)
         if [as_text(file.name) for file in files] != [Path(file.path).name for file in stored]:
@@ -232,3 +236,13 @@ def _same_files(stored: Sequence[File], path: Path) -> bool:
     except OSError:
         return False
     return True
+
+
+def _is_unchanged(before: File, path: UrlPath) -> bool:
+    """Return whether what lies at an address has the size and version that it had."""
+    try:
+        now = RemoteFile(path)
+    except LogError:
+        return False
+    version = next(iter(now.version.values()), "")
+    return bool(version) and (now.size, version) == (before.bytes, before.version)

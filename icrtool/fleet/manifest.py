@@ -12,7 +12,9 @@ import msgspec
 
 from icrtool.config import parse_toml
 from icrtool.errors import ConfigError
+from icrtool.logs.containers.remote_file import find
 from icrtool.records.regular_file import read_regular
+from icrtool.records.urls import UrlPath, place_of
 
 COLUMNS = ("log", "robot", "config", "group", "tags")
 
@@ -94,12 +96,17 @@ def read_manifest(path: Path) -> list[Entry]:
 def about(path: Path, entries: Sequence[Entry]) -> About:
     """Return what a manifest states about a recording; a later line adds to and replaces an earlier one."""
     found = About()
-    whole = path.resolve()
+    whole = _target(path)
     around = {whole, *whole.parents}
     for entry in entries:
         if not around.isdisjoint(entry.targets):
             found = found.updated(entry.about)
     return found
+
+
+def _target(place: Path) -> Path:
+    """Return a place with links followed."""
+    return place if isinstance(place, UrlPath) else place.resolve()
 
 
 def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
@@ -133,11 +140,13 @@ def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
     config = path.parent / line.config.strip() if line.config.strip() else None
     about = About(line.robot.strip(), config, line.group.strip(), tuple(line.tags))
     places = _matching(path, line.log)
-    return Entry(places, about, frozenset(place.resolve() for place in places))
+    return Entry(places, about, frozenset(_target(place) for place in places))
 
 
 def _matching(path: Path, pattern: str) -> tuple[Path, ...]:
     """Return what a pattern matches; a name with a bracket or a star of its own is taken as it is, if it is there."""
+    if isinstance(address := place_of(pattern), UrlPath):
+        return tuple(find(address))
     named = path.parent / pattern
     try:
         if named.exists():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -26,7 +26,9 @@ from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_n
 from icrtool.records.late_output import FigureSet
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
+from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
+from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
     from icrtool.dropout_analysis.baseline import BaselineReport
@@ -187,7 +189,7 @@ class Request:
 
 def path_of(name: bytes) -> Path:
     """Return a path of a request."""
-    return Path(os.fsdecode(name))
+    return place_of(os.fsdecode(name))
 
 
 _REQUEST = msgspec.json.Decoder(Request)
@@ -238,11 +240,17 @@ def failed(request: Request, reason: str, *, details: str = "", repeatable: bool
     )  # fmt: skip
 
 
-def files_of(path: Path, hashes: Mapping[str, str] | None = None) -> tuple[File, ...]:
-    """Return the files of a log with their sha256; those in `hashes`, by path, are not read again."""
+def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[File, ...]:
+    """Return the files of a log with their sha256; those in `inputs` are not read again.
+
+    Of an address, `inputs` is all that is known.
+    """
+    if isinstance(path, UrlPath):
+        return tuple(File(one.path, one.bytes, 0, one.sha256, one.version or one.etag or "") for one in inputs)
+    hashes = {file.path: file.sha256 for file in inputs}
     found = []
     for file in files_of_log(path):
-        digest = (hashes or {}).get(str(file))
+        digest = hashes.get(str(file))
         if digest is None:
             digest = file_sha256(file)
         status = file.stat()
@@ -295,7 +303,7 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         verdicts=tuple(replace(one, log=request.row.log) for one in report.verdicts),
         baseline=_baseline_numbers(report),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
-        inputs=files_of(path_of(request.path), {file.path: file.sha256 for file in summary.inputs}),
+        inputs=files_of(path_of(request.path), summary.inputs),
     )
 
 

@@ -20,8 +20,10 @@ from icrtool.logs.containers.one_recording import (
     unpacked_name,
 )
 from icrtool.logs.containers.open_log import container_of, open_log
+from icrtool.logs.containers.remote_file import find
 from icrtool.logs.containers.split_files import NumberedFile, log_name, numbered_file, split_files, split_path
 from icrtool.logs.containers.sqlite_bag import SqliteBag
+from icrtool.records.urls import UrlPath
 
 RUN_FILE = "run.json"
 
@@ -60,14 +62,14 @@ def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
         A place does not exist, or there is no recording in any of them.
     """
     for place in places:
-        if not place.exists() and not split_files(place):
+        if not (isinstance(place, UrlPath) or place.exists() or split_files(place)):
             raise LogError(place, "no such file or directory")
     logs, _ = logs_among(places)
     found = joined({os.path.realpath(log): log for log in logs if not log.is_dir() or is_bag_directory(log)})
     if not found:
         what = places[0] if len(places) == 1 else f"{len(places)} places"
         raise LogError(what, "no recording in it", "a log is an .mcap, .bag or .db3 file, or a ROS 2 bag directory")
-    root = common_parent(places)
+    root = common_parent(places if not any(isinstance(place, UrlPath) for place in places) else list(found.values()))
     return _named(sorted(found.values(), key=natural_order), root)
 
 
@@ -146,6 +148,9 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """
     found: dict[str, Path] = {}
     for place in places:
+        if isinstance(place, UrlPath):
+            found |= {path.url: path for path in find(place)}
+            continue
         searched = place.is_dir() and not is_bag_directory(place) and not (place / RUN_FILE).is_file()
         below = {os.path.realpath(path): path for path in sorted(_search(place), key=natural_order)} if searched else {}
         for real, path in (joined(below) or {os.path.realpath(place): place}).items():
@@ -250,4 +255,6 @@ def unique_name(name: str, taken: set[str]) -> str:
 
 
 def _absolute(path: Path) -> Path:
+    if isinstance(path, UrlPath):
+        return Path("/", *path.parts)
     return Path(os.path.normpath(path.absolute()))

@@ -180,8 +180,8 @@ def _pooled(
 
 
 def _content(inputs: Sequence[File | InputFile]) -> tuple[str, ...]:
-    """Return what copies of a log have in common, whatever their names."""
-    return tuple(sorted(file.sha256 for file in inputs))
+    """Return what copies of a log have in common, whatever their names; of content that is not known, the place."""
+    return tuple(sorted(file.sha256 or f"at {file.path}" for file in inputs))
 
 
 def _stored(directory: Path) -> list[PooledCalibration]:

@@ -25,12 +25,20 @@ ThisTime = Literal["processed", "skipped"]
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """A file of a log as it was when it was read; `mtime_ns` and `bytes` spare hashing it again."""
+    """A file of a log as it was when it was read.
+
+    Attributes
+    ----------
+    mtime_ns : with `bytes` spares hashing it again; 0 of one that is not on a disk
+    sha256 : None where not all of it was read
+    version : what its store states about the content, of one that is not on a disk
+    """
 
     path: str
     bytes: int
     mtime_ns: int
-    sha256: str
+    sha256: str | None
+    version: str = ""
 
 
 @dataclass(frozen=True, slots=True)

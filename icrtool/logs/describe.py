@@ -12,6 +12,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.read_log import Survey
 from icrtool.logs.streams.heading_sources import HeadingSource
 from icrtool.logs.streams.sources import PositionSource, WheelMotion
+from icrtool.records.plain_data import plain
 from icrtool.records.samples import ROLE_WORDS, Role, StreamChoice, rate_and_jitter
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
@@ -31,6 +32,7 @@ def describe_survey(survey: Survey, measured: RobotLog | None) -> str:
     size = sum(file.bytes for file in survey.inputs)
     topics, files = counted(len(survey.channels), "topic"), counted(len(survey.inputs), "file")
     lines = [f"{survey.path}: {topics}, {size / 1e6:.3g} MB in {files}"]
+    lines += [f"  {survey.transfer}"] if survey.transfer else []
     lines += _topics(survey)
     chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
     candidates: tuple[tuple[Role, Sources], ...] = (
@@ -134,7 +136,8 @@ def survey_document(survey: Survey) -> dict[str, Any]:
             }
         )
     return {
-        "inputs": [asdict(file) for file in survey.inputs],
+        "inputs": plain(survey.inputs),
+        "transfer": survey.transfer or None,
         "topics": topics,
         "candidates": {
             role: [

@@ -50,6 +50,7 @@ from icrtool.records.samples import (
 )
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText
+from icrtool.records.urls import place_of
 
 Progress = Callable[[float], None]
 
@@ -61,6 +62,7 @@ class Survey:
     Attributes
     ----------
     tables : of their columns those that candidates do not hold: stamps, turn rates, static transforms
+    transfer : how much came over a connection, in words; empty for a file on disk
     """
 
     name: LogText
@@ -70,6 +72,7 @@ class Survey:
     candidates: Candidates
     problems: tuple[str, ...]
     inputs: tuple[InputFile, ...]
+    transfer: str = ""
 
 
 def survey_log(
@@ -94,7 +97,7 @@ def survey_log(
         The log cannot be opened.
     """
     config = config if config is not None else Config()
-    path = Path(path)
+    path = place_of(path) if isinstance(path, str) else path
     begin, stop = moment(start, "start"), moment(end, "end")
     container = open_log(path, progress)
     ended = Event()
@@ -111,7 +114,7 @@ def survey_log(
                 # The pool waits for its threads before it passes on Ctrl-C or an error.
                 ended.set()
                 raise
-        channels = tuple(container.channels)
+        channels, transfer = tuple(container.channels), container.transfer()
     finally:
         container.close()
     drop_used_columns(tables)
@@ -123,6 +126,7 @@ def survey_log(
         candidates=candidates,
         problems=problems,
         inputs=inputs.result(),
+        transfer=transfer,
     )
 
 
@@ -146,8 +150,8 @@ def read_log(
     Parameters
     ----------
     path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``, each also compressed or in an archive; ``-`` for
-        standard input; ``drive_{0..3}.bag`` for the files of a split recording; or a ``.csv`` of
-        `icrtool.records.frames`
+        standard input; an address (``s3://bucket/drive.mcap``); ``drive_{0..3}.bag`` for the files of a split
+        recording; or a ``.csv`` of `icrtool.records.frames`
     config : topics, robot and frames; default: all found by type and content
     progress : called with the share of the bytes that are read, 0 to 1
     start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
@@ -165,8 +169,9 @@ def read_log(
         Streams without usable samples.
     """
     config = config if config is not None else Config()
-    if is_table(Path(path)):
-        return read_table(Path(path), start, end)
+    path = place_of(path) if isinstance(path, str) else path
+    if is_table(path):
+        return read_table(path, start, end)
     return assemble(survey_log(path, config, progress, start=start, end=end), config)
 
 

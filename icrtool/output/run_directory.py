@@ -24,6 +24,7 @@ from icrtool.records.late_output import FigureSet
 from icrtool.records.regular_file import read_regular
 from icrtool.records.run import Run
 from icrtool.records.run_document import EVENT_COLUMNS, EventDocument
+from icrtool.records.urls import UrlPath
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
@@ -73,6 +74,8 @@ def _is_made_from(directory: Path, log: Path) -> bool:
     inputs, sources = _inputs_of(directory), own_files(directory).made_from
     if any(os.path.realpath(file) in sources for file in files):
         return True
+    if isinstance(log, UrlPath):
+        return [one.get("path") for one in inputs] == [str(log)]
     return bool(inputs) and all(
         any(file.stat().st_size == one.get("bytes") and file_sha256(file) == one.get("sha256") for file in files)
         for one in inputs
@@ -151,7 +154,7 @@ def write_run(
 def replaced_log(directory: Path, run: Run) -> str | None:
     """Return the path of the log whose run a new run replaces; None where it has the same content, or none is there."""
     before, now = _inputs_of(directory), run.document.inputs
-    same = [one.get("sha256") for one in before] == [one.sha256 for one in now]
+    same = [one.get("sha256") or one.get("path") for one in before] == [one.sha256 or one.path for one in now]
     return str(before[0].get("path")) if before and not same else None
 
 

@@ -30,6 +30,7 @@ from icrtool.records.run import Run
 from icrtool.records.run_document import RUN_SCHEMA, RunDocument
 from icrtool.records.tables import States
 from icrtool.records.text import LONGEST_NAME, escaped_texts, shortened
+from icrtool.records.urls import UrlPath, place_of
 
 FIT_AGAIN = "fit the log again"
 
@@ -95,7 +96,9 @@ def log_of(run: Run) -> Path:
     RunError
         It is not where it was when the run was made.
     """
-    files = [Path(file.path) for file in run.document.inputs]
+    files = [place_of(file.path) for file in run.document.inputs]
+    if len(files) == 1 and isinstance(files[0], UrlPath):
+        return files[0]
     gone = [file for file in files if not file.is_file()]
     if gone or not files:
         what = gone[0] if gone else "a list of inputs"

@@ -355,8 +355,9 @@ class RunDocument(Record, frozen=True, kw_only=True):
 
     @property
     def content(self) -> tuple[str, ...]:
-        """SHA-256 of each file of the log."""
-        return tuple(file.sha256 for file in self.inputs)
+        """SHA-256 of each file of the log; none where one is not known: it is not known to be a copy of another."""
+        known = tuple(file.sha256 for file in self.inputs if file.sha256 is not None)
+        return known if len(known) == len(self.inputs) else ()
 
     def icr_of_drive(self, column: IcrColumn) -> tuple[float, float] | None:
         """Return an ICR of `geometry` and its standard deviation, None where it is not shown."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Self, cast
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -218,8 +219,17 @@ def rate_and_jitter(stamps: Ints) -> tuple[float | None, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class InputFile:
-    """A file that was read: path as given, size, SHA-256 (hex)."""
+    """A file that was read.
+
+    Attributes
+    ----------
+    path : as given, without a password or token
+    sha256 : hex; None where not all of it was read
+    etag, version : what an object store, or a web server, states about the content
+    """
 
     path: str
     bytes: int
-    sha256: str
+    sha256: str | None
+    etag: str | msgspec.UnsetType = msgspec.UNSET
+    version: str | msgspec.UnsetType = msgspec.UNSET

@@ -130,6 +130,10 @@ class Container(Protocol):
         """Return the log times of the first and the last message, None where only reading the log shows them."""
         ...
 
+    def transfer(self) -> str:
+        """Return in words how much came over a connection; empty for nothing."""
+        ...
+
     def share_read(self) -> float:
         """Return the share of the log that has been read, 0 to 1."""
         ...

@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from threading import Event, Lock
+from threading import Event
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -24,13 +24,19 @@ from icrtool.logs.containers.decompress import (
     decompress,
 )
 from icrtool.logs.containers.record_table import Records
-from icrtool.logs.containers.split_files import inputs_of
+from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, Source
 from icrtool.records.samples import InputFile
 
 Item = TypeVar("Item")
 
 THREADS, BLOCKS_AHEAD = 2, 3
 """Threads that make blocks of chunks, and blocks that they make while one is used."""
+
+READERS, SPANS_AHEAD, BYTES_AHEAD = 8, 16, 1 << 26
+"""Of a distant file: threads that read, and pieces and their bytes that are read before they are used."""
+
+SPAN_BYTES = 1 << 23
+"""Of chunks that are read in one piece."""
 
 JOINED_BYTES = 1 << 22
 """Of the wanted records of chunks that are made one block: each block has a cost of its own."""
@@ -49,6 +55,8 @@ class Chunk(NamedTuple):
     compression : as the log calls it
     messages : where its messages begin in the records that are read, by the index; None without one
     ranges : begin and end (2, n) of its wanted records, where only those are read
+    held : its bytes, read ahead of a distant file
+    records : the wanted ones, likewise
     """
 
     at: int
@@ -61,11 +69,17 @@ class Chunk(NamedTuple):
     compression: str = ""
     messages: Ints | None = None
     ranges: Ints | None = None
+    held: Held | None = None
+    records: bytes | None = None
 
     @property
     def wanted_bytes(self) -> int:
         """Bytes of the records that are read."""
         return max(self.size, 0) if self.ranges is None else int((self.ranges[1] - self.ranges[0]).sum())
+
+
+class NotByRangesError(Exception):
+    """A distant file that cannot be read by ranges."""
 
 
 class _PartError(DecompressionError):
@@ -81,22 +95,27 @@ class Spaces(NamedTuple):
 
 
 class ChunkedFile(ABC):
-    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end."""
+    """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end.
+
+    Parameters
+    ----------
+    source : where its bytes come from; None: from the file on disk
+    """
 
     _chunks: Sequence[Chunk] | None = None
     _chunk_head = 0
     """Bytes before the content of a chunk, in which its record begins."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, source: Source | None = None) -> None:
         self._path = path
         self.problems = Problems(path.name)
         self._inflation = Inflation()
         self._spaces: deque[Spaces] = deque()
         self._free()
-        self._stream = path.open("rb")
-        self._lock = Lock()
+        self._mixed = False
+        self._source: Source = source if source is not None else LocalFile(path)
         self._at = 0
-        self._size = path.stat().st_size
+        self._size = self._source.size
 
     @abstractmethod
     def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False) -> Packed:
@@ -138,8 +157,49 @@ class ChunkedFile(ABC):
             yield from made_ahead(self._read_in_order())
         else:
             needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
-            yield from self._indexed(self._located(chunk, wanted) for chunk in needed)
+            if self._source.distant:
+                yield from self._indexed(self._read_ahead(needed, wanted))
+            else:
+                yield from self._indexed(self._located(chunk, wanted) for chunk in needed)
         self._free()
+
+    def _read_ahead(self, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Chunk]:
+        """Yield chunks of a distant file as `_located` does, with what is wanted of the next ones read meanwhile."""
+        pending: deque[tuple[int, Future[list[Chunk]]]] = deque()
+        with ThreadPoolExecutor(READERS) as pool:
+            try:
+                for group, begin, end in self._spans(chunks, wanted):
+                    pending.append((end - begin, pool.submit(self._located_in, group, begin, end, wanted)))
+                    while len(pending) > SPANS_AHEAD or sum(length for length, _ in pending) > BYTES_AHEAD:
+                        yield from pending.popleft()[1].result()
+                while pending:
+                    yield from pending.popleft()[1].result()
+            finally:
+                for _, group_read in pending:
+                    group_read.cancel()
+
+    def _spans(self, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[list[Chunk], int, int]]:
+        """Yield chunks that follow one another and are read whole, and begin and end of what is read in one piece."""
+        group: list[Chunk] = []
+        begin = end = 0
+        for chunk in chunks:
+            first, last = self._span(chunk, wanted)
+            if group and not (end <= first <= end + NEAR_BYTES and last - begin <= SPAN_BYTES and last > first):
+                yield group, begin, end
+                group = []
+            begin, end = (begin if group else first), last
+            group.append(chunk)
+        if group:
+            yield group, begin, end
+
+    def _located_in(self, group: Sequence[Chunk], begin: int, end: int, wanted: frozenset[int]) -> list[Chunk]:
+        if 0 < end - begin <= 2 * LARGEST_CHUNK_BYTES:
+            self._source.hold(begin, end - begin)
+        return [self._located(chunk, wanted) for chunk in group]
+
+    @abstractmethod
+    def _span(self, chunk: Chunk, wanted: frozenset[int]) -> tuple[int, int]:
+        """Return begin and end of a chunk with its message index; an empty range where it is read in part."""
 
     def _indexed(self, chunks: Iterable[Chunk]) -> Iterator[Block]:
         """Yield the messages in some chunks."""
@@ -199,6 +259,9 @@ class ChunkedFile(ABC):
         DecompressionError
             As `decompress`, or they have more than the index states.
         """
+        if chunk.records is not None:
+            target[: len(chunk.records)] = np.frombuffer(chunk.records, np.uint8)
+            return len(chunk.records)
         packed = self._packed(chunk, spaces.packed)
         inflation.count(len(packed.data), packed.claimed)
         if packed.claimed >= len(target):
@@ -213,7 +276,15 @@ class ChunkedFile(ABC):
         return chunk
 
     def _learn_all(self) -> None:
-        """Read a file without an index for what its records state about channels."""
+        """Read a file without an index for what its records state about channels.
+
+        Raises
+        ------
+        NotByRangesError
+            It is a distant one, which is better read from disk.
+        """
+        if self._source.distant:
+            raise NotByRangesError
         for _ in self._read_in_order(learn=True):
             pass
         self._free()
@@ -229,7 +300,13 @@ class ChunkedFile(ABC):
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:
         """Return the file with its SHA-256."""
-        return inputs_of([self._path], ended)
+        return self._source.inputs(ended)
+
+    def transfer(self) -> str:
+        """Return how much was read of a distant file, and why all of it."""
+        words = self._source.transfer()
+        mixed = "; topics share compressed chunks, which are read whole" if words and self._mixed else ""
+        return words + mixed
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
@@ -237,7 +314,7 @@ class ChunkedFile(ABC):
 
     def close(self) -> None:
         """Release the file."""
-        self._stream.close()
+        self._source.close()
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return first and last log time by the index, None without one."""
@@ -246,12 +323,14 @@ class ChunkedFile(ABC):
 
     def _bytes(self, at: int, count: int) -> bytes:
         """Return bytes of the file, as many as there are."""
-        with self._lock:
-            self._stream.seek(at)
-            return self._stream.read(count)
+        return self._source.read_at(at, count)
 
-    def _content(self, at: int, length: int, space: Space) -> Bytes:
+    def _content(self, at: int, length: int, space: Space, held: Held | None = None) -> Bytes:
         """Return bytes of a chunk, as many as there are.
+
+        Parameters
+        ----------
+        held : where they are, if they were read ahead
 
         Raises
         ------
@@ -260,10 +339,11 @@ class ChunkedFile(ABC):
         """
         if length > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {length} bytes")
-        content = space.of(max(min(length, self._size - at), 0))
-        with self._lock:
-            self._stream.seek(min(at, self._size))
-            return content[: self._stream.readinto(content.data)]
+        length = max(min(length, self._size - at), 0)
+        if held is not None and held.at <= at and at + length <= held.at + len(held.data):
+            return np.frombuffer(held.data, np.uint8, length, at - held.at)
+        content = space.of(length)
+        return content[: self._source.read_into(at, content)]
 
     def _read_chunk(self, chunk: Chunk, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         """Yield the messages of a chunk; `cut`: it is cut off."""

@@ -25,6 +25,7 @@ from icrtool.logs.containers.decompress import (
     unpack_messages,
 )
 from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Records, scan_mcap
+from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -68,14 +69,14 @@ class McapFile(ChunkedFile):
 
     _chunk_head = _HEAD_BYTES
 
-    def __init__(self, path: Path, message_compression: str = "") -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, message_compression: str = "", source: Source | None = None) -> None:
+        super().__init__(path, source)
         self._message_compression = message_compression
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
         self._counts: dict[int, int] = {}
         try:
-            if self._stream.read(len(MAGIC)) != MAGIC:
+            if self._bytes(0, len(MAGIC)) != MAGIC:
                 raise LogError(path, "not an MCAP file", "its first bytes are not those of MCAP")
             self._chunks: list[Chunk] | None = self._read_index()
             if self._chunks is None:
@@ -97,12 +98,12 @@ class McapFile(ChunkedFile):
 
         What is compressed is read up to the last of them, what is not from the first to the last.
         """
-        if chunk.ranges is None:
+        if chunk.ranges is None or chunk.records is not None:
             return super()._unpack(chunk, spaces, target, inflation)
         first, needed = int(chunk.ranges[0, 0]), int(chunk.ranges[1, -1])
         if chunk.compression in STORED and chunk.size <= chunk.length:
             at = chunk.at + chunk.length - chunk.size + first
-            packed = Packed(self._content(at, needed - first, spaces.packed), "", needed - first)
+            packed = Packed(self._content(at, needed - first, spaces.packed, chunk.held), "", needed - first)
         else:
             # A whole frame is decompressed in one step.
             first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
@@ -122,23 +123,42 @@ class McapFile(ChunkedFile):
 
         It has neither where the index cannot be right.
         """
-        if max(chunk.size, chunk.index_length) > LARGEST_CHUNK_BYTES:
+        if max(chunk.size, chunk.length, chunk.index_length) > LARGEST_CHUNK_BYTES:
             return chunk
+        partly, by_message = self._is_read(chunk, wanted)
+        self._mixed |= partly and not by_message
+        if by_message:
+            self._source.hold(chunk.at + chunk.length, chunk.index_length)
+        else:
+            chunk = chunk._replace(held=self._source.hold(chunk.at, chunk.length + chunk.index_length))
         places, channels = _message_index(self._bytes(chunk.at + chunk.length, chunk.index_length))
         order = np.argsort(places, kind="stable")
         begins = places[order]
         ends = np.append(begins[1:], chunk.size)
         if not len(begins) or (ends <= begins).any():
             return chunk
-        if chunk.channels is not None and not chunk.channels <= wanted:
+        if partly:
             is_wanted = np.isin(channels, list(wanted))[order]
             sizes = (ends - begins)[is_wanted]
             if 0 < sizes.sum() < SMALL_PART * chunk.size:
                 first, last = begins[is_wanted], ends[is_wanted]
                 apart = first[1:] != last[:-1]
                 ranges = np.stack([first[np.append(True, apart)], last[np.append(apart, True)]])
-                return chunk._replace(messages=np.cumsum(sizes) - sizes, ranges=ranges)
+                chunk = chunk._replace(messages=np.cumsum(sizes) - sizes, ranges=ranges)
+                if by_message and self._source.distant:
+                    records = self._source.gather(chunk.at + chunk.length - chunk.size, ranges)
+                    chunk = chunk._replace(records=records)
+                return chunk
         return chunk._replace(messages=begins)
+
+    def _is_read(self, chunk: Chunk, wanted: frozenset[int]) -> tuple[bool, bool]:
+        """Return whether only a part of a chunk is wanted, and whether only that part can be read."""
+        partly = chunk.channels is not None and not chunk.channels <= wanted
+        return partly, partly and chunk.compression in STORED and chunk.index_length > 0 and chunk.size <= chunk.length
+
+    def _span(self, chunk: Chunk, wanted: frozenset[int]) -> tuple[int, int]:
+        by_message = self._is_read(chunk, wanted)[1]
+        return chunk.at, chunk.at if by_message else chunk.at + chunk.length + chunk.index_length
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -191,7 +211,11 @@ class McapFile(ChunkedFile):
         end = self._size - len(MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
         footer = self._bytes(max(end, 0), _HEAD_BYTES + _FOOTER_BYTES)
         start = int.from_bytes(footer[9:17], "little")
-        if footer[:1] != bytes([_FOOTER]) or self._stream.read() != MAGIC or not 0 < start <= end:
+        if (
+            footer[:1] != bytes([_FOOTER])
+            or self._bytes(self._size - len(MAGIC), len(MAGIC)) != MAGIC
+            or not 0 < start <= end
+        ):
             return
         if end - start > LARGEST_CHUNK_BYTES:
             return
@@ -216,7 +240,7 @@ class McapFile(ChunkedFile):
         by_place = {chunk.at - _HEAD_BYTES: chunk for chunk in chunks}
         if len(by_place) == len(chunks) and self._reaches_end(by_place):
             return chunks
-        if self._reaches_end(None):
+        if self._source.distant or self._reaches_end(None):
             return None
         standing = []
         for at, chunk in by_place.items():
@@ -236,7 +260,9 @@ class McapFile(ChunkedFile):
         """
         at, left = len(MAGIC), dict(chunks or {})
         while True:
-            opcode, length = self._head(at)
+            listed = left.get(at) if self._source.distant else None
+            # What the index lists there, reading the chunk shows too; asking for each head alone takes minutes.
+            opcode, length = self._head(at) if listed is None else (_CHUNK, listed.length)
             if opcode in (_FOOTER, _DATA_END):
                 return not left
             if opcode == 0 or length > self._size - at - _HEAD_BYTES:
@@ -296,7 +322,7 @@ class McapFile(ChunkedFile):
         needed : where not 0, so many bytes of its records are enough, and are not checked
         """
         length = min(chunk.length, needed + _LARGEST_BLOCK_BYTES) if needed else chunk.length
-        content = self._content(chunk.at, length, space)
+        content = self._content(chunk.at, length, space, chunk.held)
         if len(content) < 40:
             raise DecompressionError("its header is cut off")
         size = int.from_bytes(content[16:24], "little")

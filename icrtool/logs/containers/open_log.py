@@ -5,6 +5,8 @@ from __future__ import annotations
 import stat
 import sys
 from collections.abc import Callable, Generator, Sequence
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from threading import Event
 from typing import BinaryIO
@@ -12,18 +14,24 @@ from typing import BinaryIO
 from icrtool.errors import LogError
 from icrtool.logs.containers.bag_directory import BagDirectory
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems
+from icrtool.logs.containers.chunked_file import NotByRangesError
 from icrtool.logs.containers.mcap_file import McapFile, is_mcap
+from icrtool.logs.containers.remote_file import RemoteFile, fetch_folder
 from icrtool.logs.containers.ros1_bag import Ros1Bag, is_ros1_bag
 from icrtool.logs.containers.split_files import STANDARD_INPUT, inputs_of, split_files
 from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
 from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save, unpack
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
 from icrtool.records.samples import InputFile
+from icrtool.records.urls import UrlPath
 
 MOST_CHANNELS = 2048
 """Topics of a log, each publisher of a ROS 1 bag by itself, that are looked at: some 0.5 ms of time each."""
 
 KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file, also compressed"
+
+
+Plain = BagDirectory | McapFile | Ros1Bag | SqliteBag
 
 
 class UnpackedLog:
@@ -32,15 +40,26 @@ class UnpackedLog:
     Parameters
     ----------
     path : what the user named
-    problem : what went wrong while it was unpacked, empty for nothing
+    log : file on disk, unpacked first where it is packed
     inputs : what was read, where that is known
+    transfer : how it came over a connection
+    share : called with the share of the file that was unpacked
     """
 
     def __init__(
-        self, path: Path, log: Path, scratch: ScratchFolder, problem: str = "", inputs: tuple[InputFile, ...] = ()
+        self,
+        path: Path,
+        log: Path,
+        scratch: ScratchFolder,
+        inputs: tuple[InputFile, ...] = (),
+        transfer: str = "",
+        share: Callable[[float], None] | None = None,
     ) -> None:
-        self._path, self._scratch, self._inputs = path, scratch, inputs
+        self._path, self._scratch, self._inputs, self._transfer = path, scratch, inputs, transfer
+        problem = ""
         try:
+            if _is_packed_file(log):
+                log, problem = unpack(log, scratch.path / "unpacked", share)
             self._log = _plain_log(log)
         except LogError as err:
             # Its own path is gone when the user reads this.
@@ -69,6 +88,10 @@ class UnpackedLog:
         """Return the file that the user named, with its SHA-256."""
         return self._inputs or inputs_of([self._path], ended)
 
+    def transfer(self) -> str:
+        """Return how it came over a connection."""
+        return self._transfer
+
     def span_ns(self) -> tuple[int, int] | None:
         """Return first and last log time."""
         return self._log.span_ns()
@@ -84,11 +107,11 @@ class UnpackedLog:
 
 
 def open_log(path: Path, share: Callable[[float], None] | None = None) -> Container:
-    """Return the opened container at a path; ``-``: of what comes on standard input.
+    """Return the opened container at a path or an address; ``-``: of what comes on standard input.
 
     Parameters
     ----------
-    share : called with the share of a packed log that was unpacked
+    share : called with the share of a log that was fetched or unpacked
 
     Raises
     ------
@@ -104,21 +127,49 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
 
 
 def _open(path: Path, share: Callable[[float], None] | None) -> Container:
+    if isinstance(path, UrlPath):
+        return _open_remote(path, share)
     if path != STANDARD_INPUT and not _is_packed_file(path):
         return _plain_log(path)
     scratch = ScratchFolder()
     try:
         if path != STANDARD_INPUT:
-            log, problem = unpack(path, scratch.path, share)
-            return UnpackedLog(path, log, scratch, problem)
+            return UnpackedLog(path, path, scratch, share=share)
         if sys.stdin.isatty():
             raise LogError(path, "standard input is a terminal", "pipe a log into it, or name one")
-        log, problem = scratch.path / "stdin", ""
+        log = scratch.path / "stdin"
         digest = save(sys.stdin.buffer, log)
-        inputs = (InputFile(str(path), log.stat().st_size, digest),)
-        if _is_packed_file(log):
-            log, problem = unpack(log, scratch.path / "unpacked")
-        return UnpackedLog(path, log, scratch, problem, inputs)
+        return UnpackedLog(path, log, scratch, (InputFile(str(path), log.stat().st_size, digest),))
+    except BaseException:
+        scratch.close()
+        raise
+
+
+def _open_remote(path: UrlPath, share: Callable[[float], None] | None) -> Container:
+    """Return the container at an address: read by ranges where it has an index, else fetched to a temporary folder."""
+    remote = RemoteFile(path)
+    why = "a folder"
+    if not remote.is_folder:
+        start = remote.read_at(0, 512) if remote.has_ranges else b""
+        kind = container_of(BytesIO(start))
+        if kind in {McapFile, Ros1Bag}:
+            with suppress(NotByRangesError):
+                opened = McapFile(path, source=remote) if kind is McapFile else Ros1Bag(path, remote)
+                return _usable(opened, path)
+        elif remote.has_ranges and kind is None and not is_packed(start):
+            raise LogError(path, "not a log", f"a log is {KINDS}")
+        why = "it has no index" if kind in {McapFile, Ros1Bag} else "an SQLite file" if kind else "it is packed"
+        why = why if remote.has_ranges else "its server gives no parts of a file"
+    scratch = ScratchFolder()
+    try:
+        log = scratch.path / (path.name or "log")
+        if remote.is_folder:
+            log.mkdir()
+            inputs = fetch_folder(path, log, share)
+        else:
+            inputs = (remote.fetch(log, share),)
+        size = sum(one.bytes for one in inputs) / 1e6
+        return UnpackedLog(path, log, scratch, inputs, f"{size:.3g} MB fetched to a temporary folder: {why}")
     except BaseException:
         scratch.close()
         raise
@@ -132,9 +183,13 @@ def _is_packed_file(path: Path) -> bool:
         return is_packed(stream.read(512))
 
 
-def _plain_log(path: Path) -> BagDirectory | McapFile | Ros1Bag | SqliteBag:
+def _plain_log(path: Path) -> Plain:
     """Return the container of a log that is not packed."""
-    container = _container_at(path)
+    return _usable(_container_at(path), path)
+
+
+def _usable(container: Plain, path: Path) -> Plain:
+    """Return a container with the channels that are looked at; refuse one without any."""
     if (count := len(container.channels)) > MOST_CHANNELS:
         kept = sorted(container.channels, key=lambda channel: -(channel.count or 0))[:MOST_CHANNELS]
         container.channels = sorted(kept, key=lambda channel: channel.id)
@@ -145,11 +200,11 @@ def _plain_log(path: Path) -> BagDirectory | McapFile | Ros1Bag | SqliteBag:
     return container
 
 
-def _problems_of(container: BagDirectory | McapFile | Ros1Bag | SqliteBag) -> Problems:
+def _problems_of(container: Plain) -> Problems:
     return container.own_problems if isinstance(container, BagDirectory) else container.problems
 
 
-def _container_at(path: Path) -> BagDirectory | McapFile | Ros1Bag | SqliteBag:
+def _container_at(path: Path) -> Plain:
     if files := split_files(path):
         return BagDirectory(path, files)
     if stat.S_ISDIR(path.stat().st_mode):

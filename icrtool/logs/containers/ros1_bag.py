@@ -13,13 +13,18 @@ from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import CUT_OFF, Block, Channel, ros_type_name
 from icrtool.logs.containers.chunked_file import Chunk, ChunkedFile, Spaces
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Packed, Space
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, STORED, DecompressionError, Packed, Space
 from icrtool.logs.containers.record_table import BAG_CONNECTION, Records, scan_bag
+from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
 _BAG_HEADER, _INDEX_DATA, _CHUNK, _CHUNK_INFO = 3, 4, 5, 6
 _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
+_HEADER_BYTES = 1 << 12
+"""Of a chunk that are read to learn how it is compressed, where it may be read in part."""
+
+NO_PLACES: Ints = np.empty(0, np.int64)
 _MOST_FIELDS = 100
 """Of a header; real ones have ten at most."""
 
@@ -56,9 +61,10 @@ class Ros1Bag(ChunkedFile):
         Not a bag of version 2.0, or encrypted.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, source: Source | None = None) -> None:
+        super().__init__(path, source)
         self._connections: dict[int, Channel] = {}
+        self._stored: bool | None = None
         try:
             self._check_start()
             self._chunks: list[Chunk] | None = self._read_index()
@@ -70,16 +76,45 @@ class Ros1Bag(ChunkedFile):
             raise
         self.channels = list(self._connections.values())
 
-    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:  # noqa: ARG002 - all its records are read
+    def _span(self, chunk: Chunk, wanted: frozenset[int]) -> tuple[int, int]:
+        partly = chunk.channels is not None and not chunk.channels <= wanted
+        if partly and self._stored is None:
+            # One compression for all, as recorders write; where a chunk has another, that is found when it is read.
+            first = self._record(chunk.at)
+            self._stored = first is not None and _chunk_of(first).compression in STORED
+        return chunk.at, chunk.at + (0 if partly and self._stored else chunk.index_length)
+
+    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:
+        held, partly = None, chunk.channels is not None and not chunk.channels <= wanted
+        if self._source.distant and chunk.index_length <= 2 * LARGEST_CHUNK_BYTES:
+            in_part = partly and self._stored
+            held = self._source.hold(
+                chunk.at, min(_HEADER_BYTES, chunk.index_length) if in_part else chunk.index_length
+            )
         record = self._record(chunk.at)
         if record is None or record.op != _CHUNK:
             return chunk._replace(size=-1)
-        end = record.at + record.length
-        index = self._bytes(end, min(max(chunk.at + chunk.index_length - end, 0), LARGEST_CHUNK_BYTES))
-        return _chunk_of(record)._replace(messages=_message_index(index))
+        found, end = _chunk_of(record), record.at + record.length
+        stored = found.compression in STORED
+        index_length = min(max(chunk.at + chunk.index_length - end, 0), LARGEST_CHUNK_BYTES)
+        if held is not None and partly:
+            self._mixed |= not stored
+            held = self._source.hold(*((end, index_length) if stored else (chunk.at, chunk.index_length)))
+        index = self._bytes(end, index_length)
+        places, connections = _message_index(index)
+        found = found._replace(messages=places, held=held)
+        if held is None or not partly or not stored or places is None or not 0 < found.size == record.length:
+            return found
+        ends = np.append(places[1:], found.size)
+        rows = np.isin(connections, list(wanted))
+        if not rows.any() or (ends <= places).any() or places[0] < 0:
+            return found
+        sizes = (ends - places)[rows]
+        records = self._source.gather(found.at, np.stack([places[rows], ends[rows]]))
+        return found._replace(messages=np.cumsum(sizes) - sizes, records=records)
 
     def _check_start(self) -> None:
-        start = self._stream.read(len(MAGIC))
+        start = self._bytes(0, len(MAGIC))
         if start[:9] == MAGIC[:9] and start != MAGIC:
             raise LogError(
                 self._path, "a bag of another version", "only 2.0 can be read; `rosbag fix` converts older ones"
@@ -161,7 +196,9 @@ class Ros1Bag(ChunkedFile):
     def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False) -> Packed:
         if chunk.size < 0:
             raise DecompressionError("no chunk")
-        return Packed(self._content(chunk.at, chunk.length, space), chunk.compression, chunk.size, partial=cut)
+        return Packed(
+            self._content(chunk.at, chunk.length, space, chunk.held), chunk.compression, chunk.size, partial=cut
+        )
 
     def _scan(self, data: Bytes, begin: int, hint: Ints | None = None) -> Records:
         return scan_bag(data, begin, hint)
@@ -189,18 +226,29 @@ def _chunk_of(record: _Record) -> Chunk:
     return Chunk(record.at, record.length, size=record.number(b"size"), compression=record.text(b"compression"))
 
 
-def _message_index(index: bytes) -> Ints | None:
-    """Return where in its records the messages of a chunk begin (n,), ascending; None where that is not known."""
-    places, at = [], 0
+def _message_index(index: bytes) -> tuple[Ints | None, Ints]:
+    """Return where in its records the messages of a chunk begin (n,), ascending, and their connections (n,).
+
+    None where that is not known.
+    """
+    keys, at = [], 0
     while at + 8 <= len(index):
         content = at + 8 + int.from_bytes(index[at : at + 4], "little")
         length = int.from_bytes(index[content - 4 : content], "little")
         entries = index[content : content + length]
-        if len(entries) < length or _header_fields(index[at + 4 : content - 4]).get(b"op") != bytes([_INDEX_DATA]):
-            return None
-        places.append(np.frombuffer(entries[: length // 12 * 12], "<u4")[2::3])
+        fields = _header_fields(index[at + 4 : content - 4])
+        if len(entries) < length or fields.get(b"op") != bytes([_INDEX_DATA]):
+            return None, NO_PLACES
+        places = np.frombuffer(entries[: length // 12 * 12], "<u4")[2::3]
+        # Sorted together, as one number.
+        keys.append(
+            (places.astype(np.uint64) << np.uint64(32)) | int.from_bytes(fields.get(b"conn", b"")[:4], "little")
+        )
         at = content + length
-    return np.sort(np.concatenate(places), kind="stable").astype(np.int64) if places else None
+    if not keys:
+        return None, NO_PLACES
+    joined = np.sort(np.concatenate(keys), kind="stable")
+    return (joined >> np.uint64(32)).astype(np.int64), (joined & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
 def _header_fields(header: bytes) -> dict[bytes, bytes]:

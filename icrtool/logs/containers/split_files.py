@@ -16,6 +16,7 @@ from typing import NamedTuple
 from icrtool.logs.containers.one_recording import LOG_SUFFIXES, unpacked_name
 from icrtool.records.regular_file import open_regular
 from icrtool.records.samples import InputFile
+from icrtool.records.urls import UrlPath
 
 _NAME = re.compile(r"^(|.*?[_\-. ])((?:19|20)\d\d[\d_.\-T]*|\d+)(\.[A-Za-z]\w*)$")
 """What comes before a count or a date, the count or date (and count), the suffix."""
@@ -98,7 +99,7 @@ def log_name(path: Path) -> str:
     if path == STANDARD_INPUT:
         return "stdin"
     files = split_files(path)
-    named = Path(os.path.normpath((files[0] if files else path).absolute()))
+    named = path if isinstance(path, UrlPath) else Path(os.path.normpath((files[0] if files else path).absolute()))
     name = named.name
     if not named.is_dir():
         plain = unpacked_name(name)

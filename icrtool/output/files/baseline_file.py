@@ -118,7 +118,7 @@ def read_report(path: Path, log: str = "", inside: Path | None = None) -> Baseli
         run = document["run"]
         if not document["schema"].startswith(SCHEMA_FAMILY):
             raise ValueError(document["schema"])
-        content = tuple(str(one["sha256"]) for one in run["inputs"])
+        content = _known(one["sha256"] for one in run["inputs"])
         return BaselineReport(
             escaped(log or run["log"]), str(path), content, escaped(document["tool_version"]), dict(run["config"]),
             dict(_rows(document)),
@@ -161,8 +161,14 @@ def _fleet_baseline(path: Path) -> Baseline:
     present = {log: found for log, found in logs.items() if is_regular(found[0], path)}
     if not present:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
-    files = {log: tuple(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
+    files = {log: _known(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
     return Baseline(path, {log: file for log, (file, _) in present.items()}, files, (path / FLEET_FILE,))
+
+
+def _known(content: Iterable[str | None]) -> tuple[str, ...]:
+    """Return the SHA-256 of the files of a log; none where one is not known."""
+    found = tuple(content)
+    return () if None in found else tuple(map(str, found))
 
 
 def _report_files(path: Path) -> list[Path]:

@@ -22,9 +22,10 @@ FLEET_FAMILY = "icrtool/fleet/"
 
 
 class InputFile(msgspec.Struct, frozen=True):
-    """A file that was read: what identifies its content."""
+    """A file that was read: what identifies its content, None where not all of it was read, and its place."""
 
-    sha256: str
+    sha256: str | None
+    path: str = ""
 
 
 class FleetLog(msgspec.Struct, frozen=True):

@@ -86,6 +86,8 @@ def _holds_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
             f"{counted(len(survey.channels), 'topic')}, {size / 1e6:.3g} MB in {counted(len(survey.inputs), 'file')}"
         )
         yield "log", f"{survey.name}: {holds}"
+        if survey.transfer:
+            yield "read", survey.transfer
     elif log is not None:
         yield "log", f"{log.name}: table"
 

@@ -1,0 +1,318 @@
+"""Files in object stores and on web servers, by fsspec: found by folder and pattern, read by ranges, or fetched whole.
+
+The one place that opens connections, and only for an address that the user, or his manifest, names. Credentials are
+those that the provider's own library finds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Event, local
+from typing import Any, TypeVar
+
+import numpy as np
+
+from icrtool.errors import LogError
+from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.logs.containers.one_recording import LOG_SUFFIXES, natural_order, unpacked_name
+from icrtool.logs.containers.source import NEAR_BYTES, Held
+from icrtool.records.samples import InputFile
+from icrtool.records.urls import UrlPath, place_of, without_secrets
+
+Result = TypeVar("Result")
+
+_NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
+          "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
+"""The library that each kind of address is read with."""
+
+_LEAST_BYTES = 1 << 18
+"""That are read at once: the records of an index follow one another."""
+
+_PIECE_BYTES, PIECES_AHEAD = 1 << 24, 4
+_PAUSES_S = (0.5, 2.0)
+"""Before a request to a web server is made again; the libraries of object stores do so themselves."""
+
+_FAILURES = (
+    ("botocore.exceptions", "BotoCoreError"), ("botocore.exceptions", "ClientError"), ("aiohttp", "ClientError"),
+    ("google.auth.exceptions", "GoogleAuthError"), ("gcsfs.retry", "HttpError"),
+    ("azure.core.exceptions", "AzureError"), ("fsspec.exceptions", "FSTimeoutError"),
+)  # fmt: skip
+"""What libraries raise beside OSError, where they are loaded."""
+
+
+class RemoteFile:
+    """A file behind a connection.
+
+    Raises
+    ------
+    LogError
+        It is not there, must not be read, or is a folder; or the library for it is missing.
+    """
+
+    distant = True
+
+    def __init__(self, path: UrlPath) -> None:
+        self._path = path
+        self._files, self._name = _filesystem(path)
+        about = _asked(path, lambda: self._files.info(self._name))
+        self.is_folder = about.get("type") == "directory"
+        self.size = int(about.get("size") or 0)
+        self.has_ranges = self._finds_ranges(about)
+        self._about = about
+        self._bytes_read = 0
+        self._start: Held | None = None
+        self._held = local()
+
+    def _finds_ranges(self, about: dict[str, Any]) -> bool:
+        """Return whether the server gives parts of the file."""
+        if self.is_folder or not self.size or about.get("partial") is False:
+            return False
+        if not self._path.scheme.startswith("http"):
+            return True
+        return _asked(self._path, self._gives_last_byte)
+
+    def _gives_last_byte(self) -> bool:
+        try:
+            with self._files.open(self._name, block_size=_LEAST_BYTES, cache_type="none") as file:
+                file.seek(self.size - 1)
+                return len(file.read(1)) == 1
+        except ValueError:
+            return False
+
+    def read_at(self, at: int, count: int) -> bytes:
+        """Return bytes of the file, as many as there are."""
+        end = min(at + count, self.size)
+        held = next((one for one in (self._start, self._last) if _has(one, at, end)), None)
+        if held is None:
+            # What stands at the end of a file is read from its footer backwards.
+            first = max(min(at, self.size - _LEAST_BYTES), 0)
+            held = self.hold(first, max(end - first, _LEAST_BYTES))
+            self._start = self._start if at else held
+        return held.data[at - held.at : end - held.at]
+
+    @property
+    def _last(self) -> Held | None:
+        """What this thread read last."""
+        return getattr(self._held, "last", None)
+
+    def read_into(self, at: int, space: Bytes) -> int:
+        """Fill some space with bytes of the file, and return how many there are."""
+        data = self._range(at, len(space))
+        space[: len(data)] = np.frombuffer(data, np.uint8)
+        return len(data)
+
+    def hold(self, at: int, count: int) -> Held:
+        """Return bytes that `read_at` gives to this thread without another request."""
+        held = self._last
+        if held is not None and _has(held, at, min(at + count, self.size)):
+            return held
+        held = Held(at, self._range(at, count))
+        self._held.last = held
+        return held
+
+    def gather(self, at: int, ranges: Ints) -> bytes:
+        """Return what stands in several ranges (2, n) behind a place, one after the other."""
+        far = np.append(True, ranges[0, 1:] - ranges[1, :-1] > NEAR_BYTES)
+        begins, ends = at + ranges[0, far], at + ranges[1, np.append(far[1:], True)]
+        pieces: list[bytes] = _asked(
+            self._path, lambda: self._files.cat_ranges([self._name] * len(begins), begins.tolist(), ends.tolist())
+        )
+        self._bytes_read += sum(map(len, pieces))
+        part = np.cumsum(far) - 1
+        offsets = (at + ranges - begins[part]).T.tolist()
+        return b"".join(pieces[one][first:last] for one, (first, last) in zip(part.tolist(), offsets, strict=True))
+
+    def _range(self, at: int, count: int) -> bytes:
+        end = min(at + count, self.size)
+        if at >= end:
+            return b""
+        data = _asked(self._path, lambda: self._files.cat_file(self._name, start=at, end=end))
+        if len(data) != end - at:
+            raise LogError(self._path, f"gave {len(data)} bytes for {end - at}", "is it being written?")
+        self._bytes_read += len(data)
+        return bytes(data)
+
+    def pieces(self) -> Iterator[bytes]:
+        """Yield the content from start to end; the next pieces are read meanwhile."""
+        if not self.has_ranges:
+            with _asked(self._path, lambda: self._files.open(self._name, block_size=0)) as stream:
+                while piece := _asked(self._path, lambda: stream.read(_PIECE_BYTES), again=False):
+                    yield piece
+            return
+        with ThreadPoolExecutor(PIECES_AHEAD) as pool:
+            places = range(0, self.size, _PIECE_BYTES)
+            pending = [pool.submit(self._range, at, _PIECE_BYTES) for at in places[:PIECES_AHEAD]]
+            for number in range(len(places)):
+                piece = pending.pop(0).result()
+                if number + PIECES_AHEAD < len(places):
+                    pending.append(pool.submit(self._range, places[number + PIECES_AHEAD], _PIECE_BYTES))
+                yield piece
+
+    def fetch(self, place: Path, share: Callable[[float], None] | None) -> InputFile:
+        """Write the file to a place on disk, and return what run.json states about it.
+
+        Raises
+        ------
+        LogError
+            It cannot be read to its end.
+        OSError
+            The disk is full.
+        """
+        digest, written = hashlib.sha256(), 0
+        with place.open("wb") as sink:
+            for piece in self.pieces():
+                sink.write(piece)
+                digest.update(piece)
+                written += len(piece)
+                if share is not None:
+                    share(min(written / max(self.size, 1), 1.0))
+        return InputFile(str(self._path), written, digest.hexdigest(), **self.version)
+
+    @property
+    def version(self) -> dict[str, str]:
+        """What the store states about the content: ``version``, or else ``etag``; none where it states neither."""
+        for key, names in (("version", ("VersionId", "generation")), ("etag", ("ETag", "etag", "Last-Modified"))):
+            stated = next((str(self._about[name]) for name in names if self._about.get(name)), "null")
+            if stated != "null":
+                return {key: stated.strip('"')}
+        return {}
+
+    def inputs(self, ended: Event) -> tuple[InputFile, ...]:  # noqa: ARG002 - nothing is read for it
+        """Return the file without a SHA-256: not all of it is read."""
+        return (InputFile(str(self._path), self.size, None, **self.version),)
+
+    def transfer(self) -> str:
+        """Return how much was read."""
+        return f"{self._bytes_read / 1e6:.3g} of {self.size / 1e6:.3g} MB read by ranges"
+
+    def close(self) -> None:
+        """Forget what is held."""
+        self._held = local()
+
+
+def _has(held: Held | None, at: int, end: int) -> bool:
+    return held is not None and held.at <= at and end <= held.at + len(held.data)
+
+
+def find(path: UrlPath) -> list[UrlPath]:
+    """Return the logs that an address stands for: itself, what its pattern matches, or the recordings below a folder.
+
+    Raises
+    ------
+    LogError
+        There are none, or they cannot be listed.
+    """
+    address = without_secrets(path.url) if path.scheme.startswith("http") else path.url
+    if not re.search(r"[*\[]" if path.scheme.startswith("http") else r"[*?\[]", address):
+        one = RemoteFile(path)
+        found = _below(path) if one.is_folder else [path]
+        if not found:
+            raise LogError(
+                path, "no recording in it", f"a log has one of the suffixes {', '.join(sorted(LOG_SUFFIXES))}"
+            )
+        return found
+    files, name = _filesystem(path)
+    matched: dict[str, Any] = _asked(path, lambda: files.glob(name, detail=True))
+    found = []
+    for inner, about in matched.items():
+        one_path = _address(files.unstrip_protocol(inner), path)
+        found += _below(one_path) if about.get("type") == "directory" else [one_path]
+    if not found:
+        raise LogError(path, "matches nothing")
+    return sorted(set(found), key=natural_order)
+
+
+def _below(folder: UrlPath) -> list[UrlPath]:
+    """Return the recordings below a folder, by their names: bag directories, and files of no bag directory."""
+    files, name = _filesystem(folder)
+    names: list[str] = _asked(folder, lambda: files.find(name))
+    bags = {one.rpartition("/")[0] for one in names if one.endswith("/metadata.yaml")}
+    logs = {one for one in names if Path(unpacked_name(one.rpartition("/")[2])).suffix in LOG_SUFFIXES}
+    found = {parent if (parent := one.rpartition("/")[0]) in bags else one for one in logs}
+    return sorted((_address(files.unstrip_protocol(one), folder) for one in found), key=natural_order)
+
+
+def fetch_folder(path: UrlPath, place: Path, share: Callable[[float], None] | None) -> tuple[InputFile, ...]:
+    """Write the storage files and metadata.yaml of a bag directory to a folder on disk.
+
+    Raises
+    ------
+    LogError
+        They cannot be read.
+    """
+    files, name = _filesystem(path)
+    names: list[str] = _asked(path, lambda: files.ls(name, detail=False))
+    bag = [one for one in names if re.search(r"\.(mcap|db3|bag)\b|metadata\.yaml$", one.rpartition("/")[2])]
+    if not bag:
+        raise LogError(path, "no recording in it", "name a log in it")
+    inputs = []
+    for number, one in enumerate(bag):
+        part = (lambda done, before=number: share((before + done) / len(bag))) if share is not None else None
+        remote = RemoteFile(_address(files.unstrip_protocol(one), path))
+        inputs.append(remote.fetch(place / Path(one).name, part))
+    return tuple(one for one in inputs if not one.path.endswith("metadata.yaml"))
+
+
+def _address(url: str, asked_for: UrlPath) -> UrlPath:
+    """Return an address that was found, with the query of the one that was asked for, where a web server needs it."""
+    query = asked_for.url.partition("?")[2] if asked_for.scheme.startswith("http") else ""
+    found = place_of(f"{url}?{query}" if query and "?" not in url else url)
+    if not isinstance(found, UrlPath):
+        raise LogError(asked_for, "is no address", str(found))
+    return found
+
+
+def _filesystem(path: UrlPath) -> tuple[Any, str]:
+    """Return the fsspec file system of an address, and the name of the file in it."""
+    needed = _NEEDS.get(path.scheme)
+    extra = "http" if needed == "aiohttp" else "cloud"
+    try:
+        import fsspec
+        from fsspec.core import url_to_fs
+
+        fsspec.get_filesystem_class(path.scheme)
+    except ImportError as err:
+        raise LogError(path, f"needs {needed or err}", f"pip install 'icrtool[{extra}]'") from err
+    except ValueError as err:
+        raise LogError(
+            path, f"{path.scheme}:// is no kind of address that can be read", "try s3, gs, az or https"
+        ) from err
+    found: tuple[Any, str] = _asked(path, lambda: url_to_fs(path.url))
+    return found
+
+
+def _asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True) -> Result:
+    """Return the answer to a request, made again where the connection broke.
+
+    Raises
+    ------
+    LogError
+        The file is not there, must not be read, or the connection stays broken.
+    """
+    pauses = list(_PAUSES_S) if again and path.scheme.startswith("http") else []
+    while True:
+        try:
+            return ask()
+        except _failures() as err:
+            # fsspec calls every failure of a web server a file that is not there, and names the true one as its cause.
+            cause = err.__cause__ if isinstance(err, FileNotFoundError) and err.__cause__ is not None else err
+            status = getattr(cause, "status", None)
+            if isinstance(cause, FileNotFoundError) or status == 404:
+                raise LogError(path, "no such file") from None
+            refused = isinstance(cause, PermissionError | ValueError) or status in {401, 403}
+            if refused or not pauses:
+                why = "may not be read" if refused else "cannot be read"
+                raise LogError(path, why, without_secrets(str(cause) or type(cause).__name__)) from None
+            time.sleep(pauses.pop(0))
+
+
+def _failures() -> tuple[type[Exception], ...]:
+    """Return what a broken connection or a refused request is raised as."""
+    loaded = [getattr(sys.modules.get(module), name, None) for module, name in _FAILURES]
+    return (OSError, ValueError, *(one for one in loaded if one is not None))

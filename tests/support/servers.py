@@ -1,0 +1,142 @@
+"""Servers on this machine's loopback: files over HTTP with ranges, and a proxy that counts bytes and breaks."""
+
+from __future__ import annotations
+
+import re
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+
+@dataclass
+class FileServer:
+    """Files of a folder over HTTP.
+
+    Attributes
+    ----------
+    ranges : whether it gives parts of a file
+    token : of the query without which nothing is given
+    broken : answers that will end in the middle
+    sent : bytes of content
+    """
+
+    folder: Path
+    ranges: bool = True
+    token: str = ""
+    broken: int = 0
+    sent: int = 0
+    url: str = ""
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+@contextmanager
+def file_server(folder: Path, **options: object) -> Iterator[FileServer]:
+    """Serve a folder until the block ends."""
+    serving = FileServer(folder, **options)
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_HEAD(self) -> None:
+            self.answer(body=False)
+
+        def do_GET(self) -> None:
+            self.answer(body=True)
+
+        def answer(self, *, body: bool) -> None:
+            address = urlsplit(self.path)
+            file = serving.folder / unquote(address.path).lstrip("/")
+            if serving.token not in address.query:
+                return self.send_error(403)
+            if not file.is_file():
+                return self.send_error(404)
+            first, last = 0, file.stat().st_size - 1
+            part = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", "")) if serving.ranges else None
+            if part is not None:
+                first, last = int(part[1]), min(int(part[2]), last)
+            self.send_response(206 if part is not None else 200)
+            self.send_header("Content-Length", str(last - first + 1))
+            self.send_header("ETag", f'"{file.stat().st_mtime_ns}"')
+            if part is not None:
+                self.send_header("Content-Range", f"bytes {first}-{last}/{file.stat().st_size}")
+            self.end_headers()
+            if not body:
+                return None
+            with file.open("rb") as stream, suppress(OSError):
+                stream.seek(first)
+                left = last - first + 1
+                with serving.lock:
+                    breaks, serving.broken = serving.broken > 0, max(serving.broken - 1, 0)
+                if breaks:
+                    self.wfile.write(stream.read(left // 2))
+                    self.close_connection = True
+                    self.connection.shutdown(socket.SHUT_RDWR)
+                    return None
+                while piece := stream.read(min(left, 1 << 20)):
+                    left -= len(piece)
+                    with serving.lock:
+                        serving.sent += len(piece)
+                    self.wfile.write(piece)
+            return None
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    serving.url = f"http://127.0.0.1:{server.server_port}"
+    try:
+        yield serving
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@dataclass
+class Proxy:
+    """A port that passes everything on to another one; `received` counts the bytes that came back."""
+
+    port: int = 0
+    received: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+@contextmanager
+def counting_proxy(target: int) -> Iterator[Proxy]:
+    """Listen on a new port, and pass on to `target`, until the block ends."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    proxy = Proxy(listening.getsockname()[1])
+
+    def pass_on(source: socket.socket, sink: socket.socket, *, count: bool) -> None:
+        with suppress(OSError):
+            while data := source.recv(1 << 16):
+                if count:
+                    with proxy.lock:
+                        proxy.received += len(data)
+                sink.sendall(data)
+        for one in (source, sink):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+        if count:
+            source.close()
+            sink.close()
+
+    def serve() -> None:
+        with suppress(OSError):
+            while True:
+                client, _ = listening.accept()
+                server = socket.create_connection(("127.0.0.1", target))
+                for pair in ((client, server, False), (server, client, True)):
+                    threading.Thread(target=pass_on, args=pair[:2], kwargs={"count": pair[2]}, daemon=True).start()
+
+    threading.Thread(target=serve, daemon=True).start()
+    try:
+        yield proxy
+    finally:
+        listening.close()

@@ -1,0 +1,364 @@
+"""Logs in an object store (moto's server, with s3fs) and on a web server: equal to the file, few bytes, no secrets."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
+
+from icrtool.cli import main
+from icrtool.errors import LogError
+from icrtool.fleet.manifest import read_manifest
+from icrtool.fleet.recordings import find_recordings
+from icrtool.fleet.roll_up import _content
+from icrtool.fleet.row import File
+from icrtool.logs.containers import remote_file
+from icrtool.logs.containers.channel import Block
+from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.containers.remote_file import find
+from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.read_log import read_log
+from icrtool.records.urls import UrlPath, place_of, without_secrets
+from support.servers import counting_proxy, file_server
+
+SAMPLES = Path(__file__).parents[3] / "sample_logs"
+MCAP, BAG, DIRECTORY = (
+    SAMPLES / name for name in ("wheeled_lawnmower.mcap", "tracked_curved.bag", "wheeled_figure_eight")
+)
+DB3 = DIRECTORY / "wheeled_figure_eight.db3"
+PICTURE_BYTES = 400_000
+TOKEN = "sig=d0ntPr1ntTh1s"
+ROBOT = ("--robot", "segway-rmp400")
+pytest.importorskip("fsspec", reason="needs the extra icrtool[cloud]")
+pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="servers as threads of this process")
+
+
+@pytest.fixture(scope="module")
+def store():
+    """A bucket `field` with the sample logs, behind a proxy that counts bytes; credentials as a user sets them."""
+    pytest.importorskip("s3fs", reason="needs the extra icrtool[cloud]")
+    server_module = pytest.importorskip("moto.server", reason="needs moto, of the extra icrtool[dev]")
+    import boto3
+
+    server = server_module.ThreadedMotoServer(port=0, verbose=False)
+    server.start()
+    _, port = server.get_host_and_port()
+    with counting_proxy(port) as proxy, pytest.MonkeyPatch.context() as patch:
+        for name, value in {
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{proxy.port}", "AWS_ACCESS_KEY_ID": "testing",
+            "AWS_SECRET_ACCESS_KEY": "d0ntPr1ntTh1s", "AWS_DEFAULT_REGION": "us-east-1",
+        }.items():  # fmt: skip
+            patch.setenv(name, value)
+        client = boto3.client("s3")
+        client.create_bucket(Bucket="field")
+        for name, file in {
+            "mon/a.mcap": MCAP, "tue/b.bag": BAG,
+            "wed/c/c.db3": DB3, "wed/c/metadata.yaml": DIRECTORY / "metadata.yaml",
+        }.items():  # fmt: skip
+            client.upload_file(str(file), "field", name)
+        client.put_object(Bucket="field", Key="packed/d.mcap.gz", Body=gzip.compress(MCAP.read_bytes()))
+        client.put_object(Bucket="field", Key="notes.txt", Body=b"no log")
+        proxy.client = client
+        yield proxy
+        client.close()
+    server.stop()
+
+
+@pytest.fixture
+def fresh(store):
+    """Forget what s3fs knows of the bucket."""
+    import s3fs
+
+    s3fs.S3FileSystem.clear_instance_cache()
+    return store
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    container = open_log(path)
+    try:
+        topics = {channel.id: str(channel.topic) for channel in container.channels}
+        return [
+            (topics[channel], time_ns, block.data[start:end].tobytes())
+            for block in container.blocks(frozenset(topics))
+            for channel, time_ns, start, end in zip(*(column.tolist() for column in block[1:]), strict=True)
+        ]
+    finally:
+        container.close()
+
+
+@pytest.mark.parametrize(
+    ("key", "file"),
+    [("mon/a.mcap", MCAP), ("tue/b.bag", BAG), ("wed/c/c.db3", DB3), ("wed/c", DIRECTORY), ("packed/d.mcap.gz", MCAP)],
+)
+def test_a_log_in_a_bucket_has_the_messages_of_the_file(fresh, key, file):
+    assert messages(UrlPath(f"s3://field/{key}")) == messages(file)
+
+
+@pytest.mark.parametrize("file", [MCAP, BAG, DB3])
+@pytest.mark.parametrize("ranges", [True, False])
+def test_a_log_on_a_web_server_has_the_messages_of_the_file_with_and_without_ranges(file, ranges):
+    with file_server(file.parent, ranges=ranges, token=TOKEN) as server:
+        url = UrlPath(f"{server.url}/{file.name}?{TOKEN}")
+        assert messages(url) == messages(file)
+        container = open_log(url)
+        (found,) = container.inputs(Event())
+        container.close()
+    by_ranges = ranges and file != DB3
+    assert found.sha256 == (None if by_ranges else hashlib.sha256(file.read_bytes()).hexdigest())
+    assert (found.bytes, found.etag) == (file.stat().st_size, str(file.stat().st_mtime_ns))
+    assert TOKEN not in repr(found)
+
+
+def drive(path: Path, *, size: int, compression: CompressionType, chunk_size: int, apart: bool) -> None:
+    """Write an MCAP of small messages on one topic and pictures of 400 kB on another.
+
+    Parameters
+    ----------
+    apart : pictures are in chunks of their own
+    """
+    rng = np.random.default_rng(1)
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=compression, chunk_size=chunk_size)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        small, large = (writer.register_channel(name, "cdr", schema) for name in ("/small", "/camera"))
+        for number in range(size // PICTURE_BYTES):
+            for part in range(10):
+                # By their times alone, chunks of one topic follow those of the other.
+                writer.add_message(small, number * 1000 + part, bytes([part] * 100), number * 1000 + part)
+            if apart:
+                writer._Writer__finalize_chunk()
+            writer.add_message(large, number * 1000 + 500, rng.bytes(PICTURE_BYTES), number * 1000 + 500)
+            if apart:
+                writer._Writer__finalize_chunk()
+        writer.finish()
+
+
+def bag(path: Path, *, size: int) -> None:
+    """Write a bag without compression, of small messages and pictures."""
+    types = get_typestore(Stores.ROS1_NOETIC)
+    rng = np.random.default_rng(1)
+    with BagWriter(path) as writer:
+        small, large = (writer.add_connection(n, "std_msgs/msg/String", typestore=types) for n in ("/small", "/camera"))
+        for number in range(size // PICTURE_BYTES):
+            for part in range(10):
+                writer.write(small, number * 1000 + part + 1, bytes([part] * 100))
+            writer.write(large, number * 1000 + 500, rng.bytes(PICTURE_BYTES))
+
+
+def small_ones(path: Path) -> tuple[list[bytes], str]:
+    container = open_log(path)
+    number = next(one.id for one in container.channels if one.topic == "/small")
+    found = [text for block in container.blocks(frozenset({number})) for text in texts_of(block, number)]
+    words = container.transfer()
+    container.close()
+    return found, words
+
+
+def texts_of(block: Block, number: int) -> list[bytes]:
+    rows = np.flatnonzero(block.channel == number)
+    return [block.data[block.start[row] : block.end[row]].tobytes() for row in rows]
+
+
+LAYOUTS = {
+    "own chunks": {"compression": CompressionType.ZSTD, "chunk_size": 1 << 20, "apart": True},
+    "no compression": {"compression": CompressionType.NONE, "chunk_size": 4 << 20, "apart": False},
+    "mixed": {"compression": CompressionType.ZSTD, "chunk_size": 4 << 20, "apart": False},
+}
+
+
+@pytest.mark.parametrize("megabytes", [64, pytest.param(1000, marks=pytest.mark.stress)])
+@pytest.mark.parametrize("layout", [*LAYOUTS, "bag"])
+def test_only_the_bytes_that_are_needed_are_read(tmp_path, layout, megabytes):
+    path = tmp_path / ("a.bag" if layout == "bag" else "a.mcap")
+    if layout == "bag":
+        bag(path, size=megabytes * 1_000_000)
+    else:
+        drive(path, size=megabytes * 1_000_000, **LAYOUTS[layout])
+    expected, _ = small_ones(path)
+    with file_server(tmp_path) as server:
+        found, words = small_ones(UrlPath(f"{server.url}/{path.name}"))
+        share = server.sent / path.stat().st_size
+    assert found == expected
+    assert len(found) == megabytes * 1_000_000 // PICTURE_BYTES * 10
+    assert share < (1.05 if layout == "mixed" else 0.05)
+    assert ("share compressed chunks" in words) == (layout == "mixed")
+    path.unlink()
+
+
+def test_of_an_object_only_the_bytes_that_are_needed_are_read(fresh, tmp_path):
+    path = tmp_path / "a.mcap"
+    drive(path, size=40_000_000, **LAYOUTS["no compression"])
+    fresh.client.upload_file(str(path), "field", "large/a.mcap")
+    before = fresh.received
+    found, words = small_ones(UrlPath("s3://field/large/a.mcap"))
+    assert found == small_ones(path)[0]
+    assert fresh.received - before < 0.05 * path.stat().st_size
+    assert "read by ranges" in words
+    fresh.client.delete_object(Bucket="field", Key="large/a.mcap")
+
+
+def test_a_log_without_an_index_is_fetched_and_read_to_its_end(tmp_path):
+    (tmp_path / "cut.mcap").write_bytes(MCAP.read_bytes()[:-5000])
+    with file_server(tmp_path) as server:
+        assert messages(UrlPath(f"{server.url}/cut.mcap")) == messages(tmp_path / "cut.mcap")
+
+
+def test_a_broken_connection_is_made_again(monkeypatch):
+    monkeypatch.setattr(remote_file, "_PAUSES_S", (0.01, 0.01))
+    with file_server(SAMPLES, broken=2) as server:
+        assert messages(UrlPath(f"{server.url}/{MCAP.name}")) == messages(MCAP)
+
+
+def test_a_connection_that_stays_broken_is_one_line_without_secrets(monkeypatch):
+    monkeypatch.setattr(remote_file, "_PAUSES_S", (0.01, 0.01))
+    with file_server(SAMPLES, token=TOKEN) as server:
+        container = open_log(UrlPath(f"{server.url}/{MCAP.name}?{TOKEN}"))
+        server.broken = 10_000
+        with pytest.raises(LogError, match="cannot be read") as caught:
+            list(container.blocks(frozenset(one.id for one in container.channels)))
+        container.close()
+    assert TOKEN not in str(caught.value)
+    with pytest.raises(LogError, match="cannot be read"):
+        open_log(UrlPath(f"{server.url}/{MCAP.name}?{TOKEN}"))
+
+
+def test_a_file_that_is_not_there_or_not_allowed_is_said_so(fresh):
+    with file_server(SAMPLES, token=TOKEN) as server:
+        with pytest.raises(LogError, match="no such file"):
+            open_log(UrlPath(f"{server.url}/none.mcap?{TOKEN}"))
+        with pytest.raises(LogError, match="may not be read"):
+            open_log(UrlPath(f"{server.url}/{MCAP.name}?sig=wrong"))
+    for key in ("none.mcap", "none/"):
+        with pytest.raises(LogError, match="no such file"):
+            open_log(UrlPath(f"s3://field/{key}"))
+    with pytest.raises(LogError, match="not a log"):
+        open_log(UrlPath("s3://field/notes.txt"))
+
+
+def test_patterns_folders_and_manifests_find_the_logs_of_a_bucket(fresh, tmp_path):
+    everything = ["s3://field/mon/a.mcap", "s3://field/packed/d.mcap.gz", "s3://field/tue/b.bag", "s3://field/wed/c"]
+    assert [one.url for one in find(UrlPath("s3://field"))] == everything
+    assert [one.url for one in find(UrlPath("s3://field/**/*.bag"))] == everything[2:3]
+    assert [one.name for one in find_recordings([UrlPath("s3://field/*/*.mcap"), UrlPath("s3://field/tue")])] == [
+        "mon/a",
+        "tue/b",
+    ]
+    manifest = tmp_path / "logs.csv"
+    manifest.write_text("log,robot,group\ns3://field/mon/*.mcap,segway-rmp400,grass\n")
+    (entry,) = read_manifest(manifest)
+    assert [str(place) for place in entry.places] == everything[:1]
+    with pytest.raises(LogError, match="matches nothing"):
+        find(UrlPath("s3://field/**/*.ulg"))
+
+
+def run(monkeypatch, capfd, *arguments: object) -> tuple[int, str]:
+    """Run a command in this process; return its exit status and all that it printed."""
+    monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])
+    status = 0
+    try:
+        main()
+    except SystemExit as left:
+        status = int(left.code or 0)
+    return status, "".join(capfd.readouterr())
+
+
+def test_fit_from_an_address_gives_the_run_of_the_file_and_no_secret(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, capfd, "fit", MCAP, *ROBOT, "-o", "local", "--plots", "none")[0] == 0
+    with file_server(SAMPLES, token=TOKEN) as server:
+        url = f"{server.url}/{MCAP.name}?{TOKEN}"
+        for _ in range(2):  # a second time, its own run is replaced
+            status, said = run(
+                monkeypatch, capfd, "dropout-report", url, *ROBOT, "-o", "remote", "--plots", "none", "-v"
+            )
+            assert status == 0, said
+            assert "d0ntPr1nt" not in said
+        status, said = run(monkeypatch, capfd, "info", url, *ROBOT, "--json")
+        assert status == 0
+        assert "d0ntPr1nt" not in said
+        assert "read by ranges" in json.loads(said)["logs"][0]["transfer"]
+    assert (tmp_path / "local/states.csv").read_bytes() == (tmp_path / "remote/states.csv").read_bytes()
+    assert not [file for file in Path("remote").rglob("*") if file.is_file() and b"d0ntPr1nt" in file.read_bytes()]
+    (found,) = json.loads((tmp_path / "remote/run.json").read_text())["inputs"]
+    assert found["path"] == f"{server.url}/{MCAP.name}"
+    assert found["sha256"] is None
+    assert found["etag"]
+
+
+def test_batch_reads_a_bucket_and_skips_what_is_unchanged(fresh, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    command = ("batch", "s3://field/mon", *ROBOT, "-o", "out", "--plots", "none", "--no-ladder", "-j", "1", "--json")
+    status, said = run(monkeypatch, capfd, *command)
+    assert status == 0, said
+    status, said = run(monkeypatch, capfd, *command)
+    assert [one["this_time"] for one in json.loads(said)["logs"]] == ["skipped"]
+    fresh.client.upload_file(str(SAMPLES / "wheeled_lawnmower.mcap"), "field", "mon/a.mcap")
+    fresh.client.put_object(Bucket="field", Key="mon/a.mcap", Body=MCAP.read_bytes() + b"\0")
+    import s3fs
+
+    s3fs.S3FileSystem.clear_instance_cache()
+    status, said = run(monkeypatch, capfd, *command)
+    assert [one["this_time"] for one in json.loads(said)["logs"]] == ["processed"]
+    assert "d0ntPr1nt" not in said
+    fresh.client.upload_file(str(MCAP), "field", "mon/a.mcap")
+
+
+@pytest.mark.parametrize(
+    ("url", "library", "extra"),
+    [("s3://b/a.mcap", "s3fs", "cloud"), ("gs://b/a.mcap", "gcsfs", "cloud"), ("az://b/a.mcap", "adlfs", "cloud"),
+     ("https://b/a.mcap", "aiohttp", "http")],
+)  # fmt: skip
+def test_a_missing_library_is_named_with_the_extra_that_has_it(url, library, extra):
+    script = (
+        f"import sys; sys.modules[{library!r}] = None; sys.argv = ['icrtool', 'info', {url!r}]\n"
+        "from icrtool.cli import main; main()"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert said.returncode == 1
+    assert said.stderr.strip() == f"Error: {url}: needs {library}; pip install 'icrtool[{extra}]'"
+
+
+def test_a_log_on_disk_loads_no_network_library():
+    script = (
+        "import sys\nfrom icrtool.logs.read_log import read_log\nfrom icrtool.config import load_config\n"
+        f"read_log({str(MCAP)!r}, load_config(robot='segway-rmp400'))\n"
+        "print([name for name in ('fsspec', 's3fs', 'aiohttp', 'botocore', 'gcsfs', 'adlfs', 'urllib3', 'requests', "
+        "'http.client', 'asyncio') if name in sys.modules])"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert said.stdout.strip() == "[]"
+
+
+def test_an_address_keeps_its_slashes_and_hides_its_secrets():
+    path = place_of(f"https://user:pass@host/logs/a.mcap?{TOKEN}&x=1")
+    assert isinstance(path, UrlPath)
+    assert (str(path), path.name, path.suffix) == ("https://host/logs/a.mcap", "a.mcap", ".mcap")
+    assert path.url.endswith("&x=1")
+    assert "pass" not in repr(path) + str(path) + f"{path}"
+    assert log_name(place_of("s3://bucket/mon/a.mcap.zst")) == "a"
+    assert not isinstance(place_of("C:/logs/a.mcap"), UrlPath)
+    assert without_secrets("404, url='https://h/a?token=x'; s3://k:s@b/c") == "404, url='https://h/a'; s3://b/c"
+
+
+def test_inputs_that_were_not_wholly_read_are_not_called_copies():
+    one, other = (File(f"s3://field/{name}", 5, 0, None, "same etag") for name in "ab")
+    assert _content([one]) != _content([other])
+    assert _content([File("a", 5, 0, "ab" * 32)]) == _content([File("b", 5, 0, "ab" * 32)])
+
+
+def test_read_log_takes_an_address(fresh):
+    log = read_log("s3://field/mon/a.mcap")
+    assert len(log.wheels.stamp_ns) == 20_000
+    assert log.inputs[0].path == "s3://field/mon/a.mcap"
