@@ -15,15 +15,12 @@ import numpy as np
 
 from icrtool.calibration.error_differences import ErrorEstimate
 from icrtool.calibration.transfer import Difference
-from icrtool.config import Config
 from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import Row
-from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.motion.models import TrackGeometry
 from icrtool.records.calibration_document import CalibrationDocument, CalibrationLog
-from icrtool.records.dropout import BudgetDistance, Gate, UsedCalibration
-from icrtool.records.run_document import DriveDocument, IcrDocument, RunDocument
-from icrtool.records.samples import InputFile
+from icrtool.records.dropout_document import DropoutDocument
+from icrtool.records.run_document import RunDocument
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference" / "schemas"
 
@@ -47,81 +44,6 @@ def _nullable(hint: object) -> object:
         return Number
     return Numbers if getattr(hint, "__origin__", None) is np.ndarray else hint
 
-
-SUMMARY = {
-    "horizon_m": float, "trials": int, "expected_error_m": Number, "p50_m": Number, "p95_m": Number, "max_m": Number,
-}  # fmt: skip
-Summary = plain("Summary", SUMMARY)
-SummaryRow = plain("SummaryRow", SUMMARY | dict.fromkeys(
-    ("expected_pct", "p95_pct", "expected_low_m", "expected_high_m", "p95_low_m", "p95_high_m",
-     "heading_expected_deg", "heading_p95_deg"), Number
-))  # fmt: skip
-Blocks = record(BlockSums, "Blocks", horizon_m=float, errors_m=list[float], trials=list[int], above_p50=list[int],
-                above_p95=list[int])  # fmt: skip
-ModelRows = plain("ModelRows", {
-    "name": str, "label": str, "knows": str | None, "by_horizon": list[SummaryRow], "blocks": list[Blocks],
-})  # fmt: skip
-NoTrial = plain("NoTrial", dict.fromkeys(
-    ("too_little_way_left", "across_wheel_gap", "ends_in_gnss_outage", "from_standstill", "crosses_jump",
-     "across_slip_event"), int
-))  # fmt: skip
-TrialCount = plain("TrialCount", {
-    "horizon_m": float, "trials": int, "no_trial": NoTrial, "why_none": str | None,
-})  # fmt: skip
-OwnError = plain("OwnError", {
-    "horizon_m": float, "std_m": Number, "expected_m": Number, "p95_m": Number,
-})  # fmt: skip
-Learned = plain("Learned", {
-    "model": str, "learned_s": Number, "learned_at_distance_m": Number, "before": list[Summary], "after": list[Summary],
-})  # fmt: skip
-EventCost = plain("EventCost", {"events": int, "with_events": dict[str, list[Summary]]})
-Used = record(UsedCalibration, fitted=str)
-Split = plain("Split", {"straight": bool, "horizon_m": float, "trials": int, "expected_m": dict[str, Number]})
-Score = plain("Score", {
-    "name": str, "label": str, "fitted": str, "heading": str, "trials": list[int], "expected_error_m": Numbers,
-    "p50_m": Numbers, "p95_m": Numbers, "max_m": Numbers,
-})  # fmt: skip
-Fit = plain("Fit", {"value": dict[str, Number], "std": dict[str, Number]})
-Ladder = plain("Ladder", {
-    "left_out": str, "horizons_m": list[float], "blocks": int, "starts": int, "heading": str | None,
-    "notes": list[str], "models": list[Score], "width_m": float, "fits": dict[str, Fit],
-}, total=False)  # fmt: skip
-GateDocument = record(
-    Gate, value_m=Number, value_bound_m=Number, baseline_m=Number, margin_m=Number, margin_low_m=Number,
-    margin_high_m=Number, not_checked=str | None, unusable=str | None, passed=bool, verdict=str,
-)  # fmt: skip
-BaselineDocument = plain("BaselineDocument", {
-    "path": str, "log": str, "tool_version": str, "same_recording": bool, "changes": list[str],
-})  # fmt: skip
-Outage = plain("Outage", {
-    "kind": Literal["forced", "real"], "begin_s": float, "end_s": float, "distance_m": float, "end_error_m": Number,
-    "max_error_m": Number,
-})  # fmt: skip
-Trial = plain("Trial", {
-    "model": str,
-    "stamp_ns": int, "t_s": float, "north_m": float, "east_m": float, "horizon_m": float, "heading_change_deg": float,
-    "speed_mean_mps": float, "errors_m": dict[str, Number],
-})  # fmt: skip
-RunOfReport = plain("RunOfReport", {
-    "schema": Literal["icrtool/run/1"], "tool_version": str, "log": str, "inputs": list[InputFile],
-    "config": Config, "drive": DriveDocument, "icr": IcrDocument,
-})  # fmt: skip
-Bootstrap = plain("Bootstrap", {"method": str, "block": str, "resamples": int, "level": float, "seed": int})
-Bootstrap.__doc__ = (
-    "How the intervals of the errors were found: by `method` over `block`, at `level`. The key keeps the name of "
-    "earlier versions; `resamples` is 0 where nothing was resampled. `seed` is that of the reference's own error."
-)
-DropoutDocument = plain("DropoutDocument", {
-    "schema": Literal["icrtool/dropout/1"], "tool_version": str, "run": RunOfReport, "usable": bool,
-    "unusable_because": str | None, "reference": str, "smoothed": bool, "starts": int,
-    "starts_counted": Literal["moving", "all"], "starts_standing": int, "with_jumps": bool,
-    "without_events": EventCost | None,
-    "tolerance_m": float, "bootstrap": Bootstrap, "models": list[ModelRows], "trials": list[TrialCount],
-    "reference_error": list[OwnError], "by_learning": Learned | None, "calibrations": list[Used],
-    "recommended": CalibrationDocument | None, "budgets": list[record(BudgetDistance)], "by_turning": list[Split],
-    "ladder": Ladder, "gates": list[GateDocument], "passed": bool, "baseline": BaselineDocument | None,
-    "outages": list[Outage], "worst": list[Trial], "examples": list[Trial],
-})  # fmt: skip
 
 Group = plain("Group", {"model": str, "logs": list[CalibrationLog], "geometry": record(TrackGeometry)})
 PLACE = {"calibrated_on": str, "tested_on": str, "horizon_m": float}

@@ -52,10 +52,10 @@ def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDist
                 for p95 in (result.intervals.p95_high, result.intervals.p95_low)
             )
             # An end that stays within the budget as far as there are intervals has no such distance.
-            low, high = (math.nan if end is None or end[1] else end[0] for end in ends)
+            low, high = (None if end is None or end[1] else end[0] for end in ends)
             quiet = None if result.without_events is None else result.without_events.p95
             free = None if quiet is None else within_budget(report.horizons_m, quiet, budget_m)
-            without = (math.nan, False) if free is None else free[:2]
+            without = (None, False) if free is None else free[:2]
             found.append(BudgetDistance(result.name, result.label, budget_m, *reached, low, high, *without))
     return tuple(found)
 

@@ -167,12 +167,13 @@ def _calibration_rows(
             continue
         kept = msgspec.structs.replace(one.document(), models={}, held_out=())
         seen = one.fitted_to(recording.sha256)
+        fitted = "fitted to this log" if seen else "not fitted to this log"
         rows = [(name, label, one.recommended, False)]
         if one.gyro is not None and recording.track.gyro is not None:
             rows.append((f"{name}_gyro", f"{label} + gyro", one.gyro.model.name, True))
         for name, label, model, with_gyro in rows:
             models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=with_gyro)))
-            used.append(UsedCalibration(name, label, model, len(one.logs), seen, one.created, with_gyro, kept))
+            used.append(UsedCalibration(name, label, model, len(one.logs), seen, one.created, with_gyro, kept, fitted))
     return tuple(used), models
 
 

@@ -28,6 +28,24 @@ from icrtool.output.run_directory import is_run_directory
 from icrtool.output.tables.dropout import no_trial, why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.records.dropout import ExampleTrial, ModelResult, error_columns
+from icrtool.records.dropout_document import (
+    DROPOUT_SCHEMA,
+    BaselineDocument,
+    BlocksDocument,
+    CountDocument,
+    DropoutDocument,
+    ErrorRow,
+    EventCostDocument,
+    GateDocument,
+    IntervalsDocument,
+    LearnedDocument,
+    ModelDocument,
+    OutageDocument,
+    ReferenceRow,
+    RunOfReport,
+    SummaryRow,
+    TrialDocument,
+)
 from icrtool.records.late_output import FigureSet
 from icrtool.records.plain_data import rows_of
 
@@ -35,7 +53,6 @@ REPORT_FILE = "report.json"
 TRIALS_FILE = "trials.parquet"
 DROPOUT_DIRECTORY = "dropout"
 """Where a report stands in its run directory."""
-DROPOUT_SCHEMA = "icrtool/dropout/1"
 SCHEMA_FAMILY = "icrtool/dropout/"
 
 KNOWS = {
@@ -112,62 +129,61 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(report)))
 
 
-def report_document(report: DropoutReport) -> dict[str, Any]:
-    """Return what report.json holds."""
-    run = report.run_document
-    return {
-        "schema": DROPOUT_SCHEMA,
-        "tool_version": __version__,
-        "run": {key: getattr(run, key) for key in RUN_KEYS},
-        "usable": run.usable,
-        "unusable_because": run.unusable_because,
-        "reference": f"the {'smoother' if report.smoothed else 'filter'}'s estimate at the end of the trial",
-        "smoothed": report.smoothed,
-        "starts": report.states,
-        "starts_counted": report.starts,
-        "starts_standing": report.standing,
-        "with_jumps": report.with_jumps,
-        "without_events": _event_document(report),
-        "tolerance_m": TOLERANCE_M,
-        # how the intervals were found: the key and its parts keep their names; nothing is resampled
-        "bootstrap": {
-            "method": "Student's t over blocks of path",
-            "block": f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",
-            "resamples": 0,
-            "level": LEVEL,
-            "seed": report.seed,
-        },
-        "models": [_model_document(result, report) for result in report.results],
-        "trials": _count_documents(report),
-        "reference_error": _reference_rows(report),
-        "by_learning": _learned_document(report),
-        "calibrations": [one._asdict() | {"fitted": one.fitted_text} for one in report.calibrations],
+def report_document(report: DropoutReport) -> DropoutDocument:
+    """Return what report.json holds, NaN for a number that is not known."""
+    run, made = report.run_document, report.calibration
+    return DropoutDocument(
+        schema=DROPOUT_SCHEMA,
+        tool_version=__version__,
+        run=RunOfReport(*(getattr(run, key) for key in RunOfReport.__struct_fields__)),
+        usable=run.usable,
+        unusable_because=run.unusable_because,
+        reference=f"the {'smoother' if report.smoothed else 'filter'}'s estimate at the end of the trial",
+        smoothed=report.smoothed,
+        starts=report.states,
+        starts_counted=report.starts,
+        starts_standing=report.standing,
+        with_jumps=report.with_jumps,
+        without_events=_event_document(report),
+        tolerance_m=TOLERANCE_M,
+        # the key and its parts keep their names; nothing is resampled
+        bootstrap=IntervalsDocument(
+            method="Student's t over blocks of path",
+            block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",
+            resamples=0,
+            level=LEVEL,
+            seed=report.seed,
+        ),
+        models=tuple(_model_document(result, report) for result in report.results),
+        trials=_count_documents(report),
+        reference_error=_reference_rows(report),
+        by_learning=_learned_document(report),
+        calibrations=report.calibrations,
         # Without when it was made: the same run, the same file.
-        "recommended": report.calibration
-        and msgspec.structs.replace(report.calibration.document(), created=msgspec.UNSET),
-        "budgets": [one._asdict() for one in report.budgets],
-        "by_turning": [one._asdict() for one in report.by_turning],
-        "ladder": comparison_document(report),
-        "gates": [
-            {**asdict(one.gate), **{key: getattr(one, key) for key in VERDICT_KEYS}, "value_bound_m": one.bound_m,
-             "not_checked": one.not_checked or None, "unusable": one.unusable or None, "verdict": one.line()}
+        recommended=None if made is None else msgspec.structs.replace(made.document(), created=msgspec.UNSET),
+        budgets=report.budgets,
+        by_turning=report.by_turning,
+        ladder=comparison_document(report),
+        gates=tuple(
+            GateDocument(
+                **asdict(one.gate), **{key: getattr(one, key) for key in VERDICT_KEYS}, value_bound_m=one.bound_m,
+                not_checked=one.not_checked or None, unusable=one.unusable or None, verdict=one.line(),
+            )
             for one in report.verdicts
-        ],
-        "passed": report.passed,
-        "baseline": _baseline_document(report),
-        "outages": [{name: getattr(one, name) for name in OUTAGE_KEYS} for one in report.outages],
-        "worst": [_trial_document(one) for one in report.worst],
-        "examples": [_trial_document(one) for one in report.examples],
-    }  # fmt: skip
+        ),
+        passed=report.passed,
+        baseline=_baseline_document(report),
+        outages=tuple(OutageDocument(*(getattr(one, name) for name in OUTAGE_KEYS)) for one in report.outages),
+        worst=tuple(map(_trial_document, report.worst)),
+        examples=tuple(map(_trial_document, report.examples)),
+    )  # fmt: skip
 
-
-RUN_KEYS = ("schema", "tool_version", "log", "inputs", "config", "drive", "icr")
 
 HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent")
 
 VERDICT_KEYS = ("value_m", "baseline_m", "margin_m", "margin_low_m", "margin_high_m", "passed")
 
-OUTAGE_KEYS = ("kind", "begin_s", "end_s", "distance_m", "end_error_m", "max_error_m")
+OUTAGE_KEYS = OutageDocument.__struct_fields__
 
 WORST_COLUMNS = (
     "rank", "model", "stamp_ns", "t_s", "north_m", "east_m", "horizon_m", "heading_change_deg", "speed_mean_mps",
@@ -175,80 +191,71 @@ WORST_COLUMNS = (
 )  # fmt: skip
 
 
-def _model_document(result: ModelResult, report: DropoutReport) -> dict[str, Any]:
+def _model_document(result: ModelResult, report: DropoutReport) -> ModelDocument:
     """Return one model's rows of summary.csv, under its name."""
-    rows = [row for row in rows_of(report.summary_columns()) if row.pop("model") == result.name]
+    rows = [SummaryRow(**row) for row in rows_of(report.summary_columns()) if row.pop("model") == result.name]
     used = next((one for one in report.calibrations if one.name == result.name), None)
-    knows = used.fitted_text if used is not None else KNOWS.get(result.name, "the rest of the drive")
+    knows = used.fitted if used is not None else KNOWS.get(result.name, "the rest of the drive")
     blocks = [
-        {"horizon_m": horizon, **sums._asdict(), "errors_m": [float(f"{error:.6g}") for error in sums.errors_m]}
+        BlocksDocument(horizon, **sums._asdict() | {"errors_m": [float(f"{error:.6g}") for error in sums.errors_m]})
         for horizon, sums in zip(report.horizons_m, result.block_sums, strict=False)
         if sums is not None
     ]
-    return {"name": result.name, "label": result.label, "knows": knows, "by_horizon": rows, "blocks": blocks}
+    return ModelDocument(result.name, result.label, knows, rows, blocks)
 
 
-def _baseline_document(report: DropoutReport) -> dict[str, Any] | None:
+def _baseline_document(report: DropoutReport) -> BaselineDocument | None:
     one, run = report.baseline, report.run_document
     if one is None:
         return None
-    return {"path": one.path, "log": one.log, "tool_version": one.tool_version, "same_recording": one.is_of(run),
-            "changes": one.changes(run)}  # fmt: skip
+    return BaselineDocument(one.path, one.log, one.tool_version, one.is_of(run), one.changes(run))
 
 
-def _count_documents(report: DropoutReport) -> list[dict[str, Any]]:
+def _count_documents(report: DropoutReport) -> tuple[CountDocument, ...]:
     """Return how many starts were a trial at each horizon, and why the others were none."""
     reasons = no_trial(report)
-    return [
-        {
-            "horizon_m": horizon,
-            "trials": report.counts.trials[h],
-            "no_trial": {one.key: one.starts[h] for one in reasons},
-            "why_none": why_no_trial(report, h),
-        }
+    return tuple(
+        CountDocument(
+            horizon, report.counts.trials[h], {one.key: one.starts[h] for one in reasons}, why_no_trial(report, h)
+        )
         for h, horizon in enumerate(report.horizons_m)
-    ]
+    )
 
 
-def _event_document(report: DropoutReport) -> dict[str, Any] | None:
+def _event_document(report: DropoutReport) -> EventCostDocument | None:
     """Return what slip events cost, None where they count."""
     cost = report.event_cost
     if cost is None:
         return None
-    with_events = {name: _summary_rows(report, summary) for name, summary in cost.with_events.items()}
-    return {"events": cost.events, "with_events": with_events}
+    return EventCostDocument(
+        cost.events, {name: _summary_rows(report, summary) for name, summary in cost.with_events.items()}
+    )
 
 
-def _reference_rows(report: DropoutReport) -> list[dict[str, Any]]:
+def _reference_rows(report: DropoutReport) -> tuple[ReferenceRow, ...]:
     """Return the reference's own error at each horizon: what a perfect model would show."""
     own = report.reference_error
-    if own is None:
-        return []
-    return rows_of({"horizon_m": report.horizons_m, "std_m": own[0], "expected_m": own[1], "p95_m": own[2]})
+    return () if own is None else tuple(map(ReferenceRow, report.horizons_m, *own))
 
 
-def _learned_document(report: DropoutReport) -> dict[str, Any] | None:
+def _learned_document(report: DropoutReport) -> LearnedDocument | None:
     """Return the trials before and after the ICRs were first learned."""
     split = report.by_learning
     if split is None:
         return None
-    return {
-        "model": "icr", "learned_s": split.learned_s, "learned_at_distance_m": split.distance_m,
-        "before": _summary_rows(report, split.before), "after": _summary_rows(report, split.after),
-    }  # fmt: skip
+    sides = (_summary_rows(report, one) for one in (split.before, split.after))
+    return LearnedDocument("icr", split.learned_s, split.distance_m, *sides)
 
 
-def _summary_rows(report: DropoutReport, summary: Summary) -> list[dict[str, Any]]:
-    return rows_of({"horizon_m": report.horizons_m, **error_columns(summary)})
+def _summary_rows(report: DropoutReport, summary: Summary) -> list[ErrorRow]:
+    return list(map(ErrorRow, report.horizons_m, *error_columns(summary).values()))
 
 
-def _trial_document(trial: ExampleTrial) -> dict[str, Any]:
-    return {
-        "model": trial.model, "stamp_ns": trial.stamp_ns, "t_s": trial.t_s, "north_m": trial.north_m,
-        "east_m": trial.east_m,
-        "horizon_m": trial.horizon_m, "heading_change_deg": float(np.degrees(trial.heading_change_rad)),
-        "speed_mean_mps": trial.speed_mean_mps, "errors_m": trial.errors_m,
-    }  # fmt: skip
+def _trial_document(trial: ExampleTrial) -> TrialDocument:
+    return TrialDocument(
+        trial.model, trial.stamp_ns, trial.t_s, trial.north_m, trial.east_m, trial.horizon_m,
+        float(np.degrees(trial.heading_change_rad)), trial.speed_mean_mps, dict(trial.errors_m),
+    )  # fmt: skip
 
 
 def _histogram_rows(report: DropoutReport) -> Iterator[tuple[Any, ...]]:
@@ -260,6 +267,5 @@ def _histogram_rows(report: DropoutReport) -> Iterator[tuple[Any, ...]]:
 
 def _worst_rows(worst: Sequence[ExampleTrial]) -> Iterator[tuple[Any, ...]]:
     for rank, trial in enumerate(worst, start=1):
-        document = _trial_document(trial)
-        errors = document.pop("errors_m")
-        yield rank, *document.values(), *(errors.get(model) for model in ERROR_COLUMNS)
+        *columns, errors = msgspec.structs.astuple(_trial_document(trial))
+        yield rank, *columns, *(errors.get(model) for model in ERROR_COLUMNS)

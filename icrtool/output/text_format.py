@@ -223,8 +223,8 @@ def turn_text(turn_rad: float) -> str:
     return f"{abs(degrees):.0f}° {'right' if degrees >= 0 else 'left'}"
 
 
-def error_text(metres: float) -> str:
+def error_text(metres: float | None) -> str:
     """Return an error as ``0.0034 m``, ``0.123 m`` or ``3.45 m``: one unit, and the same digits, in all places."""
-    if not math.isfinite(metres):
+    if metres is None or not math.isfinite(metres):
         return "-"
     return f"{metres:.{4 if metres < 0.01 else 3 if metres < 1 else 2}f} m"

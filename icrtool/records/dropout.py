@@ -13,6 +13,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.kernels.open_loop.trials import Histogram, Intervals, OpenLoopPath, Summary
 from icrtool.records.calibration_document import CalibrationDocument
+from icrtool.records.plain_data import Record
 
 OutageKind = Literal["forced", "real"]
 
@@ -157,7 +158,7 @@ class LearnedSplit(NamedTuple):
     after: Summary
 
 
-class UsedCalibration(NamedTuple):
+class UsedCalibration(Record, frozen=True):
     """A calibration that a report has a row of.
 
     Attributes
@@ -168,6 +169,7 @@ class UsedCalibration(NamedTuple):
     created : date and time, UTC
     with_gyro : its row uses the gyro of the log
     calibration : what its file holds, without the models that were not recommended and without its scores
+    fitted : whether this log was among those it was fitted to, in words
     """
 
     name: str
@@ -178,18 +180,14 @@ class UsedCalibration(NamedTuple):
     created: str
     with_gyro: bool = False
     calibration: CalibrationDocument | None = None
-
-    @property
-    def fitted_text(self) -> str:
-        """Whether this log was among those it was fitted to, in words."""
-        return "fitted to this log" if self.fitted_to_this else "not fitted to this log"
+    fitted: str = ""
 
 
 NEAR_HORIZONS_M = 1.5
 """Between horizons that are further apart an interpolated distance is marked as one."""
 
 
-class BudgetDistance(NamedTuple):
+class BudgetDistance(Record, frozen=True):
     """How far a model's 95th percentile stays within a budget.
 
     Attributes
@@ -197,8 +195,8 @@ class BudgetDistance(NamedTuple):
     distance_m : interpolated between horizons, from 0 m at 0 m
     beyond : `distance_m` is a lower bound: the error is within the budget at the last horizon with trials
     between_m : horizons interpolated between
-    without_events_m, beyond_without_events : the same of the trials that touch no slip event; NaN without an event
-    low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; NaN where
+    without_events_m, beyond_without_events : the same of the trials that touch no slip event; None without an event
+    low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; None where
         they stay within it, and where there is no interval
     """
 
@@ -208,9 +206,9 @@ class BudgetDistance(NamedTuple):
     distance_m: float
     beyond: bool
     between_m: tuple[float, float]
-    low_m: float = math.nan
-    high_m: float = math.nan
-    without_events_m: float = math.nan
+    low_m: float | None = None
+    high_m: float | None = None
+    without_events_m: float | None = None
     beyond_without_events: bool = False
 
     @property
@@ -226,7 +224,7 @@ class BudgetDistance(NamedTuple):
     @property
     def without_events_text(self) -> str:
         """As `short_text`, of the trials that touch no slip event; empty where there is none."""
-        if not math.isfinite(self.without_events_m):
+        if self.without_events_m is None:
             return ""
         return (
             f"more than {self.without_events_m:g} m" if self.beyond_without_events else f"{self.without_events_m:.1f} m"
@@ -248,9 +246,9 @@ class BudgetDistance(NamedTuple):
     @property
     def interval_text(self) -> str:
         """``13.2-15.0 m`` or ``at least 13.2 m``; empty where the interval leaves the budget nowhere."""
-        if not math.isfinite(self.low_m):
+        if self.low_m is None:
             return ""
-        return f"{self.low_m:.1f}-{self.high_m:.1f} m" if math.isfinite(self.high_m) else f"at least {self.low_m:.1f} m"
+        return f"{self.low_m:.1f}-{self.high_m:.1f} m" if self.high_m is not None else f"at least {self.low_m:.1f} m"
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,7 +326,7 @@ class Verdict:
         return f", bound {bound_m:.4g} m (baseline {baseline_m:.4g} m){margin}{interval}"
 
 
-class TurningSplit(NamedTuple):
+class TurningSplit(Record, frozen=True):
     """Expected error [m] by model over the trials that are straight, or over those that turn."""
 
     straight: bool

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -31,6 +32,7 @@ from icrtool.output.page.comparison_page import comparison_page
 from icrtool.output.page.fleet_page import fleet_page
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import run_page
+from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.run import Run, track_of
 from icrtool.records.samples import GyroSamples
 from icrtool.records.text import LogText
@@ -243,7 +245,7 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     assert {one.name: one.with_gyro for one in report.calibrations} == names
     # Read back from JSON, as `icrtool report` does; so many paths that each has one point of three.
     monkeypatch.setattr(drive_data, "MOST_STEPS", 10_000)
-    document = json.loads(json_bytes(report_document(report)))
+    document = msgspec.convert(json.loads(json_bytes(report_document(report))), DropoutDocument)
     file = tmp_path / "calibrations.html"
     file.write_text(run_page(run, document, {}), encoding="utf-8")
     page = chrome.page()
@@ -313,8 +315,9 @@ def test_the_moment_follows_the_keyboard(page: Page) -> None:
 def test_hostile_names_stay_text(chrome: Browser, run: Run, report: DropoutReport, tmp_path: Path) -> None:
     streams = [{**one, "topic": HOSTILE, "why": HOSTILE} for one in run.summary["streams"]]
     hostile = with_summary(run, log=HOSTILE, warnings=[HOSTILE], streams=streams)
-    document = report_document(report)
-    document["models"] = [{**one, "label": HOSTILE} for one in document["models"]]
+    made = report_document(report)
+    models = tuple(msgspec.structs.replace(one, label=HOSTILE) for one in made.models)
+    document = msgspec.structs.replace(made, models=models)
     file = tmp_path / "hostile.html"
     file.write_text(run_page(hostile, document, {}), encoding="utf-8")
     page = chrome.page()

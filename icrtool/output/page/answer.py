@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from typing import Any, Literal
 
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.stored import read_calibration
+from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import controller_rows, format_export
 from icrtool.output.tables.brief import reach_rows, to_drive, trust
 from icrtool.output.text_format import controller_error_text, error_text, event_kinds, excitation_text, jump_count
-from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
+from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted
 
@@ -24,7 +23,7 @@ SMALLEST_SHOWN = 0.0005
 """A standard deviation below this would be printed as zero."""
 
 
-def answer_of(summary: RunDocument, report: Mapping[str, Any]) -> dict[str, Any]:
+def answer_of(summary: RunDocument, report: DropoutDocument) -> dict[str, Any]:
     """Return what the page of a run states first.
 
     Parameters
@@ -41,10 +40,10 @@ def answer_of(summary: RunDocument, report: Mapping[str, Any]) -> dict[str, Any]
         ``numbers``: name and value of what a controller is given, ``with_numbers``: the error with these alone,
         ``export``: configuration of a diff_drive_controller, ``model``: the recommended one; empty where there is none.
     """
-    found = report["recommended"]
-    calibration = read_calibration(found) if found is not None else None
+    found = report.recommended
+    calibration = calibration_of(found) if found is not None else None
     grade, sentence = trust(
-        summary, passed=report["passed"], events_left_out=report["without_events"] is not None
+        summary, passed=report.passed, events_left_out=report.without_events is not None
     )  # fmt: skip
     return {
         "drive": "" if summary.usable else to_drive(summary),
@@ -59,12 +58,9 @@ def answer_of(summary: RunDocument, report: Mapping[str, Any]) -> dict[str, Any]
     }
 
 
-def _reaches(summary: RunDocument, report: Mapping[str, Any]) -> list[tuple[float, list[tuple[str, str, str]]]]:
-    budgets = []
-    for row in report["budgets"]:
-        known: dict[str, Any] = {key: math.nan if value is None else value for key, value in row.items()}
-        budgets.append(BudgetDistance(**known))
-    given = [(one["name"], one["label"], one["fitted"]) for one in report["calibrations"]]
+def _reaches(summary: RunDocument, report: DropoutDocument) -> list[tuple[float, list[tuple[str, str, str]]]]:
+    budgets = report.budgets
+    given = [(one.name, one.label, one.fitted) for one in report.calibrations]
     events = len(summary.events)
     sizes = dict.fromkeys(one.budget_m for one in budgets)
     return [(size, rows) for size in sizes if (rows := reach_rows(budgets, given, size, events))]
@@ -88,52 +84,52 @@ def _export(calibration: Calibration | None) -> str:
         return ""
 
 
-def _checks(summary: RunDocument, report: Mapping[str, Any]) -> list[Check]:
+def _checks(summary: RunDocument, report: DropoutDocument) -> list[Check]:
     """Return the reasons, the gravest first."""
     grades: dict[Grade, int] = {"bad": 0, "care": 1, "good": 2, "fact": 3}
     shown = summary.excitation.verdict.all_shown
     found: list[Check] = [("good" if shown else "care", f"The drive: {excitation_text(summary.excitation)}.")]
-    found += [("good" if one["passed"] else "bad", f"Acceptance limit: {one['verdict']}.") for one in report["gates"]]
+    found += [("good" if one.passed else "bad", f"Acceptance limit: {one.verdict}.") for one in report.gates]
     found += [*_incidents(summary, report), *_trials(report)]
     return sorted(found, key=lambda one: grades[one[0]])
 
 
-def _incidents(summary: RunDocument, report: Mapping[str, Any]) -> list[Check]:
+def _incidents(summary: RunDocument, report: DropoutDocument) -> list[Check]:
     """Return what happened on the drive: warnings, slip, outages, rejected fixes, jumps."""
     gnss, events = summary.gnss, summary.events
     found: list[Check] = []
     if warnings := len(summary.warnings):
         found.append(("care", f"{counted(warnings, 'warning')} about the log."))
     if events:
-        what = "the ICRs are not learned there" + ("" if report["without_events"] else ", but trials across them count")
+        what = "the ICRs are not learned there" + ("" if report.without_events else ", but trials across them count")
         found.append(("care", f"{counted(len(events), 'slip event')} ({event_kinds(events)}): {what}."))
-    if real := [one for one in report["outages"] if one["kind"] == "real"]:
-        worst = max(real, key=lambda one: one["end_error_m"] or 0.0)
-        error = f"{error_text(worst['end_error_m'])} off after {worst['distance_m']:.1f} m"
+    if real := [one for one in report.outages if one.kind == "real"]:
+        worst = max(real, key=lambda one: one.end_error_m or 0.0)
+        error = f"{error_text(worst.end_error_m)} off after {worst.distance_m:.1f} m"
         found.append(("fact", f"{counted(len(real), 'real outage')}: in the worst the filter was {error}."))
     if of := gnss.used + gnss.rejected:
         share = 100 * gnss.rejected / of
         found.append(("fact", f"{gnss.rejected:,} of {of:,} positions ({share:.0f} %) were rejected."))
     if jumps := jump_count(summary.reference_jumps):
-        counts = "trials across them count" if report["with_jumps"] else "no trial crosses a jump"
+        counts = "trials across them count" if report.with_jumps else "no trial crosses a jump"
         found.append(("care", f"{jumps}: {counts}."))
     return found
 
 
-def _trials(report: Mapping[str, Any]) -> list[Check]:
+def _trials(report: DropoutDocument) -> list[Check]:
     """Return how many trials the distances rest on, and what share of the error the reference itself may have."""
-    rows = [row for row in report["trials"] if row["trials"]]
+    rows = [row for row in report.trials if row.trials]
     if not rows:
         return [("bad", "No trial was long enough to measure an error.")]
-    row = min(rows, key=lambda one: abs(one["horizon_m"] - CHOICE_HORIZON_M))
-    horizon_m = row["horizon_m"]
+    row = min(rows, key=lambda one: abs(one.horizon_m - CHOICE_HORIZON_M))
+    horizon_m = row.horizon_m
     found: list[Check] = [
-        ("fact", f"{row['trials']:,} trials of {horizon_m:g} m were driven from {report['starts']:,} states.")
+        ("fact", f"{row.trials:,} trials of {horizon_m:g} m were driven from {report.starts:,} states.")
     ]
-    icr = [row for one in report["models"] if one["name"] == "icr" for row in one["by_horizon"]]
+    icr = [row for one in report.models if one.name == "icr" for row in one.by_horizon]
     own, p95 = (
-        next((one["p95_m"] for one in table if one["horizon_m"] == horizon_m), None)
-        for table in (report["reference_error"], icr)
+        next((one.p95_m for one in table if one.horizon_m == horizon_m), None)
+        for table in (report.reference_error, icr)
     )
     if own is not None and p95 is not None:
         share = f"Up to {error_text(own)}" if own < p95 else "All"

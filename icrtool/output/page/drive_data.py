@@ -13,10 +13,11 @@ from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 
 from icrtool.calibration.pooled import calibrated
 from icrtool.calibration.run_recording import turning_recording_of
-from icrtool.calibration.stored import read_calibration
+from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
@@ -26,6 +27,7 @@ from icrtool.motion.recording import Recording, cut_windows
 from icrtool.motion.trials import predicted_path
 from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
+from icrtool.records.dropout_document import DropoutDocument, FitDocument, ModelDocument
 from icrtool.records.run import Run, no_slip_icrs, track_of, width_or_usual_m
 from icrtool.records.tables import Icrs
 
@@ -60,7 +62,7 @@ class PageSteps(NamedTuple):
     joined: int
 
 
-def drive_data(run: Run, report: Mapping[str, Any], *, coordinates: bool) -> dict[str, Any]:
+def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[str, Any]:
     """Return plain data for the page of a run.
 
     Parameters
@@ -83,42 +85,40 @@ def drive_data(run: Run, report: Mapping[str, Any], *, coordinates: bool) -> dic
         "odometry": _odometry_data(run, origin),
         "models": _models(run, report, steps),
         "events": _events_data(run, origin),
-        "outages": [
-            {"kind": one["kind"], "begin_s": one["begin_s"], "end_s": one["end_s"]} for one in report["outages"]
-        ],
+        "outages": [{"kind": one.kind, "begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
         "changes_s": list(run.changes_s),
         "errors": errors_data(report),
-        "budgets_m": sorted({one["budget_m"] for one in report["budgets"]}),
+        "budgets_m": sorted({one.budget_m for one in report.budgets}),
     }
 
 
-def main_rows(report: Mapping[str, Any]) -> set[str]:
+def main_rows(report: DropoutDocument) -> set[str]:
     """Return the models whose errors are not folded: those of `MAIN_ROWS`; without a whole model, all."""
-    names = {one["name"] for one in report["models"]}
-    given = {one["name"] for one in report["calibrations"]}
+    names = {one.name for one in report.models}
+    given = {one.name for one in report.calibrations}
     return given.union(MAIN_ROWS) & names if MAIN_ROWS[0] in names else names
 
 
-def in_order(models: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def in_order(models: Sequence[ModelDocument]) -> list[ModelDocument]:
     """Return models of a report, those of `MAIN_ROWS` first and in its order, after calibrations."""
     places = {name: place for place, name in enumerate(MAIN_ROWS)}
     return sorted(
-        models, key=lambda one: -1 if one["name"].startswith("calibration") else places.get(one["name"], len(places))
+        models, key=lambda one: -1 if one.name.startswith("calibration") else places.get(one.name, len(places))
     )
 
 
-def errors_data(report: Mapping[str, Any]) -> dict[str, Any]:
+def errors_data(report: DropoutDocument) -> dict[str, Any]:
     """Return the errors over distance by model, and those of the reference alone."""
-    models, main = in_order(report["models"]), main_rows(report)
-    reference = report["reference_error"]
+    models, main = in_order(report.models), main_rows(report)
+    reference = report.reference_error
     return {
-        "horizons_m": [row["horizon_m"] for row in models[0]["by_horizon"]] if models else [],
+        "horizons_m": [row.horizon_m for row in models[0].by_horizon] if models else [],
         "models": [
-            {"name": one["name"], "label": one["label"], "main": one["name"] in main}
-            | {key: [row[column] for row in one["by_horizon"]] for key, column in ERROR_KEYS.items()}
+            {"name": one.name, "label": one.label, "main": one.name in main}
+            | {key: [getattr(row, column) for row in one.by_horizon] for key, column in ERROR_KEYS.items()}
             for one in models
         ],
-        "reference": {"p95": [row["p95_m"] for row in reference], "expected": [row["expected_m"] for row in reference]},
+        "reference": {"p95": [row.p95_m for row in reference], "expected": [row.expected_m for row in reference]},
     }
 
 
@@ -219,9 +219,9 @@ class ModelPath(NamedTuple):
     place: Complexes
 
 
-def _models(run: Run, report: Mapping[str, Any], steps: PageSteps) -> list[dict[str, Any]]:
+def _models(run: Run, report: DropoutDocument, steps: PageSteps) -> list[dict[str, Any]]:
     """Return how each model of the report moves: by ICRs, or along a path that is turned to where a trial starts."""
-    labels = {one["name"]: one["label"] for one in report["models"]}
+    labels = {one.name: one.label for one in report.models}
     b = run.track_width_m
     icrs = {"icr": None, "no_slip": None if b is None else no_slip_icrs(b), "icr_final": run.table.icrs_at(-1)}
     models: list[dict[str, Any]] = [
@@ -241,19 +241,20 @@ def _models(run: Run, report: Mapping[str, Any], steps: PageSteps) -> list[dict[
 
 
 def _held_out(
-    recording_of: Callable[[str], Recording], report: Mapping[str, Any], labels: Mapping[str, str], rows: Ints
+    recording_of: Callable[[str], Recording], report: DropoutDocument, labels: Mapping[str, str], rows: Ints
 ) -> Iterator[ModelPath]:
     """Yield the path of each held-out model of the report, here as fitted to the whole drive."""
-    if "left_out" in (ladder := report["ladder"]):
+    ladder = report.ladder
+    if ladder.fits is UNSET:
         return
-    kind = ladder["heading"] or ""
+    kind = ladder.heading or ""
     recording = recording_of(kind)
     windows = cache(partial(cut_windows, recording))
-    wheels = {name: _fitted(name, ladder) for name in (FIVE, RECOMMENDED)}
+    wheels = {name: _fitted(name, ladder.fits) for name in (FIVE, RECOMMENDED)}
     for model, base in ((RECOMMENDED, RECOMMENDED), (CONTROLLER, FIVE)):
         fits = {model: wheels[base]}
         if recording.track.gyro is not None:
-            fits[f"{model}_{kind}"] = replace(_fitted(f"{base}_gyro", ladder), wheels=wheels[base])
+            fits[f"{model}_{kind}"] = replace(_fitted(f"{base}_gyro", ladder.fits), wheels=wheels[base])
         for name, fit in fits.items():
             # Too short a drive to find the delay of its wheels has no path.
             with suppress(DataError):
@@ -262,22 +263,22 @@ def _held_out(
                 yield ModelPath(name, labels[name], *predicted_path(recording, fitted, own)(recording.track.t[rows]))
 
 
-def _fitted(name: str, ladder: Mapping[str, Any]) -> FittedModel:
+def _fitted(name: str, fits: Mapping[str, FitDocument]) -> FittedModel:
     """Return a model as it was fitted to the whole drive."""
-    model, value = find_model(name), ladder["fits"][name]["value"]
+    model, value = find_model(name), fits[name].value
     k = len(model.terms)
     return FittedModel(model, np.array([value[term] for term in model.terms]), np.zeros((k, k)))
 
 
-def _calibrated(recording_of: Callable[[str], Recording], report: Mapping[str, Any], rows: Ints) -> Iterator[ModelPath]:
+def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Iterator[ModelPath]:
     """Yield the path of each calibration that was given; with the gyro too where there is one."""
-    recording = recording_of("gyro") if report["calibrations"] else None
-    for one in report["calibrations"]:
-        turned, document = one["with_gyro"], one["calibration"]
+    recording = recording_of("gyro") if report.calibrations else None
+    for one in report.calibrations:
+        turned, document = one.with_gyro, one.calibration
         if recording is not None and document and not (turned and recording.track.gyro is None):
             with suppress(DataError):
-                model = calibrated(read_calibration(document), recording, with_gyro=turned)
-                yield ModelPath(one["name"], one["label"], *predicted_path(recording, *model)(recording.track.t[rows]))
+                model = calibrated(calibration_of(document), recording, with_gyro=turned)
+                yield ModelPath(one.name, one.label, *predicted_path(recording, *model)(recording.track.t[rows]))
 
 
 def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:

@@ -9,13 +9,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.motion.models import TERMS
-from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, DROPOUT_SCHEMA, REPORT_FILE, report_document
+from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, report_document
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.checksums import CHECKSUM_FILE, read_sums
 from icrtool.output.files.json_file import schema_of
@@ -28,10 +29,12 @@ from icrtool.output.page.without_place import without_place
 from icrtool.output.stored_run import check_sum
 from icrtool.output.tables.dropout import shown_horizons
 from icrtool.output.text_format import duration_text, error_text, position_word, role_word
+from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.plain_data import plain
 from icrtool.records.regular_file import read_regular
 from icrtool.records.run import ICR_WORDS, Run, check_type
 from icrtool.records.run_document import RunDocument
+from icrtool.records.text import escaped_texts
 
 SCRIPTS = (
     "vendor/uPlot.iife.min.js",
@@ -74,7 +77,7 @@ def write_page(
 
 
 def run_page(
-    run: Run, report: Mapping[str, Any], pictures: Mapping[str, Picture], *, coordinates: bool = True
+    run: Run, report: DropoutDocument, pictures: Mapping[str, Picture], *, coordinates: bool = True
 ) -> str:  # fmt: skip
     """Return the page of a run as HTML.
 
@@ -84,12 +87,12 @@ def run_page(
     report : what report.json holds
     pictures : by name; those that the page is to show where no script draws
     """
-    document = plain(report)
+    document = msgspec.convert(plain(report), DropoutDocument)  # null for what is no number
     if not coordinates:
         pictures = _without_place(run, pictures)
         run, document = without_place(run, document)
     summary = run.document
-    compared = with_smoothed_reference(run) if document.setdefault("smoothed", False) else run
+    compared = with_smoothed_reference(run) if document.smoothed else run
     return render(
         "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
         title=summary.log, summary=summary, report=document, answer=answer_of(summary, document),
@@ -104,7 +107,7 @@ def run_page(
     )  # fmt: skip
 
 
-def read_report(directory: Path) -> dict[str, Any] | None:
+def read_report(directory: Path) -> DropoutDocument | None:
     """Return what the report.json of a run directory holds; None where it has none.
 
     Raises
@@ -120,7 +123,11 @@ def read_report(directory: Path) -> dict[str, Any] | None:
         check_sum(directory, name, sums)
     if schema_of(file, directory) != DROPOUT_SCHEMA:
         raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
-    return dict(json.loads(read_regular(file, directory)))
+    try:
+        return msgspec.convert(escaped_texts(json.loads(read_regular(file, directory))), DropoutDocument)
+    except (ValueError, RecursionError) as err:
+        why = f"is not as this version of icrtool writes it ({err})"
+        raise RunError(file, why, "make it again with icrtool dropout-report") from err
 
 
 def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
@@ -154,43 +161,46 @@ def _utc(stamp_ns: int) -> str:
     return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
-def _error_rows(report: Mapping[str, Any]) -> dict[str, Any]:
+def _error_rows(report: DropoutDocument) -> dict[str, Any]:
     """Return the errors by model at the horizons of the table: those nearest to 1, 5, 10 and 20 m."""
-    horizons = [row["horizon_m"] for row in report["trials"]]
+    horizons = [row.horizon_m for row in report.trials]
     shown = shown_horizons(np.array(horizons))
     return {
         "heads": _heads([horizons[h] for h in shown]),
-        "trials": [report["trials"][h]["trials"] for h in shown],
-        "why_none": [report["trials"][h]["why_none"] for h in shown],
-        "models": [{**one, "rows": [one["by_horizon"][h] for h in shown]} for one in in_order(report["models"])],
-        "reference": [report["reference_error"][h] for h in shown] if report["reference_error"] else [],
+        "trials": [report.trials[h].trials for h in shown],
+        "why_none": [report.trials[h].why_none for h in shown],
+        "models": [
+            {"name": one.name, "label": one.label, "knows": one.knows, "rows": [one.by_horizon[h] for h in shown]}
+            for one in in_order(report.models)
+        ],
+        "reference": [report.reference_error[h] for h in shown] if report.reference_error else [],
     }
 
 
-def _worst_rows(report: Mapping[str, Any], summary: RunDocument) -> list[dict[str, Any]]:
+def _worst_rows(report: DropoutDocument, summary: RunDocument) -> list[dict[str, Any]]:
     """Return the worst trials, each with what happened meanwhile: jumps of the position, outages, slip."""
     found: list[dict[str, Any]] = []
-    for one in report["worst"]:
-        speed = one["speed_mean_mps"]
-        end_s = one["t_s"] + (one["horizon_m"] / speed if speed else 0.0)
-        end_ns = one["stamp_ns"] + round(1e9 * (end_s - one["t_s"]))
+    for one in report.worst:
+        speed = one.speed_mean_mps
+        end_s = one.t_s + (one.horizon_m / speed if speed else 0.0)
+        end_ns = one.stamp_ns + round(1e9 * (end_s - one.t_s))
         sizes = [
-            jump.size_m for jump in summary.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > one["stamp_ns"]
+            jump.size_m for jump in summary.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > one.stamp_ns
         ]
-        real = [out for out in report["outages"] if out["kind"] == "real"]
-        lost = [out for out in real if out["begin_s"] < end_s and out["end_s"] > one["t_s"]]
-        slips = [slip.kind for slip in summary.events if slip.begin_s < end_s and slip.end_s > one["t_s"]]
+        real = [out for out in report.outages if out.kind == "real"]
+        lost = [out for out in real if out.begin_s < end_s and out.end_s > one.t_s]
+        slips = [slip.kind for slip in summary.events if slip.begin_s < end_s and slip.end_s > one.t_s]
         notes = [f"the position steps by {error_text(max(sizes))}"] if sizes else []
-        notes += [f"outage of {duration_text(out['end_s'] - out['begin_s'])}" for out in lost[:1]]
+        notes += [f"outage of {duration_text(out.end_s - out.begin_s)}" for out in lost[:1]]
         notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
-        found.append({**one, "rank": len(found) + 1, "note": ", ".join(notes)})
+        found.append({**msgspec.structs.asdict(one), "rank": len(found) + 1, "note": ", ".join(notes)})
     return found
 
 
-def _worst_label(report: Mapping[str, Any]) -> str:
+def _worst_label(report: DropoutDocument) -> str:
     """Return the label of the model that the worst trials are of; in earlier versions the momentary ICRs."""
-    name = next((one.get("model", "icr") for one in report["worst"]), "icr")
-    return next((f"the {one['label']}" for one in report["models"] if one["name"] == name), name)
+    name = next((one.model for one in report.worst), "icr")
+    return next((f"the {one.label}" for one in report.models if one.name == name), name)
 
 
 def _heads(horizons_m: Sequence[float]) -> list[str]:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TypeVar
 
 import msgspec
 
+from icrtool.records.dropout_document import DropoutDocument, TrialDocument
 from icrtool.records.run import Run
+from icrtool.records.run_document import EventDocument
+
+Placed = TypeVar("Placed", EventDocument, TrialDocument)
 
 HIDDEN = "left out"
 """Stands in place of a number that would show the place."""
 
 
-def without_place(run: Run, report: Mapping[str, Any]) -> tuple[Run, dict[str, Any]]:
+def without_place(run: Run, report: DropoutDocument) -> tuple[Run, DropoutDocument]:
     """Return a run and what report.json holds of it, with the first state as origin and without the datum.
 
     Notes
@@ -26,10 +29,11 @@ def without_place(run: Run, report: Mapping[str, Any]) -> tuple[Run, dict[str, A
     table = run.table
     north, east = float(table.north_m[0]), float(table.east_m[0])
 
-    def moved(one: Mapping[str, Any]) -> dict[str, Any]:
-        return {**one, "north_m": one["north_m"] - north, "east_m": one["east_m"] - east}
-
     changed, document = msgspec.structs.replace, run.document
+
+    def moved(one: Placed) -> Placed:
+        return changed(one, north_m=one.north_m - north, east_m=one.east_m - east)
+
     cause, datum = document.heading.offset_name, document.gnss.datum
     shown = changed(
         document,
@@ -37,7 +41,7 @@ def without_place(run: Run, report: Mapping[str, Any]) -> tuple[Run, dict[str, A
         warnings=tuple(one.replace(cause, f"its cause is {HIDDEN}") if cause else one for one in document.warnings),
         gnss=changed(document.gnss, datum=None if datum is None else (math.nan, math.nan, math.nan)),
         heading=changed(document.heading, offset_name=None, magnetic_declination_deg=None, utm_convergence_deg=None),
-        events=tuple(changed(one, north_m=one.north_m - north, east_m=one.east_m - east) for one in document.events),
+        events=tuple(map(moved, document.events)),
     )
     sensors, fixes = run.sensors, run.sensors.fixes
     at_origin = replace(
@@ -50,5 +54,6 @@ def without_place(run: Run, report: Mapping[str, Any]) -> tuple[Run, dict[str, A
         ),
         document=shown,
     )
-    drives = {name: [moved(one) for one in report[name]] for name in ("worst", "examples")}
-    return at_origin, {**report, **drives}
+    return at_origin, changed(
+        report, worst=tuple(map(moved, report.worst)), examples=tuple(map(moved, report.examples))
+    )  # fmt: skip

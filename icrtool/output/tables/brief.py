@@ -285,7 +285,7 @@ def _reach_blocks(report: DropoutReport) -> list[Block]:
     blocks: list[Block] = []
     width_m = report.run_document.config.robot.track_width_m
     unknown = [("   no slip", "not known", "needs robot.track_width_m (--robot, --set)")] if width_m is None else []
-    given = [(one.name, one.label, one.fitted_text) for one in report.calibrations]
+    given = [(one.name, one.label, one.fitted) for one in report.calibrations]
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows = [
             (f"   {shortened(label, 28)}", text, note)

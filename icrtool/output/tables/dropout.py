@@ -113,7 +113,7 @@ def headline(report: DropoutReport) -> list[str]:
 
 def _calibration_lines(report: DropoutReport) -> list[str]:
     return [
-        f"{one.label}: {one.model} from {counted(one.logs, 'log')}, {one.created[:10]}, {one.fitted_text}"
+        f"{one.label}: {one.model} from {counted(one.logs, 'log')}, {one.created[:10]}, {one.fitted}"
         for one in report.calibrations
     ]
 

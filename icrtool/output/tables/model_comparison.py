@@ -12,6 +12,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.motion.models import FittedModel
 from icrtool.output.text_format import FITTED
 from icrtool.records.dropout import ModelResult, error_columns
+from icrtool.records.dropout_document import FitDocument, LadderDocument, ScoreDocument
 from icrtool.records.plain_data import rows_of
 
 COMPARISON_COLUMNS = (
@@ -40,38 +41,34 @@ def comparison_rows(report: DropoutReport, comparison: ModelComparison) -> Itera
             yield one.name, fitted, heading, *row.values(), *shares
 
 
-def comparison_document(report: DropoutReport) -> dict[str, Any]:
+def comparison_document(report: DropoutReport) -> LadderDocument:
     """Return what report.json holds, with numbers of numpy; why there is none where it was left out."""
     comparison = report.comparison
     if comparison is None:
-        return {"left_out": report.no_comparison}
-    return {
-        "horizons_m": list(report.horizons_m),
-        "blocks": comparison.blocks,
-        "starts": comparison.starts,
-        "heading": comparison.heading or None,
-        "notes": list(comparison.notes),
-        "models": [
-            {
-                "name": one.name,
-                "label": one.label,
-                "fitted": fitted_text(one.name, comparison.heading),
-                "heading": _heading(one.name, comparison),
-                **error_columns(one.summary),
-            }
+        return LadderDocument(left_out=report.no_comparison)
+    heading = comparison.heading
+    return LadderDocument(
+        horizons_m=list(report.horizons_m),
+        blocks=comparison.blocks,
+        starts=comparison.starts,
+        heading=heading or None,
+        notes=list(comparison.notes),
+        models=[
+            ScoreDocument(
+                one.name, one.label, fitted_text(one.name, heading), _heading(one.name, comparison),
+                *(column.tolist() for column in error_columns(one.summary).values()),
+            )
             for one in compared_results(report)
         ],
-        "width_m": comparison.width_m,
-        "fits": {name: _fit(fit) for name, fit in comparison.fits.items()},
-    }
+        width_m=comparison.width_m,
+        fits={name: _fit(fit) for name, fit in comparison.fits.items()},
+    )  # fmt: skip
 
 
-def _fit(fit: FittedModel) -> dict[str, Any]:
+def _fit(fit: FittedModel) -> FitDocument:
     """Return the parameters of a fit with one standard deviation."""
-    return {
-        "value": dict(zip(fit.model.terms, fit.parameters, strict=True)),
-        "std": dict(zip(fit.model.terms, np.sqrt(np.diag(fit.covariance)), strict=True)),
-    }
+    columns = (fit.parameters, np.sqrt(np.diag(fit.covariance)))
+    return FitDocument(*(dict(zip(fit.model.terms, column.tolist(), strict=True)) for column in columns))
 
 
 def _heading(name: str, comparison: ModelComparison) -> str:

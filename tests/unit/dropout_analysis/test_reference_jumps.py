@@ -77,8 +77,8 @@ def test_no_trial_of_any_row_crosses_it(jumping: Run, report: DropoutReport) -> 
 def test_left_out_trials_are_counted_and_all_starts_add_up(report: DropoutReport) -> None:
     assert (report.counts.crosses_jump > 0).all()
     assert (np.sum(report.counts, axis=0) == report.states).all()
-    for row, count in zip(report_document(report)["trials"], report.counts.crosses_jump, strict=True):
-        assert row["no_trial"]["crosses_jump"] == count
+    for row, count in zip(report_document(report).trials, report.counts.crosses_jump, strict=True):
+        assert row.no_trial["crosses_jump"] == count
 
 
 def test_with_jumps_brings_them_back_and_shows_their_size(jumping: Run, report: DropoutReport) -> None:

@@ -52,8 +52,8 @@ def test_a_run_that_rejected_a_third_of_a_stream_is_not_usable(stream: str) -> N
     report = dropout(run, [5.0])
     assert format_dropout(report).startswith("Do not use: ")
     document = report_document(report)
-    assert document["usable"] is False
-    assert document["unusable_because"] == run.summary["unusable_because"]
+    assert document.usable is False
+    assert document.unusable_because == run.summary["unusable_because"]
 
 
 @pytest.mark.parametrize("stream", ["fixes", "headings"])

@@ -134,8 +134,8 @@ def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
 def test_a_distance_below_a_metre_between_far_horizons_is_not_zero() -> None:
     short = BudgetDistance("no_slip", "no slip", 0.5, 0.3, beyond=False, between_m=(0.0, 10.0))
     assert short.short_text == "less than 1 m"
-    assert short._replace(distance_m=1.4).short_text == "about 1 m"
-    assert short._replace(between_m=(0.0, 1.0)).short_text == "0.3 m"
+    assert msgspec.structs.replace(short, distance_m=1.4).short_text == "about 1 m"
+    assert msgspec.structs.replace(short, between_m=(0.0, 1.0)).short_text == "0.3 m"
 
 
 def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[..., Run]) -> None:

@@ -89,7 +89,8 @@ def test_the_answer_is_that_of_the_report(page: str, run: Run, report: DropoutRe
 
 
 def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutReport) -> None:
-    budgets = [one._replace(without_events_m=20.0, beyond_without_events=True) for one in report.budgets]
+    quiet = {"without_events_m": 20.0, "beyond_without_events": True}
+    budgets = tuple(msgspec.structs.replace(one, **quiet) for one in report.budgets)
     event = EventDocument("skid", 1.0, 2.0, 10**9, 2 * 10**9, 0.0, 0.0, 0.1, 0.5, 1.0)
     document = msgspec.structs.replace(run.document, events=(event, event))
     slipped = replace(report, budgets=budgets, run_document=document)
@@ -198,8 +199,9 @@ def test_text_of_a_log_stays_text(hostile_run: Run, report: DropoutReport) -> No
 
 
 def test_json_in_a_page_cannot_end_its_element(page: str, run: Run, report: DropoutReport) -> None:
-    document = report_document(report)
-    document["models"] = [{**one, "label": "</script><b>&"} for one in document["models"]]
+    made = report_document(report)
+    models = tuple(msgspec.structs.replace(one, label="</script><b>&") for one in made.models)
+    document = msgspec.structs.replace(made, models=models)
     found = run_page(run, document, {})
     assert data_of(found)["models"][0]["label"] == "</script><b>&"
     assert "</script><b>" not in found
@@ -216,10 +218,12 @@ def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutRe
     )
     table = replace(run.table, north_m=run.table.north_m + 4_440_123.0, east_m=run.table.east_m + 612_345.0)
     there = replace(placed, table=table)
-    document = report_document(report)
-    for one in document["worst"]:
-        one["north_m"] += 4_440_123.0
-        one["east_m"] += 612_345.0
+    made = report_document(report)
+    worst = tuple(
+        msgspec.structs.replace(one, north_m=one.north_m + 4_440_123.0, east_m=one.east_m + 612_345.0)
+        for one in made.worst
+    )
+    document = msgspec.structs.replace(made, worst=worst)
     shown, hidden = (run_page(there, document, {}, coordinates=one) for one in (True, False))
     for trace in ("40.12345", "77.65432", "-87.65", "4440123", "612345"):
         assert trace in shown, trace

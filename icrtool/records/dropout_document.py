@@ -1,0 +1,250 @@
+"""report.json: what a dropout report holds; numbers that are not known are null."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from msgspec import UNSET, UnsetType
+
+from icrtool.config import Config
+from icrtool.records.calibration_document import CalibrationDocument
+from icrtool.records.dropout import BudgetDistance, OutageKind, TurningSplit, UsedCalibration
+from icrtool.records.plain_data import Record
+from icrtool.records.run_document import DriveDocument, IcrDocument
+from icrtool.records.samples import InputFile
+
+DROPOUT_SCHEMA: Literal["icrtool/dropout/1"] = "icrtool/dropout/1"
+"""Version of what report.json holds."""
+
+Number = float | None
+Numbers = list[Number]
+
+
+class RunOfReport(Record, frozen=True):
+    """What a report holds of its run."""
+
+    schema: Literal["icrtool/run/1"]
+    tool_version: str
+    log: str
+    inputs: tuple[InputFile, ...]
+    config: Config
+    drive: DriveDocument
+    icr: IcrDocument
+
+
+class ErrorRow(Record, frozen=True):
+    """Errors of a model's trials at one horizon."""
+
+    horizon_m: float
+    trials: int
+    expected_error_m: Number
+    p50_m: Number
+    p95_m: Number
+    max_m: Number
+
+
+class SummaryRow(ErrorRow, frozen=True):
+    """A row of summary.csv: errors in percent of the distance too, with 95 % intervals, and of the heading."""
+
+    expected_pct: Number
+    p95_pct: Number
+    expected_low_m: Number
+    expected_high_m: Number
+    p95_low_m: Number
+    p95_high_m: Number
+    heading_expected_deg: Number
+    heading_p95_deg: Number
+
+
+class BlocksDocument(Record, frozen=True):
+    """Sums over blocks of path, as `icrtool.kernels.open_loop.block_sums.BlockSums`, for later comparisons."""
+
+    horizon_m: float
+    trials: list[int]
+    errors_m: list[float]
+    above_p50: list[int]
+    above_p95: list[int]
+    p50_slope_m: Number
+    p95_slope_m: Number
+
+
+class ModelDocument(Record, frozen=True):
+    """A model's errors; `knows`: what its numbers were learned from."""
+
+    name: str
+    label: str
+    knows: str
+    by_horizon: list[SummaryRow]
+    blocks: list[BlocksDocument]
+
+
+class CountDocument(Record, frozen=True):
+    """How many starts were a trial at a horizon, and why the others were none."""
+
+    horizon_m: float
+    trials: int
+    no_trial: dict[str, int]
+    why_none: str | None
+
+
+class ReferenceRow(Record, frozen=True):
+    """The reference's own error at a horizon: what a perfect model would show."""
+
+    horizon_m: float
+    std_m: Number
+    expected_m: Number
+    p95_m: Number
+
+
+class LearnedDocument(Record, frozen=True):
+    """The trials before and after the ICRs were first learned."""
+
+    model: str
+    learned_s: Number
+    learned_at_distance_m: Number
+    before: list[ErrorRow]
+    after: list[ErrorRow]
+
+
+class EventCostDocument(Record, frozen=True):
+    """What slip events cost: trials that cross one are left out; `with_events`: the errors with them, by model."""
+
+    events: int
+    with_events: dict[str, list[ErrorRow]]
+
+
+class ScoreDocument(Record, frozen=True):
+    """A model of the comparison: what it was fitted to, and its errors by horizon."""
+
+    name: str
+    label: str
+    fitted: str
+    heading: str
+    trials: list[int]
+    expected_error_m: Numbers
+    p50_m: Numbers
+    p95_m: Numbers
+    max_m: Numbers
+
+
+class FitDocument(Record, frozen=True):
+    """Parameters of a model fitted to the whole drive, by term."""
+
+    value: dict[str, float]
+    std: dict[str, Number]
+
+
+class LadderDocument(Record, frozen=True):
+    """The comparison of models; `left_out`: why there is none, and then nothing else."""
+
+    left_out: str | UnsetType = UNSET
+    horizons_m: list[float] | UnsetType = UNSET
+    blocks: int | UnsetType = UNSET
+    starts: int | UnsetType = UNSET
+    heading: str | UnsetType | None = UNSET
+    notes: list[str] | UnsetType = UNSET
+    models: list[ScoreDocument] | UnsetType = UNSET
+    width_m: float | UnsetType = UNSET
+    fits: dict[str, FitDocument] | UnsetType = UNSET
+
+
+class GateDocument(Record, frozen=True):
+    """An acceptance limit and its verdict, as `icrtool.records.dropout.Gate` and `Verdict`."""
+
+    text: str
+    model: str
+    metric: str
+    horizon_m: Number
+    relation: str
+    bound_m: float
+    baseline_factor: float
+    budget_m: Number
+    value_m: Number
+    baseline_m: Number
+    margin_m: Number
+    margin_low_m: Number
+    margin_high_m: Number
+    passed: bool
+    value_bound_m: Number
+    not_checked: str | None
+    unusable: str | None
+    verdict: str
+
+
+class BaselineDocument(Record, frozen=True):
+    """What the report was compared with, and what differs beside the numbers."""
+
+    path: str
+    log: str
+    tool_version: str
+    same_recording: bool
+    changes: tuple[str, ...]
+
+
+class OutageDocument(Record, frozen=True):
+    """An outage."""
+
+    kind: OutageKind
+    begin_s: float
+    end_s: float
+    distance_m: float
+    end_error_m: Number
+    max_error_m: Number
+
+
+class TrialDocument(Record, frozen=True):
+    """A trial; `model`: by whose error it was chosen."""
+
+    model: str
+    stamp_ns: int
+    t_s: float
+    north_m: float
+    east_m: float
+    horizon_m: float
+    heading_change_deg: float
+    speed_mean_mps: float
+    errors_m: dict[str, Number]
+
+
+class IntervalsDocument(Record, frozen=True):
+    """How the intervals were found."""
+
+    method: str
+    block: str
+    resamples: int
+    level: float
+    seed: int
+
+
+class DropoutDocument(Record, frozen=True, kw_only=True):
+    """report.json."""
+
+    schema: Literal["icrtool/dropout/1"]
+    tool_version: str
+    run: RunOfReport
+    usable: bool
+    unusable_because: str | None
+    reference: str
+    smoothed: bool = False
+    starts: int
+    starts_counted: Literal["moving", "all"]
+    starts_standing: int
+    with_jumps: bool
+    without_events: EventCostDocument | None
+    tolerance_m: float
+    bootstrap: IntervalsDocument
+    models: tuple[ModelDocument, ...]
+    trials: tuple[CountDocument, ...]
+    reference_error: tuple[ReferenceRow, ...]
+    by_learning: LearnedDocument | None
+    calibrations: tuple[UsedCalibration, ...]
+    recommended: CalibrationDocument | None
+    budgets: tuple[BudgetDistance, ...]
+    by_turning: tuple[TurningSplit, ...]
+    ladder: LadderDocument
+    gates: tuple[GateDocument, ...]
+    passed: bool
+    baseline: BaselineDocument | None
+    outages: tuple[OutageDocument, ...]
+    worst: tuple[TrialDocument, ...]
+    examples: tuple[TrialDocument, ...]
