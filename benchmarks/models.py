@@ -40,8 +40,7 @@ from icrtool.motion.models import (
     Term,
     controller_model,
 )  # fmt: skip
-from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_windows, totals_of
-from icrtool.motion.trials import cut_trials
+from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_trials, cut_windows, totals_of
 from icrtool.output.run_directory import RUN_FILE, is_run_directory
 from icrtool.output.stored_run import open_run
 

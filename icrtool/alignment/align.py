@@ -1,25 +1,26 @@
-"""Align the sensors of a log: from what was sent to what the filter can use."""
+"""Align the sensors of a log: from what was sent to what the filter can use, with the position reference that fits."""
 
 from __future__ import annotations
 
 import math
 from contextlib import suppress
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.findings import alignment_findings, start_icrs
-from icrtool.alignment.position.gnss_quality import grade_fixes
-from icrtool.alignment.position.gnss_steps import without_frozen
-from icrtool.alignment.position.sensor_noise import heading_variance, position_variance, reference_noise
+from icrtool.alignment.conventions import apply_convention, decide_conventions
+from icrtool.alignment.corrections import AlignedStreams, align_streams
+from icrtool.alignment.estimator import Geometry, estimate_alignment
+from icrtool.alignment.log_track import check_streams, cut_windows, track_of_log
+from icrtool.alignment.sensors.gnss_quality import grade_fixes
+from icrtool.alignment.sensors.sensor_noise import heading_variance, position_variance, reference_noise, without_frozen
+from icrtool.alignment.sensors.wheel_alignment import bridged
+from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
 from icrtool.alignment.slip.slip_events import find_disagreements
-from icrtool.alignment.stream_checks import check_streams
-from icrtool.alignment.wheels.wheel_alignment import bridged
-from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
 from icrtool.config import Config
-from icrtool.errors import DataError
-from icrtool.records.measurements import Fixes, Measurements, SensorData
+from icrtool.errors import ConfigError, DataError
+from icrtool.records.measurements import Finding, Fixes, IcrStart, Measurements, SensorData
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.samples import PositionFixes
 from icrtool.records.tables import RobotLog
@@ -162,3 +163,168 @@ def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
         forward if given.antenna_forward_m == "auto" else given.antenna_forward_m,
         right if given.antenna_right_m == "auto" else given.antenna_right_m,
     )
+
+
+LEAST_START_STD, INFLATION = 0.15, 3.0
+"""The filter starts from the alignment's ICRs with three times their standard deviation, at least this part of b."""
+
+LARGEST_WIDTH_STD, WIDTHS = 0.2, (0.7, 6.0)
+"""The ICRs are shown where W is known to this share, and lies between so many b."""
+
+USUAL_WIDTH = 1.5
+"""Most skid-steer robots turn as if they were this much wider than they are."""
+
+START = "start of the filter"
+
+
+def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
+    """Return all estimates of the alignment, by name with unit.
+
+    Parameters
+    ----------
+    antenna_m : the antenna from the body origin, forward and right; the ICRs refer to the origin
+    """
+    wheels, heading, delays = found.wheels, found.heading, found.delays
+    degrees = math.degrees
+    return {
+        "wheel_scale": _finding(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
+        "heading_offset_deg": _finding(
+            -degrees(heading.offset_rad), degrees(heading.offset_std_rad), -degrees(heading.applied_offset_rad)
+        ),
+        "heading_delay_s": _finding(*delays.heading, delays.applied_heading_s),
+        "position_delay_s": _finding(*delays.gnss, delays.applied_gnss_s),
+        "position_delay_against_heading_s": _finding(
+            *delays.apart, delays.applied_gnss_s - delays.applied_heading_s if not delays.together else 0.0
+        ),
+    } | _robot_findings(found, antenna_m)
+
+
+def _robot_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
+    """Return side scales, ICRs and the antenna's place against them; none without an estimate."""
+    geometry = found.geometry
+    if geometry is None:
+        return {}
+    (right, left, x, left_scale, right_scale, width), covariance = geometry.values.tolist(), geometry.covariance
+    forward_m, right_m = antenna_m
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    half_sum = np.array([0.5, 0.5, 0.0, 0.0, 0.0, 0.0])
+    middle_std = math.sqrt(max(float(half_sum @ covariance @ half_sum), 0.0))
+    place = "only the position of the antenna relative to the ICRs is determined"
+    scales = found.wheels.applied
+    return {
+        "left_scale": _finding(left_scale, std[3], scales[0], nothing=1.0),
+        "right_scale": _finding(right_scale, std[4], scales[1], nothing=1.0),
+        "icr_separation_m": Finding(width, std[5], 0.0, START),
+        "antenna_forward_minus_x_icr_m": Finding(-x, std[2], forward_m, place),
+        "antenna_right_minus_icr_middle_m": Finding(-(right + left) / 2, middle_std, right_m, place),
+        "y_icr_right_m": Finding(right + right_m, std[0], 0.0, START),
+        "y_icr_left_m": Finding(left + right_m, std[1], 0.0, START),
+        "x_icr_m": Finding(x + forward_m, std[2], 0.0, START),
+    }
+
+
+def _finding(value: float, std: float, applied: float, nothing: float = 0.0) -> Finding:
+    """Return one estimate; `nothing` is the correction that changes nothing."""
+    known = math.isfinite(value) and math.isfinite(std)
+    if applied != nothing:
+        why = "corrected"
+    elif known:
+        why = "not corrected: too small, too uncertain, or not separable from wheel slip"
+    else:
+        why = "not corrected: this drive does not show it"
+    return Finding(value if known else None, std if known else None, applied, why)
+
+
+def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: Config) -> IcrStart | None:
+    """Return the ICRs to start the filter from; None in preset ``paper``.
+
+    They are those of the alignment with an inflated standard deviation, where the drive shows them; else those of
+    most skid-steer robots, as uncertain as those differ.
+    """
+    if config.filter.preset == "paper":
+        return None
+    b = width_or_usual_m(config.robot.track_width_m)
+    least = LEAST_START_STD * b
+    if found is not None:
+        right, left, x = found.values[:3].tolist()
+        std, width = np.sqrt(np.maximum(np.diag(found.covariance), 0.0)), float(found.values[5])
+        shown = std[5] < LARGEST_WIDTH_STD * width and WIDTHS[0] * b < width < WIDTHS[1] * b
+        icrs = (right + antenna_m[1], left + antenna_m[1], x + antenna_m[0])
+        if shown and icrs[0] > least > -least > icrs[1] and float(std[:3].max()) < b:
+            inflated = [max(INFLATION * float(one), least) for one in std[:3]]
+            return IcrStart(icrs, (inflated[0], inflated[1], inflated[2]))
+    return IcrStart((USUAL_WIDTH * b / 2, -USUAL_WIDTH * b / 2, 0.0), (b / 2, b / 2, b / 2))
+
+
+LENGTH_M, SHARE = 10.0, 0.9
+"""References are compared by the residual that this share of windows of this driven distance stays below."""
+
+POOR_M = 1.0
+"""A reference whose residual is less is kept: GNSS gives positions on the globe, and does not drift."""
+
+BETTER = 0.5
+"""Another reference is taken where its residual is less than this part of the chosen one's."""
+
+LEAST_SHARE_COVERED = 0.7
+"""... and where it covers this part of the distance that the chosen one covers."""
+
+
+class Agreement(NamedTuple):
+    """How a position reference agrees with wheels and heading.
+
+    Attributes
+    ----------
+    residual_m : of displacements over `LENGTH_M`, inf where they cannot be compared
+    distance_m : driven distance that windows cover
+    """
+
+    residual_m: float
+    distance_m: float
+
+
+NONE = Agreement(math.inf, 0.0)
+
+
+def choose_reference(log: RobotLog, config: Config) -> RobotLog:
+    """Return the log with the position reference that its wheels and headings support; preset ``paper``: as it is."""
+    if not log.other_references or config.filter.preset == "paper" or not len(log.heading.stamp_ns):
+        return log
+    chosen = agreement(log, config)
+    if chosen.residual_m <= POOR_M:
+        return log
+    found = [(agreement(other, config), other) for other in log.other_references]
+    least = LEAST_SHARE_COVERED * chosen.distance_m
+    fit = [(one.residual_m, other) for one, other in found if one.distance_m > least]
+    residual, best = min(fit, key=lambda one: one[0], default=(math.inf, log))
+    if not residual < min(BETTER * chosen.residual_m, POOR_M):
+        return log
+    topics = [one.topic("gnss") for one in (best, log)]
+    against = f"{chosen.residual_m:.2f} m" if math.isfinite(chosen.residual_m) else "not comparable"
+    why = f"agrees with wheels and heading within {residual:.2f} m over {LENGTH_M:.0f} m ({topics[1]}: {against})"
+    streams = tuple(
+        replace(stream, why=f"{stream.why}; {why}") if stream.role == "gnss" else stream for stream in best.streams
+    )
+    note = f"{log.name}: the position reference is {topics[0]}, which {why}; topics.gnss sets it"
+    return replace(best, streams=streams, warnings=(*best.warnings, note))
+
+
+def agreement(log: RobotLog, config: Config) -> Agreement:
+    """Return how the position reference of a log agrees with its wheels along its heading."""
+    width = width_or_usual_m(config.robot.track_width_m)
+    try:
+        log = with_wheel_speeds(log, config)
+        check_streams(log)
+    except (ConfigError, DataError):
+        return NONE
+    track = track_of_log(log)
+    windows = cut_windows(track, LENGTH_M)
+    free = config.frames.heading == "auto"
+    decision = decide_conventions(track, windows, metric=log.datum is None and free, mirror_allowed=free)
+    named = apply_convention(log, decision.convention)
+    found = estimate_alignment(track if named is log else track_of_log(named), windows, width)
+    if found is None:
+        return NONE
+    count = len(windows.begin)
+    size = np.hypot(found.fit.residuals[:count], found.fit.residuals[count : 2 * count])
+    covered = np.unique(np.floor(track.distance[windows.begin] / LENGTH_M))
+    return Agreement(float(np.quantile(size, SHARE)), LENGTH_M * len(covered))

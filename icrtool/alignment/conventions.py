@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import LEAST_CHORD_M, DriveWindows, cut_chords
+from icrtool.alignment.log_track import LEAST_CHORD_M, DriveWindows, cut_chords
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares, sandwich_covariance, soft_l1_loss
 from icrtool.kernels.track import Track

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import DriveWindows
+from icrtool.alignment.log_track import DriveWindows
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.kernels.track import Track

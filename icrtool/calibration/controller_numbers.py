@@ -12,8 +12,7 @@ from icrtool.calibration.held_out import HeldOut, left_out
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.models import CONTROLLER, NO_SLIP, RECOMMENDED, TERMS, FittedModel
-from icrtool.motion.recording import LogConstants, Recording, Windows
-from icrtool.motion.trials import predicted_path
+from icrtool.motion.recording import LogConstants, Recording, Windows, predicted_path
 from icrtool.records.calibration_document import ControllerErrors
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known

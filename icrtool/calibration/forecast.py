@@ -14,8 +14,7 @@ from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import OMEGA, VX
 from icrtool.motion.models import FittedModel, wheel_motion
-from icrtool.motion.recording import Recording, steps_of
-from icrtool.motion.trials import Trials
+from icrtool.motion.recording import Recording, Trials, steps_of
 
 STEP_M = 0.1
 """A planned path is driven in steps of this length."""

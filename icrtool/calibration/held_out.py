@@ -21,8 +21,17 @@ from icrtool.kernels.track import Track
 from icrtool.kernels.within_budget import within_budget
 from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, FittedModel, controller_model
-from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_windows, totals_of
-from icrtool.motion.trials import TrialErrors, Trials, cut_trials, predicted_path, trial_errors
+from icrtool.motion.recording import (
+    NO_CONSTANTS,
+    Recording,
+    TrialErrors,
+    Trials,
+    cut_trials,
+    cut_windows,
+    predicted_path,
+    totals_of,
+    trial_errors,
+)
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 
 HORIZONS_M = (5.0, 10.0, 20.0)

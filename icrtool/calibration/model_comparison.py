@@ -23,8 +23,7 @@ from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.open_loop.trials import FrozenIcrs, OpenLoopPath
 from icrtool.kernels.track import Track
 from icrtool.motion.models import NO_SLIP, FittedModel
-from icrtool.motion.recording import Recording
-from icrtool.motion.trials import ErrorsOf, TrialErrors, Trials
+from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, width_or_usual_m

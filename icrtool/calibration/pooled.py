@@ -17,8 +17,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.motion.fit import Fold, Prediction, own_constants
 from icrtool.motion.models import MODELS, RECOMMENDED
-from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import ErrorsOf
+from icrtool.motion.recording import ErrorsOf, Recording, cut_windows
 from icrtool.records.calibration_document import CalibratedRobot, CalibrationLog, HeldOutScore, PooledScore
 
 

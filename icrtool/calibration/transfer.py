@@ -24,8 +24,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals
 from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
 from icrtool.motion.models import RECOMMENDED, TrackGeometry
-from icrtool.motion.recording import Recording
-from icrtool.motion.trials import cut_trials
+from icrtool.motion.recording import Recording, cut_trials
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.run import Run
 

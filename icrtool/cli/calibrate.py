@@ -141,10 +141,10 @@ def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> Lo
 
 def _draw(source: Path, run: Run, plot: Path) -> None:
     """Draw the residuals of one log's alignment."""
+    from icrtool.alignment.align import choose_reference
     from icrtool.alignment.corrections import align_streams
     from icrtool.alignment.estimator import residuals_by_estimate
-    from icrtool.alignment.position.reference_choice import choose_reference
-    from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
+    from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
     from icrtool.output.figures.calibration import residuals_figure
     from icrtool.output.files.picture_file import save_picture

@@ -103,7 +103,7 @@ def _examine(found: Found, config: Config, part: tuple[str | None, str | None], 
     IcrToolError
         The log cannot be fitted.
     """
-    from icrtool.alignment.wheels.wheel_units import with_wheel_speeds
+    from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import assemble, read_log, survey_log
     from icrtool.logs.table_file import is_table
 

@@ -15,7 +15,7 @@ from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import OpenLoopPath
 from icrtool.kernels.track import Track
 from icrtool.motion.models import RECOMMENDED
-from icrtool.motion.trials import Trials
+from icrtool.motion.recording import Trials
 from icrtool.records.dropout import ExampleTrial
 from icrtool.records.run import Run, track_of
 

@@ -29,7 +29,7 @@ from icrtool.kernels.open_loop.error_statistics import (
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import FrozenIcrs, Intervals, Summary, TrialCounts
 from icrtool.kernels.track import Track
-from icrtool.motion.trials import MOST_STARTS, ErrorsOf, Trials
+from icrtool.motion.recording import MOST_TRIALS, ErrorsOf, Trials
 from icrtool.records.dropout import DEFAULT_SEED, HeadingErrors, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type, no_slip_icrs, track_of
@@ -293,9 +293,9 @@ def models_of(run: Run) -> tuple[Model, ...]:
 
 
 def sparse_starts(track: Track) -> Ints:
-    """Return evenly spaced starts of a drive without standstill, at most some `MOST_STARTS`."""
+    """Return evenly spaced starts of a drive without standstill, at most some `MOST_TRIALS`."""
     moving = np.flatnonzero(~standing_states(track))
-    return moving[:: max(len(moving) // MOST_STARTS, 1)]
+    return moving[:: max(len(moving) // MOST_TRIALS, 1)]
 
 
 def _groups(horizons: int, states: int) -> list[slice]:

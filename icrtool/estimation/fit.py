@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from icrtool.alignment.align import align
-from icrtool.alignment.position.reference_choice import choose_reference
+from icrtool.alignment.align import align, choose_reference
 from icrtool.config import Config
 from icrtool.estimation import smooth as smoother
 from icrtool.estimation.followed_jumps import followed_jumps

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from icrtool import __version__
-from icrtool.alignment.position.gnss_quality import CLASSES
+from icrtool.alignment.sensors.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_states, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned

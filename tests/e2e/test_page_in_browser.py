@@ -23,8 +23,7 @@ from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop.direct import open_loop_path, trial_ends
 from icrtool.motion.fit import own_constants
 from icrtool.motion.models import controller_model
-from icrtool.motion.recording import cut_windows
-from icrtool.motion.trials import Trials, predicted_path
+from icrtool.motion.recording import Trials, cut_windows, predicted_path
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.files.json_file import json_bytes
 from icrtool.output.page import drive_data

@@ -9,8 +9,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import Track, ends_from
 from icrtool.motion.models import MotionModel, twist, wheel_motion
-from icrtool.motion.recording import Recording
-from icrtool.motion.trials import PathAt, Trials, trial_errors
+from icrtool.motion.recording import PathAt, Recording, Trials, trial_errors
 
 WIDTH_M = 0.6
 SLOWEST_TURN = 0.15

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.heading.courses import Guess, TurnRate, fit_middle, measure_courses
+from icrtool.alignment.heading.turn_rates import Guess, TurnRate, fit_middle, measure_courses
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import long_run_factor, mad_std
 from icrtool.kernels.track import Track

@@ -1,17 +1,250 @@
-"""The turn rate about the vertical: a gyro's, however it is mounted, or the wheels'."""
+"""Turn rates, and the courses over ground that they are compared with: directions in which fixes moved.
+
+Over windows of driven distance the fixes p_i are regressed on the wheels' speed laid along the integrated turn rate,
+S_i = ∫ v e^{jG}, both about their means: the angle of sum p_i S_i* is the heading at the window's end, G being 0
+there.
+What turns it further is linear, each divided by sum |S_i|^2:
+
+    an error δpsi(t) of the heading           Re(sum ∫ δpsi v e^{jG} S_i*)
+    an ICR ahead of the antenna               x Im(sum -e^{jG_i} S_i*)
+    positions that lag by tau                 tau Im(sum -v_i e^{jG_i} S_i*)
+
+Wheels that run backwards turn S round.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.heading.courses import TurnRate, course_changes
-from icrtool.kernels.arrays import Floats, trapezoids
+from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import huber_weights, mad_std
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.samples import GyroAxes
+
+COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
+ENOUGH_COURSES = 24.0
+"""Windows are as long as the noise of the fixes asks for; on a short drive shorter, so that there are so many."""
+
+LARGEST_TURN_ERROR_RAD = 2.0
+"""A window is used where what is not known of bias and scale of the turn rate turns its window by less than this."""
+
+FEWEST_FIXES = 5
+"""Windows share no fix, so that their errors are independent; with fewer fixes, most of the distance would be lost."""
+
+SPIKE_SIGMAS = 8.0
+MIDDLE_NOISE = 0.01
+"""Turns that change the sides' speeds by less than this show no middle."""
+
+LONGEST_STRETCH_S = 60.0
+"""Displacements that take longer, or are further apart, are not compared without a turn rate."""
+
+
+class TurnRate(NamedTuple):
+    """A turn rate, clockwise.
+
+    Attributes
+    ----------
+    t : (n,) [s]; rate : (n,) [rad/s]
+    holes : (m, 2) begins and ends of stretches [s] in which it was not measured
+    scale_std, bias_std : deviations of its scale and bias before the log
+    hole_std : of the rate within a hole [rad/s]; delay_std_s : of its stamps, None: half an interval
+    """
+
+    t: Floats
+    rate: Floats
+    holes: Floats = np.empty((0, 2))
+    scale_std: float = 0.02
+    bias_std: float = math.radians(2.0)
+    hole_std: float = math.radians(10.0)
+    delay_std_s: float | None = None
+
+    def integrated(self) -> Floats:
+        """Return the turn since the first sample (n,) [rad], by trapezoids."""
+        return trapezoids(self.t, self.rate)
+
+    def stamp_std(self) -> Floats:
+        """Return what an error of its stamps turns the heading by (n,) [rad].
+
+        A rate may be the mean over the interval before its stamp, or after it.
+        """
+        delay = float(np.median(np.diff(self.t))) / 2.0 if self.delay_std_s is None else self.delay_std_s
+        return np.abs(self.rate) * delay
+
+    def hole_variance(self, t: Floats) -> Floats:
+        """Return the variance that its holes have added until times t (n,) [rad^2]."""
+        total = np.zeros(len(t))
+        for begin, end in self.holes:
+            total += (self.hole_std * np.clip(t - begin, 0.0, end - begin)) ** 2
+        return total
+
+
+class Guess(NamedTuple):
+    """Where courses are linear in the errors that turn them.
+
+    Attributes
+    ----------
+    bias : (n,) of the turn rate at its samples [rad/s]
+    x : ICR ahead of the antenna [m]; delay_s : of the positions
+    middle : how much the antenna's speed grows with half the speed difference of the sides (left - right)
+    bias_std, scale_std : what is not known of bias [rad/s] and scale
+    """
+
+    bias: Floats
+    bias_std: float
+    scale_std: float
+    x: float = 0.0
+    delay_s: float = 0.0
+    middle: float = 0.0
+
+
+class Courses(NamedTuple):
+    """Windows of driven distance; (w,) each.
+
+    Attributes
+    ----------
+    begin, end : first and last fix [s]; angle : heading at the end by the fixes [rad]
+    of_x, of_delay, of_bias, of_scale : its derivatives by x_icr, by the delay of the positions, and by bias and scale
+        error of the turn rate
+    std : by the noise of the fixes [rad]
+    length : displacement by the fixes over that by the wheels; of_middle : its derivative by `Guess.middle`
+    """
+
+    begin: Floats
+    end: Floats
+    angle: Floats
+    of_x: Floats
+    of_delay: Floats
+    of_bias: Floats
+    of_scale: Floats
+    std: Floats
+    length: Floats
+    of_middle: Floats
+
+
+def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
+    """Cut the drive into windows of distance that follow one another, and measure the course over ground in each."""
+    corrected = turn._replace(rate=turn.rate - guess.bias).integrated()
+    v, u = track.mean_speed, track.half_difference
+    middle = track.t + track.held / 2
+    psi = np.interp(middle, turn.t, corrected)
+    nose = np.exp(1j * psi) * track.held
+    step = (v + guess.middle * u) * nose
+    gone = track.cumulate(np.abs(v))
+    length = _course_length(track)
+    t, place = _without_spikes(
+        track._replace(place_t=track.place_t - guess.delay_s),
+        max(track.t[0], turn.t[0]), min(track.t[-1], turn.t[-1]),
+    )  # fmt: skip
+    edge = _edges(np.interp(t, track.t, gone), length)
+    begin, end = edge[:-1], edge[1:] - 1
+    if not len(begin):
+        return Courses(*(np.empty(0) for _ in Courses._fields))
+    count = end + 1 - begin
+    used, first = slice(edge[0], edge[-1]), begin - edge[0]
+
+    def centred(values: Complexes) -> Complexes:
+        """Return values at the fixes about the mean of their window."""
+        mean = np.add.reduceat(values[used], first) / count
+        return np.asarray(values[used] - np.repeat(mean, count), np.complex128)
+
+    def laid(rate: Complexes) -> Complexes:
+        along = np.concatenate([[0.0], np.cumsum(rate[:-1])])
+        return np.asarray(np.interp(t, track.t, along), np.complex128)
+
+    def product(values: Complexes) -> Complexes:
+        return np.asarray(np.add.reduceat(values * np.conj(path), first), np.complex128)
+
+    turned = np.interp(t, turn.t, corrected)
+    swing = np.exp(1j * turned)
+    whole = laid(step)
+    path = centred(whole - guess.x * swing)
+    speed = v[np.clip(np.searchsorted(track.t, t, side="right") - 1, 0, len(v) - 1)]
+    square = np.maximum(product(path).real, 1e-12)
+    seen = product(centred(place)) / square
+    unknown = guess.bias_std * (t[end] - t[begin]) + guess.scale_std * np.abs(turned[end] - turned[begin])
+    kept = (unknown < LARGEST_TURN_ERROR_RAD) & (np.abs(seen) > 0.3)
+    kept &= np.abs(whole[end] - whole[begin]) > 0.5 * length * (count - 1) / count
+    kept &= track.clear(t[begin], t[end])
+    kept &= np.searchsorted(turn.holes[:, 1], t[begin]) == np.searchsorted(turn.holes[:, 0], t[end])
+    of_x, of_delay = (product(centred(-one)).imag / square for one in (swing, speed * swing))
+    of_bias = t[end] - product(centred(laid(step * middle) - guess.x * t * swing)).real / square
+    of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
+    # about no bias, no x and no delay
+    bias_at = np.interp(t[end], turn.t, guess.bias)
+    angle = np.angle(seen * np.exp(1j * turned[end])) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
+    found = Courses(
+        t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, track.place_std_m / np.sqrt(square),
+        np.abs(seen), product(centred(laid(u * nose))).real / square,
+    )  # fmt: skip
+    return Courses(*(values[kept] for values in found))
+
+
+def fit_middle(courses: Courses, guess: Guess) -> float:
+    """Return `Guess.middle` by the lengths of the courses: robust regression on the difference of the sides."""
+    x, y = courses.of_middle, courses.length
+    slope, weights = 0.0, np.ones(len(x))
+    for _ in range(3):
+        mean_x, mean_y = np.average(x, weights=weights), np.average(y, weights=weights)
+        spread = float((weights * (x - mean_x) ** 2).sum())
+        slope = float((weights * (x - mean_x) * (y - mean_y)).sum()) / (spread + len(x) * MIDDLE_NOISE**2)
+        left = y - mean_y - slope * (x - mean_x)
+        weights = huber_weights(left / max(mad_std(left, 0.0), 1e-6))
+    return guess.middle + slope
+
+
+def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
+    """Return middles (m,) [s] of windows and of those that follow, and how far the course over ground turns [rad].
+
+    Only displacements and the sense of the wheels' turning: nothing is known of the heading yet.
+    """
+    along, gone = (track.cumulate(one) for one in (track.mean_speed, np.abs(track.mean_speed)))
+    t, place = _without_spikes(track, float(track.t[0]), float(track.t[-1]))
+    length = _course_length(track)
+    edge = _edges(np.interp(t, track.t, gone), length)
+    begin, end = edge[:-1], edge[1:] - 1
+    went = np.interp(t[end], track.t, along) - np.interp(t[begin], track.t, along)
+    seen = (place[end] - place[begin]) * np.sign(went)
+    kept = (np.abs(went) > 0.3 * length) & (np.abs(seen) > 0.3 * np.abs(went))
+    kept &= t[end] - t[begin] < LONGEST_STRETCH_S
+    middle, seen = ((t[begin] + t[end]) / 2)[kept], seen[kept]
+    near = np.diff(middle) < LONGEST_STRETCH_S
+    return middle[:-1][near], middle[1:][near], np.angle(seen[1:] * np.conj(seen[:-1]))[near]
+
+
+def _course_length(track: Track) -> float:
+    std = min(track.place_std_m, 10.0)
+    short = max(float(track.travel[-1]) / ENOUGH_COURSES, SHORTEST_IN_POSITION_STD * std)
+    return max(COURSE_WINDOW_M, min(COURSE_IN_POSITION_STD * std, short))
+
+
+def _edges(gone: Floats, length: float) -> np.ndarray:
+    """Return the first fixes of windows: a new one after so much distance and so many fixes."""
+    edges, last = [0], 0
+    cell = np.floor(gone / length)
+    for one in np.flatnonzero(np.diff(cell) > 0) + 1:
+        if one - last >= FEWEST_FIXES:
+            edges.append(int(one))
+            last = int(one)
+    return np.array(edges)
+
+
+def _without_spikes(track: Track, first: float, last: float) -> tuple[Floats, Complexes]:
+    """Return times and places of the fixes in a span, without those that lie far from both neighbours."""
+    rows = np.flatnonzero((track.place_t >= first) & (track.place_t <= last))
+    t, place = track.place_t[rows], track.place[rows]
+    if len(rows) < 3:
+        return t, place
+    bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
+    far = bend > SPIKE_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
+    # the neighbours of a spike bend by half as much
+    spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
+    kept = np.concatenate([[True], ~spike, [True]])
+    return t[kept], place[kept]
+
 
 WHEEL_TURN, WHEEL_SCALE_STD = 0.6, 0.5
 """Skid-steer robots turn about this much of what their wheels would without slip."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.slip.slip_windows import Knots, Motion, Windows, compare
+from icrtool.alignment.slip.slip_windows import ComparedWindows, Knots, Motion, compare
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.records.events import ReferenceJump
 
@@ -113,7 +113,7 @@ def _cause(*, far: bool, turn: bool, stated: bool) -> str:
     return "faster than any slide" if far else "turns faster than any robot" if turn else ""
 
 
-def _jump(knots: Knots, motion: Motion, windows: Windows, row: int, why: str) -> ReferenceJump:
+def _jump(knots: Knots, motion: Motion, windows: ComparedWindows, row: int, why: str) -> ReferenceJump:
     first, last = int(windows.begin[row]), int(windows.end[row])
     level = np.exp(0.5j * (knots.heading[first] + knots.heading[last]))
     moved = complex((windows.ahead[row] + 1j * windows.aside[row]) * level)

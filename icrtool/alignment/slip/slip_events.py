@@ -13,7 +13,7 @@ import numpy as np
 
 from icrtool.alignment.slip.reference_jumps import decide_jumps, without_jumps
 from icrtool.alignment.slip.slip_extent import Extent, find_extent
-from icrtool.alignment.slip.slip_windows import Knots, Motion, Windows, compare, cut, fit_motion, lay_knots
+from icrtool.alignment.slip.slip_windows import ComparedWindows, Knots, Motion, compare, fit_motion, lay_knots, spans_of
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.records.events import ReferenceJump, SlipEvent
 from icrtool.records.measurements import SensorData
@@ -156,7 +156,7 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
     begin, end, distance2, excess, stuck, doubled = ([] for _ in range(6))
     error = np.full(3, LEAST_MODEL_ERROR)
     for duration in reversed(_durations(knots)):
-        first, last = cut(knots, duration)
+        first, last = spans_of(knots, duration)
         long = last - first >= FEWEST_INTERVALS
         windows = compare(knots, motion, first[long], last[long], RESPONSE_STD_S)
         error = _model_error(windows, quiet, quantile)
@@ -198,7 +198,7 @@ def _durations(knots: Knots) -> list[float]:
     return durations
 
 
-def _model_error(windows: Windows, quiet: Bools, quantile: float) -> Floats:
+def _model_error(windows: ComparedWindows, quiet: Bools, quantile: float) -> Floats:
     """Return the standard deviation of the model's error (3,), a share of the wheels' motion.
 
     Sensor noise s and model error k p leave a share q of the residuals r within n standard deviations where k is the
@@ -214,7 +214,7 @@ def _model_error(windows: Windows, quiet: Bools, quantile: float) -> Floats:
     return np.asarray(np.sqrt(np.maximum(square, LEAST_MODEL_ERROR**2)))
 
 
-def _exceeds(windows: Windows) -> Bools:
+def _exceeds(windows: ComparedWindows) -> Bools:
     """Return which windows show more motion than the wheels', of a side and of distance or turn, or the opposite.
 
     A side without grip turns the robot more than both sides would; a robot in a rut drags the slower side along.
@@ -230,13 +230,13 @@ def _exceeds(windows: Windows) -> Bools:
     return (beyond(*left) | beyond(*right)) & (beyond(*ahead) | beyond(*turned)) & ~_of_one_side(windows)
 
 
-def _of_one_side(windows: Windows) -> Bools:
+def _of_one_side(windows: ComparedWindows) -> Bools:
     """Return in which windows one side keeps to its wheels: the other has no grip, and may be dragged along."""
     sides = np.abs([windows.ahead + windows.turned, windows.ahead - windows.turned])
     return np.asarray(sides.min(axis=0) < KEEPING_SHARE * sides.max(axis=0))
 
 
-def _from_doubled(windows: Windows) -> Floats:
+def _from_doubled(windows: ComparedWindows) -> Floats:
     """Return how far the robot is from twice the motion of its wheels (w,) [m]: the opposite of standing still."""
     place = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
     return np.maximum(place, np.abs(windows.turned - windows.model_turned))
@@ -275,7 +275,7 @@ def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) 
     return found
 
 
-def _shows_slip(knots: Knots, steps: Windows, extent: Extent) -> bool:
+def _shows_slip(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
     """Return whether an event is severe enough, and no error of the reference.
 
     Of a side without grip the severity counts as the root mean square over both sides.
@@ -285,7 +285,7 @@ def _shows_slip(knots: Knots, steps: Windows, extent: Extent) -> bool:
     return extent.severity >= LEAST_SHARE and not _returns(knots, steps, extent)
 
 
-def _keeps_one_side(steps: Windows, extent: Extent) -> bool:
+def _keeps_one_side(steps: ComparedWindows, extent: Extent) -> bool:
     """Return whether one side does what its wheels do, and the other lacks a steady part of it.
 
     No error of a position or of a heading does that, except that of a stamp while the robot turns about a side: it is
@@ -300,7 +300,7 @@ def _keeps_one_side(steps: Windows, extent: Extent) -> bool:
     return bool(steady) and extent.end_s - extent.begin_s > LONGEST_STAMP_ERROR_S
 
 
-def _returns(knots: Knots, steps: Windows, extent: Extent) -> bool:
+def _returns(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
     """Return whether the reference makes up, shortly before or after, for the motion that is missing in the event.
 
     A reference that is wrong for a while comes back; distance and turn lost by slip do not.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.slip.slip_windows import Windows
+from icrtool.alignment.slip.slip_windows import ComparedWindows
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.records.events import SlipKind
 
@@ -53,7 +53,7 @@ class Extent(NamedTuple):
     distance_m: float
 
 
-def find_extent(t: Floats, steps: Windows, error: Floats, usable: Bools, core: slice) -> Extent | None:
+def find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools, core: slice) -> Extent | None:
     """Return the event about a window that shows one; None where none of its own is left.
 
     First the part of the window with the largest sum of evidence, then outwards as long as the evidence grows.
@@ -90,7 +90,7 @@ def find_extent(t: Floats, steps: Windows, error: Floats, usable: Bools, core: s
     return _measured(steps, span, shares, begin_s, end_s)
 
 
-def missed_shares(steps: Windows, rows: slice) -> Floats:
+def missed_shares(steps: ComparedWindows, rows: slice) -> Floats:
     """Return the shares that the left and the right side miss of their motion, and that the robot moves aside (3,).
 
     Sums, and no least squares over steps: the noise of the fixes cancels except that of the first and the last.
@@ -106,7 +106,7 @@ def missed_shares(steps: Windows, rows: slice) -> Floats:
     return np.array([share(left, -ahead - turned), share(right, turned - ahead), share(steps.path_m[rows], -aside)])
 
 
-def _measured(steps: Windows, span: slice, shares: Floats, begin_s: float, end_s: float) -> Extent:
+def _measured(steps: ComparedWindows, span: slice, shares: Floats, begin_s: float, end_s: float) -> Extent:
     left, right = _sides(steps, span)
     miss_left, miss_right = shares[0] * left, shares[1] * right
     path = float(steps.path_m[span].sum())
@@ -125,18 +125,18 @@ def _measured(steps: Windows, span: slice, shares: Floats, begin_s: float, end_s
     )  # fmt: skip
 
 
-def _sides(steps: Windows, rows: slice) -> tuple[Floats, Floats]:
+def _sides(steps: ComparedWindows, rows: slice) -> tuple[Floats, Floats]:
     """Return the motion of the left and of the right side by the model [m]."""
     return steps.model_ahead[rows] + steps.model_turned[rows], steps.model_ahead[rows] - steps.model_turned[rows]
 
 
-def _expected(steps: Windows, shares: Floats, rows: slice) -> Floats:
+def _expected(steps: ComparedWindows, shares: Floats, rows: slice) -> Floats:
     """Return the residual of steps that miss these shares (k, 3) [m]."""
     left, right = (share * side for share, side in zip(shares[:2], _sides(steps, rows), strict=True))
     return -np.column_stack([(left + right) / 2, shares[2] * steps.path_m[rows], (left - right) / 2])
 
 
-def _evidence(steps: Windows, error: Floats, shares: Floats, rows: slice) -> Floats:
+def _evidence(steps: ComparedWindows, error: Floats, shares: Floats, rows: slice) -> Floats:
     """Return the log likelihood ratio of steps (k,): missing these shares over missing none; bounded."""
     seen = steps.residual_of(rows)
     # while the robot parks, sensors without noise leave no variance, and nothing is expected
@@ -157,7 +157,7 @@ def _best_part(evidence: Floats) -> tuple[int, int]:
     return part
 
 
-def _growth(steps: Windows, error: Floats, shares: Floats, usable: Bools, rows: range) -> int:
+def _growth(steps: ComparedWindows, error: Floats, shares: Floats, usable: Bools, rows: range) -> int:
     """Return how many of the rows belong to the event: up to the largest sum of evidence before it is lost again."""
     total, best, count, done = 0.0, 0.0, 0, 0
     while done < len(rows):
@@ -173,7 +173,7 @@ def _growth(steps: Windows, error: Floats, shares: Floats, usable: Bools, rows: 
     return count
 
 
-def _part(steps: Windows, error: Floats, shares: Floats, row: int, *, default: float) -> float:
+def _part(steps: ComparedWindows, error: Floats, shares: Floats, row: int, *, default: float) -> float:
     """Return the part of a step that lies in the event, or a default where the fixes are too noisy to show it."""
     one = slice(row, row + 1)
     deviation = np.sqrt(steps.sensor[row] + (error * steps.path_m[row]) ** 2)

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import cut_windows, track_of_streams, window_length
 from icrtool.alignment.estimator import estimate_alignment
+from icrtool.alignment.log_track import cut_windows, track_of_streams, window_length
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
@@ -96,7 +96,7 @@ class Motion(NamedTuple):
     lever_m: float
 
 
-class Windows(NamedTuple):
+class ComparedWindows(NamedTuple):
     """What the reference did beyond the model, in windows between two knots.
 
     Attributes
@@ -125,9 +125,9 @@ class Windows(NamedTuple):
         """Reference minus model (w, 3): ahead, aside, turned [m]."""
         return self.residual_of(slice(None))
 
-    def rows(self, kept: Bools) -> Windows:
+    def rows(self, kept: Bools) -> ComparedWindows:
         """Return the windows marked in `kept` (w,)."""
-        return Windows._make(column[kept] for column in self)
+        return ComparedWindows._make(column[kept] for column in self)
 
     def residual_of(self, rows: slice) -> Floats:
         """Return the residual of some windows (k, 3) [m]."""
@@ -162,7 +162,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     )  # fmt: skip
 
 
-def cut(knots: Knots, duration_s: float) -> tuple[Ints, Ints]:
+def spans_of(knots: Knots, duration_s: float) -> tuple[Ints, Ints]:
     """Return first and last rows of the windows (w,) of that duration, or one fix more, which span no hole."""
     first = np.arange(len(knots.t))
     last = np.searchsorted(knots.t, knots.t + duration_s - KNOT_S / 2)
@@ -197,7 +197,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     return Motion(place, turn, abs(fit.estimate("scale")[0]), width_m / 2 / gain)
 
 
-def compare(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: float) -> Windows:
+def compare(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: float) -> ComparedWindows:
     """Compare reference and wheels between rows of the knots (w,).
 
     Parameters
@@ -215,7 +215,7 @@ def compare(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: f
     held = scale2 * (knots.held_m2[last] - knots.held_m2[first]) / 2
     ahead, spun = (scale2 * response_s**2 * square for square in (np.abs(change) ** 2, spin**2 / 4))
     turn_noise = lever**2 * 2 * knots.turn_variance
-    return Windows(
+    return ComparedWindows(
         first, last, missed.real, missed.imag, lever * (turn - model_turn), model.real, lever * model_turn,
         np.maximum(np.abs(place), lever * np.abs(turn)), motion.scale * path_m,
         np.column_stack([noise + held + ahead, noise + held / 4 + ahead / 4, turn_noise + held + spun]),

@@ -9,7 +9,7 @@ import numpy as np
 import orjson
 
 from icrtool import __version__
-from icrtool.alignment.position.gnss_quality import CLASSES
+from icrtool.alignment.sensors.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter.measurement_codes import GATED, UNSEEN

@@ -23,8 +23,7 @@ from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.motion.fit import own_constants
 from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
-from icrtool.motion.recording import Recording, cut_windows
-from icrtool.motion.trials import predicted_path
+from icrtool.motion.recording import Recording, cut_windows, predicted_path
 from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
 from icrtool.records.dropout_document import DropoutDocument, FitDocument, ModelDocument

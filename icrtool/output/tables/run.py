@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from icrtool.alignment.stream_delays import SIGNIFICANT_SIGMAS
+from icrtool.alignment.corrections import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.output.text_blocks import LABEL, TEXT_WIDTH, Block, Line, Table, Text, labelled
 from icrtool.output.text_format import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventions, senses_by_distance
-from icrtool.alignment.drive_windows import cut_windows, track_of_log
+from icrtool.alignment.log_track import cut_windows, track_of_log
 from icrtool.kernels.track import Track
 from support.exact_drives import simulate
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.drive_windows import cut_windows, track_of_log
 from icrtool.alignment.estimator import AlignmentFit, _Model, estimate_alignment
+from icrtool.alignment.log_track import cut_windows, track_of_log
 from support.exact_drives import ICRS, simulate
 
 WIDTH_M, OFFSET_DEG, SCALES = 0.6, 5.0, (1.03, 0.98)

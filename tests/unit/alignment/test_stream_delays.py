@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.conventions import AS_NAMED, decide_conventions
-from icrtool.alignment.drive_windows import cut_windows, track_of_log
+from icrtool.alignment.corrections import Delay, StreamDelays, _clear_delays
 from icrtool.alignment.estimator import estimate_alignment
-from icrtool.alignment.stream_delays import Delay, StreamDelays, _clear_delays
+from icrtool.alignment.log_track import cut_windows, track_of_log
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.run import Run

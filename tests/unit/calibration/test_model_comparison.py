@@ -17,7 +17,7 @@ from icrtool.estimation.fit import fit
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.trials import FrozenIcrs
-from icrtool.motion.trials import cut_trials
+from icrtool.motion.recording import cut_trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, track_of
 from support.drives import make_log

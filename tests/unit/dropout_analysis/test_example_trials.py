@@ -12,7 +12,7 @@ from icrtool.calibration.model_comparison import compare_models
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
-from icrtool.motion.trials import Trials
+from icrtool.motion.recording import Trials
 from icrtool.records.run import Run, track_of
 
 EQUAL_M = 1e-9

@@ -17,8 +17,7 @@ from icrtool.dropout_analysis.trials import dropout
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.open_loop.direct import trial_ends
 from icrtool.kernels.track import JUMP
-from icrtool.motion.recording import cut_windows
-from icrtool.motion.trials import cut_trials
+from icrtool.motion.recording import cut_trials, cut_windows
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.stored_run import open_run
 from icrtool.records.run import Run, track_of

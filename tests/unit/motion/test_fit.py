@@ -15,9 +15,8 @@ from icrtool.kernels.robust import LOSS_SIGMAS
 from icrtool.kernels.track import Track
 from icrtool.motion.fit import SETTLED, Fold, Pool, PooledFit, own_constants
 from icrtool.motion.models import FAMILY, TERMS, FittedModel, MotionModel, find_model, twist, wheel_motion
-from icrtool.motion.recording import LogConstants, Recording, cut_windows
+from icrtool.motion.recording import LogConstants, Recording, cut_trials, cut_windows, predicted_path
 from icrtool.motion.residuals import WindowResiduals, shortening
-from icrtool.motion.trials import cut_trials, predicted_path
 from support.recordings import WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all
 
 EIGHT = FAMILY["eight"]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import CHORD_S, LEAST_CHORD_M, cut_chords, track_of_streams
+from icrtool.alignment.log_track import CHORD_S, LEAST_CHORD_M, cut_chords, track_of_streams
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints

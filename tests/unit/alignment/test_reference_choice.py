@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.position.reference_choice import agreement, choose_reference
+from icrtool.alignment.align import agreement, choose_reference
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.samples import StreamChoice

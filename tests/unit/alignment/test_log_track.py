@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrtool.alignment.drive_windows import MOST_WHEEL_SAMPLES, track_of_streams
+from icrtool.alignment.log_track import MOST_WHEEL_SAMPLES, track_of_streams
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import Track
 from icrtool.records.samples import NO_HEADINGS, PositionFixes, WheelSamples

@@ -1,1 +1,0 @@
-"""Position fixes: which reference, which class, how noisy, where they jump."""

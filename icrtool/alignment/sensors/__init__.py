@@ -1,0 +1,1 @@
+"""Wheels and positions, each by itself: units, scales, quality and noise."""

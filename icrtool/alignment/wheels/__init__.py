@@ -1,1 +1,0 @@
-"""Wheels: their units, and what is known of each side."""
