@@ -60,9 +60,9 @@ def align(log: RobotLog, config: Config) -> Measurements:
 def _align_once(log: RobotLog, config: Config) -> Measurements:
     found = align_streams(log, config)
     heading = found.heading
-    fix_steps = found.fix_steps
+    fix_steps, heading_steps = found.steps()
     quality = grade_fixes(found.log, config, fix_steps)
-    noise = reference_noise(found.log, config.filter, fix_steps, found.heading_steps)
+    noise = reference_noise(found.log, config.filter, fix_steps, heading_steps)
     sensors = sensors_as_sent(quality.log, config, noise)
     return Measurements(
         sensors=replace(
@@ -319,9 +319,9 @@ def agreement(log: RobotLog, config: Config) -> Agreement:
     track = track_of_log(log)
     windows = cut_windows(track, LENGTH_M)
     free = config.frames.heading == "auto"
-    decision = decide_conventions(track, windows, metric=log.datum is None and free, mirror_allowed=free)
+    decision = decide_conventions(windows, metric=log.datum is None and free, mirror_allowed=free)
     named = apply_convention(log, decision.convention)
-    found = estimate_alignment(track if named is log else track_of_log(named), windows, width)
+    found = estimate_alignment(windows if named is log else windows._replace(track=track_of_log(named)), width)
     if found is None:
         return NONE
     count = len(windows.begin)

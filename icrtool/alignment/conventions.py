@@ -116,7 +116,7 @@ class _Shown(NamedTuple):
 
 
 def decide_conventions(
-    track: Track, windows: DriveWindows, *, metric: bool, gyro_sense: int = 0, mirror_allowed: bool = True
+    windows: DriveWindows, *, metric: bool, gyro_sense: int = 0, mirror_allowed: bool = True
 ) -> Decision:
     """Compare all hypotheses.
 
@@ -128,7 +128,8 @@ def decide_conventions(
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
         return Decision(AS_NAMED, None)
-    shown = {hand: _show(track, windows, hand) for hand in (1, -1)}
+    track = windows.track
+    shown = {hand: _show(windows, hand) for hand in (1, -1)}
     losses = _losses(shown, 0.5 * track.place_std_m / windows.length_m)
     costs: dict[Convention, tuple[float, float]] = {}
     for swapped, left, right, heading, position in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1)):
@@ -173,8 +174,9 @@ TIE = 9.0
 FEWEST_WINDOWS = 16
 
 
-def _show(track: Track, windows: DriveWindows, hand: int) -> _Shown:
+def _show(windows: DriveWindows, hand: int) -> _Shown:
     """Fit displacements and turns for one handedness, with hardly any prior."""
+    track = windows.track
     v, u = track.mean_speed, track.half_difference
     some = slice(None, None, max(1, len(windows.begin) // MOST_WINDOWS))
     begin, end = windows.begin[some], windows.end[some]

@@ -42,7 +42,7 @@ from icrtool.alignment.heading.heading_choice import (
     stated_source,
     without_heading,
 )
-from icrtool.alignment.log_track import DriveWindows, alignment_window_m, check_streams, cut_windows, track_of_log
+from icrtool.alignment.log_track import DriveWindows, check_streams, track_of_log, windows_of_log
 from icrtool.alignment.sensors.sensor_noise import FixSteps, measure_steps
 from icrtool.alignment.sensors.wheel_alignment import (
     WheelAlignment,
@@ -234,21 +234,21 @@ class AlignedStreams(NamedTuple):
         """ICRs with covariance, from the same estimate; None without one."""
         return None if self.fit is None else self.fit.geometry()
 
-    @property
-    def fix_steps(self) -> FixSteps:
-        """Steps between the fixes beyond the motion of the wheels."""
-        expected = self.track.laid if self.fit is None else self.fit.expected_motion()[0]
-        return measure_steps(self.track.place_t, self.track.place, expected)
+    def steps(self) -> tuple[FixSteps, FixSteps]:
+        """Return steps of position and of heading [rad] between the fixes, beyond the motion of the wheels.
 
-    @property
-    def heading_steps(self) -> FixSteps:
-        """Steps of the heading between the fixes [rad] beyond the turn of the wheels; none without an estimate."""
+        Without an estimate there are none of the heading.
+        """
         track = self.track
-        if self.fit is None or not len(track.heading_t):
-            return measure_steps(np.empty(0), np.empty(0, np.complex128), np.empty(0, np.complex128))
-        turned = track.heading_at(track.place_t)
-        by_wheels = self.fit.expected_motion()[1]
-        return measure_steps(track.place_t, turned.astype(np.complex128), by_wheels.astype(np.complex128))
+        if self.fit is None:
+            none = np.empty(0, np.complex128)
+            return measure_steps(track.place_t, track.place, track.laid), measure_steps(np.empty(0), none, none)
+        place, turn = self.fit.expected_motion()
+        turned = track.heading_at(track.place_t).astype(np.complex128)
+        return (
+            measure_steps(track.place_t, track.place, place),
+            measure_steps(track.place_t, turned, turn.astype(np.complex128)),
+        )
 
 
 def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
@@ -261,11 +261,11 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     """
     corrects, width = config.filter.preset == "field", width_or_usual_m(config.robot.track_width_m)
     as_sent = log
-    log, derived, decision, track, windows, notes, sound = _name_streams(log, config, width)
-    refuse_standing(log, track, windows)
-    course = compare_with_course(track, windows)
+    log, derived, decision, windows, notes, sound = _name_streams(log, config, width)
+    refuse_standing(log, windows)
+    course = compare_with_course(windows)
     free, convention = config.frames.heading_offset_deg == "auto" and corrects, decision.convention
-    fit = estimate_alignment(track, windows, width)
+    fit = estimate_alignment(windows, width)
     if derived is not None:
         heading = align_estimated_heading(log, derived, None)
     else:
@@ -282,29 +282,30 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
             refuse_unexplained(log, course)
         heading = align_heading(log, config, fit, course, stated_source(log), convention)
         if free and config.frames.heading == "auto":
-            derived = fuse_heading(log, track)
+            derived = fuse_heading(log, windows.track)
         if derived is not None:
             log = derived.apply(log)
-            track = track_of_log(log, derived.smoothed)
-            fit = estimate_alignment(track, cut_windows(track, alignment_window_m(track, width)), width)
+            windows = windows_of_log(log, width, derived.smoothed)
+            fit = estimate_alignment(windows, width)
             heading = align_estimated_heading(log, derived, heading)
     configured = configured_scales(config)
     if convention.swapped and corrects:
         configured = configured[::-1]
     wheels = align_wheels(log, config, fit, configured, notes, sound=sound)
     delays = find_delays(log, config, fit)
-    return AlignedStreams(delays.apply(scaled(log, *wheels.applied)), wheels, heading, delays, track, fit, derived)
+    log = delays.apply(scaled(log, *wheels.applied))
+    return AlignedStreams(log, wheels, heading, delays, windows.track, fit, derived)
 
 
 def _name_streams(
     log: RobotLog, config: Config, width_m: float
-) -> tuple[RobotLog, DerivedHeading | None, Decision, Track, DriveWindows, list[str], bool]:
+) -> tuple[RobotLog, DerivedHeading | None, Decision, DriveWindows, list[str], bool]:
     """Find the heading of a log without one, then which side is which, and in which sense streams turn.
 
     Returns
     -------
     log with the chosen convention, as sent in preset ``paper``; its heading where it was estimated; the convention;
-    the drive with it in any preset, and windows of that; what to report; whether no side is dead or a copy of the other
+    windows with it in any preset; what to report; whether no side is dead or a copy of the other
     """
     corrects, derived, senses = config.filter.preset == "field", None, AS_NAMED
     log = scaled(log, *configured_scales(config))
@@ -315,11 +316,10 @@ def _name_streams(
         log = derived.apply(log)
     check_streams(log)
     faults = dead_or_copied(log)
-    track = track_of_log(log, None if derived is None else derived.smoothed)
-    windows = cut_windows(track, alignment_window_m(track, width_m))
+    windows = windows_of_log(log, width_m, None if derived is None else derived.smoothed)
     free = config.frames.heading == "auto" and derived is None
     decision = decide_conventions(
-        track, windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, track), mirror_allowed=free
+        windows, metric=log.datum is None and free, gyro_sense=gyro_sense(log, windows.track), mirror_allowed=free
     )
     named = apply_convention(log, decision.convention)
     if named is not log:
@@ -327,18 +327,17 @@ def _name_streams(
             # it was made with wheels whose sides are exchanged, or run backwards
             derived = _derived_heading(named, width_m)
             named = derived.apply(named)
-        track = track_of_log(named, None if derived is None else derived.smoothed)
-        windows = cut_windows(track, alignment_window_m(track, width_m))
+        windows = windows_of_log(named, width_m, None if derived is None else derived.smoothed)
     notes = [
         *faults,
         *convention_notes(Decision(senses, None), corrects=True),
         *convention_notes(decision, corrects=corrects),
     ]
     if derived is None and config.frames.heading != "auto":
-        free_hand = decide_conventions(track, windows, metric=False)
+        free_hand = decide_conventions(windows, metric=False)
         if free_hand.convention.heading < 0:
             notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
-    return named if corrects else log, derived, decision, track, windows, notes, not faults
+    return named if corrects else log, derived, decision, windows, notes, not faults
 
 
 def _senses_without_heading(log: RobotLog) -> Convention:

@@ -130,7 +130,7 @@ class AlignmentFit(NamedTuple):
     ----------
     fit : the robust fit; covariance : of its parameters
     width_m : b that w was formed with
-    windows : DriveWindows it was made of, cut from drive
+    windows : that it was made of
     turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is that at this speed
     """
 
@@ -139,7 +139,6 @@ class AlignmentFit(NamedTuple):
     width_m: float
     windows: DriveWindows
     turning_speed_mps: float
-    track: Track
 
     def estimate(self, name: str) -> tuple[float, float]:
         """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
@@ -167,7 +166,7 @@ class AlignmentFit(NamedTuple):
         return self._beyond_noise(float(self.fit.scale[0]))
 
     def _beyond_noise(self, scatter_m: float) -> float:
-        return math.sqrt(max(scatter_m**2 - 2.0 * self.track.place_std_m**2, 0.0)) / self.windows.length_m
+        return math.sqrt(max(scatter_m**2 - 2.0 * self.windows.track.place_std_m**2, 0.0)) / self.windows.length_m
 
     @property
     def turn_wander_rad(self) -> float:
@@ -179,7 +178,7 @@ class AlignmentFit(NamedTuple):
     @property
     def turn_slip(self) -> float:
         """Robust scatter of the turns within a second about those of the wheels, in parts of the usual turn."""
-        turned = _turned(self.track, self.windows)
+        turned = _turned(self.windows)
         return float(self.fit.scale[-1]) / max(math.sqrt(float(np.mean(turned**2))), LEAST_TURN_RAD)
 
     @property
@@ -189,7 +188,7 @@ class AlignmentFit(NamedTuple):
 
     def expected_motion(self) -> tuple[Complexes, Floats]:
         """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,), by this estimate."""
-        return _Model(self.track, self.windows, self.width_m).until_fixes(self.fit.x)
+        return _Model(self.windows, self.width_m).until_fixes(self.fit.x)
 
     def geometry(self) -> Geometry:
         """Return ICRs and side scales, and their covariance by complex-step differentiation of first order."""
@@ -203,13 +202,13 @@ class AlignmentFit(NamedTuple):
         values = _geometry(x.astype(np.complex128), b, self.turning_speed_mps).real
         covariance = jacobian @ self.covariance @ jacobian.T
         # at one speed, positions that lag look like an antenna further back
-        covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.track, self.width_m)) ** 2
+        covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.windows.track, self.width_m)) ** 2
         return Geometry(values, covariance)
 
 
 def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
-    model, w = _Model(found.track, found.windows, found.width_m), len(found.windows.begin)
+    model, w = _Model(found.windows, found.width_m), len(found.windows.begin)
     neutral = PRIOR_MEAN.copy()
     neutral[K] = found.fit.x[K]
     parts = []
@@ -233,12 +232,12 @@ def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
     return np.array([y_right, y_left, -x[C] - x[L] * speed, left * width, right * width, width])
 
 
-def estimate_alignment(track: Track, windows: DriveWindows, width_m: float) -> AlignmentFit | None:
+def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | None:
     """Estimate all parameters jointly; None with too few windows.
 
     Parameters
     ----------
-    track : with a heading; windows : of the same drive
+    windows : of a drive with a heading
     width_m : the track width b
 
     Notes
@@ -248,7 +247,7 @@ def estimate_alignment(track: Track, windows: DriveWindows, width_m: float) -> A
     """
     if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
         return None
-    model = _Model(track, windows, width_m)
+    track, model = windows.track, _Model(windows, width_m)
     start = PRIOR_MEAN.copy()
     offset = model.first_offset()
     start[D] = 0.0 if offset is None else offset
@@ -278,7 +277,7 @@ def estimate_alignment(track: Track, windows: DriveWindows, width_m: float) -> A
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(track.t[-1]), 1e-9))
     weight = track.held * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
-    return AlignmentFit(fit, covariance, width_m, windows, speed, track)
+    return AlignmentFit(fit, covariance, width_m, windows, speed)
 
 
 def _smooth(t: Floats, angle: Floats) -> Floats:
@@ -291,17 +290,18 @@ def _smooth(t: Floats, angle: Floats) -> Floats:
     return np.where(reach > 0.0, mean, angle)
 
 
-def _turned(track: Track, windows: DriveWindows) -> Floats:
+def _turned(windows: DriveWindows) -> Floats:
     """Return the turn of the heading in each short window (m,) [rad]."""
-    begin, end = (track.heading_at(at) for at in (windows.turn_begin, windows.turn_end))
+    begin, end = (windows.track.heading_at(at) for at in (windows.turn_begin, windows.turn_end))
     return np.asarray(end - begin)
 
 
 class _Model:
     """Residuals of the windows and their Jacobian."""
 
-    def __init__(self, track: Track, windows: DriveWindows, width_m: float) -> None:
-        self.track, self.windows, self.b = track, windows, width_m
+    def __init__(self, windows: DriveWindows, width_m: float) -> None:
+        self.track, self.windows, self.b = windows.track, windows, width_m
+        track = windows.track
         self.v, self.u = track.mean_speed, track.half_difference
         self.middle_t = track.t + track.held / 2
         # places are needed where a window begins or ends: at few of the fixes of a long drive
@@ -311,7 +311,7 @@ class _Model:
         self.level = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
         self.smooth_heading = _smooth(track.heading_t, track.heading)
         self.turn_v, self.turn_w = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
-        self.turned = _turned(track, windows)
+        self.turned = _turned(windows)
 
     def first_offset(self) -> float | None:
         """Return the direction of the displacements from wheels laid along the heading [rad]; None where it spins."""

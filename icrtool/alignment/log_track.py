@@ -65,12 +65,14 @@ class DriveWindows(NamedTuple):
 
     Attributes
     ----------
-    begin, end : (w,) rows of the fixes, first and last of a window
+    track : that they are cut from
+    begin, end : (w,) rows of its positions, first and last of a window
     length_m : wheel distance of a window
     turn_begin, turn_end : (u,) [s] windows of heading changes
     group, turn_group : (w,), (u,) stretches of distance that are independent of one another
     """
 
+    track: Track
     begin: Ints
     end: Ints
     length_m: float
@@ -171,9 +173,10 @@ def window_length(track: Track, least_m: float) -> float:
     return max(least_m, noise, min(WINDOW_IN_VALUES * _value_length(track), LONGEST_WINDOW_M))
 
 
-def alignment_window_m(track: Track, width_m: float) -> float:
-    """Return how long the windows of the alignment are [m], for a robot of track width b [m]."""
-    return window_length(track, min(WINDOW_M, WINDOW_IN_WIDTHS * width_m))
+def windows_of_log(log: RobotLog, width_m: float, heading: HeadingSamples | None = None) -> DriveWindows:
+    """Return the windows of the alignment, for a robot of track width b [m]; `heading` in place of the log's."""
+    track = track_of_log(log, heading)
+    return cut_windows(track, window_length(track, min(WINDOW_M, WINDOW_IN_WIDTHS * width_m)))
 
 
 def cut_windows(track: Track, length_m: float | None = None) -> DriveWindows:
@@ -196,7 +199,7 @@ def cut_windows(track: Track, length_m: float | None = None) -> DriveWindows:
     size = _group_length(float(track.travel[-1]), length)
     turn_travel = np.interp(turn_begin, track.t, track.travel)
     return DriveWindows(
-        begin, end, length, turn_begin, turn_end,
+        track, begin, end, length, turn_begin, turn_end,
         np.floor(at[begin] / size).astype(np.int64), np.floor(turn_travel / size).astype(np.int64),
     )  # fmt: skip
 

@@ -17,7 +17,6 @@ from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.track import Track
 from icrtool.records.measurements import HeadingFacts
 from icrtool.records.plain_data import known
 from icrtool.records.samples import Datum
@@ -174,9 +173,9 @@ class CourseAngles(NamedTuple):
         return len(self.angle) >= FEWEST_WINDOWS and max(self.agreement, self.mirrored_agreement) >= EXPLAINED
 
 
-def compare_with_course(track: Track, windows: DriveWindows) -> CourseAngles:
+def compare_with_course(windows: DriveWindows) -> CourseAngles:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
-    begin, end = (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
+    track, (begin, end) = windows.track, (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
     v, nose = track.mean_speed, track.nose
     seen = track.place[end] - track.place[begin]
     along, mirrored = track.at_places(v * nose), track.at_places(v * np.conj(nose))
@@ -277,7 +276,7 @@ def align_heading(
     )  # fmt: skip
     if fit is None:
         return nothing
-    pose_mirrored = mirrored and convention.position < 0 and fit.track.same_clock
+    pose_mirrored = mirrored and convention.position < 0 and fit.windows.track.same_clock
     turn, std = fit.estimate("offset")
     offset = math.remainder(-turn, 2 * math.pi)
     scatter = fit.across_scatter

@@ -196,9 +196,9 @@ def _held_note(wheels: WheelSamples, share: float) -> list[str]:
     return [f"wheel values are held: they change {rate:.1f} times a second while moving"]
 
 
-def refuse_standing(log: RobotLog, track: Track, windows: DriveWindows) -> None:
+def refuse_standing(log: RobotLog, windows: DriveWindows) -> None:
     """Raise where the wheels turn and the position does not: a robot on a stand, or held."""
-    begin, end = windows.begin, windows.end
+    track, begin, end = windows.track, windows.begin, windows.end
     if len(begin) < FEWEST_WINDOWS:
         return
     turned = np.abs(track.heading_at(track.place_t[end]) - track.heading_at(track.place_t[begin]))
@@ -387,7 +387,7 @@ def _regress(wheels: Floats, heading: Floats, group: Ints) -> Turns | None:
 
 def find_filtering(fit: AlignmentFit) -> str:
     """Return how the wheels of a drive show that they are filtered or fused; empty where they do not."""
-    track, delay = fit.track, fit.estimate("heading_delay")[0]
+    track, delay = fit.windows.track, fit.estimate("heading_delay")[0]
     long_s = min(LONGEST_S, float(track.t[-1]) / LONG_WINDOWS)
     if long_s < SHORTEST_LONG_S:
         return ""

@@ -189,7 +189,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     turns = [
         np.searchsorted(knots.t, edge).clip(0, len(knots.t) - 1) for edge in (windows.turn_begin, windows.turn_end)
     ]
-    fit = estimate_alignment(knots.track, windows.rows(kept, clear(turns[0], turns[1])), width_m)
+    fit = estimate_alignment(windows.rows(kept, clear(turns[0], turns[1])), width_m)
     if fit is None:
         return None
     place, turn = fit.expected_motion()

@@ -21,7 +21,7 @@ LEAST_COVERAGE, LEAST_OF_ONE = 0.9, 0.8
 def estimate(seed: int, **track: float) -> AlignmentFit:
     log = simulate(seed, lever=(0.0, 0.0), offset_deg=OFFSET_DEG, scales=SCALES, seconds=160.0, **track)
     arrays = track_of_log(log)
-    found = estimate_alignment(arrays, cut_windows(arrays), WIDTH_M)
+    found = estimate_alignment(cut_windows(arrays), WIDTH_M)
     assert found is not None
     return found
 
@@ -62,13 +62,13 @@ def test_delays_of_either_stream_are_found(gnss: float, heading: float) -> None:
 def test_too_few_fixes_give_no_estimate(samples: int) -> None:
     track = track_of_log(simulate(0, seconds=20.0))
     short = track.places(slice(samples))
-    assert estimate_alignment(short, cut_windows(short), WIDTH_M) is None
+    assert estimate_alignment(cut_windows(short), WIDTH_M) is None
 
 
 def test_a_straight_drive_knows_that_it_shows_no_separation() -> None:
     log = simulate(0, path="straight", lever=(0.0, 0.0), scales=(1.0, 1.0), seconds=80.0)
     track = track_of_log(log)
-    found = estimate_alignment(track, cut_windows(track), WIDTH_M)
+    found = estimate_alignment(cut_windows(track), WIDTH_M)
     assert found is not None
     geometry = found.geometry()
     assert np.sqrt(geometry.covariance[5, 5]) > 0.3 * abs(geometry.values[5])
@@ -89,7 +89,7 @@ def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
     north = log.gnss.north_m.copy()
     north[rng.choice(len(north), len(north) // 100, replace=False)] += 5.0
     track = track_of_log(replace(log, gnss=replace(log.gnss, north_m=north)))
-    found = estimate_alignment(track, cut_windows(track), WIDTH_M)
+    found = estimate_alignment(cut_windows(track), WIDTH_M)
     assert found is not None
     assert np.abs(found.geometry().values[:2] - ICRS[:2]).max() < 0.02
     assert np.abs(found.geometry().values[3:5] - SCALES).max() < 0.02
@@ -97,7 +97,7 @@ def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
 
 def test_the_jacobian_equals_differences() -> None:
     found = estimate(2, heading_std_deg=0.0)
-    model = _Model(found.track, found.windows, WIDTH_M)
+    model = _Model(found.windows, WIDTH_M)
     x = np.array([1.01, 0.02, -0.1, 0.02, 0.5, 0.01, 1e-3, 0.1, 0.03, -0.02, 0.04])
     residuals, jacobian = model.evaluate(x)
     for column, step in enumerate([1e-6] * 8 + [0.02, 0.02, 1e-6]):

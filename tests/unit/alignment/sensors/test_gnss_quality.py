@@ -224,7 +224,7 @@ def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
     noisy = replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + noise[0], east_m=log.gnss.east_m + noise[1]))
     misreported = {
         told: grade_fixes(
-            confess(noisy, np.zeros(len(t), np.bool_), told), CONFIG, align_streams(noisy, CONFIG).fix_steps
+            confess(noisy, np.zeros(len(t), np.bool_), told), CONFIG, align_streams(noisy, CONFIG).steps()[0]
         ).misreported
         for told in ("flags", "not")
     }
@@ -247,7 +247,7 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
     count = len(log.gnss.stamp_ns)
     said, stated_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, stated_class=stated_class))
-    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).fix_steps)
+    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).steps()[0])
     (warning,) = quality.warnings
     assert warning.startswith(f"made: {words}")
     assert np.sqrt(quality.log.gnss.var_north_m2) == pytest.approx(real_m, rel=0.1)
@@ -256,7 +256,7 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
 def test_what_is_done_to_float_fixes_is_said_by_number_and_noise() -> None:
     lossy, float_ = lose_rtk(clean())
     log = confess(lossy, float_, "flags")
-    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).fix_steps)
+    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).steps()[0])
     count = int(np.count_nonzero(float_))
     # 0.4 m, erring alike for 10 s at 25 Hz: 500 fixes tell what one would.
     (warning,) = quality.warnings
@@ -269,7 +269,7 @@ def test_fixes_that_only_say_that_they_are_fixed_are_misreported_without_a_numbe
     count = len(float_)
     unknown, told = np.full(count, np.nan), np.full(count, FIXED_FIX, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, stated_class=told))
-    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).fix_steps)
+    quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).steps()[0])
     assert quality.misreported.any()
     assert "RTK float" in quality.warnings[0]
     assert not any("nan" in warning for warning in quality.warnings)
