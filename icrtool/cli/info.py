@@ -82,9 +82,9 @@ class Found:
     problem: IcrToolError | None = None
 
     @property
-    def name(self) -> str:
-        """That of the log, which its errors and warnings begin with."""
-        return self.survey.name if self.survey is not None else LogText(self.log.stem)
+    def names(self) -> tuple[str, str]:
+        """What errors and warnings of the log begin with: its name, or its path."""
+        return self.survey.name if self.survey is not None else LogText(self.log.stem), escaped(str(self.log))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ def _print(found: Found, config: Config, given: Sequence[str], *, everything: bo
 
     command = next_command(escaped(str(found.log)), given, found.run)
     if not everything:
-        show(brief_info(found.survey, found.measured, found.run, found.problem, config, command))
+        show(brief_info(found.survey, found.measured, found.run, found.problem, found.names, config, command))
         return
     if found.survey is not None:
         click.echo(describe_survey(found.survey, found.measured))
@@ -137,7 +137,7 @@ def _print(found: Found, config: Config, given: Sequence[str], *, everything: bo
         click.echo(describe_log(found.measured))
     rows = overview_rows(found.measured, found.run) if found.measured is not None else []
     rows += [excitation_row(found.run)] if found.run is not None else []
-    rows += verdict_rows(found.run, found.problem, found.name, config)
+    rows += verdict_rows(found.run, found.problem, found.names, config)
     last = [Line(f"{'next':<12}{command}", "as is")] if command is not None else []
     show(Text(["", *labelled(rows), *last]))
 
@@ -154,7 +154,7 @@ def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:
         **(survey_document(found.survey) if found.survey is not None else {}),
         "streams": streams_document(found.measured) if found.measured is not None else [],
         "warnings": list(found.warnings),
-        "verdict": verdict(found.run, found.problem, found.name),
+        "verdict": verdict(found.run, found.problem, found.names),
         "next": next_command(escaped(str(found.log)), given, found.run),
         "run": found.run.summary if found.run is not None else None,
     }

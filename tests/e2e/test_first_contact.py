@@ -174,6 +174,19 @@ def test_only_names_of_ros_are_completed(tmp_path: Path) -> None:
     assert _topics([tmp_path / "log.mcap"]) == ("/robot_1/gps/fix",)
 
 
+def test_the_verdict_on_a_log_begins_with_what_is_missing(icrtool, tmp_path: Path) -> None:
+    with (tmp_path / "log.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/Temperature", "ros2msg", b"float64 temperature")
+        writer.add_message(writer.register_channel("/motor", "cdr", schema), 1, bytes(12), 1)
+        writer.finish()
+    status, out, err = icrtool("info", tmp_path / "log.mcap")
+    assert status == 1
+    assert out.startswith("verdict     cannot be fitted: no wheels, no position and no heading found;")
+    assert err.startswith(f"Error: {tmp_path / 'log.mcap'}: ")
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_each_shell_has_its_completion(icrtool, shell: str) -> None:
     status, out, _ = icrtool("completion", shell)

@@ -111,6 +111,14 @@ def test_a_drive_with_turns_to_one_side_names_the_other(screen: Screen) -> None:
     assert re.fullmatch("! excitation y right.* weak: drive two full turns on the spot, or circles, to the left", row)
 
 
+def test_a_short_drive_states_why_the_whole_model_is_left_out(screen: Screen) -> None:
+    assert screen("simulate", "-o", "short.mcap", "--path", "curved", "--duration", "40", "-q", *ROBOT)[0] == 0
+    status, lines = screen("dropout-report", "short.mcap", *ROBOT, "--plots", "none")
+    check_fits(lines)
+    assert status == 0
+    assert any(line.startswith("left out    whole model, controller numbers: ") for line in lines), "\n".join(lines)
+
+
 def test_without_a_track_width_no_slip_is_not_known(screen: Screen) -> None:
     status, lines = screen("dropout-report", ROOT / "sample_logs" / "tracked_curved.bag", "--plots", "none")
     check_fits(lines)

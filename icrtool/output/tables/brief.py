@@ -109,6 +109,8 @@ def brief_dropout(report: DropoutReport, place: str) -> Text:
         turn, speed = turn_text(one.heading_change_rad), one.speed_mean_mps
         text = f"{error_text(one.errors_m[one.model])} after {one.horizon_m:g} m, turning {turn} at {speed:.2f} m/s"
         blocks.append(labelled_line("Worst", f"at {duration_text(one.t_s)}: {text}"))
+    if report.usable and report.result("recommended") is None and report.no_comparison:
+        blocks.append(labelled_line("left out", f"whole model, controller numbers: {report.no_comparison}"))
     blocks += [labelled_line("Outages", text) for text in _outages(report)]
     blocks += [_error_table(report)]
     blocks += [Line(one.line(), "good" if one.passed else "bad") for one in report.verdicts]
@@ -183,10 +185,13 @@ def run_checks(summary: RunDocument) -> list[Check]:
     if agreement := filter_agreement(summary):
         found.append((agreement.endswith("agrees"), "EKF", agreement))
     excitation, gnss, heading = summary.excitation, summary.gnss, summary.heading
+    drive = to_drive(summary)
     # what was lacking stands beside the ICRs; what to drive, alone
-    lacks = to_drive(summary).rpartition(": ")[2]
+    lacks = drive.rpartition(": ")[2]
     if excitation.verdict.all_shown:
-        found.append((not lacks, "excitation", lacks or "all three ICRs shown: enough turns for each"))
+        found.append(
+            (not drive, "excitation", f"shown, but {drive}" if drive else "all three ICRs shown: enough turns for each")
+        )
     else:
         verdicts = ((excitation.verdict[name], ICR_WORDS[name]) for name in ICR_COLUMNS)
         weak = [(one, word) for one, word in verdicts if one != "shown"]

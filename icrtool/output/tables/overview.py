@@ -42,9 +42,9 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
     return rows + _extent_rows(log)
 
 
-def verdict_rows(run: Run | None, problem: IcrToolError | None, log: str, config: Config) -> list[Row]:
+def verdict_rows(run: Run | None, problem: IcrToolError | None, names: Sequence[str], config: Config) -> list[Row]:
     """Return whether a log can be fitted, and what is missing."""
-    rows = [("verdict", verdict(run, problem, log))]
+    rows = [("verdict", verdict(run, problem, names))]
     if run is not None and config.robot.track_width_m is None:
         missing = (
             "robot.track_width_m (no multiplier, no no-slip odometry): --robot NAME (icrtool robots lists them), or "
@@ -55,8 +55,8 @@ def verdict_rows(run: Run | None, problem: IcrToolError | None, log: str, config
 
 
 def brief_info(
-    survey: Survey | None, log: RobotLog | None, run: Run | None, problem: IcrToolError | None, config: Config,
-    command: str | None,
+    survey: Survey | None, log: RobotLog | None, run: Run | None, problem: IcrToolError | None, names: Sequence[str],
+    config: Config, command: str | None,
 ) -> Text:  # fmt: skip
     """Return what `icrtool info` prints: the verdict, what was driven, each topic once, what is missing and next.
 
@@ -64,17 +64,17 @@ def brief_info(
     ----------
     survey, log, run : as far as reading and fitting came
     problem : why the log cannot be fitted
+    names : of the log, which stand before the problem where it is printed alone
     command : to run next
     """
-    name = survey.name if survey is not None else log.name if log is not None else ""
-    (_, decision), *missing = verdict_rows(run, problem, name, config)
+    (_, decision), *missing = verdict_rows(run, problem, names, config)
     good = run is not None and run.usable
     blocks: list[Block] = [labelled_line("verdict", decision, "good" if good else "bad", most=3)]
     rows = [*_holds_rows(survey, log), *(overview_rows(log, run) if log is not None else [])]
     rows += [excitation_row(run)] if run is not None else []
     rows += _topic_rows(survey, log)
     warnings = run.warnings if run is not None else log.warnings if log is not None else ()
-    rows += [("warnings", gravest(warnings, name))] if warnings else []
+    rows += [("warnings", gravest(warnings, names[0]))] if warnings else []
     blocks += [labelled_line(label, text) for label, text in (*rows, *missing)]
     return Text([*blocks, *([copied("next", command)] if command is not None else [])])
 
@@ -120,10 +120,10 @@ def _topic_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
             yield "others", f"{counted(len(others), 'topic')} (-v names them, and why they are not used)"
 
 
-def verdict(run: Run | None, problem: IcrToolError | None, log: str) -> str:
-    """Return in a sentence whether a log, of this name, can be fitted and used, and whether it shows the ICRs."""
+def verdict(run: Run | None, problem: IcrToolError | None, names: Sequence[str]) -> str:
+    """Return in a sentence whether a log, of these names, can be fitted and used, and whether it shows the ICRs."""
     if run is None:
-        return f"cannot be fitted: {problem.beside(log)}" if problem is not None else "cannot be fitted"
+        return f"cannot be fitted: {problem.beside(*names)}" if problem is not None else "cannot be fitted"
     if not run.usable:
         return f"not usable: {run.document.unusable_because}"
     shown = run.document.excitation.verdict.all_shown

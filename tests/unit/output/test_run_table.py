@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
+from icrtool.output.tables.brief import run_checks
 from icrtool.output.tables.run import format_run
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import distance_text, duration_text, error_text, signed
@@ -76,6 +77,18 @@ def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., R
     assert "filter to position reference" in text
     assert "outage" not in text
     assert " 0 rejected" in text
+
+
+def test_turns_to_one_side_that_show_all_icrs_are_noted_with_the_other_side(make_run: Callable[..., Run]) -> None:
+    run = make_run()
+    assert [good for good, what, _ in run_checks(run.document) if what == "excitation"] == [True]
+    excitation = run.summary["excitation"] | {"turned_right_deg": 29.0, "turned_left_deg": 904.0}
+    excitation["verdict"] = dict.fromkeys(excitation["verdict"], "shown")
+    checks = run_checks(with_summary(run, excitation=excitation).document)
+    ((good, text),) = ((good, text) for good, what, text in checks if what == "excitation")
+    assert not good
+    assert text.startswith("shown, but turned in one direction only: ")
+    assert text.endswith("to the right")
 
 
 def test_a_parked_robot_has_a_table_too(make_run: Callable[..., Run]) -> None:
