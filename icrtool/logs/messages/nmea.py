@@ -26,9 +26,8 @@ GGA, RMC, GST, HDT = 1, 2, 3, 4
 QUALITY_OF_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8, "N": 0}
 """The mode indicator of RMC as the quality of GGA: autonomous, differential, PPS, RTK fixed and float, and so on."""
 
-NMEA_FIELDS = ("latitude", "longitude", "altitude", "heading", "north_std", "east_std", "utc_s")
-"""What the sentences hold, NaN where one does not: degrees, m above the ellipsoid, degrees clockwise from north, m, m,
-seconds of the day (UTC)."""
+NMEA_FIELDS = ("latitude", "longitude", "altitude", "heading", "north_std", "east_std")
+"""What the sentences hold, NaN where one does not: degrees, m above the ellipsoid, degrees clockwise from north, m."""
 
 _SLOTS = {
     path: Slot(kind, place)
@@ -85,10 +84,9 @@ def parse_sentence(text: bytes) -> dict[str, Any] | None:
 
 
 def _gga(fields: Sequence[str]) -> dict[str, Any]:
-    utc, north, hemisphere, east, side, quality, _, _, height, _, undulation, *_ = fields
+    _, north, hemisphere, east, side, quality, _, _, height, _, undulation, *_ = fields
     return {
         "sentence_kind": GGA,
-        "utc_s": _time_s(utc),
         "latitude": _degrees(north, hemisphere, "NS"),
         "longitude": _degrees(east, side, "EW"),
         "altitude": _number(height) + _number(undulation or "0"),
@@ -97,10 +95,9 @@ def _gga(fields: Sequence[str]) -> dict[str, Any]:
 
 
 def _rmc(fields: Sequence[str]) -> dict[str, Any]:
-    utc, status, north, hemisphere, east, side, _, _, _, _, _, mode, *_ = fields
+    _, status, north, hemisphere, east, side, _, _, _, _, _, mode, *_ = fields
     return {
         "sentence_kind": RMC,
-        "utc_s": _time_s(utc),
         "latitude": _degrees(north, hemisphere, "NS"),
         "longitude": _degrees(east, side, "EW"),
         "quality": QUALITY_OF_MODE.get(mode, 1) if status == "A" else 0,
@@ -110,7 +107,6 @@ def _rmc(fields: Sequence[str]) -> dict[str, Any]:
 def _gst(fields: Sequence[str]) -> dict[str, Any]:
     return {
         "sentence_kind": GST,
-        "utc_s": _time_s(fields[0]),
         "north_std": _number(fields[5]),
         "east_std": _number(fields[6]),
     }
@@ -131,10 +127,3 @@ def _degrees(text: str, side: str, sides: str) -> float:
     """Return degrees of ``ddmm.mmmm``, negative on the second of two sides; NaN without one of them."""
     whole, minutes = divmod(_number(text), 100.0)
     return (whole + minutes / 60.0) * {sides[0]: 1.0, sides[1]: -1.0}.get(side, float("nan"))
-
-
-def _time_s(text: str) -> float:
-    """Return the seconds of the day of ``hhmmss.ss``."""
-    hours_minutes, seconds = divmod(_number(text), 100.0)
-    hours, minutes = divmod(hours_minutes, 100.0)
-    return 3600.0 * hours + 60.0 * minutes + seconds

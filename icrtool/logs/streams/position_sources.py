@@ -154,6 +154,9 @@ H_ACC, LAT_HP, LON_HP, HEIGHT_HP = (
 """u-blox fields as ROS 1 and as ROS 2 spell them."""
 
 
+GST_NEAR_NS = 1_500_000_000
+"""Receivers send GST with each fix, or once a second."""
+
 UBX_FLAGS = ("gnss_fix_ok", "invalid_llh", "gps_fix.fix_type", "carr_soln.status")
 UBX_NO_FIX = (0, 1, 5)
 """GpsFix of u-blox: none, dead reckoning only, time only."""
@@ -206,7 +209,7 @@ def _ubx_navpvt(table: TopicTable) -> PositionSource:
 
 
 def _nmea(table: TopicTable) -> PositionSource:
-    """Return the fixes of GGA, with the deviations that GST states for the same time; of RMC where there is no GGA."""
+    """Return the fixes of GGA, with the deviations of the nearest GST; of RMC where there is no GGA."""
     kinds = table.column("sentence_kind")
     kind, name = (GGA, "GGA") if (kinds == GGA).any() else (RMC, "RMC")
     fixes, deviations = table.rows(kinds == kind), table.rows(kinds == GST)
@@ -215,9 +218,9 @@ def _nmea(table: TopicTable) -> PositionSource:
     std = np.full((len(fixes), 2), np.nan)
     if len(deviations):
         times_ns = deviations.log_time_ns
-        after = np.searchsorted(times_ns[:-1] + np.diff(times_ns) // 2, fixes.log_time_ns)
-        same = deviations.column("utc_s")[after] == fixes.column("utc_s")
-        std[same] = np.column_stack([deviations.column("north_std"), deviations.column("east_std")])[after[same]]
+        nearest = np.searchsorted(times_ns[:-1] + np.diff(times_ns) // 2, fixes.log_time_ns)
+        near = np.abs(times_ns[nearest] - fixes.log_time_ns) < GST_NEAR_NS
+        std[near] = np.column_stack([deviations.column("north_std"), deviations.column("east_std")])[nearest[near]]
     quality = fixes.column("quality")
     fix_class = class_by_code(quality, NMEA_QUALITY)
     no_fix = np.isin(quality, [*NMEA_QUALITY], invert=True)
