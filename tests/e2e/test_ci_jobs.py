@@ -40,7 +40,9 @@ finally:
 """
 """A call that counts what is compiled while it runs."""
 COMMAND = COUNTED.replace("{call}", "from icrtool.cli import main; main()")
-KERNEL = COUNTED.replace("{call}", "from icrtool.kernels.kinematics import icr_separation; icr_separation(0.4, -0.5)")
+KERNEL = COUNTED.replace(
+    "{call}", "from icrtool.kernels.kinematics import body_velocity; body_velocity(1.0, 0.1, 0.4, -0.5, 0.0)"
+)
 
 
 def set_writable(folder: Path, *, writable: bool) -> None:
@@ -84,7 +86,10 @@ def job(place: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Action, 
     [step] = STEP
     assert step["uses"] == "./icrtool/.github/actions/icrtool"
     ran = action(place, tmp_path_factory.mktemp("temp"), step["with"])
-    return ran, ran.run(place)
+    outputs = ran.run(place)
+    if "connection broken by" in "".join(ran.said):
+        pytest.skip("pip cannot fetch packages here")
+    return ran, outputs
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +146,7 @@ def test_commands_compile_nothing_from_a_read_only_environment(place: Path, acti
         set_writable(cache, writable=True)
     assert (refused.returncode, refused.stderr.count("\n")) == (1, 1)
     assert other.returncode == 0
-    assert "icr_separation" in other.stderr.split()[1:], "compiled in memory, for this processor"
+    assert "body_velocity" in other.stderr.split()[1:], "compiled in memory, for this processor"
     assert sorted(cache.rglob("*")) == held
 
 

@@ -6,6 +6,7 @@ import ctypes
 import os
 import re
 import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -102,8 +103,10 @@ def without_privilege() -> None:
 def in_bash(script: str, folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
     """Run a script as runners do, without privilege and without what the tests' own Python was told."""
     own = ("NUMBA_", "PYTEST_", "PYTHON", "VIRTUAL_ENV")
+    given = {key: value for key, value in os.environ.items() if not key.startswith(own)}
+    # python3 is the one that the tests' environment was made with
+    given["PATH"] = f"{sys.base_prefix}/bin:{given['PATH']}"
     return subprocess.run(
-        ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", script], cwd=folder,
-        env={key: value for key, value in os.environ.items() if not key.startswith(own)} | environment,
+        ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", script], cwd=folder, env=given | environment,
         capture_output=True, text=True, check=False, preexec_fn=without_privilege,
     )  # fmt: skip
