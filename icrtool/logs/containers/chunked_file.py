@@ -35,7 +35,7 @@ THREADS, BLOCKS_AHEAD = 2, 3
 READERS, SPANS_AHEAD, BYTES_AHEAD = 8, 16, 1 << 26
 """Of a distant file: threads that read, and pieces and their bytes that are read before they are used."""
 
-SPAN_BYTES = 1 << 23
+SPAN_BYTES = 1 << 24
 """Of chunks that are read in one piece."""
 
 JOINED_BYTES = 1 << 22
