@@ -12,6 +12,7 @@ from icrtool.cli.fit import runs_of, runs_or_logs
 from icrtool.cli.json_output import json_option, print_json
 from icrtool.cli.terminal import show
 from icrtool.records.text import LogText
+from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
     from icrtool.records.run import Run
@@ -96,7 +97,9 @@ def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
 
 def _named(source: str) -> tuple[LogText, Path]:
     """Return the group's name and the place of one argument."""
+    whole = place_of(source)
     name, sign, place = source.partition("=")
-    if sign and name and place and not Path(source).exists():
-        return LogText(name), Path(place)
-    return LogText(Path(source).name or source), Path(source)
+    # An address may have an equals sign in its query.
+    if sign and name and place and not isinstance(whole, UrlPath) and not whole.exists():
+        return LogText(name), place_of(place)
+    return LogText(whole.name or str(whole)), whole

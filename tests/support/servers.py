@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ class FileServer:
     ranges : whether it gives parts of a file
     token : of the query without which nothing is given
     broken : answers that will end in the middle
+    silent : whether it keeps all who ask for content waiting; waiting : how many are
     sent : bytes of content
     """
 
@@ -29,9 +31,17 @@ class FileServer:
     ranges: bool = True
     token: str = ""
     broken: int = 0
+    silent: bool = False
+    waiting: int = 0
     sent: int = 0
     url: str = ""
     lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def keep_waiting(self) -> None:
+        """Return when the server is not silent any more."""
+        self.waiting += self.silent
+        while self.silent:
+            time.sleep(0.05)
 
 
 @contextmanager
@@ -67,6 +77,7 @@ def file_server(folder: Path, **options: object) -> Iterator[FileServer]:
             self.end_headers()
             if not body:
                 return None
+            serving.keep_waiting()
             with file.open("rb") as stream, suppress(OSError):
                 stream.seek(first)
                 left = last - first + 1

@@ -5,8 +5,11 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from threading import Event
 
@@ -17,6 +20,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
+from icrtool.cli.compare import _named
 from icrtool.errors import LogError
 from icrtool.fleet.manifest import read_manifest
 from icrtool.fleet.recordings import find_recordings
@@ -350,6 +354,37 @@ def test_an_address_keeps_its_slashes_and_hides_its_secrets():
     assert log_name(place_of("s3://bucket/mon/a.mcap.zst")) == "a"
     assert not isinstance(place_of("C:/logs/a.mcap"), UrlPath)
     assert without_secrets("404, url='https://h/a?token=x'; s3://k:s@b/c") == "404, url='https://h/a'; s3://b/c"
+
+
+def test_compare_names_an_address_by_its_file_and_without_its_query():
+    name, place = _named(f"https://host/mon/a.mcap?{TOKEN}")
+    assert (name, str(place)) == ("a.mcap", "https://host/mon/a.mcap")
+    assert place.url.endswith(TOKEN)
+    name, place = _named(f"grass=https://host/mon/a.mcap?{TOKEN}")
+    assert (name, place.url) == ("grass", f"https://host/mon/a.mcap?{TOKEN}")
+
+
+@pytest.mark.parametrize("log", ["a.mcap", "a.db3"])
+def test_ctrl_c_while_a_server_is_silent_ends_the_command_and_leaves_nothing(tmp_path, log):
+    (tmp_path / log).write_bytes(bytes(1_000_000))
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    with file_server(tmp_path) as server:
+        server.silent = True
+        one = subprocess.Popen(
+            [sys.executable, "-P", "-m", "icrtool", "info", f"{server.url}/{log}"],
+            env={**os.environ, "TMPDIR": str(temporary)}, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        deadline = time.monotonic() + 30
+        while not server.waiting and time.monotonic() < deadline:
+            time.sleep(0.01)
+        one.send_signal(signal.SIGINT)
+        begun = time.monotonic()
+        assert one.wait(30) == 130
+        assert time.monotonic() - begun < 5
+        one.stderr.close()
+        server.silent = False
+    assert not list(temporary.iterdir())
 
 
 def test_inputs_that_were_not_wholly_read_are_not_called_copies():
