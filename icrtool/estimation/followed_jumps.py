@@ -6,6 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 
 from icrtool.kernels.arrays import Ints
@@ -45,11 +46,11 @@ def followed_jumps(
     def followed(jump: ReferenceJump) -> ReferenceJump:
         stamps = used[jump.kind == "heading"]
         begin, end = _last_until(stamps, jump.begin_ns), _first_from(stamps, jump.end_ns)
-        return jump._replace(begin_ns=begin, end_ns=end)
+        return msgspec.structs.replace(jump, begin_ns=begin, end_ns=end)
 
     def settled(jump: ReferenceJump) -> ReferenceJump:
         end = jump.end_ns if jump.kind == "heading" else _first_from(near, jump.end_ns)
-        return jump._replace(end_ns=min(end, jump.end_ns + round(SETTLES_S * 1e9)))
+        return msgspec.structs.replace(jump, end_ns=min(end, jump.end_ns + round(SETTLES_S * 1e9)))
 
     spans = _joined([followed(jump) for jump in sensors.jumps], _in_one_rejection)
     spans = [settled(one) for one in spans if one.kind == "heading" or _remains(one)]
@@ -98,7 +99,8 @@ def _joined(jumps: list[ReferenceJump], belongs: Callable[[ReferenceJump, Refere
             continue
         before = found[-1]
         larger = max(before, jump, key=lambda one: (not one.undecided, one.size_m))
-        found[-1] = larger._replace(
+        found[-1] = msgspec.structs.replace(
+            larger,
             begin_ns=before.begin_ns,
             end_ns=max(before.end_ns, jump.end_ns),
             north_m=before.north_m,

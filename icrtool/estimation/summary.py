@@ -237,8 +237,8 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
 
 def _with_seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, Any]:
     """Return a span with begin and end also in seconds since the first recorded state, of stamp `start_ns`."""
-    seconds = {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
-    return span._asdict() | seconds
+    own = msgspec.structs.asdict(span) if isinstance(span, ReferenceJump) else span._asdict()
+    return own | {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
 
 
 def _end_error(table: States, in_gap: Bools, icrs: Icrs) -> EndErrorDocument:

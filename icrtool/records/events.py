@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Ints
+from icrtool.records.plain_data import Record
 
 SlipKind = Literal["immobilised", "slip", "skid", "spin"]
 """Wheels turn and the robot stands; it moves less than its wheels; it moves sideways; it turns less than expected."""
@@ -39,7 +40,7 @@ JumpKind = Literal["position", "heading"]
 """What jumps: the position, alone or with the heading, or the heading alone."""
 
 
-class ReferenceJump(NamedTuple):
+class ReferenceJump(Record, frozen=True):
     """One discontinuity of the reference: it moves as no robot can, or as its own messages explain.
 
     Attributes

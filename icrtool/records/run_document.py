@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from icrtool.config import Config
-from icrtool.records.events import JumpKind, SlipKind
+from icrtool.records.events import ReferenceJump, SlipKind
 from icrtool.records.measurements import Finding, HeadingFacts, IcrStart, Triple, WheelFacts
 from icrtool.records.plain_data import Record
 from icrtool.records.samples import InputFile, StreamChoice
@@ -160,20 +160,9 @@ EVENT_COLUMNS = EventDocument.__struct_fields__
 """The columns of events.csv; seconds count from the first recorded state."""
 
 
-class ReferenceJumpDocument(Record, frozen=True):
-    """A discontinuity of the reference, as `icrtool.records.events.ReferenceJump`."""
+class ReferenceJumpDocument(ReferenceJump, frozen=True):
+    """A discontinuity of the reference; seconds count from the first recorded state."""
 
-    kind: JumpKind
-    begin_ns: int
-    end_ns: int
-    north_m: float
-    east_m: float
-    size_m: float
-    turn_deg: float
-    moved_north_m: float
-    moved_east_m: float
-    why: str
-    undecided: bool
     begin_s: float
     end_s: float
 

@@ -12,6 +12,7 @@ from tokenize import TokenError
 from typing import Any
 from zipfile import ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -107,10 +108,7 @@ def read_measurements(
             antenna_m=facts.antenna_m,
             losses_ns=spans_of(document.rtk_losses_ns),
             events=tuple(SlipEvent(*(getattr(one, name) for name in SlipEvent._fields)) for one in document.events),
-            jumps=tuple(
-                ReferenceJump(*(getattr(one, name) for name in ReferenceJump._fields))
-                for one in document.reference_jumps
-            ),
+            jumps=tuple(ReferenceJump(*msgspec.structs.astuple(one)[:-2]) for one in document.reference_jumps),
             icr_start=facts.icr_start,
             heading_is_estimated=facts.heading_is_estimated,
             heading_is_measured=facts.heading_is_measured,

@@ -115,7 +115,7 @@ def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> No
 def test_a_worst_trial_in_which_the_reference_jumped_is_marked(run: Run, report: DropoutReport) -> None:
     at = report.worst[0].stamp_ns + 10**9
     jump = ReferenceJump("position", at, at + 10**8, 0.0, 0.0, 7.25, 0.0, 7.25, 0.0, "", undecided=True)
-    jumping = with_summary(run, reference_jumps=[jump._asdict() | {"begin_s": 0.0, "end_s": 0.1}])
+    jumping = with_summary(run, reference_jumps=[msgspec.structs.asdict(jump) | {"begin_s": 0.0, "end_s": 0.1}])
     found = [run_page(one, report_document(report), {}) for one in (run, jumping)]
     texts = [" ".join("".join(Elements(page).text).split()) for page in found]
     assert ["steps by 7.25 m" in text for text in texts] == [False, True]
