@@ -75,6 +75,7 @@ class McapFile(ChunkedFile):
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
         self._counts: dict[int, int] = {}
+        self._listed: list[int] = []
         try:
             if self._bytes(0, len(MAGIC)) != MAGIC:
                 raise LogError(path, "not an MCAP file", "its first bytes are not those of MCAP")
@@ -200,11 +201,12 @@ class McapFile(ChunkedFile):
         if len(schemas) < statistics.schema_count or len(channels) < statistics.channel_count:
             return None
         chunks.sort(key=lambda chunk: chunk.at)
-        standing = self._found_in_file(chunks)
-        if standing is not None:
-            self._schemas, self._channels = schemas, channels
-            self._counts = dict(statistics.channel_message_counts)
-        return standing
+        self._listed = [chunk.at - _HEAD_BYTES for chunk in chunks]
+        if not self._fits(dict(zip(self._listed, chunks, strict=True))):
+            return None
+        self._schemas, self._channels = schemas, channels
+        self._counts = dict(statistics.channel_message_counts)
+        return chunks
 
     def _summary_records(self) -> Iterator[tuple[int, bytes]]:
         """Yield opcode and content of the records of the summary that reading needs; none where it is damaged."""
@@ -231,50 +233,28 @@ class McapFile(ChunkedFile):
                 yield opcode, summary[at : at + length]
             at += length
 
-    def _found_in_file(self, chunks: list[Chunk]) -> list[Chunk] | None:
-        """Return the chunks of the index that are at their stated offsets; None where the index must not be used.
-
-        It must not be used where messages are outside chunks, or where it does not fit a complete file: reading the
-        records one after the other finds more messages then.
-        """
-        by_place = {chunk.at - _HEAD_BYTES: chunk for chunk in chunks}
-        if len(by_place) == len(chunks) and self._reaches_end(by_place):
-            return chunks
-        if self._source.distant or self._reaches_end(None):
-            return None
-        standing = []
-        for at, chunk in by_place.items():
-            if self._head(at) == (_CHUNK, chunk.length):
-                standing.append(chunk)
-            else:
-                self.problems.add(f"no chunk at byte {at}, where the index lists one")
-        return standing or None
-
-    def _reaches_end(self, chunks: dict[int, Chunk] | None) -> bool:
-        """Return whether the records follow one another to the end of the data.
+    def _fits(self, listed: dict[int, Chunk]) -> bool:
+        """Return whether the index lists what is in the file: all its chunks, and no message is outside them.
 
         Parameters
         ----------
-        chunks : by file offset of their record; True then also means that the file has no other chunk, and no message
-            outside them. None: any records.
+        listed : chunks of the index by the file offset of their record
         """
-        at, left = len(MAGIC), dict(chunks or {})
+        if len(listed) < len(self._listed):
+            return False
+        at = len(MAGIC)
         while True:
-            listed = left.get(at) if self._source.distant else None
+            chunk = listed.pop(at, None)
             # What the index lists there, reading the chunk shows too; asking for each head alone takes minutes.
-            opcode, length = self._head(at) if listed is None else (_CHUNK, listed.length)
+            known = chunk is not None and self._source.distant
+            opcode, length = (_CHUNK, chunk.length) if chunk is not None and known else self._head(at)
             if opcode in (_FOOTER, _DATA_END):
-                return not left
-            if opcode == 0 or length > self._size - at - _HEAD_BYTES:
+                return not listed and chunk is None
+            if opcode in (0, MCAP_MESSAGE) or length > self._size - at - _HEAD_BYTES:
                 return False
-            chunk = left.pop(at, None)
-            if chunks is not None and (opcode == MCAP_MESSAGE or (opcode == _CHUNK) != (chunk is not None)):
+            if (opcode == _CHUNK) != (chunk is not None) or (chunk is not None and chunk.length != length):
                 return False
-            at += _HEAD_BYTES + length
-            if chunk is not None:
-                if chunk.length != length:
-                    return False
-                at += chunk.index_length
+            at += _HEAD_BYTES + length + (chunk.index_length if chunk is not None else 0)
 
     def _head(self, at: int) -> tuple[int, int]:
         """Return opcode and length of the record at a file offset; opcode 0 where there is none."""
@@ -282,7 +262,8 @@ class McapFile(ChunkedFile):
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
-        at = len(MAGIC)
+        """Yield the messages record by record; behind damage it goes on at the next chunk that the index lists."""
+        begin = at = len(MAGIC)
         while True:
             opcode, length = self._head(at)
             left = self._size - at - _HEAD_BYTES
@@ -295,9 +276,14 @@ class McapFile(ChunkedFile):
                 block, length = self._read_loose(at, length, learn=learn)
                 if block is not None:
                     yield block
-            if opcode == 0 or length > left:
+            if opcode != 0 and length <= left:
+                begin, at = at, at + _HEAD_BYTES + length
+                continue
+            further = next((place for place in self._listed if place > begin and self._head(place)[0] == _CHUNK), None)
+            if further is None:
                 break
-            at += _HEAD_BYTES + length
+            self.problems.add(f"damaged at byte {at}; reading goes on at byte {further}")
+            begin = at = further
         self.problems.add(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_loose(self, at: int, length: int, *, learn: bool) -> tuple[Block | None, int]:
