@@ -67,7 +67,7 @@ def _end(number: int, _frame: FrameType | None = None) -> None:
     """Remove what this process is writing, and end it and its worker processes, whatever its threads do."""
     # No import here: the main thread may hold its lock.
     if (processes := sys.modules.get("icrtool.fleet.processes")) is not None:
-        processes.close_all()
+        processes.end_for_good()
     remove_unfinished()
     with suppress(OSError, ValueError, RuntimeError):  # RuntimeError: it was just being written
         sys.stdout.flush()

@@ -21,7 +21,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Executor, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -70,6 +70,7 @@ LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
 _ANSWER: msgspec.json.Decoder[str | Row] = msgspec.json.Decoder(str | Row)
 """Made at import: msgspec crashes where several threads are the first to use a type."""
 
+_over = threading.Event()
 _all: set[Worker] = set()
 _idle: list[Worker] = []
 """Those of them that wait for a log; each thread that asks takes one, or starts one."""
@@ -84,6 +85,8 @@ def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) 
     timeout_s : after which the process is killed
     stage : called with what is done next, where the caller is on the same machine
     """
+    if _over.is_set():
+        raise CancelledError
     try:
         worker = _idle.pop()
     except IndexError:
@@ -92,6 +95,12 @@ def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) 
     if worker in _all:
         _idle.append(worker)
     return row
+
+
+def end_for_good() -> None:
+    """End all worker processes, and let none be started: this process is about to end."""
+    _over.set()
+    close_all()
 
 
 def close_all() -> None:
