@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,12 @@ _DRIVER_WORDS = re.compile(r"tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|robote
 """Words of a message about wheels, beside those of `WHEEL_WORDS`; the last ones are makes of motor controllers."""
 _ELEMENTS = re.compile(r"\[([\d,]+)\]")
 _KNOWN = {*WHEEL_TYPES, *POSITION_TYPES, *HEADING_TYPES}
+MOST_SEARCHED = 1 << 19
+"""Characters of the definitions in a log whose fields are searched for sides: those of some hundred types."""
+
+MOST_PAIRS = 256
+"""Of sides of a log that are looked at."""
+
 _HOLD_NS = 500_000_000
 """A side that ends before the other is held for this long at most [s]."""
 
@@ -111,9 +118,10 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
                     found.setdefault(channel.id, set()).update({*HEADER, stored_path(path or "data")})
         return found
     names: dict[str, dict[str, list[tuple[int, str]]]] = {}
+    searched: set[tuple[str, str]] = set()
     for channel in channels:
         if topics.wheels in (None, channel.topic):
-            for path in _fields_of(channel):
+            for path in _fields_of(channel, searched):
                 names.setdefault(channel.message_type, {}).setdefault(_name(channel.topic, path), []).append(
                     (channel.id, path)
                 )
@@ -125,8 +133,13 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
     return found
 
 
-def _fields_of(channel: Channel) -> list[str]:
-    """Return the fields of a channel's messages that may be of wheels; of unknown types by their names."""
+def _fields_of(channel: Channel, searched: set[tuple[str, str]]) -> list[str]:
+    """Return the fields of a channel's messages that may be of wheels; of unknown types by their names.
+
+    Parameters
+    ----------
+    searched : the types whose definitions were parsed for that; this one joins them
+    """
     if channel.message_type in PAIR_TYPES:
         return ["data"]
     if channel.message_type in ARRAY_TYPES:
@@ -134,6 +147,10 @@ def _fields_of(channel: Channel) -> list[str]:
     words = f"{channel.topic} {channel.message_type} {channel.definition}"
     if not (_SIDE_WORDS.search(words) and _of_wheels(words)):
         return []
+    one = (channel.message_type, channel.definition)
+    if sum(len(text) for _, text in searched | {one}) > MOST_SEARCHED:
+        return []
+    searched.add(one)
     return [path for path in number_fields(channel) if _may_be_side(channel.topic, channel.message_type, path)]
 
 
@@ -169,7 +186,8 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelM
     twins = (
         (left, alike.get(right_twin(name, alike) or "")) for alike in found.values() for name, left in alike.items()
     )
-    pairs = [pair_motion(left, right, config) for left, right in twins if right is not None]
+    first = islice(((left, right) for left, right in twins if right is not None), MOST_PAIRS)
+    pairs = [pair_motion(left, right, config) for left, right in first]
     return pairs + [
         _array_motion(table, config) for table in tables if table.message_type in ARRAY_TYPES and len(table)
     ]

@@ -78,7 +78,10 @@ def test_a_cluster_that_is_lost_gives_a_row_for_each_log_and_all_tables(tmp_path
                  "--robot", "pentzer-tracked", "--no-ladder", "--worker-timeout", "3")  # fmt: skip
     batch = start(*arguments, "--json", "--scheduler", address, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     if lost == "scheduler":
-        time.sleep(4)
+        for _ in range(3000):
+            if list((tmp_path / "out").rglob("*.partial")):  # a worker writes: the batch is connected
+                break
+            time.sleep(0.02)
         processes[0].kill()
     output, errors = batch.communicate(timeout=300)
     assert b"Traceback" not in errors

@@ -34,6 +34,7 @@ from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_la
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import read_log, survey_log
 from icrtool.logs.streams.sources import stamp_rows
+from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
 from icrtool.records.text import LogText
 
 SEPARATOR = "=" * 80 + "\n"
@@ -432,7 +433,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, open_log, sqlite_bag, unpack
     from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf, schema
-    from icrtool.logs.streams import wheel_joints
+    from icrtool.logs.streams import wheel_joints, wheel_pairs
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
@@ -446,6 +447,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         schema.DEEPEST, schema.MOST_FIELDS,
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
         bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheel_joints.MOST_WHEELS,
+            wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PAIRS,
         table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
     ]  # fmt: skip
 
@@ -613,3 +615,22 @@ def test_a_signalling_nan_warns_nobody() -> None:
     with np.errstate(invalid="raise"):
         assert np.isnan(positions * 2.0)[7, 1]
         assert np.count_nonzero(np.isnan(np.abs(positions - 1.0))) == 1
+
+
+@pytest.mark.parametrize("alike", [False, True])
+def test_hundreds_of_types_with_fields_of_hundreds_of_wheels_cost_little_time(tmp_path: Path, alike: bool) -> None:
+    with (tmp_path / "log.mcap").open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2")
+        for number in range(400):
+            own = "" if alike else f"float64 x{number}\n"
+            text = own + "".join(f"float64 {side}_wheel_{k}\n" for k in range(200) for side in ("left", "right"))
+            schema = writer.register_schema(f"pkg/msg/T{number}", "ros2msg", text.encode())
+            channel = writer.register_channel(f"/t{number}", "cdr", schema)
+            for k in range(3):
+                writer.add_message(channel, START_NS + k, b"\0\1\0\0" + bytes(8 * 401), START_NS + k)
+        writer.finish()
+    begin = time.process_time()
+    found = survey_log(tmp_path / "log.mcap").candidates.wheels
+    assert time.process_time() - begin < LONGEST_S
+    assert 0 < len(found) <= MOST_PAIRS
