@@ -19,7 +19,7 @@ from icrtool.fleet.one_log import decode_request, process
 from icrtool.fleet.row import Row
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"^ *icrtool (.*)$", PAGE.replace("    icrtool cache warm\n", ""), re.MULTILINE)
+COMMANDS = re.findall(r"^ *icrtool ((?!cache warm|batch s3:).*)$", PAGE, re.MULTILINE)
 LIMIT = ("--baseline", "baseline", "--gate", "recommended.p95@5m <= 1.1 * baseline")
 RATES = ("--duration", "80", "--wheel-rate", "20", "--gnss-rate", "5", "--heading-rate", "20", "--gnss", "0.002")
 
