@@ -1,8 +1,9 @@
 """Jumps of the reference: steps between fixes that neither the wheels nor a robot that slides can make.
 
-A step beyond the motion of the wheels is the robot's slip or an error of the reference. Without a second reference
-nothing separates them, except that a robot has a largest speed, and that receivers state when their solution changes.
-What neither shows stays undecided, and is the robot's.
+A step beyond the motion of the wheels is the robot's slip or an error of the reference. A gyro separates them where the
+heading steps: it turns with the robot, so a heading that leaves wheels and gyro behind jumps, with the position of the
+same pose. Otherwise only what no robot can do, and what receivers state of their solution, is a jump. What neither
+shows stays undecided, and is the robot's.
 """
 
 from __future__ import annotations
@@ -76,21 +77,36 @@ def decide_jumps(knots: Knots, motion: Motion, steps: Steps) -> tuple[ReferenceJ
     """
     windows = compare(knots, motion, steps.first, steps.last, 0.0)
     duration = knots.t[steps.last] - knots.t[steps.first]
-    slide, jitter = (SLIDE_MPS + _fastest_mps(knots, motion)) * duration, _by_jitter(knots, motion, steps)
+    slide = (SLIDE_MPS + _fastest_mps(knots, motion)) * duration
+    along, turns = motion.scale * knots.track.distance, motion.lever_m * motion.turn
+    jitter, spin = (_by_jitter(knots, one, steps) for one in (along, turns))
     noise = JUMP_SIGMAS * np.sqrt(windows.sensor)
     ahead = np.maximum(np.abs(windows.ahead) - jitter, 0.0)
     moved = np.hypot(ahead, windows.aside) - noise[:, :2].max(axis=1)
-    turned = np.maximum(np.abs(windows.turned) - jitter, 0.0) - noise[:, 2]
+    turned = np.maximum(np.abs(windows.turned) - spin, 0.0) - noise[:, 2]
     turned = np.where(knots.turn_follows_place, 0.0, turned)
     restated = knots.fix_class[steps.first] != knots.fix_class[steps.last]
     shown = (moved > JUMP_MPS * duration) | (turned > JUMP_MPS * duration)
+    alone = (turned > JUMP_MPS * duration) & _turn_with_wheels(knots, motion, windows, duration)
     return tuple(
         _jump(
             knots, motion, windows, row,
-            _cause(far=bool(moved[row] > slide[row]), turn=bool(turned[row] > slide[row]), stated=bool(restated[row])),
+            _cause(
+                far=bool(moved[row] > slide[row]), turn=bool(turned[row] > slide[row]), stated=bool(restated[row]),
+                alone=bool(alone[row]),
+            ),
         )
         for row in np.flatnonzero(shown).tolist()
     )  # fmt: skip
+
+
+def _turn_with_wheels(knots: Knots, motion: Motion, windows: ComparedWindows, duration: Floats) -> Bools:
+    """Return whether a gyro turns as the wheels do (s,), nearer to them than to the reference."""
+    if knots.gyro is None:
+        return np.zeros(len(duration), np.bool_)
+    by_gyro = motion.lever_m * (knots.gyro[windows.end] - knots.gyro[windows.begin])
+    slipped = np.abs(by_gyro - windows.model_turned)
+    return np.asarray(slipped < np.minimum(JUMP_MPS * duration, np.abs(windows.turned) / 2))
 
 
 def _fastest_mps(knots: Knots, motion: Motion) -> float:
@@ -98,18 +114,24 @@ def _fastest_mps(knots: Knots, motion: Motion) -> float:
     return motion.scale * float(np.quantile(np.diff(knots.track.distance) / np.diff(knots.t), 0.99))
 
 
-def _by_jitter(knots: Knots, motion: Motion, steps: Steps) -> Floats:
-    """Return the distance of the wheels (s,) [m] in the time by which stamps are wrong, before and after each step."""
+def _by_jitter(knots: Knots, along: Floats, steps: Steps) -> Floats:
+    """Return the motion of the wheels (s,) in the time by which stamps are wrong, before and after each step.
+
+    Parameters
+    ----------
+    along : (m,) the wheels' motion until each knot
+    """
     off = 3 * STAMP_STD_S
-    reach = np.interp(knots.t[steps.last] + off, knots.t, knots.track.distance)
-    reach = reach - np.interp(knots.t[steps.first] - off, knots.t, knots.track.distance)
-    return np.asarray(motion.scale * (reach - (knots.track.distance[steps.last] - knots.track.distance[steps.first])))
+    reach = np.interp(knots.t[steps.last] + off, knots.t, along) - np.interp(knots.t[steps.first] - off, knots.t, along)
+    return np.abs(np.asarray(reach - (along[steps.last] - along[steps.first])))
 
 
-def _cause(*, far: bool, turn: bool, stated: bool) -> str:
+def _cause(*, far: bool, turn: bool, stated: bool, alone: bool) -> str:
     """Return why a step is no motion of the robot; empty where it may be."""
     if stated:
         return "the receiver changes its solution there"
+    if alone:
+        return "gyro and wheels do not turn with it"
     return "faster than any slide" if far else "turns faster than any robot" if turn else ""
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import cut_windows, track_of_streams, window_length
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints
-from icrtool.kernels.robust import mad_std
+from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.robust import mad_std, robust_least_squares
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import SensorData
 
@@ -36,6 +37,11 @@ WINDOW_M = 1.0
 LEAST_STD_M, LEAST_TURN_GAIN = 0.01, 1e-3
 
 
+GYRO_STEP_S, GYRO_STD, GYRO_SCALE_RANGE = 1.0, np.array([10.0, 0.1]), 0.1
+"""A gyro is compared with the headings over this time; prior of its scale, whose sign is open, and bias [rad/s]; with
+a scale further from 1 it does not measure the robot's yaw."""
+
+
 class Knots(NamedTuple):
     """Fixes about `KNOT_S` apart, and the motion at them, as integrals since the first.
 
@@ -49,6 +55,7 @@ class Knots(NamedTuple):
     holes : (m,) number of holes in any stream so far
     fix_class : (m,) classes of the fixes
     turn_follows_place : the headings are estimated from the positions, and jump with them
+    gyro : (m,) turn of the gyro [rad], in sense and scale of the headings; None without one that turns with them
     """
 
     epoch_ns: int
@@ -62,6 +69,7 @@ class Knots(NamedTuple):
     holes: Ints
     fix_class: Bytes
     turn_follows_place: bool
+    gyro: Floats | None
 
     @property
     def t(self) -> Floats:
@@ -159,7 +167,28 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
         holes=_holes(t, track.t) + _holes(t, track.heading_t) + np.concatenate([[0], np.cumsum(gap)]),
         fix_class=fixes.fix_class[rows], turn_follows_place=sensors.heading_is_estimated,
+        gyro=_turn_by_gyro(sensors, t, heading),
     )  # fmt: skip
+
+
+def _turn_by_gyro(sensors: SensorData, t: Floats, heading: Floats) -> Floats | None:
+    """Return the turn of the gyro at times (m,) [rad], in sense and scale of the headings (m,), without its bias."""
+    gyro = sensors.gyro
+    if gyro is None or len(gyro.stamp_ns) < FEWEST_KNOTS:
+        return None
+    at = (gyro.stamp_ns - sensors.wheels.stamp_ns[0]) / 1e9
+    turned = np.interp(t, at, np.concatenate([[0.0], np.cumsum(np.diff(at) * gyro.rate_radps[:-1])]))
+    rows = rows_at_steps(t, GYRO_STEP_S)
+    made, passed, shown = (np.diff(column[rows]) for column in (turned, t, heading))
+    if len(made) < FEWEST_KNOTS:
+        return None
+    by = np.column_stack([made, passed])
+
+    def evaluate(line: Floats) -> tuple[Floats, Floats]:
+        return by @ line - shown, by
+
+    scale, bias = robust_least_squares(evaluate, np.zeros(2), np.zeros(2), GYRO_STD).x.tolist()
+    return scale * turned + bias * t if abs(abs(scale) - 1.0) < GYRO_SCALE_RANGE else None
 
 
 def spans_of(knots: Knots, duration_s: float) -> tuple[Ints, Ints]:

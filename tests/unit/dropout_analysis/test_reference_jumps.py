@@ -21,6 +21,7 @@ from icrtool.motion.recording import cut_trials, cut_windows
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.stored_run import open_run
 from icrtool.records.run import Run, track_of
+from icrtool.records.samples import GyroSamples, HeadingSamples
 from support.drives import make_log
 
 HORIZONS_M = (1.0, 5.0, 10.0)
@@ -109,6 +110,37 @@ def test_a_slide_without_a_gyro_stays_in_the_headline(speed_mps: float) -> None:
     whole = dropout(replace(run, sensors=replace(run.sensors, jumps=())), HORIZONS_M)
     for one, other in zip(found.results, whole.results, strict=True):
         np.testing.assert_array_equal(one.summary.p95, other.summary.p95)
+
+
+def relocated(gyro_deg: float | None) -> Run:
+    """Fit a drive whose poses jump by 0.5 m and 20 degrees, as those of SLAM do; its gyro turns by so much then."""
+    log = make_log(seconds=180.0, heading_std_deg=0.2)
+    stamps, psi = log.gnss.stamp_ns, np.unwrap(log.heading.heading_rad)
+    every = (log.heading.stamp_ns - stamps[0]) / 1e9
+    rate = np.gradient(np.convolve(np.pad(psi, 25, "edge"), np.ones(51) / 51, "valid"), every)
+    rate += np.radians(gyro_deg or 0.0) / 0.1 * ((every >= AT_S - 0.1) & (every < AT_S))
+    t = (stamps - stamps[0]) / 1e9
+    turned = np.exp(1j * np.radians(20.0) * (t >= AT_S))
+    place = log.gnss.north_m + 1j * log.gnss.east_m
+    about = place[np.searchsorted(t, AT_S)]
+    place = about + (place - about) * turned + 0.5 * (t >= AT_S)
+    heading = np.angle(np.exp(1j * np.interp(t, every, psi)) * turned)
+    poses = HeadingSamples(stamps, heading, np.full(len(t), np.radians(0.2) ** 2))
+    seen = None if gyro_deg is None else GyroSamples("/imu", log.heading.stamp_ns, 1.01 * rate + 0.002)
+    gnss = replace(log.gnss, north_m=place.real, east_m=place.imag)
+    return fit(replace(log, gnss=gnss, heading=poses, gyro=seen), load_config(sets=FIELD))
+
+
+def test_a_pose_that_turns_where_gyro_and_wheels_do_not_jumps() -> None:
+    decided = [jump for jump in relocated(0.0).summary["reference_jumps"] if not jump["undecided"]]
+    assert len(decided) == 1
+    assert abs(decided[0]["turn_deg"]) == pytest.approx(20.0, abs=3.0)
+    assert decided[0]["begin_s"] - 0.2 <= AT_S <= decided[0]["end_s"] + 0.2
+
+
+@pytest.mark.parametrize("gyro_deg", [20.0, None])
+def test_a_pose_that_turns_with_the_gyro_or_without_one_is_the_robots(gyro_deg: float | None) -> None:
+    assert all(jump["undecided"] for jump in relocated(gyro_deg).summary["reference_jumps"])
 
 
 def test_an_excursion_that_the_filter_rejects_is_no_jump_of_its_states() -> None:
