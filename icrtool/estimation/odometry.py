@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.chords import chord_rows
-from icrtool.kernels.open_loop.direct import open_loop_path
+from icrtool.kernels.open_loop.direct import open_loop_pieces
+from icrtool.kernels.open_loop.trials import OpenLoopPath
 from icrtool.records.run import track_of_states
 from icrtool.records.run_document import DriveDocument
 from icrtool.records.tables import Icrs, States
@@ -51,31 +56,49 @@ def drive_wheels(table: States, in_gap: Bools, icrs: Icrs) -> OdometryPath:
     Nobody knows what the wheels did in a gap. The filter's displacement stands in for it, turned by the heading error
     that the odometry has gathered so far, so that a gap neither adds an error nor forgives one.
     """
+    path = OpenLoopPath(*np.empty((3, len(table))))
+    for rows, piece in _pieces(table, in_gap, icrs):
+        path.north[rows], path.east[rows], path.heading[rows] = piece
+    return OdometryPath(*path, _apart(table, path))
+
+
+def odometry_end_error(table: States, in_gap: Bools, icrs: Icrs) -> float:
+    """Return `OdometryPath.end_error_m` [m] of `drive_wheels` without keeping its path."""
+    [(_, last)] = deque(_pieces(table, in_gap, icrs), maxlen=1)
+    return _apart(table, last)
+
+
+def _apart(table: States, path: OpenLoopPath) -> float:
+    """Return how far the end of a path is from the last state [m]."""
+    return math.hypot(path.north[-1] - table.north_m[-1], path.east[-1] - table.east_m[-1])
+
+
+def _pieces(table: States, in_gap: Bools, icrs: Icrs) -> Iterator[tuple[slice, OpenLoopPath]]:
+    """Yield the path of `drive_wheels` in order, some states at a time: paths are as long as columns of the run."""
     track = track_of_states(table, in_gap, np.empty((0, 2), np.int64))
-    north, east, heading = (np.empty(len(table)) for _ in range(3))
     edges = np.flatnonzero(in_gap[:-1])
     miss_north, miss_east, turned = 0.0, 0.0, 0.0
-    for first, last in zip([0, *(edges + 1)], [*edges, len(table) - 1], strict=True):
-        piece = open_loop_path(track, *icrs, int(first), int(last))
-        stretch = slice(first, last + 1)
+    for first, last in zip([0, *(edges + 1).tolist()], [*edges.tolist(), len(table) - 1], strict=True):
+        north, east, psi = float(track.north[first]), float(track.east[first]), float(track.heading[first])
+        cos, sin = math.cos(turned), math.sin(turned)
         if first:
             # The error at the gap's begin is carried over it: the displacement turned by `turned`, less itself.
-            step_north = table.north_m[first] - table.north_m[first - 1]
-            step_east = table.east_m[first] - table.east_m[first - 1]
-            cos, sin = np.cos(turned), np.sin(turned)
+            step_north, step_east = north - float(track.north[first - 1]), east - float(track.east[first - 1])
             miss_north += step_north * cos - step_east * sin - step_north
             miss_east += step_north * sin + step_east * cos - step_east
-            ahead_north, ahead_east = piece.north - table.north_m[first], piece.east - table.east_m[first]
-            north[stretch] = table.north_m[first] + miss_north + ahead_north * cos - ahead_east * sin
-            east[stretch] = table.east_m[first] + miss_east + ahead_north * sin + ahead_east * cos
-            heading[stretch] = piece.heading + turned
-        elif last == len(table) - 1:
-            north, east, heading = piece
-        else:
-            north[stretch], east[stretch], heading[stretch] = piece
-        miss_north, miss_east = north[last] - table.north_m[last], east[last] - table.east_m[last]
-        turned += float(piece.heading[-1] - table.heading_rad[last])
-    return OdometryPath(north, east, heading, float(np.hypot(miss_north, miss_east)))
+        path = OpenLoopPath(*(np.array([one]) for one in (north, east, psi)))
+        for rows, piece in chain([(slice(first, first + 1), path)], open_loop_pieces(track, *icrs, first, last)):
+            ahead_north, ahead_east = piece.north - north, piece.east - east
+            path = OpenLoopPath(
+                north + miss_north + ahead_north * cos - ahead_east * sin,
+                east + miss_east + ahead_north * sin + ahead_east * cos,
+                piece.heading + turned,
+            )
+            yield rows, path
+        miss_north, miss_east = (
+            float(one[-1] - reference[last]) for one, reference in ((path.north, track.north), (path.east, track.east))
+        )
+        turned = float(path.heading[-1] - track.heading[last])
 
 
 def path_speed(table: States) -> Floats:

@@ -19,6 +19,7 @@ from icrtool.estimation.filter_setup import (
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
 from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE
 from icrtool.kernels.filter.filter_records import FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
@@ -195,15 +196,17 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
         return
     headings = sensors.headings
     stamps, psi = headings.stamp_ns[used], table.heading_rad
-    t, seen = ((one - table.stamp_ns[0]) / 1e9 for one in (table.stamp_ns, stamps))
-    last = np.searchsorted(seen, t, side="right") - 1
-    age = t - seen[last]
-    recent = (last >= 0) & (age < LONGEST_CARRY_S)
-    off = np.angle(np.exp(1j * (headings.heading_rad[used] - np.interp(seen, t, psi))))
-    std = np.sqrt(headings.var_rad2[used][last] + TURN_WANDER_RAD**2 * np.abs(age))
-    clear = recent & (CLEARLY * std < table.std_heading_rad)
-    np.add(psi, off[last], out=psi, where=clear)
-    np.copyto(table.std_heading_rad, std, where=clear)
+    seen, var_rad2 = (stamps - table.stamp_ns[0]) / 1e9, headings.var_rad2[used]
+    off = np.angle(np.exp(1j * (headings.heading_rad[used] - np.interp(seen, table.t_s, psi))))
+    for lo in range(0, len(psi), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        last = np.searchsorted(seen, table.t_s[some], side="right") - 1
+        age = table.t_s[some] - seen[last]
+        recent = (last >= 0) & (age < LONGEST_CARRY_S)
+        std = np.sqrt(var_rad2[last] + TURN_WANDER_RAD**2 * np.abs(age))
+        clear = recent & (CLEARLY * std < table.std_heading_rad[some])
+        np.add(psi[some], off[last], out=psi[some], where=clear)
+        np.copyto(table.std_heading_rad[some], std, where=clear)
 
 
 def _outages(table: States, gnss: MeasurementOutcome, rtk_losses_ns: Ints) -> Ints:

@@ -14,7 +14,7 @@ from icrtool.alignment.sensors.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.icr_uncertainty import cut_states, final_covariance, multiplier_std
 from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
-from icrtool.estimation.odometry import drive_summary, drive_wheels
+from icrtool.estimation.odometry import drive_summary, odometry_end_error
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import (
     antenna_warning,
@@ -243,7 +243,7 @@ def _with_seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, A
 
 def _end_error(table: States, in_gap: Bools, icrs: Icrs) -> EndErrorDocument:
     """Return how far from the filter's last position the path by wheels alone ends, with constant ICRs."""
-    return EndErrorDocument(drive_wheels(table, in_gap, icrs).end_error_m)
+    return EndErrorDocument(odometry_end_error(table, in_gap, icrs))
 
 
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, ClassDocument]:

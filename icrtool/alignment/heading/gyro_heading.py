@@ -364,8 +364,8 @@ class _Problem:
         for i, j in product(f, f):
             variance += f[i] * P[last, i, j] * f[j]
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
-        scaled = (1 + constants[SCALE]) * G
-        smoothed = scaled[rows] + np.interp(s, t, states[:, PSI] - np.interp(t, turn.t, scaled))
+        scale = 1 + constants[SCALE]
+        smoothed = scale * G[rows] + np.interp(s, t, states[:, PSI] - scale * self.at)
         stamp = turn.stamp_std()[rows] ** 2
         smoothed_std = np.sqrt(np.interp(s, t, covariances[:, PSI, PSI]) + stamp)
         return HeadingEstimate(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -133,11 +134,21 @@ def open_loop_path(
     """
     path = OpenLoopPath(*np.empty((3, end - start + 1)))
     path.north[0], path.east[0], path.heading[0] = track.north[start], track.east[start], track.heading[start]
+    for reached, some in open_loop_pieces(track, y_icr_right, y_icr_left, x_icr, start, end):
+        for column, values in zip(path, some, strict=True):
+            column[reached.start - start : reached.stop - start] = values
+    return path
+
+
+def open_loop_pieces(
+    track: Track, y_icr_right: float, y_icr_left: float, x_icr: float, start: int, end: int
+) -> Iterator[tuple[slice, OpenLoopPath]]:
+    """Yield the states after `start` piece by piece, and the path of `open_loop_path` at them."""
     separation, turned, place = max(abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M), 0.0, 0j
     ahead = cmath.exp(1j * track.heading[start])
     for lo in range(start, end, ROWS_AT_ONCE):  # paths of whole drives are as long as a column of the run
         some = slice(lo, min(lo + ROWS_AT_ONCE, end))
-        reached, over = slice(some.start - start + 1, some.stop - start + 1), track.held[some] / separation
+        over = track.held[some] / separation
         left, right = track.v_left[some] * over, track.v_right[some] * over
         turn = left - right
         heading = turned + np.cumsum(np.append(0.0, turn))
@@ -145,6 +156,9 @@ def open_loop_path(
         places = place + np.cumsum(moved)
         turned, place = heading[-1], places[-1]
         places *= ahead
-        path.north[reached], path.east[reached] = track.north[start] + places.real, track.east[start] + places.imag
-        path.heading[reached] = track.heading[start] + heading[1:]
-    return path
+        yield (
+            slice(some.start + 1, some.stop + 1),
+            OpenLoopPath(
+                track.north[start] + places.real, track.east[start] + places.imag, track.heading[start] + heading[1:]
+            ),
+        )
