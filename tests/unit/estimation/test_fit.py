@@ -215,7 +215,7 @@ def test_a_robot_that_hardly_moved_has_nothing_to_show() -> None:
     run = fit(log, load_config(sets=[WIDTH]))
     assert any("hardly any turns" in warning for warning in run.warnings)
     assert not run.usable
-    assert "not shown" in run.summary["unusable_because"]
+    assert run.summary["unusable_because"].startswith("this drive does not show")
     assert set(run.summary["icr"]["final"].values()) == {None}
     assert run.summary["icr"]["separation_multiplier"] is None
 

@@ -81,7 +81,7 @@ def test_a_log_that_is_not_usable_has_no_next_command() -> None:
     assert next_command("log", [], run) == "icrtool dropout-report log"
     unusable = with_summary(run, usable=False, unusable_because="why")
     assert next_command("log", [], unusable) is None
-    assert verdict(unusable, None) == "not usable: why"
+    assert verdict(unusable, None, ["log"]) == "not usable: why"
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.5])
