@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from icrtool.records.text import LONGEST_MESSAGE, escaped, shortened
+from icrtool.records.text import LONGEST_MESSAGE, LONGEST_NAME, escaped, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -30,7 +30,8 @@ class IcrToolError(Exception):
 
     def beside(self, *names: str) -> str:
         """Return the line as it is read beside one of some names: without that name."""
-        return _line(self._reason) if str(self.what) in names else str(self)
+        what = shortened(str(self.what), LONGEST_NAME)
+        return _line(self._reason) if what in (shortened(str(one), LONGEST_NAME) for one in names) else str(self)
 
 
 def _line(text: str) -> str:

@@ -22,6 +22,7 @@ ELSEWHERE = {
     "docs/how-to/another-robot.md": "tests/test_docs_site.py runs it in order",
     "docs/how-to/controllers.md": "tests/test_docs_site.py runs it in order",
     "docs/how-to/notebook.md": "tests/test_docs_site.py runs it in order",
+    "docs/cloud.md": "needs an object store; tests/unit/logs/test_remote_logs.py reads logs of moto's server",
     "docs/how-to/autopilot.md": "tests/test_docs_autopilot.py runs it on logs of both autopilots",
 }
 NOT_RUN = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from icrtool.errors import ConfigError, DataError
+from icrtool.records.text import LogText
 
 
 def test_beside_the_name_of_its_log_a_line_does_not_repeat_it() -> None:
@@ -10,6 +11,8 @@ def test_beside_the_name_of_its_log_a_line_does_not_repeat_it() -> None:
     assert str(error) == "field: too short; drive longer"
     assert error.beside("/logs/field", "field") == "too short; drive longer"
     assert error.beside("other") == str(error)
+    path = "/logs/" + "long/" * 30 + "field.mcap"
+    assert DataError(LogText(path), "too short").beside(path) == "too short"
 
 
 def test_a_key_of_the_configuration_stays_in_its_line() -> None:
