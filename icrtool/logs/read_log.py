@@ -49,7 +49,7 @@ from icrtool.records.samples import (
     rate_and_jitter,
 )
 from icrtool.records.tables import RobotLog
-from icrtool.records.text import LogText
+from icrtool.records.text import LogText, escaped
 from icrtool.records.urls import place_of
 
 Progress = Callable[[float], None]
@@ -66,7 +66,7 @@ class Survey:
     """
 
     name: LogText
-    path: LogText
+    path: str
     channels: tuple[Channel, ...]
     tables: tuple[TopicTable, ...]
     candidates: Candidates
@@ -120,7 +120,7 @@ def survey_log(
     drop_used_columns(tables)
     return Survey(
         name=LogText(log_name(path)),
-        path=LogText(str(path)),
+        path=escaped(str(path)),
         channels=channels,
         tables=tuple(tables),
         candidates=candidates,
