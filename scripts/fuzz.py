@@ -207,7 +207,9 @@ def write(folder: Path, columns: dict[str, np.ndarray], kind: int, wheels: str) 
     options = WriteOptions(
         container=container, compression=compression, wheels=wheels, wheel_radius_m=0.165, track_width_m=0.55
     )
-    return write_log(folder / name_of(kind), SensorColumns(**columns), options)
+    # columns of any values: what overflows here is what the log is to hold
+    with np.errstate(all="ignore"):
+        return write_log(folder / name_of(kind), SensorColumns(**columns), options)
 
 
 def write_table(path: Path, columns: dict[str, np.ndarray]) -> Path:
