@@ -10,8 +10,10 @@ import bz2
 import hashlib
 import lzma
 import re
+import secrets
 import shutil
 import tempfile
+import weakref
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -56,13 +58,15 @@ class ScratchFolder:
     """A temporary folder, removed when it is closed, or when the process is ended by force."""
 
     def __init__(self) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="icrtool-")
-        self.path = Path(self._folder.name)
+        self.path = Path(tempfile.gettempdir()) / f"icrtool-{secrets.token_hex(8)}"
+        # before it is there: a signal may come at any time
         unfinished.begin(self.path)
+        self.path.mkdir(mode=0o700)
+        self._remove = weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
 
     def close(self) -> None:
         """Remove it."""
-        self._folder.cleanup()
+        self._remove()
         unfinished.end(self.path)
 
 
