@@ -9,22 +9,12 @@ import numpy as np
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.equal_steps import rows_at_steps
-from icrtool.kernels.robust import robust_least_squares
+from icrtool.motion.gyro_line import GyroLine, fit_gyro_line
 from icrtool.motion.models import Lever
 from icrtool.motion.recording import Recording
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, track_of
-
-GYRO_STEP_S, FEWEST_GYRO_STEPS = 1.0, 10
-"""Turns over this time are compared, at least so many."""
-
-GYRO_PRIOR_STD = np.array([10.0, 0.005, 0.2])
-"""Of scale, whose sign is open, bias [rad/s] and lead [s]: on a circle only this separates scale and bias."""
-
-GYRO_SCALE_RANGE = 0.1
-"""A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
 
 
 def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: float | None = None) -> Recording:
@@ -81,12 +71,12 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
         turned, dt = (np.diff(one, append=one[-1:]) for one in (np.interp(t + later_s, t, heading.angle_rad), t))
         return np.divide(turned, dt, out=np.zeros(len(t)), where=dt > 0.0)
 
-    slope, _, later_s = _gyro_line(plain, rate(0.0))
+    line = _gyro_line(plain, rate(0.0))
     give_back_freed()
-    if not abs(abs(slope) - 1.0) < GYRO_SCALE_RANGE:
+    if not line.is_yaw:
         return plain
-    track = plain.track._replace(gyro=np.sign(slope) * rate(later_s))
-    return replace(plain, track=track, gyro_reversed=slope < 0.0)
+    track = plain.track._replace(gyro=np.sign(line.scale) * rate(line.lead_s))
+    return replace(plain, track=track, gyro_reversed=line.scale < 0.0)
 
 
 def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
@@ -98,25 +88,13 @@ def scaled_gyro(recording: Recording) -> Floats:
     """Return the turn rate of a recording's gyro (n,) [rad/s] with scale and bias that fit its reference."""
     if recording.track.gyro is None:
         return np.zeros(len(recording.track.t))
-    slope, bias, _ = _gyro_line(recording, recording.track.gyro)
-    rate: Floats = slope * recording.track.gyro
-    rate += bias
+    line = _gyro_line(recording, recording.track.gyro)
+    rate: Floats = line.scale * recording.track.gyro
+    rate += line.bias_radps
     return rate
 
 
-def _gyro_line(recording: Recording, rate: Floats) -> tuple[float, float, float]:
-    """Return scale, bias [rad/s] and lead [s] with which a turn rate (n,) makes the reference's turns over seconds."""
-    t = recording.track.t
-    every = rows_at_steps(t - t[0], GYRO_STEP_S)
-    if len(every) < FEWEST_GYRO_STEPS:
-        return float("nan"), float("nan"), 0.0
-    sums = recording.track.cumulate(rate)
-    turned, lasting = np.diff(recording.track.heading[every]), np.diff(t[every])
-
-    def evaluate(x: Floats) -> tuple[Floats, Floats]:
-        at = t[every] + x[2]
-        by_scale, by_lead = (np.diff(np.interp(at, t, column)) for column in (sums, x[0] * rate))
-        return x[0] * by_scale + x[1] * lasting - turned, np.column_stack([by_scale, lasting, by_lead])
-
-    zero = np.zeros(3)
-    return tuple(robust_least_squares(evaluate, zero, zero, GYRO_PRIOR_STD, overlap=10.0).x.tolist())
+def _gyro_line(recording: Recording, rate: Floats) -> GyroLine:
+    """Return the line by which a turn rate (n,) makes the turns of a recording's reference."""
+    track = recording.track
+    return fit_gyro_line(track.t, rate, track.cumulate(rate), track.t, track.heading)

@@ -13,9 +13,9 @@ import numpy as np
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import cut_windows, track_of_streams, window_length
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints
-from icrtool.kernels.equal_steps import rows_at_steps
-from icrtool.kernels.robust import mad_std, robust_least_squares
+from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
+from icrtool.motion.gyro_line import fit_gyro_line
 from icrtool.records.measurements import SensorData
 
 KNOT_S = 0.1
@@ -35,11 +35,6 @@ WINDOW_M = 1.0
 """The motion is estimated over shorter windows than the alignment: events disturb fewer of them."""
 
 LEAST_STD_M, LEAST_TURN_GAIN = 0.01, 1e-3
-
-
-GYRO_STEP_S, GYRO_STD, GYRO_SCALE_RANGE = 1.0, np.array([10.0, 0.1]), 0.1
-"""A gyro is compared with the headings over this time; prior of its scale, whose sign is open, and bias [rad/s]; with
-a scale further from 1 it does not measure the robot's yaw."""
 
 
 class Knots(NamedTuple):
@@ -177,18 +172,9 @@ def _turn_by_gyro(sensors: SensorData, t: Floats, heading: Floats) -> Floats | N
     if gyro is None or len(gyro.stamp_ns) < FEWEST_KNOTS:
         return None
     at = (gyro.stamp_ns - sensors.wheels.stamp_ns[0]) / 1e9
-    turned = np.interp(t, at, np.concatenate([[0.0], np.cumsum(np.diff(at) * gyro.rate_radps[:-1])]))
-    rows = rows_at_steps(t, GYRO_STEP_S)
-    made, passed, shown = (np.diff(column[rows]) for column in (turned, t, heading))
-    if len(made) < FEWEST_KNOTS:
-        return None
-    by = np.column_stack([made, passed])
-
-    def evaluate(line: Floats) -> tuple[Floats, Floats]:
-        return by @ line - shown, by
-
-    scale, bias = robust_least_squares(evaluate, np.zeros(2), np.zeros(2), GYRO_STD).x.tolist()
-    return scale * turned + bias * t if abs(abs(scale) - 1.0) < GYRO_SCALE_RANGE else None
+    turned = np.concatenate([[0.0], np.cumsum(np.diff(at) * gyro.rate_radps[:-1])])
+    line = fit_gyro_line(at, gyro.rate_radps, turned, t, heading)
+    return line.scale * np.interp(t + line.lead_s, at, turned) + line.bias_radps * t if line.is_yaw else None
 
 
 def spans_of(knots: Knots, duration_s: float) -> tuple[Ints, Ints]:
