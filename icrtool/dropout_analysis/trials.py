@@ -121,7 +121,7 @@ def dropout(
     start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
     where it ends in a real GNSS outage. Of a standstill only the last state starts trials: the others would be copies,
     and a parked robot would set the result. Overlapping trials are not independent: the
-    intervals come from blocks of path of at least two horizons (`icrtool.kernels.open_loop.block_sums`).
+    intervals come from blocks of path of at least four horizons (`icrtool.kernels.open_loop.block_sums`).
     """
     check_type(run, Run, MAKE_RUN)
     if len(run.table) < 2:
