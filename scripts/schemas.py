@@ -13,8 +13,7 @@ from typing import Any, Literal, TypedDict, get_type_hints
 import msgspec
 import numpy as np
 
-from icrtool.calibration.error_differences import ErrorEstimate
-from icrtool.calibration.transfer import Difference
+from icrtool.calibration.transfer import Difference, ErrorEstimate
 from icrtool.fleet.roll_up import PooledCalibration
 from icrtool.fleet.row import Row
 from icrtool.motion.models import TrackGeometry

@@ -15,14 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.error_differences import ErrorEstimate, blocks_of, compare_errors, same_route
 from icrtool.calibration.from_runs import calibrate_runs
 from icrtool.calibration.pooled import CalibrationResult, predictor
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals
+from icrtool.kernels.open_loop.block_sums import BlockSums, block_sums, difference_half_width, error_intervals
 from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
+from icrtool.kernels.track import Track
 from icrtool.motion.models import RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import Recording, cut_trials
 from icrtool.records.dropout import CHOICE_HORIZON_M
@@ -33,7 +33,21 @@ HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
 TWO_SIDED = 1.96
 """Standard deviations in a 95 % interval."""
 
+SAME_ROUTE_M = 1.0
+"""Two drives took the same route where they are nowhere further apart at the same distance."""
+
 COMPARED = ("y_icr_right_m", "y_icr_left_m", "x_icr_m", "multiplier", "radius_left", "radius_right")
+
+
+class ErrorEstimate(NamedTuple):
+    """Errors, or differences of errors, with 95 % intervals [m]; NaN where there is none."""
+
+    p95_m: float
+    p95_low_m: float
+    p95_high_m: float
+    expected_m: float
+    expected_low_m: float
+    expected_high_m: float
 
 
 class Difference(NamedTuple):
@@ -117,10 +131,10 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> Transfer:
 
     Notes
     -----
-    Parameters of different logs are independent, and their covariances are clustered by distance; errors have intervals
-    from blocks of the distance of all runs of a group (`icrtool.kernels.open_loop.block_sums`). Differences of errors
-    have a bootstrap over blocks, over pairs of blocks where both are of the same trials or the same route
-    (`icrtool.calibration.error_differences`).
+    Parameters of different logs are independent, and their covariances are clustered by distance. Errors and their
+    differences have intervals from blocks of the distance of all runs of a group
+    (`icrtool.kernels.open_loop.block_sums`), differences from pairs of blocks where both are of the same trials or the
+    same route.
     """
     if len(groups) < 2:
         raise ConfigError("groups", "only one is given", "name two or more to compare")
@@ -178,34 +192,60 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
     return _Tested(np.concatenate(errors), np.concatenate(path))
 
 
+class _Sums(NamedTuple):
+    """The trials of one horizon: p95 and mean [m] with their intervals, and the sums of blocks of path."""
+
+    errors: ErrorEstimate
+    blocks: BlockSums | None
+
+
+def _sum_up(errors_m: Floats, path_m: Floats, horizon_m: float) -> _Sums:
+    summary = error_summary(errors_m[:, None])
+    p50, p95, expected = (float(one[0]) for one in (summary.p50, summary.p95, summary.expected))
+    blocks = cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
+    sums = block_sums(errors_m, blocks, sort_trials(errors_m), p50, p95)
+    low, high, p95_low, p95_high = error_intervals(errors_m, blocks, sums, p95)
+    return _Sums(ErrorEstimate(p95, p95_low, p95_high, expected, low, high), sums)
+
+
 def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[ErrorEstimate]:
-    """Return the difference of errors at each horizon, second minus first."""
+    """Return the difference of errors at each horizon, second minus first; of the same trials only where both are."""
     found = []
+    same = np.array_equal(first.path, second.path)
     for h, horizon in enumerate(HORIZONS_M):
-        blocks = [blocks_of(one.path, horizon) for one in (first, second)]
-        sides = first.errors[:, h], blocks[0], second.errors[:, h], blocks[1]
-        found.append(compare_errors(*sides, paired=paired))
+        sides = [one.errors[:, h] for one in (first, second)]
+        if same:
+            both = np.isfinite(sides[0]) & np.isfinite(sides[1])
+            sides = [np.where(both, one, np.nan) for one in sides]
+        before, after = (_sum_up(side, one.path, horizon) for side, one in zip(sides, (first, second), strict=True))
+        numbers = []
+        for metric, name in (("p95", "p95_m"), ("expected", "expected_m")):
+            more = getattr(after.errors, name) - getattr(before.errors, name)
+            half = difference_half_width(after.blocks, before.blocks, metric, 1.0, paired=paired)
+            numbers += [more, more - half, more + half]
+        found.append(ErrorEstimate(*numbers))
     return found
 
 
 def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested]) -> Iterator[Cell]:
     """Yield the cells of one row and column, a horizon each."""
-    errors, path = tested[row, column]
-    summary = error_summary(errors)
-    intervals = []
-    for h, horizon in enumerate(HORIZONS_M):
-        of_horizon, p95 = errors[:, h], float(summary.p95[h])
-        blocks = cut_blocks(np.isfinite(of_horizon), path, horizon)
-        sums = block_sums(of_horizon, blocks, sort_trials(of_horizon), float(summary.p50[h]), p95)
-        intervals.append(error_intervals(of_horizon, blocks, sums, p95))
-    expected_low, expected_high, p95_low, p95_high = np.array(intervals).T
     own, foreign = tested[column, column], tested[row, column]
     costs = [None] * len(HORIZONS_M) if row == column else _differences(own, foreign, paired=True)
-    of_horizons = np.column_stack([
-        summary.p95, p95_low, p95_high, summary.expected, expected_low, expected_high,
-    ])  # fmt: skip
-    for horizon, trials, values, cost in zip(HORIZONS_M, summary.trials, of_horizons.tolist(), costs, strict=True):
-        yield Cell(row, column, horizon, int(trials), ErrorEstimate(*values), cost)
+    for h, (horizon, cost) in enumerate(zip(HORIZONS_M, costs, strict=True)):
+        errors = foreign.errors[:, h]
+        trials = int(np.count_nonzero(np.isfinite(errors)))
+        yield Cell(row, column, horizon, trials, _sum_up(errors, foreign.path, horizon).errors, cost)
+
+
+def same_route(first: Track, second: Track) -> bool:
+    """Return whether two drives took the same route at the same distance."""
+    ends = [float(one.distance[-1]) for one in (first, second)]
+    if abs(ends[1] - ends[0]) > 0.05 * min(ends):
+        return False
+    at = np.arange(0.0, min(ends), 1.0)
+    places = [np.interp(at, one.distance, one.north) + 1j * np.interp(at, one.distance, one.east)
+              for one in (first, second)]  # fmt: skip
+    return bool(np.abs(places[1] - places[0]).max() < SAME_ROUTE_M)
 
 
 def _check_apart(recordings: Mapping[str, Sequence[Recording]]) -> None:

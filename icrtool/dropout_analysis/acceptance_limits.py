@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_width
+from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
-from icrtool.kernels.open_loop.block_sums import BlockSums
+from icrtool.kernels.open_loop.block_sums import BlockSums, difference_half_width
 from icrtool.kernels.within_budget import within_budget
 from icrtool.motion.models import FAMILY
 from icrtool.records.dropout import METRICS, BudgetDistance, Gate, ModelResult, Verdict
@@ -112,7 +112,7 @@ def check_gate(
     if gate.baseline_factor and baseline is not None:
         before, old = _before(gate, baseline)
         half_width = difference_half_width(
-            sums, old, gate.metric, gate.baseline_factor, same_recording=baseline.is_of(report.run_document)
+            sums, old, gate.metric, gate.baseline_factor, paired=baseline.is_of(report.run_document)
         )
     bound = gate.bound_m + (gate.baseline_factor * before if gate.baseline_factor else 0.0)
     margin = bound - value if gate.relation.startswith("<") else value - bound

@@ -12,7 +12,7 @@ import numpy as np
 from icrtool import __version__
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.block_sums import BlockSums, student_factor, variance_of_sum
+from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.records.dropout import Gate
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import listed
@@ -87,33 +87,6 @@ class BaselineReport:
     def is_of(self, run_document: RunDocument) -> bool:
         """Return whether the report was made of the same recording as a run."""
         return bool(self.sha256) and self.sha256 == run_document.content
-
-
-def difference_half_width(
-    now: BlockSums | None, before: BlockSums | None, metric: str, factor: float, *, same_recording: bool
-) -> float:
-    """Return half the confidence interval [m] of ``number - factor * baseline``; NaN where there is none.
-
-    Parameters
-    ----------
-    same_recording : both were made of the same blocks of path, whose errors are then compared one by one
-
-    Notes
-    -----
-    Student's distribution. Of one recording: of the differences of the blocks' influences. Of two: both variances add
-    up, degrees of freedom of Welch (1947).
-    """
-    if now is None or before is None or metric in {"max", "within"}:
-        return math.nan
-    new, old = now.influence(metric), factor * before.influence(metric)
-    if same_recording and len(new) == len(old):
-        variance, freedom = variance_of_sum(new - old), float(len(new) - 1)
-    else:
-        parts = [(variance_of_sum(part), len(part) - 1) for part in (new, old)]
-        variance = sum(part for part, _ in parts)
-        weight = sum(part**2 / degrees for part, degrees in parts)
-        freedom = variance**2 / weight if weight > 0 else 1.0
-    return student_factor(freedom) * math.sqrt(variance)
 
 
 def _different_keys(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -144,6 +144,33 @@ def error_intervals(
     return expected_m / grown[0], expected_m * grown[0], p95_m / grown[1], p95_m * grown[1]
 
 
+def difference_half_width(
+    now: BlockSums | None, before: BlockSums | None, metric: str, factor: float, *, paired: bool
+) -> float:
+    """Return half the confidence interval [m] of ``number - factor * baseline``; NaN where there is none.
+
+    Parameters
+    ----------
+    paired : both have the same blocks of path, whose errors are then compared one by one
+
+    Notes
+    -----
+    Student's distribution. Paired: of the differences of the blocks' influences. Otherwise both variances
+    add up, degrees of freedom of Welch (1947).
+    """
+    if now is None or before is None or metric in {"max", "within"}:
+        return math.nan
+    new, old = now.influence(metric), factor * before.influence(metric)
+    if paired and len(new) == len(old):
+        variance, freedom = variance_of_sum(new - old), float(len(new) - 1)
+    else:
+        parts = [(variance_of_sum(part), len(part) - 1) for part in (new, old)]
+        variance = sum(part for part, _ in parts)
+        weight = sum(part**2 / degrees for part, degrees in parts)
+        freedom = variance**2 / weight if weight > 0 else 1.0
+    return student_factor(freedom) * math.sqrt(variance)
+
+
 def block_sums(
     errors_m: Floats, blocks: Blocks | None, ordered: Floats, p50_m: float, p95_m: float
 ) -> BlockSums | None:

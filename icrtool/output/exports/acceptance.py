@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
-from icrtool.dropout_analysis.baseline import BaselineReport, difference_half_width
+from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
+from icrtool.kernels.open_loop.block_sums import difference_half_width
 from icrtool.output.files.atomic import write_file
 from icrtool.output.tables.dropout import format_dropout, shown_horizons
 from icrtool.output.text_blocks import Line, Table
@@ -123,9 +124,7 @@ def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str
                 before = row.values_m[metric] if row is not None else math.nan
                 difference = float(column[h]) - before
                 sums = result.block_sums[h] if result.block_sums else None
-                half = difference_half_width(
-                    sums, row.sums if row is not None else None, metric, 1.0, same_recording=same
-                )
+                half = difference_half_width(sums, row.sums if row is not None else None, metric, 1.0, paired=same)
                 interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
                 cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
             rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.calibration.error_differences import compare_errors
 from icrtool.calibration.pooled import calibrate_recordings
 from icrtool.calibration.transfer import Transfer, compare_calibrations, compare_groups
 from icrtool.errors import ConfigError
@@ -92,21 +91,6 @@ def test_costs_are_differences_in_the_same_trials(transfer: Transfer) -> None:
     same = transfer.cell("old", "again", 10.0).cost
     assert same is not None
     assert same.expected_low_m < 0.1
-
-
-def test_pairs_of_blocks_take_what_is_hard_for_both_out_of_the_difference() -> None:
-    """Errors of 40 stretches, some hard for both, that differ by 0.1 m: intervals hold it, paired ones tightly."""
-    inside, widths = 0, []
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        hard, block = np.repeat(rng.exponential(1.0, 40), 20), np.repeat(np.arange(40), 20)
-        first = hard + rng.normal(0.0, 0.05, len(hard)) + np.repeat(rng.normal(0.0, 0.05, 40), 20)
-        second = hard + 0.1 + rng.normal(0.0, 0.05, len(hard)) + np.repeat(rng.normal(0.0, 0.05, 40), 20)
-        paired, apart = (compare_errors(first, block, second, block, paired=how, seed=1) for how in (True, False))
-        inside += paired.expected_low_m <= 0.1 <= paired.expected_high_m
-        widths.append((paired.expected_high_m - paired.expected_low_m) / (apart.expected_high_m - apart.expected_low_m))
-    assert inside >= 34
-    assert np.median(widths) < 0.3
 
 
 def test_the_same_route_driven_twice_is_paired() -> None:

@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 
 from icrtool.dropout_analysis.acceptance_limits import check_gate, parse_gate
-from icrtool.dropout_analysis.baseline import difference_half_width
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError, IcrToolError
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import runs_of_fleet
 from icrtool.fleet.row import File, Row
-from icrtool.kernels.open_loop.block_sums import BlockSums, block_sums
+from icrtool.kernels.open_loop.block_sums import BlockSums, block_sums, difference_half_width
 from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
 from icrtool.output.files.baseline_file import open_baseline, read_report
 from icrtool.records.run import Run
@@ -60,7 +59,7 @@ def test_the_interval_of_two_recordings_holds_no_difference(metric: str, least: 
     held = 0
     for _ in range(300):
         (a, now), (b, before) = sums_of(moving_sums(rng, 3000)), sums_of(moving_sums(rng, 4500))
-        half = difference_half_width(a, b, metric, 1.0, same_recording=False)
+        half = difference_half_width(a, b, metric, 1.0, paired=False)
         held += abs(now[metric] - before[metric]) <= half
     assert least <= held / 300 <= 0.99
 
@@ -71,12 +70,12 @@ def test_one_recording_is_compared_block_by_block() -> None:
     changed = 1.05 * errors + 0.02 * moving_sums(rng, 4000)
     a, b = sums_of(changed)[0], sums_of(errors)[0]
     for metric in ("expected", "p95"):
-        paired = difference_half_width(a, b, metric, 1.0, same_recording=True)
-        apart = difference_half_width(a, b, metric, 1.0, same_recording=False)
+        paired = difference_half_width(a, b, metric, 1.0, paired=True)
+        apart = difference_half_width(a, b, metric, 1.0, paired=False)
         assert paired < 0.3 * apart
-    assert difference_half_width(b, b, "p95", 1.0, same_recording=True) == 0.0
-    assert math.isnan(difference_half_width(a, b, "max", 1.0, same_recording=True))
-    assert math.isnan(difference_half_width(None, b, "p95", 1.0, same_recording=True))
+    assert difference_half_width(b, b, "p95", 1.0, paired=True) == 0.0
+    assert math.isnan(difference_half_width(a, b, "max", 1.0, paired=True))
+    assert math.isnan(difference_half_width(None, b, "p95", 1.0, paired=True))
 
 
 @pytest.mark.parametrize(
