@@ -110,7 +110,7 @@ def _json(calibration: Calibration, errors: ControllerErrors) -> str:
 def _nav2(errors: ControllerErrors) -> list[str]:
     (alpha1, alpha2), (alpha3, alpha4) = errors.turn_noise, errors.way_noise
     return [
-        "# robot_localization, odom frame: wheels give vx and vyaw, with the twist covariance of the odometry message:",
+        "# robot_localization, odom frame: wheels give vx and vyaw, with the twist covariance of the message:",
         f"# set there twist_covariance_diagonal: {_diagonal(errors.twist_variance)}",
         "ekf_filter_node:",
         "  ros__parameters:",
@@ -120,7 +120,7 @@ def _nav2(errors: ControllerErrors) -> list[str]:
         f"    odom0_config: [{', '.join('true' if used in ODOMETRY_USED else 'false' for used in range(15))}]",
         "    odom0_differential: false",
         "    odom0_relative: false",
-        "# AMCL: shares of variance of turn by turn, turn by distance, distance by distance, distance by turn",
+        "# AMCL: shares of variance: turn by turn, turn by distance, distance by distance, distance by turn",
         "amcl:",
         "  ros__parameters:",
         '    robot_model_type: "nav2_amcl::DifferentialMotionModel"',
@@ -186,7 +186,9 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
             f"{factor:.4f} times the old"
         )
     sentences += [f"WARNING: {_one_line(warning)}" for warning in export_warnings(calibration)]
-    return [f"# {line}" for sentence in sentences for line in textwrap.wrap(sentence, TEXT_WIDTH)]
+    return [
+        line for sentence in sentences for line in textwrap.wrap(f"# {sentence}", TEXT_WIDTH, subsequent_indent="# ")
+    ]
 
 
 def _diagonal(planar: tuple[float, float, float]) -> str:

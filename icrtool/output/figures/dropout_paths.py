@@ -64,6 +64,9 @@ LINE_FROM_PT = 20.0
 BAR_SHARE = 0.4
 """The bar of a scale is at most this part of the width."""
 FRAME_COLOR = "0.75"
+LOST_LOOK: dict[str, Any] = {"color": "0.82", "linewidth": 6.0, "solid_capstyle": "butt", "zorder": 1}
+"""Beneath the paths, where no fix corrected the reference."""
+
 SLOWEST_MPS = 0.001
 
 
@@ -240,6 +243,9 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
             label="where each ends",
         )  # fmt: skip
     end_s = drive.t_s + drive.horizon_m / max(drive.speed_mean_mps, SLOWEST_MPS)
+    for one in report.outages:
+        if one.kind == "real" and drive.t_s <= one.end_s and one.begin_s <= end_s:
+            axes.plot(one.east_m - drive.east_m, one.north_m - drive.north_m, label="real outage", **LOST_LOOK)
     jumps = [one for one in report.run_document.reference_jumps if drive.t_s <= one.end_s and one.begin_s <= end_s]
     if jumps:
         axes.plot(

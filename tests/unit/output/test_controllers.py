@@ -16,6 +16,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError, DataError
 from icrtool.motion.models import FAMILY, FittedModel, Lever, controller_model, wheel_motion
 from icrtool.output.exports.controllers import TARGETS, format_export
+from icrtool.output.text_blocks import TEXT_WIDTH
 
 CONTROLLER_KEYS = {
     "wheel_separation", "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
@@ -77,6 +78,7 @@ def test_comments_say_log_date_doubt_and_what_is_lost(calibration: Calibration, 
     )
     for word in ("barn", "2025-10-09", "±", "x_icr", "not expressible here", "held out"):
         assert word in text
+    assert max(len(line) for line in format_export(calibration, target).splitlines() if line[0] == "#") <= TEXT_WIDTH
 
 
 def test_a_log_with_a_wild_name_stays_a_comment(calibration: Calibration) -> None:

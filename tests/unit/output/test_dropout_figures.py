@@ -218,3 +218,15 @@ def test_a_picture_that_cannot_be_written_is_named(report: DropoutReport, tmp_pa
     (tmp_path / "histogram.png").mkdir()
     with pytest.raises(OSError, match="histogram"):
         draw_figures("report", report, tmp_path, ("png",))
+
+
+def test_an_outage_within_a_worst_trial_is_marked_there(
+    run: Run, report: DropoutReport, outages: tuple[Outage, ...]
+) -> None:
+    worst = worst_trials(run, horizon_m=2.0)
+    (real,) = (one for one in outages if one.kind == "real")
+    meanwhile = replace(real, begin_s=worst[0].t_s, end_s=worst[0].t_s + 0.1)
+    before = replace(real, begin_s=-2.0, end_s=-1.0)
+    for outage, marked in ((meanwhile, True), (before, False)):
+        figure = drawn(lambda shown=outage: dropout_worst(replace(report, outages=(shown,), worst=worst)))
+        assert ("real outage" in {line.get_label() for line in figure.axes[1].lines}) is marked
