@@ -25,9 +25,10 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.log_track import LEAST_CHORD_M, DriveWindows, cut_chords
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares, sandwich_covariance, soft_l1_loss
 from icrtool.kernels.track import Track
+from icrtool.motion.turns import fit_gyro_line
 from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
@@ -261,19 +262,11 @@ def _in_words(one: Convention) -> str:
 
 def gyro_sense(log: RobotLog, track: Track) -> int:
     """Return +1 where the gyro turns as the heading is named, -1 where in the opposite sense, 0 where not shown."""
-    if log.gyro is None or len(track.heading_t) < 3:
+    if log.gyro is None or len(track.heading_t) < 2:
         return 0
-    t = (log.gyro.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
-    turned = np.concatenate([[0.0], np.cumsum(np.diff(t) * log.gyro.rate_radps[:-1])])
-    edges = t[0] + np.unique(np.floor(t - t[0]))
-    by_gyro, by_heading = (
-        np.diff(np.interp(edges, t, turned)),
-        np.diff(track.heading_at(edges)),
-    )
-    if len(by_gyro) < FEWEST_WINDOWS or not (np.ptp(by_gyro) > 0 and np.ptp(by_heading) > 0):
-        return 0
-    correlation = float(np.corrcoef(by_gyro, by_heading)[0, 1])
-    return int(np.sign(correlation)) if abs(correlation) > 0.5 else 0
+    t, rate = (log.gyro.stamp_ns - log.wheels.stamp_ns[0]) / 1e9, log.gyro.rate_radps
+    line = fit_gyro_line(t, rate, trapezoids(t, rate), track.heading_t, track.heading)
+    return int(np.sign(line.scale)) if line.is_yaw else 0
 
 
 def apply_convention(log: RobotLog, convention: Convention) -> RobotLog:

@@ -9,9 +9,9 @@ import numpy as np
 from icrtool.errors import ConfigError
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.arrays import Floats
-from icrtool.motion.gyro_line import GyroLine, fit_gyro_line
 from icrtool.motion.models import Lever
 from icrtool.motion.recording import Recording
+from icrtool.motion.turns import GyroLine, fit_gyro_line
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import Run, track_of

@@ -16,6 +16,7 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
+from icrtool.motion.turns import compare_turns
 from icrtool.records.samples import (
     NO_HEADINGS,
     GyroAxes,
@@ -97,8 +98,9 @@ LARGEST_SPREAD = 2.0
 LARGEST_DRIFT = math.radians(10.0)
 """A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
 
-COMPARED_S, FOLLOWS, LEAST_GAIN, LARGEST_GAIN = 1.0, 0.9, 0.15, 1.3
-"""A gyro whose turns within a second explain this share of the wheels', with such a gain, turns with the robot."""
+COMPARED_S, LEFT_SHARE, LEAST_GAIN, LARGEST_GAIN = 1.0, 0.3, 0.15, 1.3
+"""A gyro whose turns within a second are those of the wheels but for this share, with such a gain, turns with the
+robot."""
 
 LONGEST_HOLE_S = 1.0
 """No heading is estimated within a longer hole of the turn rate."""
@@ -213,19 +215,12 @@ def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, epoch
     gyro = derived.gyro
     if gyro is None:
         return False
-    begin = np.arange(track.t[0], track.t[-1] - COMPARED_S, COMPARED_S)
     t = (gyro.stamp_ns - epoch_ns) / 1e9
-    turned = trapezoids(t, gyro.rate_radps)
-    wheels = track.cumulate(2.0 * track.half_difference / width_m)
-    by_gyro, by_wheels = (
-        np.interp(begin + COMPARED_S, times, angle) - np.interp(begin, times, angle)
-        for times, angle in ((t, turned), (track.t, wheels))
-    )
-    both, own = float(by_gyro @ by_wheels), float(by_wheels @ by_wheels)
-    if min(own, float(by_gyro @ by_gyro)) <= 0.0:
+    turning = track._replace(heading_t=t, heading=trapezoids(t, gyro.rate_radps))
+    found = compare_turns(turning, width_m, 0.0, COMPARED_S)
+    if found is None:
         return False
-    explained = both**2 / own / float(by_gyro @ by_gyro)
-    return explained > FOLLOWS and LEAST_GAIN < both / own < LARGEST_GAIN
+    return found.left_rad < LEFT_SHARE * found.turn_rad and LEAST_GAIN < found.ratio < LARGEST_GAIN
 
 
 def attitude_error(estimate: HeadingEstimate) -> float:

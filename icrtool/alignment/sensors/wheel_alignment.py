@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,10 +17,9 @@ from icrtool.alignment.log_track import DriveWindows
 from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.equal_steps import rows_at_steps
-from icrtool.kernels.robust import huber_weights, mad_std
-from icrtool.kernels.track import Track
+from icrtool.motion.turns import Turns, compare_turns
 from icrtool.records.measurements import WheelFacts
 from icrtool.records.plain_data import known
 from icrtool.records.samples import WheelSamples
@@ -310,10 +308,9 @@ def _fused_note(log: RobotLog) -> list[str]:
 NOISE_S, SHORT_S, MIDDLE_S, LONGEST_S = 0.3, 1.0, 5.0, 40.0
 """Turns are compared over these times; in the first there is hardly more than noise."""
 
-SHORTEST_LONG_S, LONG_WINDOWS, FEWEST_SPANS = 15.0, 8.0, 6
-"""The long windows last at least so long, a drive has so many of them, and so many are whole."""
+SHORTEST_LONG_S, LONG_WINDOWS = 15.0, 8.0
+"""The long windows last at least so long, and a drive has so many of them."""
 
-STARTS_A_WINDOW, ROUNDS = 4, 5
 SIGMAS, SMALLEST_CHANGE = 3.0, 0.1
 """The ratio of turn to wheels' turn changes from short to long windows where it differs by more than both."""
 
@@ -326,63 +323,6 @@ more than attitude sensors err."""
 
 BOUNDED = 1.5
 """What a random walk adds grows by 2 from 5 to 20 s and by 2.8 to 40 s."""
-
-
-class Turns(NamedTuple):
-    """Turns of the heading and of the wheels over windows of one length.
-
-    Attributes
-    ----------
-    ratio, ratio_std : turn of the heading per turn of the wheels
-    left_rad : robust scatter of the heading's turn beyond that; turn_rad : rms turn of the heading
-    """
-
-    ratio: float
-    ratio_std: float
-    left_rad: float
-    turn_rad: float
-
-
-def compare_turns(track: Track, width_m: float, delay_s: float, window_s: float) -> Turns | None:
-    """Compare the turns of heading and wheels over windows of some length; None where there are too few.
-
-    Parameters
-    ----------
-    width_m : the track width b
-    delay_s : by which the heading lags the wheels
-    """
-    t = track.t
-    turned = track.cumulate(2.0 * track.half_difference / width_m)
-    first = max(t[0] + delay_s, track.heading_t[0])
-    last = min(t[-1] + delay_s, track.heading_t[-1]) - window_s
-    begin = np.arange(first, last, window_s / STARTS_A_WINDOW)
-    by_wheels, by_heading = (
-        np.interp(begin + window_s - shift, times, angle) - np.interp(begin - shift, times, angle)
-        for shift, times, angle in ((delay_s, t, turned), (0.0, track.heading_t, track.heading))
-    )
-    whole = track.clear(begin - delay_s, begin + window_s - delay_s)
-    moved = np.interp(begin + window_s - delay_s, t, track.travel) > np.interp(begin - delay_s, t, track.travel)
-    kept = whole & moved
-    if np.count_nonzero(kept) < STARTS_A_WINDOW * FEWEST_SPANS:
-        return None
-    return _regress(by_wheels[kept], by_heading[kept], np.arange(len(begin))[kept] // STARTS_A_WINDOW)
-
-
-def _regress(wheels: Floats, heading: Floats, group: Ints) -> Turns | None:
-    """Return the ratio of two turns (w,) by robust regression, its deviation from groups of windows."""
-    weight, information = np.ones(len(wheels)), float(wheels @ wheels)
-    if information <= 0.0:
-        return None
-    ratio = float(wheels @ heading) / information
-    for _ in range(ROUNDS):
-        left = heading - ratio * wheels
-        weight = huber_weights(left / max(mad_std(left, 0.0), 1e-6))
-        information = float(weight @ wheels**2)
-        ratio = float(weight @ (wheels * heading)) / information
-    left = heading - ratio * wheels
-    pull = np.bincount(group - group.min(), weight * wheels * left)
-    turn = math.sqrt(float(np.mean(heading**2)))
-    return Turns(ratio, math.sqrt(float(pull @ pull)) / information, mad_std(left, 0.0), turn)
 
 
 def find_filtering(fit: AlignmentFit) -> str:

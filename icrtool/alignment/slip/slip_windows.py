@@ -12,10 +12,10 @@ import numpy as np
 
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import cut_windows, track_of_streams, window_length
-from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapezoids
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
-from icrtool.motion.gyro_line import fit_gyro_line
+from icrtool.motion.turns import fit_gyro_line
 from icrtool.records.measurements import SensorData
 
 KNOT_S = 0.1
@@ -172,7 +172,7 @@ def _turn_by_gyro(sensors: SensorData, t: Floats, heading: Floats) -> Floats | N
     if gyro is None or len(gyro.stamp_ns) < FEWEST_KNOTS:
         return None
     at = (gyro.stamp_ns - sensors.wheels.stamp_ns[0]) / 1e9
-    turned = np.concatenate([[0.0], np.cumsum(np.diff(at) * gyro.rate_radps[:-1])])
+    turned = trapezoids(at, gyro.rate_radps)
     line = fit_gyro_line(at, gyro.rate_radps, turned, t, heading)
     return line.scale * np.interp(t + line.lead_s, at, turned) + line.bias_radps * t if line.is_yaw else None
 
