@@ -28,6 +28,9 @@ LEAST_DISTANCE2 = 36.0
 LEAST_SHARE = 0.3
 """... and the least share of the wheels' motion that the robot does not make, or makes sideways."""
 
+LEAST_OF_SIDE = 0.12
+"""... where the robot drives and one side keeps to its wheels. In a spin a side slips by its own share."""
+
 STUCK_SHARE = 0.2
 """Robot that moves and turns less than this share of what its wheels do: immobilised."""
 
@@ -164,7 +167,9 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
         windows = windows.rows(windows.path_m > TURNING_MPS * duration)
         square = (windows.residual**2 / (windows.sensor + (error * windows.path_m[:, None]) ** 2)).sum(axis=1)
         missed = np.hypot(np.hypot(windows.ahead, windows.turned), windows.aside)
-        shows = (square > LEAST_DISTANCE2) & (missed > LEAST_SHARE * windows.path_m)
+        drives = np.abs(windows.model_ahead) > np.abs(windows.model_turned)
+        least = np.where(_of_one_side(windows) & drives, LEAST_OF_SIDE, LEAST_SHARE)
+        shows = (square > LEAST_DISTANCE2) & (missed > least * windows.path_m)
         windows, square = windows.rows(shows), square[shows]
         begin.append(windows.begin)
         end.append(windows.end)
@@ -281,7 +286,7 @@ def _shows_slip(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
     Of a side without grip the severity counts as the root mean square over both sides.
     """
     if _keeps_one_side(steps, extent):
-        return extent.severity >= LEAST_SHARE * math.sqrt(0.5)
+        return extent.severity >= LEAST_OF_SIDE * math.sqrt(0.5)
     return extent.severity >= LEAST_SHARE and not _returns(knots, steps, extent)
 
 

@@ -136,6 +136,26 @@ def test_one_event_of_a_side_without_grip_is_found_also_where_it_is_dragged_alon
     assert (first, last) == pytest.approx((begin, end), abs=TIMING_S)
 
 
+@pytest.mark.parametrize(("side", "span"), [(0, LEFT_FAST), (1, HOLD)])
+def test_a_side_that_loses_a_quarter_of_its_motion_is_found(side: int, span: tuple[float, float]) -> None:
+    def weak(t: Floats) -> Floats:
+        missed = np.zeros((3, len(t)))
+        missed[side] = 0.25 * hold(t, span)[side]
+        return missed
+
+    (event,) = found_events(drive(weak, seed=3), WIDTH_M)
+    assert span_s(event) == pytest.approx(span, abs=2 * TIMING_S)
+
+
+def test_a_spin_on_the_spot_in_which_the_inner_side_slips_more_is_no_event() -> None:
+    def inner(t: Floats) -> Floats:
+        missed = np.zeros((3, len(t)))
+        missed[1] = np.where((t >= SPIN[0]) & (t < SPIN[1]), 0.2, 0.0)
+        return missed
+
+    assert not found_events(drive(inner, wheels=spinning, seed=4), WIDTH_M)
+
+
 def test_a_side_without_grip_is_slip_and_not_a_robot_that_stands() -> None:
     def left_side(t: Floats) -> Floats:
         return hold(t, LEFT_FAST) * np.array([[0.9], [0.0], [0.0]])
