@@ -32,8 +32,8 @@ LONGEST_STAGE, LEAST_NAME = 28, 12
 
 @click.command("batch")
 @click.argument("places", metavar="LOG|FOLDER|MANIFEST...", nargs=-1, required=True, type=options.LOG)
-@click.option("-o", "--output", metavar="DIR", required=True, type=options.FILE,
-              help="Folder for the tables; the run directories go to runs/ in it.")  # fmt: skip
+@click.option("-o", "--output", metavar="DIR", required=True, type=options.PLACE,
+              help="Folder for the tables, or its address; the run directories go to runs/ in it.")  # fmt: skip
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(min=1),
               help="Logs at the same time; default: one per core, fewer where memory is short.")  # fmt: skip
 @click.option("--scheduler", metavar="ADDRESS", help="Process on a Dask cluster, for example tcp://host:8786.")
@@ -67,25 +67,31 @@ def command(
       icrtool batch logs.csv -o results -j 4 --gate "recommended.p95@10m <= 1.5"
     """  # noqa: D301 - click reads the escape
     from icrtool.fleet.batch import BatchOptions, plan
-    from icrtool.fleet.fleet_files import PLOTS, write_fleet
+    from icrtool.fleet.fleet_files import FOLDERS, PLOTS, write_fleet
     from icrtool.fleet.roll_up import pooled_calibrations
+    from icrtool.output.files.remote_place import on_disk
 
     compared = options.baseline_of(baseline, asked.gates)
     batch = BatchOptions(config_file, robot, sets, asked, redo, timeout_s, overwrite, baseline)
-    requests = plan(places, output, batch)
-    output.mkdir(parents=True, exist_ok=True)
-    view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
-    rows = run_all(requests, jobs, scheduler, worker_timeout_s, batch, view)
-    calibrations = list(pooled_calibrations(rows, output, allow_unusable=asked.allow_unusable)) if asked.ladder else []
-    drawn = (output / PLOTS).is_dir() and not any((row.status, row.this_time) == ("done", "processed") for row in rows)
-    write_fleet(rows, output, calibrations, asked.plots if not drawn else ())
+    with on_disk(output, parts=FOLDERS) as folder:
+        requests = plan(places, output, batch, folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
+        rows = run_all(requests, jobs, scheduler, worker_timeout_s, batch, view, folder)
     missing = compared.missing(row.log for row in rows) if compared is not None else []
-    write_exports(rows, calibrations, missing, output if asked.page else None, junit=junit, markdown=markdown)
+    # Of an address once more: it has the runs now.
+    with on_disk(output, parts=FOLDERS) as folder:
+        pooled = pooled_calibrations(rows, folder, output, allow_unusable=asked.allow_unusable) if asked.ladder else ()
+        calibrations = list(pooled)
+        new = any((row.status, row.this_time) == ("done", "processed") for row in rows)
+        write_fleet(rows, folder, calibrations, asked.plots if new or not (folder / PLOTS).is_dir() else ())
+        write_exports(rows, calibrations, missing, folder if asked.page else None, junit=junit, markdown=markdown)
+        written = files_written(folder)
     if compared is not None:
         from icrtool.fleet.fleet_files import changes_of
 
         options.warn([escaped(change) for change in changes_of(rows, missing)], quiet=quiet)
-    print_results(rows, calibrations, output, quiet=quiet, as_json=as_json)
+    print_results(rows, calibrations, output, written, quiet=quiet, as_json=as_json)
     options.check_compared(one for row in rows for one in row.verdicts)
     missed = any(row.gates_failed for row in rows)
     if missed or any(row.status == "failed" for row in rows):
@@ -94,9 +100,14 @@ def command(
 
 def run_all(
     requests: Sequence[Request], jobs: int | None, scheduler: str | None, worker_timeout_s: float,
-    batch: BatchOptions, view: View,
+    batch: BatchOptions, view: View, folder: Path,
 ) -> list[Row]:  # fmt: skip
-    """Process all logs, and return a row of each, in the order of the requests."""
+    """Process all logs, and return a row of each, in the order of the requests.
+
+    Parameters
+    ----------
+    folder : on disk, that stands for the place of the results
+    """
     from icrtool.fleet.batch import run_batch
     from icrtool.fleet.one_log import path_of
     from icrtool.fleet.processes import executor_of
@@ -105,7 +116,7 @@ def run_all(
     with (
         executor_of([path_of(one.path) for one in requests], jobs, scheduler, worker_timeout_s) as (executor, lost),
         closing(view),
-        closing(run_batch(requests, executor, batch, view.stage, lost)) as coming,
+        closing(run_batch(requests, executor, batch, view.stage, lost, folder)) as coming,
     ):
         for row in coming:
             rows.append(row)
@@ -140,15 +151,16 @@ def write_exports(
 
 
 def print_results(
-    rows: Sequence[Row], calibrations: Sequence[PooledCalibration], output: Path, *, quiet: bool, as_json: bool
-) -> None:
-    """Print the results of the logs."""
+    rows: Sequence[Row], calibrations: Sequence[PooledCalibration], output: Path, written: str, *, quiet: bool,
+    as_json: bool,
+) -> None:  # fmt: skip
+    """Print the results of the logs; `written`: what stands in the folder of the results."""
     from icrtool.fleet.fleet_files import calibrations_text, fleet_document
 
     if as_json:
         print_json("batch", fleet_document(rows, calibrations) | {"output": escaped(str(output))})
     elif not quiet:
-        click.echo(summary_of(rows, output))
+        click.echo(summary_of(rows, output, written))
         if calibrations:
             click.echo(f"\n{calibrations_text(calibrations, tables=False)}", nl=False)
 
@@ -232,15 +244,19 @@ def line_of(row: Row) -> str:
     return "  ".join(parts)
 
 
-def summary_of(rows: Sequence[Row], output: Path) -> str:
+def files_written(folder: Path) -> str:
+    """Return what stands in the folder of a batch."""
+    files = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")
+    return ", ".join(f"{name}/" if (folder / name).is_dir() else name for name in files if (folder / name).exists())
+
+
+def summary_of(rows: Sequence[Row], output: Path, written: str) -> str:
     """Return the last line: how many logs were done or failed, and where the tables are."""
     from icrtool.fleet.row import counts_text
 
     parts = [counts_text(rows)]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
-    files = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")
-    written = ", ".join(f"{name}/" if (output / name).is_dir() else name for name in files if (output / name).exists())
     place = f"written to {LogText(str(output))}: {written}"
     lines = textwrap.wrap(place, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     return "\n".join(["", f"{counted(len(rows), 'log')}: {', '.join(parts)}", *lines])

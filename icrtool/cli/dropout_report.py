@@ -98,8 +98,8 @@ def command(
 ) -> None:  # fmt: skip
     """Report how far off a robot is without GNSS: open loop from every recorded state, over 1 to 20 m.
 
-    RUN is a directory that `icrtool fit` wrote; a LOG is fitted first. Without an argument: the newest run below
-    icrtool-runs/. The report is written into the run directory, as dropout/.
+    RUN is a directory that `icrtool fit` wrote, or its address; a LOG is fitted first. Without an argument: the newest
+    run below icrtool-runs/. The report is written into the run directory, as dropout/.
 
     \b
     Example:
@@ -149,11 +149,11 @@ def plan_sources(
     its place.
     """
     from icrtool.errors import ConfigError
-    from icrtool.output.run_directory import RUN_FILE
+    from icrtool.output.run_directory import RUN_FILE, is_run_directory
     from icrtool.output.stored_run import newest_run
 
     sources = logs_of(sources or (newest_run(RUNS),), quiet=quiet)
-    logs = tuple(source for source in sources if not (source / RUN_FILE).is_file())
+    logs = tuple(source for source in sources if not ((source / RUN_FILE).is_file() or is_run_directory(source)))
     if logs:
         return sources, dict(zip(logs, run_directories(logs, output, into), strict=True))
     check_run_config(config, free="dropout")
@@ -195,14 +195,18 @@ def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdo
 
 def _report_one(source: Path, place: RunPlace | None, request: Request) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
+    from icrtool.output.files.remote_place import on_disk
+
     reports: list[DropoutReport] = []
 
     def report_into(run: Run, directory: Path) -> None:
         reports.append(_analyse(run, directory, request))
 
     if place is None:
-        directory, run = source, _read(source)
-        report_into(run, directory)
+        directory = source
+        with on_disk(source, needed=bool) as folder:
+            run = _read(folder)
+            report_into(run, folder)
     else:
         directory = place.directory
         # One result: where the report fails, an old run in this place stays, with its report.

@@ -30,8 +30,8 @@ POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
 
 
-class _Log(click.Path):
-    """A log, as a path or an address.
+class _Place(click.Path):
+    """A log, or a place of results, as a path or an address.
 
     Not checked by click: the reader reports an unreadable log with its own message and exit status 1.
     """
@@ -48,7 +48,7 @@ class _Log(click.Path):
         return place if isinstance(place, UrlPath) else cast("Path", super().convert(value, param, ctx))
 
 
-LOG = _Log()
+LOG = PLACE = _Place()
 LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
 
@@ -116,9 +116,9 @@ def place(command: Command) -> Command:
     """Add -o, --into and --overwrite, as `output`, `into` and `overwrite`."""
     return add_options(
         command,
-        click.option("-o", "--output", metavar="DIR", type=FILE,
+        click.option("-o", "--output", metavar="DIR", type=PLACE,
                      help="Run directory of the log; with several logs: the folder of their run directories."),
-        click.option("--into", metavar="DIR", type=FILE, help="Folder of the run directories, also for one log."),
+        click.option("--into", metavar="DIR", type=PLACE, help="Folder of the run directories, also for one log."),
         click.option("--overwrite", is_flag=True, help="Also replace the run of another recording."),
     )  # fmt: skip
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import partial
-from hashlib import blake2b, sha256
+from hashlib import sha256
 from pathlib import Path
 
 import msgspec
@@ -15,18 +15,16 @@ import msgspec
 from icrtool import __version__
 from icrtool.config import Config, builtin_robots, load_config
 from icrtool.errors import ConfigError, LogError, OutputError
-from icrtool.fleet.fleet_files import ROWS, check_tables
+from icrtool.fleet.fleet_files import check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
-from icrtool.fleet.row import File, Row, as_text
+from icrtool.fleet.row import RUNS, File, Row, as_text
 from icrtool.logs.containers.remote_file import RemoteFile
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.records.regular_file import read_regular
 from icrtool.records.urls import UrlPath
-
-RUNS = "runs"
 
 POLL_S = 1.0
 """Time between two looks at a cluster."""
@@ -58,8 +56,15 @@ class BatchOptions:
     baseline: Path | None = None
 
 
-def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Request]:
+def plan(
+    places: Sequence[Path], output: Path, options: BatchOptions, folder: Path | None = None
+) -> list[Request]:  # fmt: skip
     """Return a request for each recording among logs, folders and manifests.
+
+    Parameters
+    ----------
+    output : folder of the results
+    folder : on disk, that stands for it where it is an address
 
     Raises
     ------
@@ -75,11 +80,12 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Re
 
     for gate in options.report.gates:
         parse_gate(gate)
-    if (output / RUN_FILE).is_file():
+    folder = folder or output
+    if (folder / RUN_FILE).is_file():
         raise OutputError(output, "is a run itself", "name another place for the batch")
-    if output.exists() and not output.is_dir():
+    if folder.exists() and not folder.is_dir():
         raise OutputError(output, "a file is there", "name another place for the batch")
-    check_tables(output, page=options.report.page)
+    check_tables(folder, page=options.report.page)
     # A table of simulated truth beside its log, from a pattern of the shell, is no manifest.
     beside = logs_among([place for place in places if place.is_file()])[1]
     places = [place for place in places if place not in beside]
@@ -96,29 +102,34 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions) -> list[Re
     return [_request(one, about(one.path, entries), output, options, baseline) for one in find_recordings(searched)]
 
 
-def finished(request: Request) -> Row | None:
+def finished(request: Request, folder: Path) -> Row | None:
     """Return the row of a log that an earlier batch processed with the same input, configuration and version.
 
     A log that failed for a reason of its own, and would fail again, counts as processed.
+
+    Parameters
+    ----------
+    folder : on disk, of the results
     """
+    from icrtool.output.files.checksums import CHECKSUM_FILE
     from icrtool.output.run_directory import PAGE_FILE
 
     try:
-        row = msgspec.json.decode(read_regular(path_of(request.row_file), path_of(request.folder)), type=Row)
+        row = msgspec.json.decode(read_regular(folder / request.row_file, folder), type=Row)
     except (OSError, ValueError):
         return None
     if row.key != request.row.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
         return None
     if row.status != "failed":
-        needed = ["run.json", "dropout", *([PAGE_FILE] if request.report.page else [])]
-        if not all((path_of(request.directory) / name).exists() for name in needed):
+        needed = ["run.json", "dropout", CHECKSUM_FILE, *([PAGE_FILE] if request.report.page else [])]
+        if not all((folder / request.row.run / name).exists() for name in needed):
             return None
     return replace(row, this_time="skipped", log=request.row.log, group=request.row.group, tags=request.row.tags)
 
 
 def run_batch(
     requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None = None,
-    lost: Lost = str,
+    lost: Lost = str, folder: Path | None = None,
 ) -> Generator[Row, None, None]:  # fmt: skip
     """Yield the row of each log as it comes; what died or hung is tried once more when all others are done.
 
@@ -127,10 +138,11 @@ def run_batch(
     executor : runs `process_apart`; threads on this machine, or workers of a cluster
     watch : called when a log comes to its next stage, where the executor is on this machine
     lost : of the executor
+    folder : on disk, that stands for the place of the results where that is an address
     """
     todo: list[Request] = []
     for request in requests:
-        done = finished(request) if not options.redo else None
+        done = finished(request, folder or path_of(request.folder)) if not options.redo else None
         if done is not None:
             yield done
         else:
@@ -197,14 +209,10 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
         one.log, f"{RUNS}/{one.name}", "failed", usable=False, robot=known.robot, group=known.group, tags=known.tags,
         key=key,
     )  # fmt: skip
-    place = blake2b(os.fsencode(one.name), digest_size=16).hexdigest()
     # Workers of a cluster may have another working directory.
-    folder = output.absolute()
     return Request(
-        path=os.fsencode(one.path.absolute()), row=row, folder=os.fsencode(folder),
-        directory=os.fsencode(folder / RUNS / one.name),
-        row_file=os.fsencode(folder / ROWS / f"{place}.json"), config=config, report=report,
-        overwrite=options.overwrite,
+        path=os.fsencode(one.path.absolute()), row=row, folder=os.fsencode(output.absolute()),
+        config=config, report=report, overwrite=options.overwrite,
         baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
     )  # fmt: skip
 

@@ -13,8 +13,8 @@ import msgspec
 
 from icrtool import __version__
 from icrtool.errors import OutputError
-from icrtool.fleet.roll_up import MOST_POOLED_S, PooledCalibration
-from icrtool.fleet.row import SHOWN_ERROR, SHOWN_WITHOUT, Row, as_text, columns_of, counts_text
+from icrtool.fleet.roll_up import CALIBRATIONS, MOST_POOLED_S, PooledCalibration
+from icrtool.fleet.row import ROWS, RUNS, SHOWN_ERROR, SHOWN_WITHOUT, Row, as_text, columns_of, counts_text
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import disk
 from icrtool.output.files.atomic import atomic_file, make_folders, write_file
@@ -36,8 +36,8 @@ FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
 
 PLOTS = "plots"
 
-ROWS = ".rows"
-"""Folder of the rows of the logs, written as they come."""
+FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
+"""Of a batch."""
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
 

@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,7 +21,7 @@ import msgspec
 from icrtool import __version__
 from icrtool.config import Config
 from icrtool.errors import IcrToolError, OutputError
-from icrtool.fleet.row import HORIZONS_M, File, Row, as_text
+from icrtool.fleet.row import HORIZONS_M, ROWS, RUNS, File, Row, as_text
 from icrtool.logs.containers.channel import truncation
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
 from icrtool.records.late_output import FigureSet
@@ -88,6 +89,7 @@ def fit_and_write(
 
     Parameters
     ----------
+    directory : may be at an address, as `icrtool.output.files.remote_place.on_disk` takes it
     overwrite : the run of another recording may be replaced
     plots, figures, states, note, inside : as in `icrtool.output.run_directory.write_run`
     span : from when to when the log is read, as in `icrtool.read_log`
@@ -95,22 +97,25 @@ def fit_and_write(
     share : called with the share of the log that was read
     then : called with the run and its new directory before that is put in place: writes what belongs to the result
     """
+    from icrtool.output.files.remote_place import on_disk
     from icrtool.output.run_directory import check_target, replaced_log, write_run
 
-    check_target(directory, log, overwrite=overwrite, inside=inside)
-    begin("reading")
-    from icrtool.logs.read_log import read_log
+    with on_disk(directory, begin=begin) as place:
+        inside = inside if place is directory else None
+        check_target(place, log, overwrite=overwrite, inside=inside)
+        begin("reading")
+        from icrtool.logs.read_log import read_log
 
-    logs = [read_log(log, config, share, start=span[0], end=span[1])]
-    from icrtool.calibration.fit import fit
+        logs = [read_log(log, config, share, start=span[0], end=span[1])]
+        from icrtool.calibration.fit import fit
 
-    # The callee alone holds the log, and frees its columns where they are needed no longer.
-    run = fit(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=begin)
-    if note is not None and (before := replaced_log(directory, run)) is not None:
-        note(f"{directory}: replaced the run of another recording ({before})")
-    begin("writing, pictures" if plots else "writing")
-    more = partial(then, run) if then is not None else None
-    write_run(run, directory, states=states, plots=plots, figures=figures, note=note, inside=inside, then=more)
+        # The callee alone holds the log, and frees its columns where they are needed no longer.
+        run = fit(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=begin)
+        if note is not None and (before := replaced_log(place, run)) is not None:
+            note(f"{directory}: replaced the run of another recording ({before})")
+        begin("writing, pictures" if plots else "writing")
+        more = partial(then, run) if then is not None else None
+        write_run(run, place, states=states, plots=plots, figures=figures, note=note, inside=inside, then=more)
     return run
 
 
@@ -167,20 +172,22 @@ class Request:
     path : of the log
     row : what is known of it before: names, robot, group, tags, key
     folder : of the batch
-    directory : of the run, below it
     baseline : place of an earlier report or batch to compare with; empty: none
-    row_file : below `folder`, where the row is written, for a batch that continues this one
     """
 
     path: bytes
     row: Row
     folder: bytes
-    directory: bytes
-    row_file: bytes
     config: Config
     report: ReportOptions
     overwrite: bool = False
     baseline: bytes = b""
+
+    @property
+    def row_file(self) -> str:
+        """Where the row is written, below the folder, for a batch that continues this one."""
+        name = self.row.run.removeprefix(f"{RUNS}/")
+        return f"{ROWS}/{blake2b(os.fsencode(name), digest_size=16).hexdigest()}.json"
 
     def encode(self) -> bytes:
         """Return it as one line of JSON."""
@@ -208,24 +215,26 @@ def process(request: Request, stage: Stage) -> Row:
     ----------
     stage : called with what is done next
     """
-    from icrtool.output.files.atomic import make_folders, write_file
+    from icrtool.output.files.remote_place import write_below
 
     begun = time.monotonic()
+    folder = path_of(request.folder)
     try:
         row = _results(request, stage)
     except IcrToolError as err:
         # A full disk may not be full the next time; the log's own errors come again.
-        path, directory = path_of(request.path), path_of(request.directory)
-        reason = err.beside(str(path), str(directory), log_name(path))
+        path = path_of(request.path)
+        reason = err.beside(str(path), str(folder / request.row.run), log_name(path))
         row = failed(request, reason, repeatable=not isinstance(err, OutputError))
     except OSError as err:
         # The log was removed meanwhile, or its disk fails.
         place = escaped(str(err.filename or path_of(request.path)))
         row = failed(request, f"{place}: {err.strerror or err}", repeatable=False)
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
-    row_file, folder = path_of(request.row_file), path_of(request.folder)
-    make_folders(row_file.parent, folder)
-    write_file(row_file, msgspec.json.encode(row), folder)
+    try:
+        write_below(folder, request.row_file, msgspec.json.encode(row))
+    except OutputError as err:
+        row = failed(request, str(err), repeatable=False)
     return row
 
 
@@ -262,7 +271,7 @@ def _results(request: Request, stage: Stage) -> Row:
     """Fit and analyse a log, write run and report."""
     from icrtool.output.files.baseline_file import open_baseline
 
-    directory, place = path_of(request.directory), path_of(request.baseline) if request.baseline else None
+    folder, place = path_of(request.folder), path_of(request.baseline) if request.baseline else None
     reports: list[DropoutReport] = []
 
     def report(run: Run, partial: Path) -> None:
@@ -270,8 +279,8 @@ def _results(request: Request, stage: Stage) -> Row:
         reports.append(report_and_write(run, partial, request.report, stage, baseline=baseline))
 
     run = fit_and_write(
-        path_of(request.path), directory, request.config, stage, overwrite=request.overwrite,
-        plots=request.report.plots, figures=request.report.figures, inside=path_of(request.folder), then=report,
+        path_of(request.path), folder / request.row.run, request.config, stage, overwrite=request.overwrite,
+        plots=request.report.plots, figures=request.report.figures, inside=folder, then=report,
     )  # fmt: skip
     return _row(request, run.document, int(run.table.stamp_ns[0]), reports[0])
 

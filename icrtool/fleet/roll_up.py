@@ -73,13 +73,14 @@ class PooledCalibration:
 
 
 def pooled_calibrations(
-    rows: Sequence[Row], directory: Path, *, allow_unusable: bool = False
+    rows: Sequence[Row], directory: Path, place: Path | None = None, *, allow_unusable: bool = False
 ) -> Iterator[PooledCalibration]:
     """Yield the calibration of each robot in each group; one of the same logs as before is not fitted again.
 
     Parameters
     ----------
-    directory : of the batch, where the runs are; calibration files are written below it
+    directory : of the batch, on disk; calibration files are written below it
+    place : the address that it stands for, where the runs are
     allow_unusable : also from runs that are not usable
     """
     before = {one.key: one for one in _stored(directory)}
@@ -95,7 +96,7 @@ def pooled_calibrations(
         else:
             logs = tuple(row.log for row in members)
             empty = PooledCalibration(robot, group, logs, key=key)
-            yield _pooled(empty, members, directory, name, allow_unusable=allow_unusable)
+            yield _pooled(empty, members, directory, place or directory, name, allow_unusable=allow_unusable)
 
 
 def groups_of(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
@@ -132,7 +133,7 @@ def is_fleet(directory: Path) -> bool:
 
 
 def _pooled(
-    one: PooledCalibration, members: Sequence[Row], directory: Path, name: str, *, allow_unusable: bool
+    one: PooledCalibration, members: Sequence[Row], directory: Path, place: Path, name: str, *, allow_unusable: bool
 ) -> PooledCalibration:
     from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.output.stored_run import open_run
@@ -152,7 +153,7 @@ def _pooled(
     def usable() -> Iterator[Run]:
         for row in members:
             if row.log in spaced and (row.usable or allow_unusable):
-                run = open_run(directory / row.run)
+                run = open_run(place / row.run)
                 used.append(row.log)
                 opened.append(run.name)
                 yield run

@@ -10,6 +10,9 @@ from typing import Any, Literal
 from icrtool.records.dropout import Verdict
 from icrtool.records.run import ICR_COLUMNS
 
+RUNS, ROWS = "runs", ".rows"
+"""Folders of a batch: of the runs, and of the rows of the logs, written as they come."""
+
 HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 
 SHOWN_ERROR, SHOWN_WITHOUT = "recommended_p95_10m_m", "icr_p95_10m_m"

@@ -19,6 +19,7 @@ from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.files.own_files import check_directory, own_files
+from icrtool.output.files.remote_place import lies_there
 from icrtool.output.files.states_file import StatesFormat, write_states
 from icrtool.records.late_output import FigureSet
 from icrtool.records.regular_file import read_regular
@@ -168,7 +169,9 @@ def _inputs_of(directory: Path) -> list[dict[str, Any]]:
 
 
 def is_run_directory(directory: Path) -> bool:
-    """Return whether a directory is a run of ours, of whatever version."""
+    """Return whether a directory, or an address, is a run of ours, of whatever version."""
+    if isinstance(directory, UrlPath):
+        return lies_there(directory, RUN_FILE)
     return schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
 
 

@@ -16,6 +16,7 @@ from icrtool.errors import ConfigError, RunError
 from icrtool.logs.containers.split_files import numbered_file, split_path
 from icrtool.output.files.checksums import CHECKSUM_FILE, file_b2sum, read_sums
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
+from icrtool.output.files.remote_place import fetched
 from icrtool.output.files.states_file import StatesFileError, StatesFormat, read_states
 from icrtool.output.run_directory import (
     RUN_FILE,
@@ -43,14 +44,22 @@ def open_run(path: str | Path) -> Run:
 
     Parameters
     ----------
-    path : a directory that `icrtool fit` or `Run.write` made
+    path : a directory that `icrtool fit` or `Run.write` made, or its address
 
     Raises
     ------
     RunError
         Not a run directory, one of another version, or one that was edited or cut short since it was written.
+    OutputError
+        The address cannot be read.
     """
-    directory = Path(path)
+    place = place_of(path) if isinstance(path, str) else path
+    with fetched(place, lambda name: "/" not in name) as directory:
+        return _run_in(directory, place)
+
+
+def _run_in(directory: Path, place: Path) -> Run:
+    """Return the run in a directory on disk; `place`: that it stands for."""
     stored = _read_document(directory)
     sums = read_sums(directory)
     check_sum(directory, RUN_FILE, sums)
@@ -78,7 +87,7 @@ def open_run(path: str | Path) -> Run:
             gnss=gnss,
             heading=heading,
             smoothed=smoothed,
-            directory=directory,
+            directory=place,
         )
     except ConfigError as err:
         raise RunError(directory, f"its configuration is not of this version ({err.what})", FIT_AGAIN) from err

@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from typing import Self
 
 if sys.platform == "win32":
-    from pathlib import Path
+    from pathlib import Path, PurePosixPath
     from pathlib import WindowsPath as _LocalPath
 else:
-    from pathlib import Path
+    from pathlib import Path, PurePosixPath
     from pathlib import PosixPath as _LocalPath
 
 _URL = re.compile(r"^([a-z][a-z0-9+.-]+)://", re.IGNORECASE)
@@ -21,7 +21,7 @@ _SECRETS = re.compile(r"(?<=://)[^/\s'\"@]*@|(?<=[\w/.~%+*-])\?[^\s'\"]*")
 
 
 class UrlPath(_LocalPath):
-    """An address where a path of a log is expected.
+    """An address where the path of a log or of a result is expected.
 
     Its text has no password and no query, where tokens and signatures stand: it is what every output shows. Only
     `url` has them. To Python's functions on files it is a path that does not exist; nothing here opens a connection.
@@ -57,9 +57,10 @@ class UrlPath(_LocalPath):
         """Return what is made of parts of it: a path like any other."""
         return Path(*map(str, segments))
 
-    def __truediv__(self, name: object) -> Path:  # type: ignore[override]  # of any path
-        """Return what a file beside or below it would be: a path like any other."""
-        return Path(*self.parts, str(name))
+    def __truediv__(self, name: object) -> Self:
+        """Return the address of what lies below it."""
+        place, mark, query = self._url.partition("?") if self.scheme.startswith("http") else (self._url, "", "")
+        return type(self)(f"{place.rstrip('/')}/{PurePosixPath(str(name)).as_posix()}{mark}{query}")
 
     def absolute(self) -> Self:
         """Return itself."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import re
 import socket
 import threading
@@ -11,7 +13,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
+
+SECRET = "d0ntPr1ntTh1s"
+"""Of the credentials: stands in no output."""
 
 
 @dataclass
@@ -111,10 +117,20 @@ def file_server(folder: Path, **options: object) -> Iterator[FileServer]:
 
 @dataclass
 class Proxy:
-    """A port that passes everything on to another one; `received` counts the bytes that came back."""
+    """A port that passes everything on to another one.
+
+    Attributes
+    ----------
+    received, sent : bytes that came back, and that went there
+    most_sent : after which every connection breaks
+    client : of boto3, past the proxy, where it stands before an object store
+    """
 
     port: int = 0
     received: int = 0
+    sent: int = 0
+    most_sent: float = math.inf
+    client: Any = None
     lock: threading.Lock = field(default_factory=threading.Lock)
 
 
@@ -127,9 +143,13 @@ def counting_proxy(target: int) -> Iterator[Proxy]:
     def pass_on(source: socket.socket, sink: socket.socket, *, count: bool) -> None:
         with suppress(OSError):
             while data := source.recv(1 << 16):
-                if count:
-                    with proxy.lock:
+                with proxy.lock:
+                    if count:
                         proxy.received += len(data)
+                    else:
+                        proxy.sent += len(data)
+                if proxy.sent > proxy.most_sent:
+                    break
                 sink.sendall(data)
         for one in (source, sink):
             with suppress(OSError):
@@ -151,3 +171,33 @@ def counting_proxy(target: int) -> Iterator[Proxy]:
         yield proxy
     finally:
         listening.close()
+
+
+@contextmanager
+def object_store() -> Iterator[Proxy]:
+    """Run moto's server, with a bucket `field`, behind a proxy; address and credentials are set as a user sets them."""
+    import boto3
+    from moto.server import ThreadedMotoServer
+
+    server = ThreadedMotoServer(port=0, verbose=False)
+    server.start()
+    _, port = server.get_host_and_port()
+    with counting_proxy(port) as proxy:
+        settings = {
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{proxy.port}", "AWS_ACCESS_KEY_ID": "testing",
+            "AWS_SECRET_ACCESS_KEY": SECRET, "AWS_DEFAULT_REGION": "us-east-1",
+        }  # fmt: skip
+        before = {name: os.environ.get(name) for name in settings}
+        os.environ.update(settings)
+        try:
+            proxy.client = boto3.client("s3", endpoint_url=f"http://127.0.0.1:{port}")
+            proxy.client.create_bucket(Bucket="field")
+            yield proxy
+            proxy.client.close()
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
+    server.stop()

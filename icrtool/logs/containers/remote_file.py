@@ -1,49 +1,29 @@
-"""Files in object stores and on web servers, by fsspec: found by folder and pattern, read by ranges, or fetched whole.
-
-The one place that opens connections, and only for an address that the user, or his manifest, names. Credentials are
-those that the provider's own library finds.
-"""
+"""Files in object stores and on web servers: found by folder and pattern, read by ranges, or fetched whole."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-import sys
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Event, local
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.logs.containers.address import address_of, asked, filesystem
 from icrtool.logs.containers.one_recording import LOG_SUFFIXES, natural_order, unpacked_name
 from icrtool.logs.containers.source import NEAR_BYTES, Held
 from icrtool.records.samples import InputFile
-from icrtool.records.urls import UrlPath, place_of, without_secrets
-
-Result = TypeVar("Result")
-
-_NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
-          "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
-"""The library that each kind of address is read with."""
+from icrtool.records.urls import UrlPath, without_secrets
 
 _LEAST_BYTES = 1 << 18
 """That are read at once: the records of an index follow one another."""
 
 _PIECE_BYTES, PIECES_AHEAD = 1 << 24, 4
-_PAUSES_S = (0.5, 2.0)
-"""Before a request to a web server is made again; the libraries of object stores do so themselves."""
-
-_FAILURES = (
-    ("botocore.exceptions", "BotoCoreError"), ("botocore.exceptions", "ClientError"), ("aiohttp", "ClientError"),
-    ("google.auth.exceptions", "GoogleAuthError"), ("gcsfs.retry", "HttpError"),
-    ("azure.core.exceptions", "AzureError"), ("fsspec.exceptions", "FSTimeoutError"),
-)  # fmt: skip
-"""What libraries raise beside OSError, where they are loaded."""
 
 
 class RemoteFile:
@@ -59,8 +39,8 @@ class RemoteFile:
 
     def __init__(self, path: UrlPath) -> None:
         self._path = path
-        self._files, self._name = _filesystem(path)
-        about = _asked(path, lambda: self._files.info(self._name))
+        self._files, self._name = filesystem(path)
+        about = asked(path, lambda: self._files.info(self._name))
         self.is_folder = about.get("type") == "directory"
         self.size = int(about.get("size") or 0)
         self.has_ranges = self._finds_ranges(about)
@@ -75,7 +55,7 @@ class RemoteFile:
             return False
         if not self._path.scheme.startswith("http"):
             return True
-        return _asked(self._path, self._gives_last_byte)
+        return asked(self._path, self._gives_last_byte)
 
     def _gives_last_byte(self) -> bool:
         try:
@@ -120,7 +100,7 @@ class RemoteFile:
         """Return what stands in several ranges (2, n) behind a place, one after the other."""
         far = np.append(True, ranges[0, 1:] - ranges[1, :-1] > NEAR_BYTES)
         begins, ends = at + ranges[0, far], at + ranges[1, np.append(far[1:], True)]
-        pieces: list[bytes] = _asked(
+        pieces: list[bytes] = asked(
             self._path, lambda: self._files.cat_ranges([self._name] * len(begins), begins.tolist(), ends.tolist())
         )
         self._bytes_read += sum(map(len, pieces))
@@ -132,7 +112,7 @@ class RemoteFile:
         end = min(at + count, self.size)
         if at >= end:
             return b""
-        data = _asked(self._path, lambda: self._files.cat_file(self._name, start=at, end=end))
+        data = asked(self._path, lambda: self._files.cat_file(self._name, start=at, end=end))
         if len(data) != end - at:
             raise LogError(self._path, f"gave {len(data)} bytes for {end - at}", "is it being written?")
         self._bytes_read += len(data)
@@ -141,8 +121,8 @@ class RemoteFile:
     def pieces(self) -> Iterator[bytes]:
         """Yield the content from start to end; the next pieces are read meanwhile."""
         if not self.has_ranges:
-            with _asked(self._path, lambda: self._files.open(self._name, block_size=0)) as stream:
-                while piece := _asked(self._path, lambda: stream.read(_PIECE_BYTES), again=False):
+            with asked(self._path, lambda: self._files.open(self._name, block_size=0)) as stream:
+                while piece := asked(self._path, lambda: stream.read(_PIECE_BYTES), again=False):
                     yield piece
             return
         with ThreadPoolExecutor(PIECES_AHEAD) as pool:
@@ -217,11 +197,11 @@ def find(path: UrlPath) -> list[UrlPath]:
                 path, "no recording in it", f"a log has one of the suffixes {', '.join(sorted(LOG_SUFFIXES))}"
             )
         return found
-    files, name = _filesystem(path)
-    matched: dict[str, Any] = _asked(path, lambda: files.glob(name, detail=True))
+    files, name = filesystem(path)
+    matched: dict[str, Any] = asked(path, lambda: files.glob(name, detail=True))
     found = []
     for inner, about in matched.items():
-        one_path = _address(files.unstrip_protocol(inner), path)
+        one_path = address_of(files.unstrip_protocol(inner), path)
         found += _below(one_path) if about.get("type") == "directory" else [one_path]
     if not found:
         raise LogError(path, "matches nothing")
@@ -229,13 +209,18 @@ def find(path: UrlPath) -> list[UrlPath]:
 
 
 def _below(folder: UrlPath) -> list[UrlPath]:
-    """Return the recordings below a folder, by their names: bag directories, and files of no bag directory."""
-    files, name = _filesystem(folder)
-    names: list[str] = _asked(folder, lambda: files.find(name))
+    """Return the recordings below a folder, by their names: bag directories, and files of no bag directory.
+
+    A folder that is a run is itself.
+    """
+    files, name = filesystem(folder)
+    names: list[str] = asked(folder, lambda: files.find(name))
+    if f"{name.rstrip('/')}/run.json" in names:
+        return [folder]
     bags = {one.rpartition("/")[0] for one in names if one.endswith("/metadata.yaml")}
     logs = {one for one in names if Path(unpacked_name(one.rpartition("/")[2])).suffix in LOG_SUFFIXES}
     found = {parent if (parent := one.rpartition("/")[0]) in bags else one for one in logs}
-    return sorted((_address(files.unstrip_protocol(one), folder) for one in found), key=natural_order)
+    return sorted((address_of(files.unstrip_protocol(one), folder) for one in found), key=natural_order)
 
 
 def fetch_folder(path: UrlPath, place: Path, share: Callable[[float], None] | None) -> tuple[InputFile, ...]:
@@ -246,73 +231,14 @@ def fetch_folder(path: UrlPath, place: Path, share: Callable[[float], None] | No
     LogError
         They cannot be read.
     """
-    files, name = _filesystem(path)
-    names: list[str] = _asked(path, lambda: files.ls(name, detail=False))
+    files, name = filesystem(path)
+    names: list[str] = asked(path, lambda: files.ls(name, detail=False))
     bag = [one for one in names if re.search(r"\.(mcap|db3|bag)\b|metadata\.yaml$", one.rpartition("/")[2])]
     if not bag:
         raise LogError(path, "no recording in it", "name a log in it")
     inputs = []
     for number, one in enumerate(bag):
         part = (lambda done, before=number: share((before + done) / len(bag))) if share is not None else None
-        remote = RemoteFile(_address(files.unstrip_protocol(one), path))
+        remote = RemoteFile(address_of(files.unstrip_protocol(one), path))
         inputs.append(remote.fetch(place / Path(one).name, part))
     return tuple(one for one in inputs if not one.path.endswith("metadata.yaml"))
-
-
-def _address(url: str, asked_for: UrlPath) -> UrlPath:
-    """Return an address that was found, with the query of the one that was asked for, where a web server needs it."""
-    query = asked_for.url.partition("?")[2] if asked_for.scheme.startswith("http") else ""
-    found = place_of(f"{url}?{query}" if query and "?" not in url else url)
-    if not isinstance(found, UrlPath):
-        raise LogError(asked_for, "is no address", str(found))
-    return found
-
-
-def _filesystem(path: UrlPath) -> tuple[Any, str]:
-    """Return the fsspec file system of an address, and the name of the file in it."""
-    needed = _NEEDS.get(path.scheme)
-    extra = "http" if needed == "aiohttp" else "cloud"
-    try:
-        import fsspec
-        from fsspec.core import url_to_fs
-
-        fsspec.get_filesystem_class(path.scheme)
-    except ImportError as err:
-        raise LogError(path, f"needs {needed or err}", f"pip install 'icrtool[{extra}]'") from err
-    except ValueError as err:
-        raise LogError(
-            path, f"{path.scheme}:// is no kind of address that can be read", "try s3, gs, az or https"
-        ) from err
-    found: tuple[Any, str] = _asked(path, lambda: url_to_fs(path.url))
-    return found
-
-
-def _asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True) -> Result:
-    """Return the answer to a request, made again where the connection broke.
-
-    Raises
-    ------
-    LogError
-        The file is not there, must not be read, or the connection stays broken.
-    """
-    pauses = list(_PAUSES_S) if again and path.scheme.startswith("http") else []
-    while True:
-        try:
-            return ask()
-        except _failures() as err:
-            # fsspec calls every failure of a web server a file that is not there, and names the true one as its cause.
-            cause = err.__cause__ if isinstance(err, FileNotFoundError) and err.__cause__ is not None else err
-            status = getattr(cause, "status", None)
-            if isinstance(cause, FileNotFoundError) or status == 404:
-                raise LogError(path, "no such file") from None
-            refused = isinstance(cause, PermissionError | ValueError) or status in {401, 403}
-            if refused or not pauses:
-                why = "may not be read" if refused else "cannot be read"
-                raise LogError(path, why, without_secrets(str(cause) or type(cause).__name__)) from None
-            time.sleep(pauses.pop(0))
-
-
-def _failures() -> tuple[type[Exception], ...]:
-    """Return what a broken connection or a refused request is raised as."""
-    loaded = [getattr(sys.modules.get(module), name, None) for module, name in _FAILURES]
-    return (OSError, ValueError, *(one for one in loaded if one is not None))

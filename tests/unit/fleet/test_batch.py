@@ -47,9 +47,10 @@ def results(request, stage):
     if "bad" in path.stem:
         raise DataError(path.name, "no wheels")
     time.sleep(0.3 if "slow" in path.stem else 0)
-    directory = one_log.path_of(request.directory)
+    directory = one_log.path_of(request.folder) / request.row.run
     (directory / "dropout").mkdir(parents=True, exist_ok=True)
     (directory / "run.json").write_text("{}")
+    (directory / "B2SUMS").touch()
     if request.report.page:
         (directory / "report.html").touch()
     return replace(request.row, status="done", usable=True, distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
@@ -278,6 +279,6 @@ def test_a_finished_log_of_a_moved_folder_is_found_by_content(season: Path, tmp_
     season.rename(moved)
     request = plan([moved], tmp_path / "out", BatchOptions())[0]
     assert isinstance(request, Request)
-    found = finished(request)
+    found = finished(request, tmp_path / "out")
     assert found is not None
-    assert finished(replace(request, row=replace(request.row, key="other"))) is None
+    assert finished(replace(request, row=replace(request.row, key="other")), tmp_path / "out") is None

@@ -109,5 +109,5 @@ def test_hostile_names_of_robots_and_groups_stay_text() -> None:
     found = PooledCalibration(hostile, hostile, ("a",), reason=hostile)
     assert max(map(len, calibrations_text([found]).split("\n"))) < 600
     row = Row(hostile, "runs/a", "done", robot=hostile, group=hostile)
-    for text in (calibrations_text([found]), line_of(row), summary_of([row], Path(hostile[:50]))):
+    for text in (calibrations_text([found]), line_of(row), summary_of([row], Path(hostile[:50]), "fleet.csv")):
         assert text.replace("\n", "").isprintable()

@@ -26,14 +26,14 @@ from icrtool.fleet.manifest import read_manifest
 from icrtool.fleet.recordings import find_recordings
 from icrtool.fleet.roll_up import _content
 from icrtool.fleet.row import File
-from icrtool.logs.containers import remote_file
+from icrtool.logs.containers import address
 from icrtool.logs.containers.channel import Block
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.remote_file import find
 from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.read_log import read_log
 from icrtool.records.urls import UrlPath, place_of, without_secrets
-from support.servers import counting_proxy, file_server
+from support.servers import SECRET, file_server, object_store
 
 SAMPLES = Path(__file__).parents[3] / "sample_logs"
 MCAP, BAG, DIRECTORY = (
@@ -41,7 +41,7 @@ MCAP, BAG, DIRECTORY = (
 )
 DB3 = DIRECTORY / "wheeled_figure_eight.db3"
 PICTURE_BYTES = 400_000
-TOKEN = "sig=d0ntPr1ntTh1s"
+TOKEN = f"sig={SECRET}"
 ROBOT = ("--robot", "segway-rmp400")
 pytest.importorskip("fsspec", reason="needs the extra icrtool[cloud]")
 pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
@@ -52,31 +52,16 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="servers as thre
 def store():
     """A bucket `field` with the sample logs, behind a proxy that counts bytes; credentials as a user sets them."""
     pytest.importorskip("s3fs", reason="needs the extra icrtool[cloud]")
-    server_module = pytest.importorskip("moto.server", reason="needs moto, of the extra icrtool[dev]")
-    import boto3
-
-    server = server_module.ThreadedMotoServer(port=0, verbose=False)
-    server.start()
-    _, port = server.get_host_and_port()
-    with counting_proxy(port) as proxy, pytest.MonkeyPatch.context() as patch:
-        for name, value in {
-            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{proxy.port}", "AWS_ACCESS_KEY_ID": "testing",
-            "AWS_SECRET_ACCESS_KEY": "d0ntPr1ntTh1s", "AWS_DEFAULT_REGION": "us-east-1",
-        }.items():  # fmt: skip
-            patch.setenv(name, value)
-        client = boto3.client("s3")
-        client.create_bucket(Bucket="field")
+    pytest.importorskip("moto.server", reason="needs moto, of the extra icrtool[dev]")
+    with object_store() as proxy:
         for name, file in {
             "mon/a.mcap": MCAP, "tue/b.bag": BAG,
             "wed/c/c.db3": DB3, "wed/c/metadata.yaml": DIRECTORY / "metadata.yaml",
         }.items():  # fmt: skip
-            client.upload_file(str(file), "field", name)
-        client.put_object(Bucket="field", Key="packed/d.mcap.gz", Body=gzip.compress(MCAP.read_bytes()))
-        client.put_object(Bucket="field", Key="notes.txt", Body=b"no log")
-        proxy.client = client
+            proxy.client.upload_file(str(file), "field", name)
+        proxy.client.put_object(Bucket="field", Key="packed/d.mcap.gz", Body=gzip.compress(MCAP.read_bytes()))
+        proxy.client.put_object(Bucket="field", Key="notes.txt", Body=b"no log")
         yield proxy
-        client.close()
-    server.stop()
 
 
 @pytest.fixture
@@ -220,13 +205,13 @@ def test_a_log_without_an_index_is_fetched_and_read_to_its_end(tmp_path):
 
 
 def test_a_broken_connection_is_made_again(monkeypatch):
-    monkeypatch.setattr(remote_file, "_PAUSES_S", (0.01, 0.01))
+    monkeypatch.setattr(address, "_PAUSES_S", (0.01, 0.01))
     with file_server(SAMPLES, broken=2) as server:
         assert messages(UrlPath(f"{server.url}/{MCAP.name}")) == messages(MCAP)
 
 
 def test_a_connection_that_stays_broken_is_one_line_without_secrets(monkeypatch):
-    monkeypatch.setattr(remote_file, "_PAUSES_S", (0.01, 0.01))
+    monkeypatch.setattr(address, "_PAUSES_S", (0.01, 0.01))
     with file_server(SAMPLES, token=TOKEN) as server:
         container = open_log(UrlPath(f"{server.url}/{MCAP.name}?{TOKEN}"))
         server.broken = 10_000
@@ -288,13 +273,13 @@ def test_fit_from_an_address_gives_the_run_of_the_file_and_no_secret(tmp_path, m
                 monkeypatch, capfd, "dropout-report", url, *ROBOT, "-o", "remote", "--plots", "none", "-v"
             )
             assert status == 0, said
-            assert "d0ntPr1nt" not in said
+            assert SECRET not in said
         status, said = run(monkeypatch, capfd, "info", url, *ROBOT, "--json")
         assert status == 0
-        assert "d0ntPr1nt" not in said
+        assert SECRET not in said
         assert "read by ranges" in json.loads(said)["logs"][0]["transfer"]
     assert (tmp_path / "local/states.csv").read_bytes() == (tmp_path / "remote/states.csv").read_bytes()
-    assert not [file for file in Path("remote").rglob("*") if file.is_file() and b"d0ntPr1nt" in file.read_bytes()]
+    assert not [file for file in Path("remote").rglob("*") if file.is_file() and SECRET.encode() in file.read_bytes()]
     (found,) = json.loads((tmp_path / "remote/run.json").read_text())["inputs"]
     assert found["path"] == f"{server.url}/{MCAP.name}"
     assert found["sha256"] is None
@@ -315,7 +300,7 @@ def test_batch_reads_a_bucket_and_skips_what_is_unchanged(fresh, tmp_path, monke
     s3fs.S3FileSystem.clear_instance_cache()
     status, said = run(monkeypatch, capfd, *command)
     assert [one["this_time"] for one in json.loads(said)["logs"]] == ["processed"]
-    assert "d0ntPr1nt" not in said
+    assert SECRET not in said
     fresh.client.upload_file(str(MCAP), "field", "mon/a.mcap")
 
 

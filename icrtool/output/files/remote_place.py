@@ -1,0 +1,250 @@
+"""Results at an address: made in a temporary folder, then uploaded; what makes them count is uploaded last.
+
+The one place that writes over a connection. All others write to a folder on disk, which `on_disk` gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import TypeVar
+
+from icrtool.errors import IcrToolError, LogError, OutputError
+from icrtool.logs.containers.address import asked, filesystem
+from icrtool.logs.containers.unpack import ScratchFolder
+from icrtool.output.files.atomic import make_folders, write_file
+from icrtool.output.files.checksums import CHECKSUM_FILE
+from icrtool.output.files.json_file import FLEET_FILE
+from icrtool.output.files.own_files import OWN_FILES, reported
+from icrtool.records.urls import UrlPath
+
+Result = TypeVar("Result")
+
+COUNTS = (CHECKSUM_FILE, FLEET_FILE)
+"""Files without which a run, or a batch, does not count: removed before anything is replaced, and uploaded last."""
+
+REQUESTS = 8
+"""That are made at the same time."""
+
+_PROBE = ".icrtool-upload"
+"""Written and removed before any work is done for the place."""
+
+Needed = Callable[[str], bool]
+"""Whether the content of a file is needed, by its name below the place; of others the name alone is."""
+
+
+def is_document(name: str) -> bool:
+    """Return whether a file shows what lies beside it, and whether that may be replaced."""
+    own = name.endswith((".json", ".html", ".png")) or PurePosixPath(name).name in {OWN_FILES, CHECKSUM_FILE}
+    return own and not name.startswith("runs/")
+
+
+@contextmanager
+def on_disk(
+    place: Path,
+    needed: Needed = is_document,
+    parts: Collection[str] | None = None,
+    begin: Callable[[str], None] | None = None,
+) -> Iterator[Path]:
+    """Give the folder on disk that stands for a place of results; of an address, upload what changed in it at the end.
+
+    Parameters
+    ----------
+    place : on disk it is given itself
+    needed : whose content is fetched; a file that is there and not needed is empty
+    parts : folders that are looked at below an address, beside the files in it; None: all
+    begin : called before the upload
+
+    Raises
+    ------
+    OutputError
+        The address cannot be read or written; what is there then does not count, or is what was there before.
+    """
+    if not isinstance(place, UrlPath):
+        yield place
+        return
+    with _scratch(place) as folder:
+        store = _Store(place)
+        store.probe()
+        before = store.fetch(folder, needed, parts)
+        with _named(place, folder):
+            yield folder
+        if begin is not None:
+            begin("uploading")
+        store.upload(folder, before)
+
+
+@contextmanager
+def fetched(place: Path, needed: Needed) -> Iterator[Path]:
+    """Give the folder on disk that stands for a place of results, to read it.
+
+    Raises
+    ------
+    OutputError
+        The address cannot be read.
+    """
+    if not isinstance(place, UrlPath):
+        yield place
+        return
+    with _scratch(place) as folder:
+        _Store(place).fetch(folder, needed, None)
+        with _named(place, folder):
+            yield folder
+
+
+def write_below(folder: Path, name: str, content: bytes) -> None:
+    """Write a file below a folder of results, on disk or at an address.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    file = folder / name
+    if isinstance(file, UrlPath):
+        _Store(file).put(content)
+        return
+    make_folders(file.parent, folder)
+    write_file(file, content, folder)
+
+
+def lies_there(place: UrlPath, name: str) -> bool:
+    """Return whether an object store has a file of this name below an address."""
+    if place.scheme.startswith("http"):
+        return False
+    files, path = filesystem(place / name)
+    return bool(asked(place, lambda: files.exists(path)))
+
+
+class _Store:
+    """A folder, or a file, at an address that is written."""
+
+    def __init__(self, place: UrlPath) -> None:
+        if place.scheme.startswith("http"):
+            raise OutputError(place, "results are not written to a web server", "name a folder, or s3://, gs://, az://")
+        self._place = place
+        with _as_output(place):
+            self._files, self._name = filesystem(place)
+        self._name = self._name.rstrip("/")
+
+    def put(self, content: bytes, name: str = "") -> None:
+        """Write a file."""
+        self._done(lambda: self._files.pipe_file(self._of(name), content))
+
+    def probe(self) -> None:
+        """Refuse a place that cannot be written."""
+        self.put(b"icrtool", _PROBE)
+        self._remove([_PROBE])
+
+    def fetch(self, folder: Path, needed: Needed, parts: Collection[str] | None) -> dict[str, tuple[int, int]]:
+        """Make the folder on disk what the address is.
+
+        Returns
+        -------
+        dict of str to (int, int)
+            What identifies the content of the files, by their names.
+        """
+        names = [name for name in self._names(parts) if name != _PROBE and _is_below(name)]
+        with reported(self._place):
+            for name in names:
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).touch(exist_ok=False)
+        self._each(lambda name: self._files.get_file(self._of(name), str(folder / name)), filter(needed, names))
+        return {name: _identity(folder / name) for name in names}
+
+    def upload(self, folder: Path, before: dict[str, tuple[int, int]]) -> None:
+        """Make the address what the folder on disk is now."""
+        there = [path for path in folder.rglob("*") if path.is_file() and path.stat().st_size]
+        now = {path.relative_to(folder).as_posix(): _identity(path) for path in there}
+        gone = [name for name in before if not (folder / name).exists()]
+        changed = [name for name, identity in now.items() if identity != before.get(name)]
+        if not changed and not gone:
+            return
+        last = [name for name in COUNTS if name in now]
+        self._remove([name for name in COUNTS if name in before])
+        self._remove([name for name in gone if name not in COUNTS])
+        # What a broken upload leaves is known as icrtool's by this list.
+        for names in ([name for name in changed if name == OWN_FILES],
+                      [name for name in changed if name not in {OWN_FILES, *last}]):  # fmt: skip
+            self._each(lambda name: self._files.put_file(str(folder / name), self._of(name)), names)
+        self._each(lambda name: self._files.put_file(str(folder / name), self._of(name)), last)
+
+    def _names(self, parts: Collection[str] | None) -> list[str]:
+        """Return the files below the address."""
+        self._files.invalidate_cache()
+        if parts is None:
+            found = self._done(lambda: self._files.find(self._name))
+        else:
+            found = self._done(self._at_top)
+            found += self._done(lambda: [name for part in parts for name in self._files.find(self._of(part))])
+        if found == [self._name]:
+            raise OutputError(self._place, "a file is there", "name another place")
+        return [name.removeprefix(f"{self._name}/") for name in found]
+
+    def _at_top(self) -> list[str]:
+        try:
+            entries = self._files.ls(self._name, detail=True)
+        except FileNotFoundError:
+            return []
+        return [entry["name"] for entry in entries if entry["type"] == "file"]
+
+    def _of(self, name: str) -> str:
+        return f"{self._name}/{name}" if name else self._name
+
+    def _remove(self, names: list[str]) -> None:
+        self._each(lambda name: self._files.rm_file(self._of(name)), names)
+
+    def _each(self, request: Callable[[str], object], names: Iterable[str]) -> None:
+        """Make a request for each file, several at the same time."""
+        with ThreadPoolExecutor(REQUESTS) as pool:
+            list(pool.map(lambda name: self._done(lambda: request(name)), names))
+
+    def _done(self, request: Callable[[], Result]) -> Result:
+        """Return the answer to a request."""
+        with reported(self._place), _as_output(self._place):
+            return asked(self._place, request, done="written")
+
+
+@contextmanager
+def _as_output(place: UrlPath) -> Iterator[None]:
+    """Raise an error of a connection as one of a place of results."""
+    try:
+        yield
+    except LogError as err:
+        why = "cannot be written" if err.why == "no such file" else err.why
+        raise OutputError(place, why, err.advice or "is there such a bucket?") from err
+
+
+@contextmanager
+def _scratch(place: UrlPath) -> Iterator[Path]:
+    """Give the name of a folder on disk of the same name, which is removed at the end."""
+    scratch = ScratchFolder()
+    try:
+        yield scratch.path / (place.name or "results")
+    finally:
+        scratch.close()
+
+
+@contextmanager
+def _named(place: UrlPath, folder: Path) -> Iterator[None]:
+    """Let errors about a folder name the address that it stands for."""
+    try:
+        yield
+    except IcrToolError as err:
+        texts = [str(err.what), err.why, err.advice]
+        if not any(str(folder) in text for text in texts):
+            raise
+        raise type(err)(*(text.replace(str(folder), str(place)) for text in texts)) from err
+
+
+def _is_below(name: str) -> bool:
+    """Return whether a name, of whoever wrote it, is that of a file below a folder."""
+    path = PurePosixPath(name)
+    return bool(name) and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
+
+
+def _identity(file: Path) -> tuple[int, int]:
+    status = file.stat()
+    return status.st_ino, status.st_mtime_ns

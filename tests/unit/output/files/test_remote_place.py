@@ -1,0 +1,204 @@
+"""Results in an object store (moto's server, with s3fs): whole or not counted, continued, rolled up, no secrets."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import icrtool
+from icrtool.cli import main
+from icrtool.errors import OutputError, RunError
+from icrtool.output.files.remote_place import on_disk
+from icrtool.records.urls import UrlPath
+from support.servers import SECRET, object_store
+
+SAMPLES = Path(__file__).parents[4] / "sample_logs"
+MCAP, BAG = SAMPLES / "wheeled_lawnmower.mcap", SAMPLES / "tracked_curved.bag"
+ROBOT = ("--robot", "segway-rmp400")
+QUICK = ("--plots", "none", "--no-ladder", "--no-page")
+
+pytest.importorskip("s3fs", reason="needs the extra icrtool[cloud]")
+pytest.importorskip("moto.server", reason="needs moto, of the extra icrtool[dev]")
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="servers as threads of this process")
+
+
+@pytest.fixture(scope="module")
+def server():
+    with object_store() as store:
+        yield store
+
+
+@pytest.fixture
+def store(server, tmp_path, monkeypatch):
+    """The object store with an empty bucket; one attempt a request, and a folder of its own for temporary files."""
+    import s3fs
+
+    s3fs.S3FileSystem.clear_instance_cache()
+    for name in names(server):
+        server.client.delete_object(Bucket="field", Key=name)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    monkeypatch.setattr(s3fs.S3FileSystem, "retries", 1)
+    yield server
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+def names(store, prefix: str = "") -> list[str]:
+    found = store.client.list_objects_v2(Bucket="field", Prefix=prefix).get("Contents", [])
+    return [one["Key"].removeprefix(prefix) for one in found]
+
+
+def content(store, name: str) -> bytes:
+    return store.client.get_object(Bucket="field", Key=name)["Body"].read()
+
+
+def run(monkeypatch, capfd, *arguments: object) -> tuple[int, str]:
+    """Run a command in this process; return its exit status and all that it printed."""
+    monkeypatch.setattr(sys, "argv", ["icrtool", *map(str, arguments)])
+    status = 0
+    try:
+        main()
+    except SystemExit as left:
+        status = int(left.code or 0)
+    said = "".join(capfd.readouterr())
+    assert SECRET not in said
+    return status, said
+
+
+def test_a_run_at_an_address_is_that_on_disk_and_its_report_is_added_there(store, tmp_path, monkeypatch, capfd):
+    assert run(monkeypatch, capfd, "fit", MCAP, *ROBOT, "-o", "one", "--plots", "none")[0] == 0
+    status, said = run(monkeypatch, capfd, "fit", MCAP, *ROBOT, "-o", "s3://field/runs/one", "--plots", "none")
+    assert status == 0, said
+    assert "s3://field/runs/one" in said
+    written = sorted(str(file.relative_to(tmp_path / "one")) for file in (tmp_path / "one").rglob("*"))
+    assert sorted(names(store, "runs/one/")) == written
+    for name in set(written) - {"run.json"}:
+        assert content(store, f"runs/one/{name}") == (tmp_path / "one" / name).read_bytes()
+
+    before = content(store, "runs/one/B2SUMS")
+    assert run(monkeypatch, capfd, "dropout-report", "s3://field/runs/one", *QUICK)[0] == 0
+    assert "runs/one/dropout/summary.csv" in names(store)
+    after = content(store, "runs/one/B2SUMS")
+    assert after.startswith(before)
+    assert b"dropout/summary.csv" in after
+    assert run(monkeypatch, capfd, "dropout-report", "one", *QUICK)[0] == 0
+    summary = "dropout/summary.csv"
+    assert content(store, f"runs/one/{summary}") == (tmp_path / "one" / summary).read_bytes()
+    assert not [name for name in names(store) if SECRET.encode() in content(store, name)]
+
+    theirs, ours = icrtool.open_run("s3://field/runs/one"), icrtool.open_run("one")
+    np.testing.assert_array_equal(theirs.states.to_numpy(), ours.states.to_numpy())
+    for place in ("s3://field/runs/one", "one"):
+        assert run(monkeypatch, capfd, "calibrate", place, "-o", f"{place[-3:]}{len(place)}.json", "-q")[0] == 0
+    first, second = (json.loads(file.read_text())["parameters"] for file in tmp_path.glob("*.json"))
+    assert first == second
+
+
+def test_an_upload_that_breaks_leaves_no_run_that_counts_and_is_made_again(store, monkeypatch, capfd):
+    fit = ("fit", MCAP, *ROBOT, "-o", "s3://field/runs/one", "--plots", "none")
+    store.most_sent = store.sent + 1_000_000
+    status, said = run(monkeypatch, capfd, *fit)
+    store.most_sent = float("inf")
+    assert status == 1
+    (line,) = [one for one in said.splitlines() if one.startswith("Error: ")]
+    assert "s3://field/runs/one: cannot be written" in line
+    left = names(store, "runs/one/")
+    assert ".icrtool-files" in left
+    assert "B2SUMS" not in left
+    with pytest.raises(RunError):
+        icrtool.open_run("s3://field/runs/one")
+    assert run(monkeypatch, capfd, *fit)[0] == 0
+    assert len(icrtool.open_run("s3://field/runs/one").states) == 19_901
+
+
+def test_a_run_that_is_replaced_does_not_count_before_it_is_whole(store, monkeypatch, capfd):
+    fit = ("fit", MCAP, *ROBOT, "-o", "s3://field/runs/one", "--plots", "none")
+    assert run(monkeypatch, capfd, *fit, "--smooth")[0] == 0
+    store.client.put_object(Bucket="field", Key="runs/one/notes.txt", Body=b"of a person")
+    store.most_sent = store.sent + 1_000_000
+    assert run(monkeypatch, capfd, *fit)[0] == 1
+    store.most_sent = float("inf")
+    assert "B2SUMS" not in names(store, "runs/one/")
+    assert run(monkeypatch, capfd, *fit)[0] == 0
+    left = names(store, "runs/one/")
+    assert "smoothed.csv" not in left
+    assert content(store, "runs/one/notes.txt") == b"of a person"
+
+
+@pytest.mark.parametrize(
+    ("there", "place", "why"),
+    [("season/a.mcap", "s3://field/season", "not a run directory"), ("one", "s3://field/one", "a file is there"),
+     ("x", "s3://none/one", "cannot be written"), ("x", "https://host/one", "not written to a web server"),
+     ("runs/one/run.json", "s3://field/runs/one", "not a run directory")],
+)  # fmt: skip
+def test_a_place_that_cannot_be_written_is_refused_before_the_log_is_read(
+    store, monkeypatch, capfd, there, place, why
+):  # fmt: skip
+    store.client.put_object(Bucket="field", Key=there, Body=b"of a person")
+    status, said = run(monkeypatch, capfd, "fit", "none.mcap", *ROBOT, "-o", place)
+    assert status == 1
+    assert why in said
+    assert len(said.splitlines()) == 1
+    assert names(store) == [there]
+    assert content(store, there) == b"of a person"
+
+
+def test_the_run_of_another_recording_is_not_replaced(store, monkeypatch, capfd):
+    assert run(monkeypatch, capfd, "fit", MCAP, *ROBOT, "-o", "s3://field/one", "--plots", "none")[0] == 0
+    before = content(store, "one/run.json")
+    status, said = run(monkeypatch, capfd, "fit", BAG, *ROBOT, "-o", "s3://field/one", "--plots", "none")
+    assert status == 1
+    assert "holds the run of another recording" in said
+    assert content(store, "one/run.json") == before
+    assert run(monkeypatch, capfd, "fit", BAG, *ROBOT, "-o", "s3://field/one", "--plots", "none", "--overwrite")[0] == 0
+    assert content(store, "one/run.json") != before
+
+
+def test_a_batch_at_an_address_is_that_on_disk_and_is_continued(store, tmp_path, monkeypatch, capfd):
+    (tmp_path / "season").mkdir()
+    for log in (MCAP, BAG):
+        shutil.copy(log, tmp_path / "season")
+        store.client.upload_file(str(log), "field", f"season/{log.name}")
+    command = ("batch", "s3://field/season", *ROBOT, "-o", "s3://field/out", "--plots", "none", "-j", "1")
+    status, said = run(monkeypatch, capfd, *command)
+    assert status == 0, said
+    assert "fleet.csv" in said
+    assert run(monkeypatch, capfd, "batch", "season", *ROBOT, "-o", "out", "--plots", "none", "-j", "1")[0] == 0
+    written = {str(file.relative_to(tmp_path / "out")) for file in (tmp_path / "out").rglob("*") if file.is_file()}
+    assert set(names(store, "out/")) == written
+    tables = content(store, "out/fleet.csv"), (tmp_path / "out/fleet.csv").read_bytes()
+    theirs, ours = ([line.split(b",")[6:-3] for line in table.splitlines()] for table in tables)
+    assert theirs == ours
+    links = [f"runs/{log.stem}/report.html".encode() for log in (MCAP, BAG)]
+    assert all(link in content(store, "out/report.html") for link in links)
+    calibrations = [json.loads(text)["calibrations"] for text in (content(store, "out/fleet.json"),
+                    (tmp_path / "out/fleet.json").read_bytes())]  # fmt: skip
+    assert [{**one, "key": ""} for one in calibrations[0]] == [{**one, "key": ""} for one in calibrations[1]]
+
+    store.client.delete_object(Bucket="field", Key=f"out/runs/{BAG.stem}/B2SUMS")
+    status, said = run(monkeypatch, capfd, *command, "--json")
+    assert status == 0, said
+    document = json.loads(said)
+    assert {one["log"]: one["this_time"] for one in document["logs"]} == {MCAP.name: "skipped", BAG.name: "processed"}
+    assert document["output"] == "s3://field/out"
+    assert set(names(store, "out/")) == written
+    assert not [name for name in names(store) if SECRET.encode() in content(store, name)]
+
+
+def test_names_in_a_bucket_lead_to_no_place_outside_the_temporary_folder(store, tmp_path):
+    for name in ("one/../../../escaped.json", "one//etc/x.json", "one/a/", "one/b.json"):
+        store.client.put_object(Bucket="field", Key=name, Body=b"{}")
+    with on_disk(UrlPath("s3://field/one")) as folder:
+        found = [str(file.relative_to(folder)) for file in folder.rglob("*") if file.is_file()]
+        assert found == ["b.json"]
+    store.client.put_object(Bucket="field", Key="one/b.json/c", Body=b"{}")
+    with pytest.raises(OutputError, match="cannot be written"), on_disk(UrlPath("s3://field/one")):
+        pass
+    assert not list(tmp_path.rglob("escaped.json"))
