@@ -138,7 +138,7 @@ def filter_speed(bench: Bench) -> None:
     import icrtool
     from icrtool.alignment.align import align
     from icrtool.estimation.filter_setup import FilterSetup, set_up_filter
-    from icrtool.kernels.filter.ekf import run_ekf
+    from icrtool.kernels.ekf import run_ekf
 
     sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
     from support.matrix_filter import run_ekf_plain

@@ -11,7 +11,7 @@ from icrtool.dropout_analysis.starts import standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.run_filter import set_up_again
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.filter.ekf import run_ekf
+from icrtool.kernels.ekf import run_ekf
 from icrtool.records.dropout import Outage
 from icrtool.records.run import Run, track_of
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.equal_steps import rows_at_steps
-from icrtool.kernels.filter.ekf import REFERENCE_STEP_S
+from icrtool.kernels.filter_records import REFERENCE_STEP_S
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
 from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import PathKnots, path_at, window_residuals

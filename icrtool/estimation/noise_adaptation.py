@@ -10,9 +10,8 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.kernels.filter.ekf import REFERENCE_STEP_S, run_ekf
-from icrtool.kernels.filter.filter_records import FilterOutput
-from icrtool.kernels.filter.measurement_codes import UNSEEN
+from icrtool.kernels.ekf import run_ekf
+from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import WarmStart
 

@@ -13,7 +13,7 @@ from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
 from icrtool.estimation.observability import Excitation
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.filter.measurement_codes import UNSEEN
+from icrtool.kernels.filter_records import UNSEEN
 from icrtool.records.measurements import Finding
 from icrtool.records.run import ICR_WORDS, MeasurementOutcome
 from icrtool.records.tables import States

@@ -24,7 +24,7 @@ from icrtool.estimation.run_warnings import (
     unusable_reasons,
 )
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.filter.measurement_codes import RECOVERED
+from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.events import ReferenceJump, SlipEvent
 from icrtool.records.measurements import Fixes, FixStatistics, Measurements

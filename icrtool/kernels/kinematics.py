@@ -1,26 +1,30 @@
-"""The skid-steer ICR kinematics, one step of them and its Jacobian (Pentzer 2014, Eqs. 8-12, 14, 17, 27-29, 32-34)."""
+"""The skid-steer ICR kinematics (Pentzer 2014, Eqs. 8-12, 14, 17, 27-29, 32-34): velocities, one step, its Jacobian.
+
+And the true motion of a robot of known ICRs. While track speeds and ICRs are constant the body moves on a circle
+(Section 2), so a true step is an arc, not an Euler step: it does not depend on the filter's own steps (Eq. 14).
+"""
 
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
-from icrtool.kernels.arrays import Floats
+import numpy as np
+
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.compiled import njit, njit_part
+from icrtool.kernels.filter_records import GUARDED, PRINTED, REFERENCE_STEP_S
+
+Number = TypeVar("Number", float, Floats)
 
 MIN_ICR_SEPARATION_M = 1e-6
 """Floor of W = |y_l - y_r|: two coincident ICRs have no finite turn rate (Section 2 rules them out physically)."""
 
-GUARDED, UNGUARDED, PRINTED = 0, 1, 2
-"""Sign guards (Section 5.1): Eqs. 32-34 with their derivatives; Eqs. 8-10; Eqs. 32-34 with derivatives as printed.
 
-`PRINTED` divides by W, but differentiates y_r - y_l (Eq. 28 with the difference of Eqs. 32-34 put in).
-"""
-
-
-@njit
+@njit_part
 def body_velocity(
-    v_left: float, v_right: float, y_icr_right: float, y_icr_left: float, x_icr: float
-) -> tuple[float, float, float]:
+    v_left: Number, v_right: Number, y_icr_right: Number, y_icr_left: Number, x_icr: Number
+) -> tuple[Number, Number, Number]:
     """Map track speeds to body velocity.
 
     Parameters
@@ -36,18 +40,18 @@ def body_velocity(
     -----
     Eqs. 32-34. The no-slip model (Eqs. 38-39) is the case ``(b/2, -b/2, 0)``.
     """
-    W = max(abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M)
+    W = np.maximum(np.abs(y_icr_left - y_icr_right), MIN_ICR_SEPARATION_M)
     omega = (v_left - v_right) / W
     return (v_left * y_icr_right - v_right * y_icr_left) / W, -omega * x_icr, omega
 
 
 @njit_part
-def wheel_speed(v_left: float, v_right: float) -> float:
+def wheel_speed(v_left: Number, v_right: Number) -> Number:
     """Return the speed of the wheels (|V_l| + |V_r|) / 2 [m/s]: that of a spin on the spot is not zero."""
     return 0.5 * (abs(v_left) + abs(v_right))
 
 
-@njit
+@njit_part
 def euler_step(
     north: float, east: float, heading: float, dt: float,
     v_left: float, v_right: float, y_icr_right: float, y_icr_left: float, x_icr: float,
@@ -102,3 +106,92 @@ def step_jacobian(
     G[1, 2] = dt * (vx_l * s - w_l * x_v * c) + e_psi * ahead * w_l
     G[2, 1], G[2, 2] = dt * w_r, dt * w_l
     return dt * omega, dt * math.sqrt(v_x * v_x + v_y * v_y)
+
+
+def _arcs(heading: Floats, v_left: Floats, v_right: Floats, icrs: Floats, dt: Floats) -> Floats:
+    """Return the motion (n, 3) N, E [m], psi [rad] on arcs: the exact solution of Eqs. 11-12.
+
+    Parameters
+    ----------
+    heading : (n,) at the begin [rad]; v_left, v_right : (n,) held [m/s]; dt : (n,) how long [s]
+    icrs : (n, 3) y_icr_right, y_icr_left, x_icr [m]
+    """
+    v_x, v_y, omega = body_velocity(v_left, v_right, *icrs.T)
+    half = 0.5 * omega * dt
+    chord = dt * np.sinc(half / np.pi) * (v_x + 1j * v_y) * np.exp(1j * (heading + half))
+    return np.column_stack([chord.real, chord.imag, omega * dt])
+
+
+def drive(t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, which: Ints, start: Floats) -> Floats:
+    """Return the true pose at every time.
+
+    Parameters
+    ----------
+    t : (n,) increasing [s]
+    v_left, v_right : (n,) track speeds [m/s], held over [k, k+1)
+    icrs : (c, 3) y_icr_right, y_icr_left, x_icr [m]; which : (n,) row of `icrs` that holds over [k, k+1)
+    start : (3,) N, E [m], psi [rad] at t[0]
+
+    Returns
+    -------
+    (n, 3) N, E [m], psi [rad] (unwrapped)
+    """
+    held, own, dt = slice(len(t) - 1), icrs[which[:-1]], np.diff(t)
+    turned = dt * body_velocity(v_left[held], v_right[held], *own.T)[2]
+    heading = np.cumsum(np.append(start[2], turned))
+    moved = _arcs(heading[:-1], v_left[held], v_right[held], own, dt)
+    return np.cumsum(np.vstack([start, moved]), axis=0)
+
+
+def poses_at(
+    times: Floats, t: Floats, v_left: Floats, v_right: Floats, icrs: Floats, which: Ints, pose: Floats
+) -> Floats:
+    """Return the pose (m, 3) at any times (m,) between those of `drive`, on the arcs it drove."""
+    k = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 1)
+    return np.asarray(pose[k] + _arcs(pose[k, 2], v_left[k], v_right[k], icrs[which[k]], times - t[k]))
+
+
+def follow(command: Floats, t: Floats, lag_s: float) -> Floats:
+    """Return the speed (n,) of a track that follows its command (n,) [m/s] as a first-order lag, from rest with it.
+
+    Parameters
+    ----------
+    t : (n,) [s]; the command is held over [k, k+1)
+    lag_s : time constant, positive
+    """
+    speed = np.array(command, np.float64)
+    lag(speed, np.exp(-np.diff(t) / lag_s))
+    return speed
+
+
+@njit
+def lag(speed: Floats, kept: Floats) -> None:
+    """Replace a command (n,) by what follows it; (n - 1,) of the difference is kept from one to the next."""
+    command = speed[0]
+    for k in range(len(kept)):
+        command, speed[k + 1] = speed[k + 1], command + (speed[k] - command) * kept[k]
+
+
+def model_states(
+    x0: Floats, wheel_t: Floats, v_left: Floats, v_right: Floats, std: Floats, rate_invariant: bool, noise: Floats
+) -> Floats:
+    """Return states (n, 6) that obey the filter's own model: Eq. 14 with its process noise.
+
+    Parameters
+    ----------
+    x0 : (6,) at wheel_t[0]
+    wheel_t : (n,) [s]; v_left, v_right : (n,) [m/s], held over [k, k+1)
+    std : (6,) square roots of the diagonal of Q (Eq. 30)
+    rate_invariant : as in `FilterParameters`
+    noise : (n, 6) standard normal
+    """
+    dt, left, right = np.diff(wheel_t), v_left[:-1], v_right[:-1]
+    of_pose = np.sqrt(REFERENCE_STEP_S * dt) if rate_invariant else dt
+    of_icrs = of_pose * (np.sqrt(wheel_speed(left, right)) if rate_invariant else 1.0)
+    steps = np.column_stack([of_pose] * 3 + [of_icrs] * 3) * std * noise[:-1]
+    icrs = np.cumsum(np.vstack([x0[3:], steps[:, 3:]]), axis=0)
+    v_x, v_y, omega = body_velocity(left, right, *icrs[:-1].T)
+    psi = np.cumsum(np.append(x0[2], dt * omega + steps[:, 2]))
+    moved = dt * (v_x + 1j * v_y) * np.exp(1j * psi[:-1])
+    place = np.cumsum(np.vstack([x0[:2], np.column_stack([moved.real, moved.imag]) + steps[:, :2]]), axis=0)
+    return np.column_stack([place, psi, icrs])

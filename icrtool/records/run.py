@@ -11,7 +11,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
-from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
+from icrtool.kernels.filter_records import GATED, RECOVERED, USED
 from icrtool.kernels.track import Track
 from icrtool.records.events import intervals_in
 from icrtool.records.late_output import FigureSet, call_output
@@ -58,7 +58,7 @@ class MeasurementOutcome:
     ----------
     stamp_ns : int64 (m,); t_s : (m,) seconds since the first recorded state
     nis : (m,) normalised innovation squared, NaN where unseen
-    code : uint8 (m,), see `icrtool.kernels.filter.measurement_codes`
+    code : uint8 (m,), see `icrtool.kernels.filter_records`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
     """
 

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 
 from icrtool.errors import ConfigError
-from icrtool.kernels.arcs import drive, follow, poses_at
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.kinematics import drive, follow, poses_at
 from icrtool.records.tables import Icrs
 from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED
+from icrtool.kernels.filter_records import GUARDED, PRINTED, UNGUARDED
 from icrtool.simulation.studies import StudyNumber, StudyRequest, StudyResult, table_of
 from icrtool.simulation.study_measures import ICR_NAMES, inverted, trace
 from icrtool.simulation.study_runs import Progress, StudyRun, run_scenarios, with_start

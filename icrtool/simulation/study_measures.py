@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrtool.kernels.arcs import drive
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.kinematics import drive
 from icrtool.simulation.study_runs import StudyRun
 
 ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")

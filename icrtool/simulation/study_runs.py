@@ -13,10 +13,10 @@ import numpy as np
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import configured_noise, process_variance, rate_invariant, set_up_filter
-from icrtool.kernels.arcs import model_states
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.filter.ekf import run_ekf
-from icrtool.kernels.kinematics import GUARDED
+from icrtool.kernels.ekf import run_ekf
+from icrtool.kernels.filter_records import GUARDED
+from icrtool.kernels.kinematics import model_states
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import Icrs, RobotLog
 from icrtool.simulation.drives import (

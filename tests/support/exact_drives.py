@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from icrtool.config import parse_config
-from icrtool.kernels.arcs import drive, poses_at
+from icrtool.kernels.kinematics import drive, poses_at
 from icrtool.records.samples import HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog
 

@@ -1,4 +1,4 @@
-"""The ICR EKF in matrices, as the paper writes it: an independent oracle of `icrtool.kernels.filter.ekf`.
+"""The ICR EKF in matrices, as the paper writes it: an independent oracle of `icrtool.kernels.ekf`.
 
 Pentzer 2014, Section 3. F is assembled from Eqs. 17 and 27-29, updates are joint (north, east) with
 K = P H^T (H P H^T + R)^-1. Slow; shares no equation with the compiled filter.
@@ -11,9 +11,15 @@ import math
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.filter.ekf import REFERENCE_STEP_S, empty_output
-from icrtool.kernels.filter.filter_records import FilterInputs, FilterOutput, FilterParameters
-from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
+from icrtool.kernels.filter_records import (
+    GATED,
+    RECOVERED,
+    REFERENCE_STEP_S,
+    USED,
+    FilterInputs,
+    FilterOutput,
+    FilterParameters,
+)
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 
 
@@ -60,9 +66,9 @@ def state_jacobian(x: Floats, v_left: float, v_right: float, dt: float, step_hea
 
 
 def run_ekf_plain(data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters) -> FilterOutput:
-    """Do what `icrtool.kernels.filter.ekf.run_ekf` does, with matrices; the same arguments and result."""
+    """Do what `icrtool.kernels.ekf.run_ekf` does, with matrices; the same arguments and result."""
     first = int(np.searchsorted(data.wheel_t, t0))
-    out = empty_output(data, len(data.wheel_t) - first)
+    out = FilterOutput.empty(data, len(data.wheel_t) - first)
     x, P, t, travelled = x0.astype(float), P0.astype(float), t0, 0.0
     events = sorted(
         [(time, 0, i) for i, time in enumerate(data.change_t) if time > t0]
@@ -159,9 +165,8 @@ def _measure(
         P = (P + P.T) / 2
         x = _keep_sides(x, P, parameters.least_icr)
     if kind == 1:
-        out.gnss_nis[i], out.gnss_code[i] = nis, code
-        out.gnss_det[i] = innovation_det
-        out.gnss_residual[i] = data.gnss_z[i] - x[:2] - _antenna(x[2], parameters)
+        residual = data.gnss_z[i] - x[:2] - _antenna(x[2], parameters)
+        out.fixes[:, i] = code, nis, innovation_det, *residual
     else:
-        out.heading_nis[i], out.heading_code[i], out.heading_innovation[i] = nis, code, nu[0]
+        out.headings[:, i] = code, nis, nu[0]
     return x, P

@@ -24,7 +24,7 @@ from icrtool.kernels.robust import long_run_factor, mad_std
 from icrtool.kernels.track import Track
 
 if TYPE_CHECKING:
-    from icrtool.kernels.filter.heading_kalman import HeadingEvents, HeadingModel, HeadingPasses
+    from icrtool.kernels.heading_filter import HeadingEvents, HeadingModel, HeadingPasses
 
 PSI, BIAS, SCALE, X, DELAY = range(5)
 OFFSET, WANDER, LAG = 5, 6, 7
@@ -235,7 +235,7 @@ class _Problem:
 
     def events(self, noises: dict[str, float], alike: float = 1.0) -> HeadingEvents:
         """Return the events with the variances of some noises."""
-        from icrtool.kernels.filter.heading_kalman import HeadingEvents
+        from icrtool.kernels.heading_filter import HeadingEvents
 
         r = self.std**2
         course = self.kind == COURSE
@@ -259,7 +259,7 @@ class _Problem:
 
     def model(self, noises: dict[str, float]) -> HeadingModel:
         """Return start and process of the states."""
-        from icrtool.kernels.filter.heading_kalman import HeadingModel
+        from icrtool.kernels.heading_filter import HeadingModel
 
         count = len(self.absolute)
         std = np.concatenate([PRIOR_STD, *(ABSOLUTE_PRIOR_STD for _ in range(count))])
@@ -281,7 +281,7 @@ class _Problem:
 
     def guess(self, noises: dict[str, float]) -> Guess:
         """Return where to measure the courses next."""
-        from icrtool.kernels.filter.heading_kalman import filter_headings, smooth_headings
+        from icrtool.kernels.heading_filter import filter_headings, smooth_headings
 
         events, model = self.events(noises), self.model(noises)
         states, covariances = smooth_headings(events, model, filter_headings(events, model))
@@ -292,7 +292,7 @@ class _Problem:
 
     def solve(self, noises: dict[str, float]) -> HeadingEstimate:
         """Return the estimate with some noises."""
-        from icrtool.kernels.filter.heading_kalman import filter_headings, smooth_headings
+        from icrtool.kernels.heading_filter import filter_headings, smooth_headings
 
         events, model = self.events(noises), self.model(noises)
         passes = filter_headings(events, model)
@@ -331,7 +331,7 @@ class _Problem:
 
     def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
         """Return the noises with those of the grids that have the largest likelihood, one after the other."""
-        from icrtool.kernels.filter.heading_kalman import heading_log_likelihood
+        from icrtool.kernels.heading_filter import heading_log_likelihood
 
         def likelihood(name: str, value: float) -> float:
             tried = noises | {name: value}

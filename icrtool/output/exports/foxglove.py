@@ -155,9 +155,8 @@ def _transforms(paths: Sequence[ExportPath], rows: Ints, store: Typestore) -> To
 def _odometry(run: Run, path: ExportPath, rows: Ints) -> TopicPlan:
     """Return the poses of a path; its twist is what its ICRs make of the wheel speeds."""
     table, stamps, (z, w) = run.table, path.stamp_ns[rows], path.quaternion
-    icrs = (column[rows] if len(column) > 1 else np.repeat(column, len(rows)) for column in path.icrs)
-    speeds = (column.tolist() for column in (table.v_left_mps[rows], table.v_right_mps[rows], *icrs))
-    v_x, v_y, omega = np.array([body_velocity(*row) for row in zip(*speeds, strict=True)]).T
+    icrs = (column[rows] if len(column) > 1 else column for column in path.icrs)
+    v_x, v_y, omega = body_velocity(table.v_left_mps[rows], table.v_right_mps[rows], *icrs)
     columns = header_stamps(stamps) | {
         "pose.pose.position.x": path.x_m[rows],
         "pose.pose.position.y": path.y_m[rows],

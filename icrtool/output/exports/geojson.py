@@ -12,7 +12,7 @@ from icrtool import __version__
 from icrtool.alignment.sensors.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.filter.measurement_codes import GATED, UNSEEN
+from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.output.decimate import places
 from icrtool.output.exports.paths import (
     ERROR_HORIZON_M,

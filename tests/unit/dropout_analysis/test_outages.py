@@ -15,7 +15,7 @@ from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.fit import fit
-from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, USED
+from icrtool.kernels.filter_records import GATED, RECOVERED, USED
 from icrtool.logs.read_log import read_log
 from icrtool.records.run import STATE_COLUMNS, Run, WarmStart, track_of
 from support.barn import OUTAGE_S, START_NS, configured, simulate

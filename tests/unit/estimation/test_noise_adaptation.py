@@ -13,8 +13,8 @@ from icrtool.estimation.filter_setup import FIELD_NOISE, PAPER_NOISE, ProcessNoi
 from icrtool.estimation.fit import fit
 from icrtool.estimation.noise_adaptation import find_noise, innovation_cost
 from icrtool.estimation.run_filter import noise_of, set_up_again
-from icrtool.kernels.filter.ekf import run_ekf
-from icrtool.kernels.filter.measurement_codes import GATED
+from icrtool.kernels.ekf import run_ekf
+from icrtool.kernels.filter_records import GATED
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum
 from icrtool.records.tables import RobotLog

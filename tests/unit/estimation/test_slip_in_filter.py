@@ -13,10 +13,9 @@ from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
 from icrtool.estimation.fit import fit
-from icrtool.kernels.filter.ekf import run_ekf
-from icrtool.kernels.filter.filter_records import FilterInputs
-from icrtool.kernels.filter.measurement_codes import GATED
-from icrtool.kernels.filter.smoother import run_smoother
+from icrtool.kernels.ekf import run_ekf
+from icrtool.kernels.filter_records import GATED, FilterInputs
+from icrtool.kernels.smoother import run_smoother
 from icrtool.motion.recording import cut_windows
 from icrtool.records.events import SlipEvent
 from icrtool.records.measurements import SensorData

@@ -16,7 +16,7 @@ from icrtool.estimation.fit import fit
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS
 from icrtool.estimation.observability import Excitation
 from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
-from icrtool.kernels.filter.measurement_codes import GATED, UNSEEN, USED
+from icrtool.kernels.filter_records import GATED, UNSEEN, USED
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from icrtool.estimation.fit import fit
 from icrtool.estimation.odometry import drive_wheels
-from icrtool.kernels.filter.measurement_codes import GATED
+from icrtool.kernels.filter_records import GATED
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.gnss_difference import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style

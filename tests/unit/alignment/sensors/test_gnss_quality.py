@@ -15,7 +15,7 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.real_outages import real_outages
 from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Bools
-from icrtool.kernels.filter.measurement_codes import GATED
+from icrtool.kernels.filter_records import GATED
 from icrtool.logs.read_log import read_log
 from icrtool.logs.writing.log import WriteOptions, write_log
 from icrtool.records.run import Run

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.kernels.filter.ekf import run_ekf, wrap
-from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters
-from icrtool.kernels.filter.measurement_codes import GATED, RECOVERED, UNSEEN, USED
+from icrtool.kernels.ekf import run_ekf, wrap
+from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN, USED, FilterInputs, FilterParameters
 from support.matrix_filter import run_ekf_plain, state_jacobian, step_state
 
 PAPER_Q = (0.2**2, 0.2**2, math.radians(5.0) ** 2, 1e-4, 1e-4, 1e-4)
@@ -120,16 +119,13 @@ def test_twins_agree_where_stamps_coincide() -> None:
 
 
 def test_the_kernel_equals_its_python_function(monkeypatch: pytest.MonkeyPatch) -> None:
-    from icrtool.kernels.filter import ekf
+    from icrtool.kernels import ekf
 
     data, _ = drive(5, seconds=3.0)
     t0, x0, P0 = start(data)
     out = run_ekf(data, t0, x0, P0, parameters())
-    first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
-    state, again = ekf.start_state(data, t0, x0, P0), ekf.empty_output(data, last - first)
-    monkeypatch.setattr(ekf, "filter_block", ekf.filter_block.py_func)  # type: ignore[attr-defined]
-    ekf.filter_rows(data, first, last, state, parameters(), again, None)
-    again = again._replace(P=state.P)
+    monkeypatch.setattr(ekf, "filter_events", ekf.filter_events.py_func)  # type: ignore[attr-defined]
+    again = run_ekf(data, t0, x0, P0, parameters())
     for name in out._fields:
         np.testing.assert_allclose(getattr(out, name), getattr(again, name), rtol=1e-12, atol=1e-12, err_msg=name)
 
@@ -139,7 +135,7 @@ def test_the_size_of_compiled_blocks_changes_nothing(monkeypatch: pytest.MonkeyP
     t0, x0, P0 = start(data)
     settings = parameters(gnss_gate=9.0, heading_gate=6.0)
     whole = run_ekf(data, t0, x0, P0, settings)
-    monkeypatch.setattr("icrtool.kernels.filter.ekf.BLOCK_EVENTS", 50)
+    monkeypatch.setattr("icrtool.kernels.ekf.BLOCK_EVENTS", 50)
     for name, one, other in zip(whole._fields, whole, run_ekf(data, t0, x0, P0, settings), strict=True):
         np.testing.assert_array_equal(one, other, err_msg=name)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.compiled import njit
-from icrtool.kernels.filter.kalman import correct, propagate, smooth_back, store
+from icrtool.kernels.kalman import correct, propagate, smooth_passes, store
 
 HUBER_SIGMAS = 2.5
 
@@ -92,7 +92,7 @@ def _run(events: HeadingEvents, model: HeadingModel, out: HeadingPasses) -> floa
     """Run the filter, fill `out` where it has rows, and return the log likelihood."""
     k = len(model.x)
     start = model._replace(x=model.x.copy(), P=model.P.copy())
-    return float(_forward(events, start, out, np.zeros((1, k - 1)), np.empty(k), np.empty((k, k))))
+    return float(_forward(events, start, out, np.empty((1, 2)), np.empty(k), np.empty((1, k))))
 
 
 @njit
@@ -104,7 +104,7 @@ def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses, G: 
         dt, turn = events.dt[i], events.turn[i]
         x[0] += (1.0 + x[2]) * turn - x[1] * dt
         G[0, 0], G[0, 1] = -dt, turn
-        propagate(G, P, T)
+        propagate(G, P, T, 1, 1, 2, k)
         for a in range(k):
             if model.decay[a] > 0.0:
                 phi = math.exp(-model.decay[a] * dt)
@@ -133,7 +133,7 @@ def _forward(events: HeadingEvents, model: HeadingModel, out: HeadingPasses, G: 
         )
         if stored:
             out.innovation[i], out.variance[i] = y, S
-        correct(x, P, Ph, S if size < HUBER_SIGMAS else S * size / HUBER_SIGMAS, y, model.fixed)
+        correct(x, P, Ph, S if size < HUBER_SIGMAS else S * size / HUBER_SIGMAS, y, model.fixed, k)
         if stored:
             store(x, P, out.x, out.P, i)
     return likelihood
@@ -145,8 +145,6 @@ def smooth_headings(events: HeadingEvents, model: HeadingModel, passes: HeadingP
     F = np.zeros((n - 1, k, k))
     F[:, np.arange(k), np.arange(k)] = np.exp(-model.decay * events.dt[1:, None])
     F[:, 0, 1], F[:, 0, 2] = -events.dt[1:], events.turn[1:]
-    solved = np.asarray(np.linalg.solve(passes.P_predicted[1:], F @ passes.P[:-1]), np.float64)
-    gains = np.ascontiguousarray(solved.transpose(0, 2, 1))
     x, P = passes.x.copy(), passes.P.copy()
-    smooth_back(gains, passes.x_predicted, passes.P_predicted, x, P, np.empty((k, k)))
+    smooth_passes(F, passes.x_predicted, passes.P_predicted, x, P)
     return x, P

@@ -7,12 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.kernels.filter import ekf
-from icrtool.kernels.filter.ekf import REFERENCE_STEP_S, empty_output, filter_rows, run_ekf, start_state, wrap
-from icrtool.kernels.filter.filter_records import FilterInputs, FilterParameters, Nodes, Space
-from icrtool.kernels.filter.kalman import smooth_back, solve_positive
-from icrtool.kernels.filter.smoother import fill_gains, most_events, run_smoother
-from icrtool.kernels.kinematics import step_jacobian
+from icrtool.kernels import ekf, kalman
+from icrtool.kernels.ekf import FilterState, Nodes, filter_rows, run_ekf, wrap
+from icrtool.kernels.filter_records import REFERENCE_STEP_S, FilterInputs, FilterOutput, FilterParameters
+from icrtool.kernels.smoother import run_smoother
+from support.matrix_filter import state_jacobian
 
 BATCH_TOLERANCE = 1e-7
 """Relative: the dense normal equations are conditioned like 1e8."""
@@ -52,10 +51,8 @@ P0 = np.diag([1e-2, 1e-2, 1e-2, 0.09, 0.09, 0.04])
 
 def nodes_of(data: FilterInputs, settings: FilterParameters) -> Nodes:
     end = len(data.wheel_t)
-    state = start_state(data, 0.0, X0, P0)
-    nodes = Nodes.empty(most_events(data, state.place, 0, end))
-    count = filter_rows(data, 0, end, state, settings, empty_output(data, end), nodes)
-    return Nodes(*(column[:count] for column in nodes))
+    state, out = FilterState.start(0.0, X0, P0), FilterOutput.empty(data, end)
+    return filter_rows(data, 0, end, state, settings, out, 0, keep=True)
 
 
 def test_smoothed_states_are_the_batch_solution() -> None:
@@ -72,23 +69,22 @@ def test_smoothed_states_are_the_batch_solution() -> None:
             for k, B in rows.items():
                 information[6 * i : 6 * i + 6, 6 * k : 6 * k + 6] += A.T @ weight @ B
 
-    t, j, h = 0.0, 0, 0
-    for i in range(count):
+    times, j, h = np.unique(np.concatenate([[0.0], data.wheel_t, data.gnss_t, data.heading_t])), 0, 0
+    assert count == len(times)
+    for i, t in enumerate(times):
         predicted, P_predicted = nodes.x_predicted[i], nodes.P_predicted[i]
         if i == 0:
             add({0: np.eye(6)}, X0, P0)
         else:
-            F, G, (dt, v_left, v_right, gap) = np.eye(6), np.zeros((3, 4)), nodes.step[i]
-            if dt > 0.0 and not gap:
-                step_jacobian(nodes.x[i - 1], v_left, v_right, dt, settings.step_heading, settings.guard, G)
-            F[:3, 2:] += G
+            dt, k = t - times[i - 1], int(np.searchsorted(data.wheel_t, t))
+            gap = data.wheel_t[k] - data.wheel_t[k - 1] > settings.wheel_gap_s
+            v_left, v_right = data.v_left[k - 1], data.v_right[k - 1]
+            F = np.eye(6) if gap else state_jacobian(nodes.x[i - 1], v_left, v_right, dt, settings.step_heading)
             Q = np.diag(settings.process_variance) * REFERENCE_STEP_S * dt
-            Q[3:] *= np.abs(nodes.step[i, 1:3]).mean()
+            Q[3:] *= (abs(v_left) + abs(v_right)) / 2.0
             Q += gap * dt * np.diag([4.0, 4.0, 1.0, 0.0, 0.0, 0.0])
-            Q += 1e-14 * np.eye(6)  # nodes at one time differ by nothing: a batch wants that as a covariance
             assert np.allclose(F @ nodes.P[i - 1] @ F.T + Q, P_predicted, atol=1e-12)
             add({i: np.eye(6), i - 1: -F}, predicted - F @ nodes.x[i - 1], Q)
-        t += nodes.step[i, 0]
         while j < len(data.gnss_t) and data.gnss_t[j] <= t + 1e-12:
             c, s = math.cos(predicted[2]), math.sin(predicted[2])
             a = np.array([LEVER[0] * c - LEVER[1] * s, LEVER[0] * s + LEVER[1] * c])
@@ -133,27 +129,22 @@ def test_smoothing_never_adds_variance_and_ends_where_the_filter_does() -> None:
     assert smoothed.variance[0, 3] < 0.5 * filtered.variance[0, 3]
 
 
-def test_positive_systems_are_solved() -> None:
-    rng = np.random.default_rng(0)
-    root, B = rng.normal(size=(6, 6)), rng.normal(size=(6, 6))
-    A = root @ root.T + 0.1 * np.eye(6)
-    X = B.copy()
-    solve_positive(A.copy(), X)
-    assert np.allclose(A @ X, B, atol=1e-9)
+def test_a_state_that_is_known_for_certain_stays() -> None:
+    data, settings = measurements(200), parameters(process_variance=(0.04, 0.04, 0.01, 0.0, 0.0, 0.0))
+    known = P0.copy()
+    known[4, :] = known[:, 4] = 0.0
+    smoothed = run_smoother(data, 0.0, X0, known, settings)
+    assert np.array_equal(smoothed.x[:, 4], np.full(200, X0[4]))
+    assert np.array_equal(smoothed.variance[:, 4], np.zeros(200))
+    assert np.ptp(smoothed.x[:, 3]) < BATCH_TOLERANCE
 
 
 def test_kernels_equal_their_python_source(monkeypatch: pytest.MonkeyPatch) -> None:
     data, settings = measurements(25), parameters()
-    results = [nodes_of(data, settings)]
-    monkeypatch.setattr(ekf, "filter_block", ekf.filter_block.py_func)  # type: ignore[attr-defined]
-    results.append(nodes_of(data, settings))
-    assert all(np.allclose(a, b, rtol=1e-12) for a, b in zip(*results, strict=True))
-    nodes, gains = results[0], np.empty((2, len(results[0].row) - 1, 6, 6))
-    for kernel, found in zip((fill_gains, fill_gains.py_func), gains, strict=True):  # type: ignore[attr-defined]
-        kernel(nodes, 0.5, settings.guard, found, Space.empty())
-    assert np.allclose(*gains, rtol=1e-9, atol=1e-12)
-    smoothed = [(nodes.x.copy(), nodes.P.copy()) for _ in range(2)]
-    for kernel, (x, P) in zip((smooth_back, smooth_back.py_func), smoothed, strict=True):  # type: ignore[attr-defined]
-        kernel(gains[0], nodes.x_predicted, nodes.P_predicted, x, P, np.empty((6, 6)))
-    assert np.allclose(smoothed[0][0], smoothed[1][0], rtol=1e-12)
-    assert np.allclose(smoothed[0][1], smoothed[1][1], rtol=1e-9, atol=1e-12)
+    nodes, smoothed = nodes_of(data, settings), run_smoother(data, 0.0, X0, P0, settings)
+    monkeypatch.setattr(ekf, "filter_events", ekf.filter_events.py_func)  # type: ignore[attr-defined]
+    assert all(np.allclose(a, b, rtol=1e-12) for a, b in zip(nodes, nodes_of(data, settings), strict=True))
+    monkeypatch.setattr(kalman, "step_back", kalman.step_back.py_func)  # type: ignore[attr-defined]
+    plain = run_smoother(data, 0.0, X0, P0, settings)
+    assert np.allclose(smoothed.x, plain.x, rtol=1e-12)
+    assert np.allclose(smoothed.variance, plain.variance, rtol=1e-9, atol=1e-12)

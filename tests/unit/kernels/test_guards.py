@@ -7,11 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.kernels.arcs import model_states
-from icrtool.kernels.filter.ekf import run_ekf
-from icrtool.kernels.filter.filter_records import FilterInputs, FilterOutput, FilterParameters
-from icrtool.kernels.filter.kalman import propagate
-from icrtool.kernels.kinematics import GUARDED, PRINTED, UNGUARDED, step_jacobian
+from icrtool.kernels.ekf import run_ekf
+from icrtool.kernels.filter_records import GUARDED, PRINTED, UNGUARDED, FilterInputs, FilterOutput, FilterParameters
+from icrtool.kernels.kalman import propagate
+from icrtool.kernels.kinematics import model_states, step_jacobian
 from support.matrix_filter import step_state
 
 DERIVATIVE_TOLERANCE = 1e-12
@@ -60,7 +59,7 @@ def predict(x: np.ndarray, P: np.ndarray, v_left: float, v_right: float, guard: 
     """Take an Euler step of 0.01 s, in place."""
     G = np.empty((3, 4))
     turn, _ = step_jacobian(x, v_left, v_right, 0.01, 0.0, guard, G)
-    propagate(G, P, np.empty((6, 6)))
+    propagate(G, P, np.empty((3, 6)), 3, 2, 4, 6)
     x[:3] += G[1, 0], -G[0, 0], turn
 
 

@@ -1,0 +1,400 @@
+"""The ICR EKF, compiled: event-driven propagation and updates (Pentzer 2014, Section 3, Eqs. 13-25).
+
+The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
+The tests compare this filter with one in matrix form (tests/support/matrix_filter.py), the one to read first.
+`filter_events` is the one event loop: the filter and the smoother's forward pass call it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.compiled import njit, njit_part
+from icrtool.kernels.filter_records import (
+    GATED,
+    RECOVERED,
+    REFERENCE_STEP_S,
+    USED,
+    FilterInputs,
+    FilterOutput,
+    FilterParameters,
+)
+from icrtool.kernels.kalman import correct, propagate, store
+from icrtool.kernels.kinematics import step_jacobian, wheel_speed
+
+NORTH, EAST, PSI = (cast(int, np.int64(axis)) for axis in range(3))
+"""Which state is measured. Typed: numba compiles one more copy of a function for every plain number in a call."""
+
+CHANGE, FIX, HEADING, WHEELS = range(4)
+"""Kinds of events, in their order at equal stamps: terrain changes, fixes, headings, wheel samples."""
+
+BLOCK_EVENTS = 500_000
+"""Events in one compiled call of `run_ekf`: some 0.1 s, between which Ctrl-C and SIGTERM are acted on."""
+
+
+class Events(NamedTuple):
+    """Events in order of time: (m,) time [s], kind, and row among those of its kind."""
+
+    t: Floats
+    kind: Ints
+    row: Ints
+
+
+class FilterState(NamedTuple):
+    """All that a run needs to go on from the events before. Changed in place.
+
+    Attributes
+    ----------
+    reached : (2,) time [s], and path length up to there [m]
+    rejected : (2, 4) rows of `rejected_run`, of GNSS and of heading
+    x : (6,); P : (6, 6)
+    """
+
+    reached: Floats
+    rejected: Floats
+    x: Floats
+    P: Floats
+
+    @classmethod
+    def start(cls, t0: float, x0: Floats, P0: Floats) -> FilterState:
+        """Return the state of a run that starts at t0 [s] with state x0 (6,) and covariance P0 (6, 6)."""
+        return cls(np.array([t0, 0.0]), np.zeros((2, 4)), x0.astype(np.float64), P0.astype(np.float64))
+
+    def copy(self) -> FilterState:
+        """Return a state that later events do not change."""
+        return FilterState._make(column.copy() for column in self)
+
+
+class Space(NamedTuple):
+    """Memory of kernels, which allocate none: PH (6,); G (3, 4), as in `step_jacobian`; T (3, 6)."""
+
+    PH: Floats
+    G: Floats
+    T: Floats
+
+    @classmethod
+    def empty(cls) -> Space:
+        """Return new memory."""
+        return cls(np.empty(6), np.empty((3, 4)), np.empty((3, 6)))
+
+
+class Nodes(NamedTuple):
+    """Times of events in order, for the smoother; (m, ...) each.
+
+    Attributes
+    ----------
+    x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 6, 6) likewise
+    G : (m, 3, 4) of `step_jacobian` for the step from the node before; 0 where the pose is not dead-reckoned
+    row : int64 (m,), wheel sample recorded here, -1 where none is
+    """
+
+    x_predicted: Floats
+    P_predicted: Floats
+    x: Floats
+    P: Floats
+    G: Floats
+    row: Ints
+
+    @classmethod
+    def empty(cls, count: int) -> Nodes:
+        """Return so many nodes, to be filled."""
+        x, P, G = (count, 6), (count, 6, 6), (count, 3, 4)
+        return cls(np.empty(x), np.empty(P), np.empty(x), np.empty(P), np.zeros(G), np.empty(count, np.int64))
+
+
+@njit_part
+def wrap(angle: float) -> float:
+    """Wrap an angle [rad] to (-pi, pi]."""
+    if -math.pi < angle <= math.pi:
+        return angle
+    return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
+
+
+@njit_part
+def rejected_run(run: Floats, t: float, nu_n: float, nu_e: float, limit: float, parameters: FilterParameters) -> bool:
+    """Remember a rejected innovation; return whether the rejected ones agree, so that the filter must be wrong.
+
+    Wrong fixes disagree with one another; a filter that is wrong sees the same innovation again and again.
+    `run` (4,) holds count, time of the first, and the last innovation; `limit` is the squared difference that two
+    consecutive innovations of a run may have.
+    """
+    step_n, step_e = nu_n - run[2], nu_e - run[3]
+    if run[0] > 0.0 and step_n * step_n + step_e * step_e <= limit:
+        run[0] += 1.0
+    else:
+        run[0] = 1.0
+        run[1] = t
+    run[2] = nu_n
+    run[3] = nu_e
+    return bool(run[0] >= parameters.recovery_count and t - run[1] >= parameters.recovery_s)
+
+
+@njit_part
+def antenna(x: Floats, forward: float, right: float) -> tuple[float, float]:
+    """Return the antenna's position relative to the body origin: a = R(psi) (forward, right), north and east [m].
+
+    h(x) = (N, E) + a, so dh/dpsi = (-a_E, a_N); without a lever arm H is Eq. 22.
+    """
+    c, s = math.cos(x[2]), math.sin(x[2])
+    return forward * c - right * s, forward * s + right * c
+
+
+@njit_part
+def measured_column(P: Floats, axis: int, h_psi: float, PH: Floats) -> float:
+    """Fill PH (6,) = P H^T and return H P H^T, for H = e_axis + h_psi e_psi; of the heading with h_psi 0."""
+    for i in range(6):
+        PH[i] = P[i, axis] + h_psi * P[i, 2]
+    return float(PH[axis] + h_psi * PH[2])
+
+
+@njit_part
+def keep_sides(x: Floats, P: Floats, least: float) -> None:
+    """Move the state to the nearest one, in the metric of P, with y_icr_right >= least and y_icr_left <= -least.
+
+    The right track is to the right of the left one: the paper's guard (Section 5.1) applied to the states, too.
+    Estimate projection (Simon and Chia 2002): the covariance stays as it is.
+    """
+    for turn in range(4):
+        place = 3 + turn % 2
+        sign = 7.0 - 2.0 * place
+        beyond = least - sign * x[place]
+        if beyond > 0.0:
+            for i in range(6):
+                x[i] += sign * P[i, place] / P[place, place] * beyond
+
+
+@njit_part
+def take_fix(
+    data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, found: Floats
+) -> tuple[float, float, float]:
+    """Gate and apply a fix, and fill its column of `FilterOutput.fixes`; return what it adds to P (3,) first.
+
+    A fix that ends a lock-out makes north and east uncertain by its innovation [m^2]; others add nothing.
+    North and east are applied one after the other, which equals the joint update since their noises are independent.
+    """
+    x, P, run = state.x, state.P, state.rejected[0]
+    z_n, z_e, r_n, r_e = data.gnss_z[row, 0], data.gnss_z[row, 1], data.gnss_r[row, 0], data.gnss_r[row, 1]
+    a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
+    nu_n, nu_e = z_n - x[0] - a_n, z_e - x[1] - a_e
+    S_ee = measured_column(P, EAST, a_n, PH) + r_e
+    S_nn = measured_column(P, NORTH, -a_e, PH) + r_n
+    S_ne = PH[1] + a_n * PH[2]
+    det = S_nn * S_ee - S_ne * S_ne
+    nis = (S_ee * nu_n * nu_n - 2.0 * S_ne * nu_n * nu_e + S_nn * nu_e * nu_e) / det
+    code, more_n, more_e = USED, 0.0, 0.0
+    if nis > parameters.gnss_gate:
+        code = GATED
+        if rejected_run(run, state.reached[0], nu_n, nu_e, parameters.gnss_gate * 2.0 * (r_n + r_e), parameters):
+            code = RECOVERED
+            more_n, more_e = nu_n * nu_n, nu_e * nu_e
+            P[0, 0] += more_n
+            P[1, 1] += more_e
+            S_nn = measured_column(P, NORTH, -a_e, PH) + r_n
+    if code != GATED:
+        run[0] = 0.0
+        E, psi = x[1], x[2]
+        correct(x, P, PH, S_nn, nu_n, None, 6)
+        S_ee = measured_column(P, EAST, a_n, PH) + r_e
+        correct(x, P, PH, S_ee, nu_e - (x[1] - E) - a_n * (x[2] - psi), None, 6)
+        keep_sides(x, P, parameters.least_icr)
+    a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
+    found[0, row], found[1, row], found[2, row] = code, nis, det
+    found[3, row], found[4, row] = z_n - x[0] - a_n, z_e - x[1] - a_e
+    return more_n, more_e, 0.0
+
+
+@njit_part
+def take_heading(
+    data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, found: Floats
+) -> tuple[float, float, float]:
+    """Gate and apply a heading, and fill its column of `FilterOutput.headings`; return what it adds to P (3,) first.
+
+    The gate tests this sample alone (variance r). The update uses variance r times the correlation, because the errors
+    of neighbouring samples are not independent.
+    """
+    x, P, run, r = state.x, state.P, state.rejected[1], data.heading_r[row]
+    nu = wrap(data.heading_z[row] - x[2])
+    nis = nu * nu / (P[2, 2] + r)
+    code, more = USED, 0.0
+    if nis > parameters.heading_gate:
+        code = GATED
+        if rejected_run(run, state.reached[0], nu, 0.0, parameters.heading_gate * 2.0 * r, parameters):
+            code = RECOVERED
+            more = nu * nu
+            P[2, 2] += more
+    if code != GATED:
+        run[0] = 0.0
+        S = measured_column(P, PSI, 0.0, PH) + r * parameters.heading_correlation
+        correct(x, P, PH, S, nu, None, 6)
+        keep_sides(x, P, parameters.least_icr)
+    found[0, row], found[1, row], found[2, row] = code, nis, nu
+    return 0.0, 0.0, more
+
+
+@njit_part
+def advance(
+    dt: float, data: FilterInputs, k: int, state: FilterState, parameters: FilterParameters, space: Space
+) -> None:
+    """Propagate by dt [s] (Eqs. 14, 16) and add the process noise and the path length by the wheels.
+
+    Through a gap in the wheel data, and through slip, the pose is not dead-reckoned: only its uncertainty grows, and
+    the next measurement does not change the ICRs; ``space.G`` becomes 0. These wander with the wheels' travel, through
+    a gap as before it: a parked robot keeps what it has learned.
+
+    Parameters
+    ----------
+    k : next wheel sample, before which the speeds of the one before hold
+    """
+    x, P, G, held = state.x, state.P, space.G, max(k - 1, 0)
+    v_left, v_right = data.v_left[held], data.v_right[held]
+    in_gap = data.wheel_t[k] - data.wheel_t[held] > parameters.wheel_gap_s
+    turn, length = step_jacobian(x, v_left, v_right, dt, parameters.step_heading, parameters.guard, G)
+    if in_gap or (len(data.slipping) > 0 and data.slipping[held]):
+        P[0, 0] += parameters.gap_speed_variance * dt
+        P[1, 1] += parameters.gap_speed_variance * dt
+        P[2, 2] += parameters.gap_turn_variance * dt
+        for i in range(3):
+            for j in range(4):
+                G[i, j] = 0.0
+    else:
+        propagate(G, P, space.T, 3, 2, 4, 6)
+        x[0] += G[1, 0]
+        x[1] -= G[0, 0]
+        x[2] += turn
+    of_pose = of_icrs = dt * dt
+    if parameters.rate_invariant:
+        of_pose = REFERENCE_STEP_S * dt
+        of_icrs = of_pose * wheel_speed(v_left, v_right)
+    for i in range(6):
+        P[i, i] += (of_pose if i < 3 else of_icrs) * parameters.process_variance[i]
+    if len(data.turn_variance) > 0:
+        P[2, 2] += data.turn_variance[held] * dt
+    if not in_gap:
+        state.reached[1] += length
+
+
+@njit_part
+def begin_node(nodes: Nodes, m: int, state: FilterState, dt: float, G: Floats) -> None:
+    """Keep in node m what is predicted there, dt [s] after the node before."""
+    store(state.x, state.P, nodes.x_predicted, nodes.P_predicted, m)
+    for i in range(3):
+        for j in range(4):
+            nodes.G[m, i, j] = G[i, j] if dt > 0.0 else 0.0
+
+
+@njit_part
+def end_node(nodes: Nodes, m: int, state: FilterState, row: int, more: tuple[float, float, float]) -> None:
+    """Keep in node m what is left after an event, which added to P first, and the wheel sample recorded there."""
+    store(state.x, state.P, nodes.x, nodes.P, m)
+    nodes.row[m] = row
+    for axis in range(3):
+        nodes.P_predicted[m, axis, axis] += more[axis]
+
+
+@njit_part
+def record(state: FilterState, states: Floats, column: int) -> None:
+    """Fill a column of `FilterOutput.states`."""
+    for axis in range(6):
+        states[axis, column], states[6 + axis, column] = state.x[axis], state.P[axis, axis]
+    states[12, column] = state.reached[1]
+
+
+@njit
+def filter_events(
+    events: Events, data: FilterInputs, first: int, begin: int, state: FilterState, parameters: FilterParameters,
+    space: Space, out: FilterOutput, nodes: Nodes | None,
+) -> int:  # fmt: skip
+    """Run the filter over events; return the number of nodes, which are distinct times.
+
+    Parameters
+    ----------
+    first, begin : wheel sample of the first column of ``out.states``, and of the first state that is recorded now
+    nodes : filled with every time of events; None: nothing is kept, compiled as a function of its own
+    """
+    count, recorded, k = 0, True, begin
+    for i in range(len(events.t)):
+        kind, row, dt = events.kind[i], events.row[i], events.t[i] - state.reached[0]
+        more = (0.0, 0.0, 0.0)
+        if dt > 0.0:
+            advance(dt, data, k, state, parameters, space)
+            state.reached[0] = events.t[i]
+        if kind == CHANGE:
+            for axis in range(3, 6):
+                state.P[axis, axis] = max(state.P[axis, axis], parameters.icr_inflation_m2)
+        if nodes is not None and (dt > 0.0 or recorded):
+            begin_node(nodes, count, state, dt, space.G)
+            count += 1
+        if kind == FIX:
+            more = take_fix(data, row, state, parameters, space.PH, out.fixes)
+        elif kind == HEADING:
+            more = take_heading(data, row, state, parameters, space.PH, out.headings)
+        recorded = kind == WHEELS
+        if recorded:
+            record(state, out.states, row - first)
+            k = row + 1
+        if nodes is not None:
+            end_node(nodes, count - 1, state, row if recorded else -1, more)
+    return count
+
+
+def events_until(data: FilterInputs, begin: int, end: int, after: float) -> Events:
+    """Return wheel samples [begin, end) and what is measured after a time [s] until the last of them, in order."""
+    stamps, until = (data.change_t, data.gnss_t, data.heading_t, data.wheel_t), data.wheel_t[end - 1]
+    spans = [np.searchsorted(times, [after, until], side="right").tolist() for times in stamps[:-1]]
+    spans.append([begin, end])
+    t = np.concatenate([times[first:stop] for times, (first, stop) in zip(stamps, spans, strict=True)])
+    order = np.argsort(t, kind="stable")
+    kind = np.repeat(np.arange(len(spans)), [stop - first for first, stop in spans])
+    row = np.concatenate([np.arange(first, stop) for first, stop in spans])
+    return Events(t[order], kind[order], row[order])
+
+
+def filter_rows(
+    data: FilterInputs, begin: int, end: int, state: FilterState, parameters: FilterParameters, out: FilterOutput,
+    first: int, *, keep: bool = False,
+) -> Nodes:  # fmt: skip
+    """Run the filter over wheel samples [begin, end); return its nodes, none unless they are to be kept.
+
+    Parameters
+    ----------
+    data : of `compiled_inputs`
+    first : wheel sample of the first column of ``out.states``
+    """
+    events = events_until(data, begin, end, state.reached[0])
+    nodes = Nodes.empty(len(events.t)) if keep else None
+    count = filter_events(events, data, first, begin, state, parameters, Space.empty(), out, nodes)
+    return Nodes.empty(0) if nodes is None else Nodes._make(column[:count] for column in nodes)
+
+
+def run_ekf(
+    data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, stops: Sequence[int] = ()
+) -> FilterOutput:
+    """Run the filter from state x0 (6,), covariance P0 (6, 6) at time t0 [s] over all that follows.
+
+    Measurements stamped at or before t0 are not used: x0 was made from them. One state is recorded per wheel sample
+    from t0 on, after all updates at its stamp. At equal stamps: terrain changes, GNSS, heading, wheels.
+
+    Parameters
+    ----------
+    stops : rows of recorded states, ascending, at which the whole covariance is kept
+    """
+    first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
+    size = max(last * BLOCK_EVENTS // (last + len(data.gnss_t) + len(data.heading_t)), 1)
+    data, state = compiled_inputs(data), FilterState.start(t0, x0, P0)
+    out, kept = FilterOutput.empty(data, last - first), []
+    for begin, end in pairwise(sorted({*range(first, last, size), *(first + stop + 1 for stop in stops), last})):
+        filter_rows(data, begin, end, state, parameters, out, first)
+        if end - first - 1 in stops:
+            kept.append(state.P.copy())
+    return out._replace(P=state.P, P_at_stops=np.array(kept).reshape(-1, 6, 6))
+
+
+def compiled_inputs(data: FilterInputs) -> FilterInputs:
+    """Return the inputs in the one form that the kernel is compiled for; copies only what is not in it."""
+    return FilterInputs._make(np.require(column, requirements=["C", "A", "W"]) for column in data)

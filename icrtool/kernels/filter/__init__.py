@@ -1,1 +1,0 @@
-"""Filters and smoothers, event by event."""

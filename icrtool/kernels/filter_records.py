@@ -1,0 +1,169 @@
+"""Records of the filter: its constants, inputs and outputs. No kernel is here: who only reads them loads no numba."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.arrays import Floats
+
+Codes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+
+UNSEEN, USED, GATED, RECOVERED = 0, 1, 2, 3
+"""What was done with a measurement: outside the run, used, rejected by the gate, used to end a lock-out."""
+
+GUARDED, UNGUARDED, PRINTED = 0, 1, 2
+"""Sign guards (Section 5.1): Eqs. 32-34 with their derivatives; Eqs. 8-10; Eqs. 32-34 with derivatives as printed.
+
+`PRINTED` divides by W, but differentiates y_r - y_l (Eq. 28 with the difference of Eqs. 32-34 put in).
+"""
+
+REFERENCE_STEP_S = 0.01
+"""The paper propagates at 100 Hz; its dt^2 Q per step is Q * 0.01 s per second of time at that rate."""
+
+
+class FilterParameters(NamedTuple):
+    """Constants of one run.
+
+    Attributes
+    ----------
+    process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
+    rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q, that of the ICRs by the wheels' travel: dt times
+        their speed over 1 m/s
+    step_heading : the part of a step's turn after which its displacement is turned into the world: 0 at the start
+        (Euler, Eq. 14), 0.5 in the middle, where the displacement of an arc points
+    gnss_gate, heading_gate : largest NIS accepted; inf accepts all
+    heading_correlation : a heading sample counts as 1 / this of an independent one: neighbours err together
+    antenna_forward, antenna_right : lever arm of the antenna [m], body frame
+    wheel_gap_s : a longer interval between wheel samples is not dead-reckoned
+    gap_speed_variance, gap_turn_variance : growth through such a gap [m^2/s, rad^2/s]
+    recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
+    icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
+    least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: anywhere
+    guard : sign guard of the kinematics, one of the above; other than GUARDED in studies only
+    """
+
+    process_variance: tuple[float, float, float, float, float, float]
+    rate_invariant: bool
+    step_heading: float
+    gnss_gate: float
+    heading_gate: float
+    heading_correlation: float
+    antenna_forward: float
+    antenna_right: float
+    wheel_gap_s: float
+    gap_speed_variance: float
+    gap_turn_variance: float
+    recovery_count: int
+    recovery_s: float
+    icr_inflation_m2: float
+    least_icr: float
+    guard: int = GUARDED
+
+
+class FilterInputs(NamedTuple):
+    """Inputs of one run: times [s] since any one epoch, non-decreasing.
+
+    Attributes
+    ----------
+    wheel_t : (n,); v_left, v_right : (n,) [m/s], held over [k, k+1)
+    gnss_t : (m,); gnss_z : (m, 2) north, east [m]; gnss_r : (m, 2) var north, var east [m^2]
+    heading_t : (h,); heading_z : (h,) [rad]; heading_r : (h,) [rad^2]
+    change_t : (c,) times of terrain changes
+    slipping : (n,) intervals [k, k+1) in a slip event; empty for none
+    turn_variance : (n,) further growth of the heading's variance over [k, k+1) [rad^2/s]; empty for none
+    """
+
+    wheel_t: Floats
+    v_left: Floats
+    v_right: Floats
+    gnss_t: Floats
+    gnss_z: Floats
+    gnss_r: Floats
+    heading_t: Floats
+    heading_z: Floats
+    heading_r: Floats
+    change_t: Floats
+    slipping: Flags = np.zeros(0, np.bool_)
+    turn_variance: Floats = np.zeros(0)
+
+
+class FilterOutput(NamedTuple):
+    """What a run makes, a column for each recorded state, fix and heading; filled in place as it goes on.
+
+    Attributes
+    ----------
+    states : (13, k) x, diagonal of P, path length [m], after all updates at the stamps of the last k wheel samples
+    fixes : (5, m) code, NIS, determinant of S [m^4], fix minus estimate after the update, north and east [m]
+    headings : (3, h) code, NIS, innovation [rad]
+    P : (6, 6) covariance at the end
+    P_at_stops : (s, 6, 6) likewise at the rows that were asked for
+
+    Codes are `UNSEEN`, `USED`, `GATED` or `RECOVERED`; the numbers of what is unseen are NaN.
+    """
+
+    states: Floats
+    fixes: Floats
+    headings: Floats
+    P: Floats
+    P_at_stops: Floats = np.zeros((0, 6, 6))
+
+    @classmethod
+    def empty(cls, data: FilterInputs, rows: int) -> FilterOutput:
+        """Return the output of a run of so many recorded states, before it has run."""
+        fixes, headings = np.full((5, len(data.gnss_t)), np.nan), np.full((3, len(data.heading_t)), np.nan)
+        fixes[0] = headings[0] = UNSEEN
+        return cls(np.empty((13, rows)), fixes, headings, np.empty((6, 6)))
+
+    @property
+    def x(self) -> Floats:
+        """States (k, 6)."""
+        return np.asarray(self.states[:6].T)
+
+    @property
+    def variance(self) -> Floats:
+        """Diagonal of P (k, 6)."""
+        return np.asarray(self.states[6:12].T)
+
+    @property
+    def distance(self) -> Floats:
+        """Path length (k,) [m]."""
+        return np.asarray(self.states[12])
+
+    @property
+    def gnss_code(self) -> Codes:
+        """What was done with each fix (m,)."""
+        return np.asarray(self.fixes[0].astype(np.uint8))
+
+    @property
+    def gnss_nis(self) -> Floats:
+        """Normalised innovation squared of each fix (m,)."""
+        return np.asarray(self.fixes[1])
+
+    @property
+    def gnss_det(self) -> Floats:
+        """Determinant of the innovation covariance of each fix (m,) [m^4]."""
+        return np.asarray(self.fixes[2])
+
+    @property
+    def gnss_residual(self) -> Floats:
+        """Fix minus estimate after the update (m, 2) [m]."""
+        return np.asarray(self.fixes[3:].T)
+
+    @property
+    def heading_code(self) -> Codes:
+        """What was done with each heading (h,)."""
+        return np.asarray(self.headings[0].astype(np.uint8))
+
+    @property
+    def heading_nis(self) -> Floats:
+        """Normalised innovation squared of each heading (h,)."""
+        return np.asarray(self.headings[1])
+
+    @property
+    def heading_innovation(self) -> Floats:
+        """Innovation of each heading (h,) [rad]."""
+        return np.asarray(self.headings[2])
