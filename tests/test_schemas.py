@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from msgspec.structs import astuple
 
 from icrtool.calibration.forecast import forecast_drive
 from icrtool.calibration.from_runs import calibrate
@@ -20,13 +21,11 @@ from icrtool.dropout_analysis.acceptance_limits import parse_gate
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.estimation.fit import fit
 from icrtool.fleet.fleet_files import fleet_document
-from icrtool.fleet.roll_up import PooledCalibration
-from icrtool.fleet.row import File, Row
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.files.json_file import json_bytes
 from icrtool.output.tables.forecast import forecast_document
-from icrtool.output.tables.transfer import transfer_document
-from icrtool.records.dropout import Verdict
+from icrtool.records.dropout import CheckedGate
+from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.text import LogText
 from support.barn import configured, simulate
 from support.documents import with_summary
@@ -56,14 +55,17 @@ def documents() -> dict[str, Any]:
         run, horizons_m=(1.0, 5.0), outage_s=(4.0,), gates=("icr.p95@5m <= 0.001",), calibrations=[calibration],
         without_events=True,
     )  # fmt: skip
-    verdicts = (Verdict(parse_gate("icr.p95@5m <= 1"), passed=True, value_m=0.5, margin_m=0.5),)
-    row = Row("a.bag", "runs/a", "done", verdicts=verdicts, inputs=(File("a.bag", 1, 2, "ab"),), icr={"x_icr_m": None})
-    pooled = PooledCalibration("jackal", "grass", ("a.bag",), ())
+    gate = CheckedGate(*astuple(parse_gate("icr.p95@5m <= 1")), passed=True, value_m=0.5, margin_m=0.5)
+    row = FleetLog(
+        "a.bag", "runs/a", "done", verdicts=(fleet_verdict(gate, "a"),), inputs=(FleetFile("a.bag", 1, 2, "ab"),),
+        icr={"x_icr_m": None},
+    )  # fmt: skip
+    pooled = FleetCalibration("jackal", "grass", ("a.bag",), ())
     found = {
         "run": run.summary,
         "dropout": report_document(report),
         "calibration": calibration.summary(),
-        "compare": transfer_document(compare_groups({LogText("one"): [run], LogText("two"): [other]})),
+        "compare": compare_groups({LogText("one"): [run], LogText("two"): [other]}),
         "forecast": forecast_document(forecast_drive(calibration, recording_of(run)), calibration, (0.5,)),
         "fleet": fleet_document([row], [pooled]),
     }

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import astuple
 
+from icrtool import __version__
 from icrtool.calibration.from_runs import calibrate_runs
 from icrtool.calibration.pooled import CalibrationResult, predictor
 from icrtool.calibration.record import Calibration
@@ -25,10 +26,26 @@ from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary
 from icrtool.kernels.track import Track
 from icrtool.motion.models import RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import Recording, cut_trials
+from icrtool.records.calibration_document import (
+    COMPARE_SCHEMA,
+    ComparedGroup,
+    ComparedPair,
+    ErrorDifference,
+    ErrorsAt,
+    GroupComparison,
+    ParameterDifference,
+    TransferCell,
+    TransferCost,
+)
 from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.plain_data import known
 from icrtool.records.run import Run
+from icrtool.records.text import with_interval, with_std
 
 HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
+
+SAME_ROUTE_M = 1.0
+"""Two drives took the same route where they are nowhere further apart at the same distance."""
 
 TWO_SIDED = 1.96
 """Standard deviations in a 95 % interval."""
@@ -39,82 +56,7 @@ SAME_ROUTE_M = 1.0
 COMPARED = ("y_icr_right_m", "y_icr_left_m", "x_icr_m", "multiplier", "radius_left", "radius_right")
 
 
-class ErrorEstimate(NamedTuple):
-    """Errors, or differences of errors, with 95 % intervals [m]; NaN where there is none."""
-
-    p95_m: float
-    p95_low_m: float
-    p95_high_m: float
-    expected_m: float
-    expected_low_m: float
-    expected_high_m: float
-
-
-class Difference(NamedTuple):
-    """A quantity of two groups: second minus first, with one standard deviation."""
-
-    quantity: str
-    first: float
-    second: float
-    difference: float
-    std: float
-
-    @property
-    def significant(self) -> bool:
-        """Whether zero lies outside the 95 % interval."""
-        return abs(self.difference) > TWO_SIDED * self.std
-
-
-class Cell(NamedTuple):
-    """Errors at one horizon of the calibration of one group in the runs of another.
-
-    `cost` are these errors minus those of the tested group's own held-out calibration in the same trials; None on the
-    diagonal.
-    """
-
-    calibrated_on: str
-    tested_on: str
-    horizon_m: float
-    trials: int
-    errors: ErrorEstimate
-    cost: ErrorEstimate | None
-
-
-class Pair(NamedTuple):
-    """Two groups: how their parameters differ, and their held-out errors at each horizon [m], second minus first.
-
-    `paired`: both drove the same route, and trials at the same distance are compared.
-    """
-
-    first: str
-    second: str
-    parameters: tuple[Difference, ...]
-    errors: dict[float, ErrorEstimate]
-    paired: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Transfer:
-    """The comparison of groups.
-
-    Attributes
-    ----------
-    calibrations : by group
-    pairs : the first group with each of the others
-    cells : the transfer matrix, by row, column and horizon
-    """
-
-    calibrations: Mapping[str, Calibration]
-    pairs: tuple[Pair, ...]
-    cells: tuple[Cell, ...]
-
-    def cell(self, calibrated_on: str, tested_on: str, horizon_m: float) -> Cell:
-        """Return a cell of the matrix."""
-        where = (calibrated_on, tested_on, horizon_m)
-        return next(one for one in self.cells if one[:3] == where)
-
-
-def compare_groups(groups: Mapping[str, Sequence[Run]]) -> Transfer:
+def compare_groups(groups: Mapping[str, Sequence[Run]]) -> GroupComparison:
     """Calibrate each group of runs and compare the groups.
 
     Parameters
@@ -146,25 +88,57 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> Transfer:
 
 def compare_calibrations(
     results: Mapping[str, CalibrationResult], recordings: Mapping[str, Sequence[Recording]]
-) -> Transfer:
+) -> GroupComparison:
     """Compare calibrations of groups of recordings; see `compare_groups`."""
     tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
     for (row, result), (column, own) in product(results.items(), results.items()):
         if _of_one_robot(result.calibration, own.calibration):
             tested.setdefault((row, column), _test(result, recordings[column], own=False))
         else:
-            known = tested[column, column]
-            tested[row, column] = known._replace(errors=np.full_like(known.errors, np.nan))
-    cells = (cell for row, column in product(results, results) for cell in _cells(row, column, tested))
+            held_out = tested[column, column]
+            tested[row, column] = held_out._replace(errors=np.full_like(held_out.errors, np.nan))
+    cells = [cell for row, column in product(results, results) for cell in _cells(row, column, tested[row, column])]
+    costs = [
+        TransferCost(*astuple(errors), calibrated_on=row, tested_on=column)
+        for row, column in product(results, results) if row != column
+        for errors in _differences(tested[column, column], tested[row, column], paired=True)
+    ]  # fmt: skip
     first, *others = results
     pairs = []
     for other in others:
         (one, *_), (two, *_) = groups = recordings[first], recordings[other]
         paired = len(groups[0]) == len(groups[1]) == 1 and same_route(one.track, two.track)
         parameters = _parameter_differences(results[first].calibration, results[other].calibration)
-        errors = _differences(tested[first, first], tested[other, other], paired=paired)
-        pairs.append(Pair(first, other, parameters, dict(zip(HORIZONS_M, errors, strict=True)), paired))
-    return Transfer({name: one.calibration for name, one in results.items()}, tuple(pairs), tuple(cells))
+        found = _differences(tested[first, first], tested[other, other], paired=paired)
+        at_choice = (first, other, CHOICE_HORIZON_M)
+        cost = next(one for one in costs if (one.calibrated_on, one.tested_on, one.horizon_m) == at_choice)
+        sentence = _verdict(first, other, parameters, cost)
+        errors = tuple(ErrorDifference(*astuple(one), paired=paired) for one in found)
+        pairs.append(ComparedPair(first, other, parameters, errors, sentence))
+    return GroupComparison(
+        schema=COMPARE_SCHEMA, tool_version=__version__,
+        groups={name: _group(one.calibration) for name, one in results.items()},
+        pairs=tuple(pairs), transfer=tuple(cells), costs=tuple(costs),
+    )  # fmt: skip
+
+
+def _group(calibration: Calibration) -> ComparedGroup:
+    return ComparedGroup(calibration.recommended, calibration.logs, calibration.geometry()[0]._asdict())
+
+
+def _verdict(first: str, second: str, parameters: Sequence[ParameterDifference], cost: TransferCost) -> str:
+    """Return one sentence: how the multiplier differs, and what the calibration of the first costs on the second."""
+    one = next(one for one in parameters if one.quantity == "multiplier")
+    change = f"by {with_std(one.difference, one.std)}"
+    if not one.significant:
+        change += ", which may be chance"
+    if cost.p95_m is None:
+        return f"The multiplier of {second} differs from that of {first} {change}."
+    low, high = cost.p95_low_m, cost.p95_high_m
+    sentence = f"costs {with_interval(cost.p95_m, low, high)} at 95 % after {CHOICE_HORIZON_M:g} m on {second}"
+    if low is not None and high is not None and low <= 0.0 <= high:
+        sentence += ", which may be chance"
+    return f"The multiplier of {second} differs from that of {first} {change}; a calibration of {first} {sentence}."
 
 
 def _of_one_robot(one: Calibration, other: Calibration) -> bool:
@@ -195,7 +169,7 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
 class _Sums(NamedTuple):
     """The trials of one horizon: p95 and mean [m] with their intervals, and the sums of blocks of path."""
 
-    errors: ErrorEstimate
+    errors: ErrorsAt
     blocks: BlockSums | None
 
 
@@ -205,10 +179,10 @@ def _sum_up(errors_m: Floats, path_m: Floats, horizon_m: float) -> _Sums:
     blocks = cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
     sums = block_sums(errors_m, blocks, sort_trials(errors_m), p50, p95)
     low, high, p95_low, p95_high = error_intervals(errors_m, blocks, sums, p95)
-    return _Sums(ErrorEstimate(p95, p95_low, p95_high, expected, low, high), sums)
+    return _Sums(ErrorsAt(horizon_m, *map(known, (p95, p95_low, p95_high, expected, low, high))), sums)
 
 
-def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[ErrorEstimate]:
+def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[ErrorsAt]:
     """Return the difference of errors at each horizon, second minus first; of the same trials only where both are."""
     found = []
     same = np.array_equal(first.path, second.path)
@@ -218,23 +192,23 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[Error
             both = np.isfinite(sides[0]) & np.isfinite(sides[1])
             sides = [np.where(both, one, np.nan) for one in sides]
         before, after = (_sum_up(side, one.path, horizon) for side, one in zip(sides, (first, second), strict=True))
-        numbers = []
+        numbers: list[float | None] = []
         for metric, name in (("p95", "p95_m"), ("expected", "expected_m")):
-            more = getattr(after.errors, name) - getattr(before.errors, name)
+            then, now = getattr(before.errors, name), getattr(after.errors, name)
+            more = math.nan if then is None or now is None else now - then
             half = difference_half_width(after.blocks, before.blocks, metric, 1.0, paired=paired)
-            numbers += [more, more - half, more + half]
-        found.append(ErrorEstimate(*numbers))
+            numbers += [known(more), known(more - half), known(more + half)]
+        found.append(ErrorsAt(horizon, *numbers))
     return found
 
 
-def _cells(row: str, column: str, tested: Mapping[tuple[str, str], _Tested]) -> Iterator[Cell]:
+def _cells(row: str, column: str, tested: _Tested) -> Iterator[TransferCell]:
     """Yield the cells of one row and column, a horizon each."""
-    own, foreign = tested[column, column], tested[row, column]
-    costs = [None] * len(HORIZONS_M) if row == column else _differences(own, foreign, paired=True)
-    for h, (horizon, cost) in enumerate(zip(HORIZONS_M, costs, strict=True)):
-        errors = foreign.errors[:, h]
+    for h, horizon in enumerate(HORIZONS_M):
+        errors = tested.errors[:, h]
         trials = int(np.count_nonzero(np.isfinite(errors)))
-        yield Cell(row, column, horizon, trials, _sum_up(errors, foreign.path, horizon).errors, cost)
+        sums = _sum_up(errors, tested.path, horizon)
+        yield TransferCell(*astuple(sums.errors), calibrated_on=row, tested_on=column, trials=trials)
 
 
 def same_route(first: Track, second: Track) -> bool:
@@ -257,13 +231,11 @@ def _check_apart(recordings: Mapping[str, Sequence[Recording]]) -> None:
                 raise ConfigError(one.name, why, "a calibration would be tested on what it was fitted to")
 
 
-def _parameter_differences(first: Calibration, second: Calibration) -> tuple[Difference, ...]:
+def _parameter_differences(first: Calibration, second: Calibration) -> tuple[ParameterDifference, ...]:
     (before, covariance_before), (after, covariance_after) = first.geometry(), second.geometry()
-    places = [TrackGeometry._fields.index(name) for name in COMPARED]
-    return tuple(
-        Difference(
-            name, before[k], after[k], after[k] - before[k],
-            math.sqrt(covariance_before[k, k] + covariance_after[k, k]),
-        )
-        for name, k in zip(COMPARED, places, strict=True)
-    )  # fmt: skip
+    found = []
+    for name in COMPARED:
+        k = TrackGeometry._fields.index(name)
+        difference, std = after[k] - before[k], math.sqrt(covariance_before[k, k] + covariance_after[k, k])
+        found.append(ParameterDifference(name, before[k], after[k], difference, std, abs(difference) > TWO_SIDED * std))
+    return tuple(found)

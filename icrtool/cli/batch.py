@@ -23,8 +23,7 @@ from icrtool.records.text import LogText, counted, escaped, shortened
 if TYPE_CHECKING:
     from icrtool.fleet.batch import BatchOptions
     from icrtool.fleet.one_log import ReportOptions, Request
-    from icrtool.fleet.roll_up import PooledCalibration
-    from icrtool.fleet.row import Row
+    from icrtool.records.fleet_document import FleetCalibration, FleetLog
 
 LONGEST_STAGE, LEAST_NAME = 28, 12
 """Characters of the live line for the stage of a log with its separators, and for its name at least."""
@@ -101,7 +100,7 @@ def command(
 def run_all(
     requests: Sequence[Request], jobs: int | None, scheduler: str | None, worker_timeout_s: float,
     batch: BatchOptions, view: View, folder: Path,
-) -> list[Row]:  # fmt: skip
+) -> list[FleetLog]:  # fmt: skip
     """Process all logs, and return a row of each, in the order of the requests.
 
     Parameters
@@ -112,7 +111,7 @@ def run_all(
     from icrtool.fleet.one_log import path_of
     from icrtool.fleet.processes import executor_of
 
-    rows: list[Row] = []
+    rows: list[FleetLog] = []
     with (
         executor_of([path_of(one.path) for one in requests], jobs, scheduler, worker_timeout_s) as (executor, lost),
         closing(view),
@@ -126,7 +125,7 @@ def run_all(
 
 
 def write_exports(
-    rows: Sequence[Row], calibrations: Sequence[PooledCalibration], missing: Sequence[str], page: Path | None, *,
+    rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibration], missing: Sequence[str], page: Path | None, *,
     junit: Path | None, markdown: Path | None,
 ) -> None:  # fmt: skip
     """Write the page of the fleet, and what machines that watch pull requests read, where they are asked for."""
@@ -151,14 +150,16 @@ def write_exports(
 
 
 def print_results(
-    rows: Sequence[Row], calibrations: Sequence[PooledCalibration], output: Path, written: str, *, quiet: bool,
+    rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibration], output: Path, written: str, *, quiet: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
     """Print the results of the logs; `written`: what stands in the folder of the results."""
     from icrtool.fleet.fleet_files import calibrations_text, fleet_document
 
     if as_json:
-        print_json("batch", fleet_document(rows, calibrations) | {"output": escaped(str(output))})
+        from msgspec.structs import replace
+
+        print_json("batch", replace(fleet_document(rows, calibrations), output=escaped(str(output))))
     elif not quiet:
         click.echo(summary_of(rows, output, written))
         if calibrations:
@@ -184,7 +185,7 @@ class View:
         self._stages[log] = stage
         self._show()
 
-    def row(self, row: Row) -> None:
+    def row(self, row: FleetLog) -> None:
         """Show the result of a log."""
         self._stages.pop(row.log, None)
         self._counts[row.status] += 1
@@ -199,7 +200,7 @@ class View:
             click.echo(line_of(row))
         for verdict in row.verdicts:
             if not verdict.passed:
-                click.echo(escaped(verdict.line()), err=True)
+                click.echo(escaped(verdict.line), err=True)
         self._show()
 
     def _show(self) -> None:
@@ -226,7 +227,7 @@ class View:
             click.echo("\r\x1b[2K", err=True, nl=False)
 
 
-def line_of(row: Row) -> str:
+def line_of(row: FleetLog) -> str:
     """Return a line about a log that could be used."""
     # Of a log that can be used, the only reason is that its end is missing.
     word = "skipped" if row.this_time == "skipped" else "cut off" if row.usable and row.reason else row.status
@@ -250,9 +251,9 @@ def files_written(folder: Path) -> str:
     return ", ".join(f"{name}/" if (folder / name).is_dir() else name for name in files if (folder / name).exists())
 
 
-def summary_of(rows: Sequence[Row], output: Path, written: str) -> str:
+def summary_of(rows: Sequence[FleetLog], output: Path, written: str) -> str:
     """Return the last line: how many logs were done or failed, and where the tables are."""
-    from icrtool.fleet.row import counts_text
+    from icrtool.fleet.fleet_files import counts_text
 
     parts = [counts_text(rows)]
     failed_gates = sum(row.gates_failed for row in rows)

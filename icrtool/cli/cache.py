@@ -70,6 +70,7 @@ def call_all_kernels() -> None:
     from icrtool.kernels.open_loop.trials import FrozenIcrs
     from icrtool.logs.writing.log import WriteOptions, write_log
     from icrtool.records.run import track_of
+    from icrtool.records.unfinished import unfinished
     from icrtool.simulation.drives import DrivePlan, Sensors
     from icrtool.simulation.record import simulate
     from icrtool.simulation.studies import default_request, run_study
@@ -79,7 +80,7 @@ def call_all_kernels() -> None:
     options = WriteOptions(
         wheel_radius_m=needed(config, "wheel_radius_m"), track_width_m=needed(config, "track_width_m")
     )
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, unfinished(Path(folder)):
         log = icrtool.read_log(write_log(Path(folder) / "drive.mcap", columns, options), config)
     run = icrtool.fit(log, config)
     icrtool.dropout(run)

@@ -46,7 +46,7 @@ def command(
     from icrtool.output.files.atomic import write_file
     from icrtool.output.files.json_file import json_bytes
     from icrtool.output.files.picture_file import save_picture
-    from icrtool.output.tables.transfer import brief_transfer, format_transfer, transfer_csv, transfer_document
+    from icrtool.output.tables.transfer import brief_transfer, format_transfer, transfer_csv
 
     config = options.load(config_file, robot, sets)
     places = _groups(sources)
@@ -55,19 +55,18 @@ def command(
     runs = runs_of([path for _, path in found], config, quiet=quiet, verbose=verbose)
     for (name, _), run in zip(found, runs, strict=True):
         groups.setdefault(name, []).append(run)
-    transfer = compare_groups(groups)
-    document = transfer_document(transfer)
-    for file, content in ((csv_file, transfer_csv(transfer)), (output, json_bytes(document))):
+    compared = compare_groups(groups)
+    for file, content in ((csv_file, transfer_csv(compared)), (output, json_bytes(compared))):
         if file is not None:
             write_file(file, content)
     if plot is not None:
         from icrtool.output.figures.transfer import transfer as transfer_figure
 
-        save_picture(transfer_figure(document), plot)
+        save_picture(transfer_figure(compared), plot)
     if as_json:
-        print_json("compare", document)
+        print_json("compare", compared)
     elif not quiet:
-        show(format_transfer(transfer) if verbose else brief_transfer(transfer))
+        show(format_transfer(compared) if verbose else brief_transfer(compared))
 
 
 def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:

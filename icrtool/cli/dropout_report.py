@@ -223,7 +223,7 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
     else:
         for verdict in report.verdicts:
             if not verdict.passed:
-                click.echo(verdict.line(), err=True)
+                click.echo(verdict.verdict, err=True)
     return report
 
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    import msgspec
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -16,16 +19,17 @@ def json_option(command: Command) -> Command:
     return click.option("--json", "as_json", is_flag=True, help=text)(command)
 
 
-def print_json(command: str, document: Mapping[str, Any]) -> None:
+def print_json(command: str, document: msgspec.Struct | Mapping[str, object]) -> None:
     """Print the document of a command; its schema is ``icrtool/<command>/1``, whatever `document` states.
 
     Parameters
     ----------
     command : its name on the command line
-    document : plain data and numpy's; numbers that are not finite become null
+    document : a record, or plain data and numpy's; numbers that are not finite become null
     """
     from icrtool import __version__
     from icrtool.output.files.json_file import json_bytes
+    from icrtool.records.plain_data import plain
 
     own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
-    click.echo(json_bytes(own | {key: value for key, value in document.items() if key not in own}), nl=False)
+    click.echo(json_bytes(own | {key: value for key, value in plain(document).items() if key not in own}), nl=False)

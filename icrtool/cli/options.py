@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from icrtool.errors import IcrToolError
     from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.dropout import Verdict
+    from icrtool.records.fleet_document import FleetVerdict
     from icrtool.records.late_output import FigureSet
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -225,11 +226,11 @@ def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
     return None
 
 
-def check_compared(verdicts: Iterable[Verdict]) -> None:
+def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
     """Refuse a baseline that has none of the logs: a gate that is never checked would always pass."""
     from icrtool.errors import ConfigError
 
-    relative = [bool(one.not_checked) for one in verdicts if one.gate.baseline_factor]
+    relative = [bool(one.not_checked) for one in verdicts if one.relative]
     if relative and all(relative):
         raise ConfigError("--baseline", "none of these logs is in it", "logs are matched by content, else by name")
 

@@ -54,24 +54,22 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
 
 def _page_of(source: Path, *, coordinates: bool) -> str:
     """Return the page of a run, a fleet or a comparison."""
-    import json
-
     from icrtool.errors import RunError
-    from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, schema_of
-    from icrtool.output.page.comparison_page import comparison_in, comparison_page
+    from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, read_fleet, schema_of
+    from icrtool.output.page.comparison_page import comparison_in, comparison_page, read_comparison
     from icrtool.output.page.fleet_page import fleet_page
     from icrtool.output.run_directory import is_run_directory
-    from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_regular
+    from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
 
     if is_run_directory(source):
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
             return _page_of_run(source, coordinates=coordinates)
     if schema_of(source / FLEET_FILE, source).startswith(FLEET_FAMILY):
         with _as_written(source / FLEET_FILE, "run icrtool batch again"):
-            return fleet_page(json.loads(read_regular(source / FLEET_FILE, source)), source)
+            return fleet_page(read_fleet(source), source)
     if (file := comparison_in(source)) is not None:
         with _as_written(file, "run icrtool compare again"):
-            return comparison_page(json.loads(read_regular(file, source if source.is_dir() else None)), file.stem)
+            return comparison_page(read_comparison(file, source if source.is_dir() else None), file.stem)
     if is_special(source):
         raise RunError(source, NOT_REGULAR, SAVE_IT)
     what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 
 import numpy as np
+from msgspec.structs import asdict, astuple
 
 from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.report import DropoutReport
@@ -15,8 +16,8 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.open_loop.block_sums import BlockSums, difference_half_width
 from icrtool.kernels.within_budget import within_budget
 from icrtool.motion.models import FAMILY
-from icrtool.records.dropout import METRICS, BudgetDistance, Gate, ModelResult, Verdict
-from icrtool.records.plain_data import plain
+from icrtool.records.dropout import METRICS, BudgetDistance, CheckedGate, Gate, ModelResult, Verdict
+from icrtool.records.plain_data import known
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(
@@ -107,7 +108,8 @@ def check_gate(
         h = _place(gate, report)
         value, sums = float(getattr(result.summary, METRICS[gate.metric][0])[h]), result.block_sums[h]
     if gate.baseline_factor and baseline is None:
-        return Verdict(gate, True, plain(value), log=report.name, not_checked="this log is not in the baseline")
+        why = "this log is not in the baseline"
+        return verdict_on(CheckedGate(*astuple(gate), value_m=known(value), passed=True, not_checked=why), report.name)
     half_width, before = math.nan, math.nan
     if gate.baseline_factor and baseline is not None:
         before, old = _before(gate, baseline)
@@ -119,16 +121,24 @@ def check_gate(
     passed = _RELATIONS[gate.relation](value, bound)
     if not strict and not passed and margin + half_width >= 0.0:
         passed = True
-    low, high = margin - half_width, margin + half_width
-    return Verdict(gate, passed, *plain((value, margin, low, high, bound, before, report.name)))
+    checked = CheckedGate(
+        *astuple(gate), passed=passed, value_m=known(value), value_bound_m=known(bound), baseline_m=known(before),
+        margin_m=known(margin), margin_low_m=known(margin - half_width), margin_high_m=known(margin + half_width),
+    )  # fmt: skip
+    return verdict_on(checked, report.name)
+
+
+def verdict_on(checked: CheckedGate, log: str) -> Verdict:
+    """Return a limit that was checked with the line about it, which names the log."""
+    return Verdict(**asdict(checked), verdict=checked.line(log))
 
 
 def _place(gate: Gate, report: DropoutReport) -> int:
     """Return the place of a gate's horizon among those of the report."""
     places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m or math.nan))
     if not len(places):
-        known = ", ".join(f"{horizon:g}" for horizon in report.horizons_m)
-        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", f"use {known}")
+        found = ", ".join(f"{horizon:g}" for horizon in report.horizons_m)
+        raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", f"use {found}")
     return int(places[0])
 
 
@@ -149,6 +159,6 @@ def _result(gate: Gate, report: DropoutReport) -> ModelResult:
         return result
     if gate.model.removesuffix("_gyro") in FORMER_ROWS:
         raise ConfigError(f"gate {gate.text!r}", "no such row", "use recommended")
-    known = ", ".join(one.name for one in report.results)
-    advice = f"this run has {known}; no_slip needs robot.track_width_m"
+    found = ", ".join(one.name for one in report.results)
+    advice = f"this run has {found}; no_slip needs robot.track_width_m"
     raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)

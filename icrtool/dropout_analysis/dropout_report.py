@@ -8,12 +8,13 @@ from dataclasses import replace
 from typing import Literal
 
 import msgspec
+from msgspec.structs import astuple
 
 from icrtool.calibration.model_comparison import ComparedModels, compare_models
 from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import turning_recording_of
-from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
+from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate, verdict_on
 from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
@@ -26,7 +27,7 @@ from icrtool.dropout_analysis.straight_and_turning import split_by_turning
 from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
-from icrtool.records.dropout import DEFAULT_SEED, Gate, Outage, UsedCalibration, Verdict
+from icrtool.records.dropout import DEFAULT_SEED, CheckedGate, Gate, Outage, UsedCalibration
 from icrtool.records.memory import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type
 
@@ -116,7 +117,7 @@ def dropout_report(
         outages=(*forced, *real_outages(compared)),
         budgets=() if unusable else tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
         verdicts=tuple(
-            Verdict(gate, False, None, log=run.name, unusable=unusable)
+            verdict_on(CheckedGate(*astuple(gate), value_m=None, passed=False, unusable=unusable), run.name)
             if unusable
             else check_gate(gate, report, baseline, strict=strict)
             for gate in limits

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
 import msgspec
+from msgspec.structs import replace
 
 from icrtool import __version__
 from icrtool.config import Config, builtin_robots, load_config
@@ -19,10 +20,10 @@ from icrtool.fleet.fleet_files import check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
-from icrtool.fleet.recordings import FoundRecording, find_recordings, logs_among
-from icrtool.fleet.row import RUNS, File, Row, as_text
+from icrtool.fleet.recordings import FoundRecording, as_text, find_recordings, logs_among
 from icrtool.logs.containers.remote_file import RemoteFile
 from icrtool.logs.containers.split_files import files_of_log
+from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
 from icrtool.records.regular_file import read_regular
 from icrtool.records.urls import UrlPath
 
@@ -102,7 +103,7 @@ def plan(
     return [_request(one, about(one.path, entries), output, options, baseline) for one in find_recordings(searched)]
 
 
-def finished(request: Request, folder: Path) -> Row | None:
+def finished(request: Request, folder: Path) -> FleetLog | None:
     """Return the row of a log that an earlier batch processed with the same input, configuration and version.
 
     A log that failed for a reason of its own, and would fail again, counts as processed.
@@ -115,7 +116,7 @@ def finished(request: Request, folder: Path) -> Row | None:
     from icrtool.output.run_directory import PAGE_FILE
 
     try:
-        row = msgspec.json.decode(read_regular(folder / request.row_file, folder), type=Row)
+        row = msgspec.json.decode(read_regular(folder / request.row_file, folder), type=FleetLog)
     except (OSError, ValueError):
         return None
     if row.key != request.row.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
@@ -130,7 +131,7 @@ def finished(request: Request, folder: Path) -> Row | None:
 def run_batch(
     requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None = None,
     lost: Lost = str, folder: Path | None = None,
-) -> Generator[Row, None, None]:  # fmt: skip
+) -> Generator[FleetLog, None, None]:  # fmt: skip
     """Yield the row of each log as it comes; what died or hung is tried once more when all others are done.
 
     Parameters
@@ -163,8 +164,8 @@ def run_batch(
 
 def _all_of(
     requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None, lost: Lost
-) -> Generator[tuple[Request, Row], None, None]:
-    pending: dict[Future[Row], Request] = {}
+) -> Generator[tuple[Request, FleetLog], None, None]:
+    pending: dict[Future[FleetLog], Request] = {}
     try:
         for request in requests:
             if why := lost():
@@ -189,7 +190,7 @@ def _all_of(
         raise
 
 
-def _row_of(future: Future[Row], request: Request) -> Row:
+def _row_of(future: Future[FleetLog], request: Request) -> FleetLog:
     """Return the row of a log, also where a cluster lost the work on it."""
     try:
         return future.result()
@@ -205,7 +206,7 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
                 "budgets": report.budgets_m, "ladder": report.ladder, "robot": known.robot,
                 "baseline": baseline, "strict": report.strict, "allow_unusable": report.allow_unusable}  # fmt: skip
     key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
-    row = Row(
+    row = FleetLog(
         one.log, f"{RUNS}/{one.name}", "failed", usable=False, robot=known.robot, group=known.group, tags=known.tags,
         key=key,
     )  # fmt: skip
@@ -227,7 +228,7 @@ def _config(one: FoundRecording, known: About, options: BatchOptions) -> Config:
     return load_config(known.config or options.config_file, robot, options.sets)
 
 
-def _same_files(stored: Sequence[File], path: Path) -> bool:
+def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
     """Return whether a log's files are those of an earlier batch; content is compared where their time differs."""
     if isinstance(path, UrlPath):
         return bool(stored) and _is_unchanged(stored[0], path)
@@ -246,7 +247,7 @@ def _same_files(stored: Sequence[File], path: Path) -> bool:
     return True
 
 
-def _is_unchanged(before: File, path: UrlPath) -> bool:
+def _is_unchanged(before: FleetFile, path: UrlPath) -> bool:
     """Return whether what lies at an address has the size and version that it had."""
     try:
         now = RemoteFile(path)

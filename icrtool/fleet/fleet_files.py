@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from icrtool import __version__
 from icrtool.errors import OutputError
-from icrtool.fleet.roll_up import CALIBRATIONS, MOST_POOLED_S, PooledCalibration
-from icrtool.fleet.row import ROWS, RUNS, SHOWN_ERROR, SHOWN_WITHOUT, Row, as_text, columns_of, counts_text
+from icrtool.fleet.recordings import as_text
+from icrtool.fleet.roll_up import CALIBRATIONS, MOST_POOLED_S
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import disk
 from icrtool.output.files.atomic import atomic_file, make_folders, write_file
@@ -23,16 +22,32 @@ from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, json_bytes,
 from icrtool.output.files.own_files import check_place, is_page
 from icrtool.output.run_directory import PAGE_FILE, PLOT_FORMATS
 from icrtool.output.text_format import MODEL_WORDS
-from icrtool.records.dropout import Verdict
+from icrtool.records.fleet_document import (
+    FLEET_SCHEMA,
+    ROWS,
+    RUNS,
+    SHOWN_ERROR,
+    SHOWN_WITHOUT,
+    FleetCalibration,
+    FleetCounts,
+    FleetDocument,
+    FleetLog,
+)
+from icrtool.records.plain_data import rows_of
+from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.text import LogText, counted, escaped
 
 if TYPE_CHECKING:
     from icrtool.output.exports.acceptance import Suite
 
-FLEET_SCHEMA = "icrtool/fleet/1"
+BEFORE_ICRS = ("log", "status", "this_time", "reason", "robot", "group", "start_utc", "duration_s", "distance_m")
+AFTER_ERRORS = ("events", "outages", "warnings", "tool_version", "run")
+"""Columns of fleet.csv that a log has as they are."""
+
+WITHIN, IS_BOUND = "_within_", "_is_bound"
+"""Parts of the names of the columns of a distance within a budget, and of whether that is a lower bound (1) or not."""
 
 FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
-
 
 PLOTS = "plots"
 
@@ -68,30 +83,41 @@ def check_tables(folder: Path, *, page: bool) -> None:
             raise OutputError(file, "a file that no batch wrote is there", "it is left alone; name another folder")
 
 
-def fleet_document(rows: Sequence[Row], calibrations: Sequence[PooledCalibration] = ()) -> dict[str, Any]:
+def fleet_document(rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibration] = ()) -> FleetDocument:
     """Return what fleet.json holds: how many logs were done or failed, all of each, and the pooled calibrations."""
     counts = Counter(row.status for row in rows) + Counter(row.this_time for row in rows)
-    return {
-        "schema": FLEET_SCHEMA,
-        "tool_version": __version__,
-        "counts": {status: counts[status] for status in ("done", "failed", "skipped")},
-        "gates_failed": sum(row.gates_failed for row in rows),
-        "calibrations": [asdict(one) for one in calibrations],
-        "logs": [msgspec.to_builtins(row) | {"verdicts": [_verdict(one) for one in row.verdicts]} for row in rows],
+    return FleetDocument(
+        schema=FLEET_SCHEMA,
+        tool_version=__version__,
+        counts=FleetCounts(counts["done"], counts["failed"], counts["skipped"]),
+        gates_failed=sum(row.gates_failed for row in rows),
+        calibrations=tuple(calibrations),
+        logs=tuple(rows),
+    )
+
+
+def fleet_columns(rows: Sequence[FleetLog]) -> dict[str, list[object]]:
+    """Return the columns of fleet.csv, those of the errors in the order of models and horizons."""
+    errors = list(dict.fromkeys(name for row in rows for name in row.errors))
+    found: dict[str, list[object]] = {name: [getattr(row, name) for row in rows] for name in BEFORE_ICRS}
+    found |= {
+        name: [row.icr.get(name) for row in rows] for name in (*ICR_COLUMNS, *(f"std_{one}" for one in ICR_COLUMNS))
     }
-
-
-def _verdict(one: Verdict) -> dict[str, Any]:
-    return {
-        "gate": one.gate.text, "value_m": one.value_m, "margin_m": one.margin_m, "passed": one.passed,
-        "line": one.line(), "relative": bool(one.gate.baseline_factor), "bound_m": one.bound_m,
-        "baseline_m": one.baseline_m, "margin_low_m": one.margin_low_m, "margin_high_m": one.margin_high_m,
-        "not_checked": one.not_checked,
-    }  # fmt: skip
+    found |= {name: [getattr(row, name) for row in rows] for name in ("multiplier", "multiplier_std")}
+    for name in errors:
+        found[name] = [row.errors.get(name) for row in rows]
+        if WITHIN in name:
+            bounds = [int(name in row.bounds) if row.errors.get(name) is not None else None for row in rows]
+            found[f"{name.removesuffix('_m')}{IS_BOUND}"] = list(bounds)
+    found |= {name: [getattr(row, name) for row in rows] for name in AFTER_ERRORS}
+    found["tags"] = [";".join(row.tags) for row in rows]
+    found["gates_failed"] = [row.gates_failed if row.status != "failed" else None for row in rows]
+    found["took_s"] = [row.took_s for row in rows]
+    return found
 
 
 def write_fleet(
-    rows: Sequence[Row], directory: Path, calibrations: Sequence[PooledCalibration] = (), plots: Sequence[str] = ()
+    rows: Sequence[FleetLog], directory: Path, calibrations: Sequence[FleetCalibration] = (), plots: Sequence[str] = ()
 ) -> None:
     """Write the tables and figures of a batch; those of an earlier one are replaced.
 
@@ -104,19 +130,12 @@ def write_fleet(
     OutputError
         The disk does not take them.
     """
-    columns = columns_of(rows)
-    cells = [row.columns() for row in rows]
-    write_file(
-        directory / "fleet.csv", csv_bytes(columns, [[row.get(name) for name in columns] for row in cells]), directory
-    )
-    failures = [msgspec.to_builtins(row) for row in rows if row.status == "failed"]
-    write_file(
-        directory / "failures.csv",
-        csv_bytes(FAILURES, [[row[name] for name in FAILURES] for row in failures]),
-        directory,
-    )
+    columns = fleet_columns(rows)
+    write_file(directory / "fleet.csv", csv_bytes(columns, zip(*columns.values(), strict=True)), directory)
+    failures = [[getattr(row, name) for name in FAILURES] for row in rows if row.status == "failed"]
+    write_file(directory / "failures.csv", csv_bytes(FAILURES, failures), directory)
     with atomic_file(directory / "fleet.parquet", directory) as file:
-        _write_parquet(columns, cells, file)
+        _write_parquet(columns, file)
     if calibrations:
         write_file(directory / "calibrations.txt", calibrations_text(calibrations), directory)
     if plots:
@@ -125,7 +144,7 @@ def write_fleet(
     write_file(directory / FLEET_FILE, json_bytes(fleet_document(rows, calibrations)), directory)
 
 
-def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool = True) -> str:
+def calibrations_text(calibrations: Sequence[FleetCalibration], *, tables: bool = True) -> str:
     """Return the pooled calibrations, a line each, or with their leave-one-log-out tables."""
     parts = []
     for one in calibrations:
@@ -143,7 +162,7 @@ def calibrations_text(calibrations: Sequence[PooledCalibration], *, tables: bool
     return ("\n\n" if tables else "\n").join(parts) + "\n"
 
 
-def write_figures(rows: Sequence[Row], folder: Path, formats: tuple[str, ...]) -> None:
+def write_figures(rows: Sequence[FleetLog], folder: Path, formats: tuple[str, ...]) -> None:
     """Draw the ICRs by robot and date, and the error of each log; older pictures are removed.
 
     Parameters
@@ -154,14 +173,14 @@ def write_figures(rows: Sequence[Row], folder: Path, formats: tuple[str, ...]) -
     from icrtool.output.figures.fleet import FleetNumbers
     from icrtool.output.files.picture_file import save_picture
 
-    points: list[dict[str, Any]] = []
+    points: list[FleetLog] = []
     errors: dict[str, dict[str, float]] = {}
     known = {name for row in rows for name in row.errors}
     model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", SHOWN_WITHOUT))
     for row in sorted(rows, key=lambda row: row.start_utc):
         shown = all(row.icr.get(name) is not None for name in ("y_icr_right_m", "y_icr_left_m"))
         if shown and row.start_utc:
-            points.append(msgspec.to_builtins(row))
+            points.append(row)
         if (error := row.errors.get(error_name)) is not None:
             name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, {})[row.log] = error
@@ -176,16 +195,16 @@ def write_figures(rows: Sequence[Row], folder: Path, formats: tuple[str, ...]) -
             disk.remove(old)
 
 
-def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file: Path) -> None:
+def _write_parquet(columns: Mapping[str, Sequence[object]], file: Path) -> None:
     import pyarrow as pa
     import pyarrow.json as pj
     import pyarrow.parquet as pq
 
     texts = {"log", "status", "this_time", "reason", "robot", "group", "start_utc", "tool_version", "run", "tags"}
-    counts = {"events", "outages", "warnings", "gates_failed"}
+    counts = {"events", "outages", "warnings", "gates_failed", *(name for name in columns if name.endswith(IS_BOUND))}
     kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in columns}
     # Names of files need not be text. As JSON, since to convert lists pyarrow would load pandas.
-    cells = ({name: as_text(row[name]) if name in texts else row.get(name) for name in columns} for row in rows)
+    cells = ({name: as_text(one) if name in texts else one for name, one in row.items()} for row in rows_of(columns))
     lines = b"\n".join(map(msgspec.json.encode, cells))
     table = pj.read_json(
         pa.BufferReader(lines), pj.ReadOptions(block_size=len(lines) + 1), pj.ParseOptions(pa.schema(kinds))
@@ -193,7 +212,15 @@ def _write_parquet(columns: Sequence[str], rows: Sequence[dict[str, Any]], file:
     pq.write_table(table, file)
 
 
-def suites_of(rows: Sequence[Row]) -> list[Suite]:
+def counts_text(rows: Sequence[FleetLog]) -> str:
+    """Return how many logs were done and failed, and how many of them by an earlier batch."""
+    counts = Counter(row.status for row in rows)
+    text = ", ".join(f"{counts[status]} {status}" for status in ("done", "failed") if counts[status])
+    skipped = sum(row.this_time == "skipped" for row in rows)
+    return f"{text} ({skipped} of them before, skipped this time)" if skipped else text
+
+
+def suites_of(rows: Sequence[FleetLog]) -> list[Suite]:
     """Return a suite per log."""
     # Not at import: it loads the analysis, which a batch that is finished does not need.
     from icrtool.output.exports.acceptance import Suite
@@ -201,7 +228,7 @@ def suites_of(rows: Sequence[Row]) -> list[Suite]:
     return [Suite(row.log, row.verdicts, row.reason if row.status == "failed" else "") for row in rows]
 
 
-def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
+def format_fleet_markdown(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> str:
     """Return a batch as Markdown: counts, limits that were missed, every log against the baseline, what changed.
 
     Parameters
@@ -215,7 +242,7 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     if verdicts := sorted((one for row in rows for one in row.verdicts), key=lambda one: one.passed):
         missed = sum(not one.passed for one in verdicts)
         lines += [f"**Acceptance limits not met: {missed}.**" if missed else "All acceptance limits are met.", ""]
-        lines += [*(f"- {escaped_markdown(one.line())}" for one in verdicts), ""]
+        lines += [*(f"- {escaped_markdown(one.line)}" for one in verdicts), ""]
     errors = []
     for row in rows:
         if row.status == "failed":
@@ -229,7 +256,7 @@ def format_fleet_markdown(rows: Sequence[Row], missing: Sequence[str] = ()) -> s
     return "\n".join([*lines, *([""] if changes else []), *(f"- {escaped_markdown(change)}" for change in changes), ""])
 
 
-def changes_of(rows: Sequence[Row], missing: Sequence[str]) -> list[str]:
+def changes_of(rows: Sequence[FleetLog], missing: Sequence[str]) -> list[str]:
     """Return how the logs, their configuration and the version differ from those of the baseline, a sentence each."""
     found = [f"not in this batch, but in the baseline: {', '.join(missing)}"] if missing else []
     new = [row.log for row in rows if row.status != "failed" and not row.baseline]

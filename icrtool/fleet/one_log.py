@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from hashlib import blake2b
@@ -17,13 +17,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from icrtool import __version__
 from icrtool.config import Config
 from icrtool.errors import IcrToolError, OutputError
-from icrtool.fleet.row import HORIZONS_M, ROWS, RUNS, File, Row, as_text
+from icrtool.fleet.recordings import as_text
 from icrtool.logs.containers.channel import truncation
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
+from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.late_output import FigureSet
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
@@ -35,8 +37,12 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.baseline import BaselineReport
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.dropout_analysis.trials import ErrorSink
+    from icrtool.records.dropout import BudgetDistance
     from icrtool.records.run import Run, WarmStart
     from icrtool.records.run_document import RunDocument
+
+HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
+"""Distances whose errors a batch collects."""
 
 Stage = Callable[[str], None]
 """Called with what is done next."""
@@ -176,7 +182,7 @@ class Request:
     """
 
     path: bytes
-    row: Row
+    row: FleetLog
     folder: bytes
     config: Config
     report: ReportOptions
@@ -208,7 +214,7 @@ def decode_request(line: bytes) -> Request:
     return _REQUEST.decode(line)
 
 
-def process(request: Request, stage: Stage) -> Row:
+def process(request: Request, stage: Stage) -> FleetLog:
     """Fit a log, analyse the run, write both, and return its row; one that cannot be used gives a row with the reason.
 
     Parameters
@@ -238,9 +244,9 @@ def process(request: Request, stage: Stage) -> Row:
     return row
 
 
-def failed(request: Request, reason: str, *, details: str = "", repeatable: bool) -> Row:
+def failed(request: Request, reason: str, *, details: str = "", repeatable: bool) -> FleetLog:
     """Return the row of a log that could not be processed."""
-    inputs: tuple[File, ...] = ()
+    inputs: tuple[FleetFile, ...] = ()
     with suppress(OSError):  # a log that was removed meanwhile, or is a device
         inputs = files_of(path_of(request.path)) if repeatable else ()
     return replace(
@@ -249,13 +255,13 @@ def failed(request: Request, reason: str, *, details: str = "", repeatable: bool
     )  # fmt: skip
 
 
-def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[File, ...]:
+def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, ...]:
     """Return the files of a log with their sha256; those in `inputs` are not read again.
 
     Of an address, `inputs` is all that is known.
     """
     if isinstance(path, UrlPath):
-        return tuple(File(one.path, one.bytes, 0, one.sha256, one.version or one.etag or "") for one in inputs)
+        return tuple(FleetFile(one.path, one.bytes, 0, one.sha256, one.version or one.etag or "") for one in inputs)
     hashes = {file.path: file.sha256 for file in inputs}
     found = []
     for file in files_of_log(path):
@@ -263,11 +269,11 @@ def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[File, ...]:
         if digest is None:
             digest = file_sha256(file)
         status = file.stat()
-        found.append(File(as_text(file), status.st_size, status.st_mtime_ns, digest))
+        found.append(FleetFile(as_text(file), status.st_size, status.st_mtime_ns, digest))
     return tuple(found)
 
 
-def _results(request: Request, stage: Stage) -> Row:
+def _results(request: Request, stage: Stage) -> FleetLog:
     """Fit and analyse a log, write run and report."""
     from icrtool.output.files.baseline_file import open_baseline
 
@@ -285,7 +291,7 @@ def _results(request: Request, stage: Stage) -> Row:
     return _row(request, run.document, int(run.table.stamp_ns[0]), reports[0])
 
 
-def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> Row:
+def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> FleetLog:
     icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}
     controller = summary.controller
     if controller is None and report.calibration is not None:
@@ -306,10 +312,11 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         multiplier=None if controller is None else controller.multiplier,
         multiplier_std=None if controller is None else controller.multiplier_std,
         errors=_errors(report),
+        bounds=tuple(_within_name(one) for one in report.budgets if one.beyond),
         events=len(summary.events),
         outages=len(report.outages),
         warnings=len(summary.warnings),
-        verdicts=tuple(replace(one, log=request.row.log) for one in report.verdicts),
+        verdicts=tuple(fleet_verdict(one, request.row.log) for one in report.verdicts),
         baseline=_baseline_numbers(report),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
         inputs=files_of(path_of(request.path), summary.inputs),
@@ -328,8 +335,12 @@ def _errors(report: DropoutReport) -> dict[str, float | None]:
                 errors[f"{result.name}_p95_{horizon_m:g}m_m"] = plain(result.summary.p95[h])
                 errors[f"{result.name}_expected_{horizon_m:g}m_m"] = plain(result.summary.expected[h])
     for budget in report.budgets:
-        errors[f"{budget.model}_within_{budget.budget_m:g}m_m"] = plain(budget.distance_m)
+        errors[_within_name(budget)] = plain(budget.distance_m)
     return errors
+
+
+def _within_name(one: BudgetDistance) -> str:
+    return f"{one.model}_within_{one.budget_m:g}m_m"
 
 
 def _baseline_numbers(report: DropoutReport) -> dict[str, float | None]:

@@ -23,16 +23,16 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 import msgspec
+from msgspec.structs import replace
 
 from icrtool.errors import ConfigError
 from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
-from icrtool.fleet.row import Row
 from icrtool.logs.containers.split_files import files_of_log
+from icrtool.records.fleet_document import FleetLog
 from icrtool.records.memory import give_back_freed
 from icrtool.records.unfinished import remove_unfinished
 
@@ -67,7 +67,7 @@ PROCESS_BYTES = 400 << 20
 LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
 """Memory of a log: so many times its size, at most that of 10 h at 100 Hz."""
 
-_ANSWER: msgspec.json.Decoder[str | Row] = msgspec.json.Decoder(str | Row)
+_ANSWER: msgspec.json.Decoder[str | FleetLog] = msgspec.json.Decoder(str | FleetLog)
 """Made at import: msgspec crashes where several threads are the first to use a type."""
 
 _over = threading.Event()
@@ -76,7 +76,7 @@ _idle: list[Worker] = []
 """Those of them that wait for a log; each thread that asks takes one, or starts one."""
 
 
-def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) -> Row:
+def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) -> FleetLog:
     """Process a log in a process of its own; one that hangs, or kills its process, gives a row with the reason.
 
     Parameters
@@ -222,13 +222,13 @@ class Worker:
         self._answers = _lines_of(self._process.stdout, lambda lines: lines.put(b""))
         _all.add(self)
 
-    def run(self, request: Request, timeout_s: float, stage: Stage | None) -> Row:
+    def run(self, request: Request, timeout_s: float, stage: Stage | None) -> FleetLog:
         """Process a log, as `process_apart`."""
         begun, begin_of_errors = time.monotonic(), self._errors.seek(0, os.SEEK_END)
         details = ""
         try:
             self._ask(request)
-            while not isinstance(answer := self._answer(begun + timeout_s), Row):
+            while not isinstance(answer := self._answer(begun + timeout_s), FleetLog):
                 if stage is not None:
                     stage(answer)
         except queue.Empty:
@@ -266,7 +266,7 @@ class Worker:
         self._process.stdin.write(request.encode() + b"\n")
         self._process.stdin.flush()
 
-    def _answer(self, end_s: float) -> str | Row:
+    def _answer(self, end_s: float) -> str | FleetLog:
         return _ANSWER.decode(self._answers.get(timeout=max(end_s - time.monotonic(), 0.0)))
 
     def _how_it_ended(self) -> str:
@@ -302,7 +302,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.set_threshold(100_000)
 
-    def send(answer: str | Row) -> None:
+    def send(answer: str | FleetLog) -> None:
         output.write(msgspec.json.encode(answer) + b"\n")
         output.flush()
 

@@ -11,7 +11,6 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from icrtool.errors import LogError
-from icrtool.fleet.row import as_text
 from icrtool.logs.containers.one_recording import (
     LEAST_OVERLAP_S,
     LOG_SUFFIXES,
@@ -258,3 +257,8 @@ def _absolute(path: Path) -> Path:
     if isinstance(path, UrlPath):
         return Path("/", *path.parts)
     return Path(os.path.normpath(path.absolute()))
+
+
+def as_text(path: object) -> str:
+    """Return a path as text that every file takes: bytes of its name that are no UTF-8 as escapes."""
+    return str(path).encode("utf-8", errors="backslashreplace").decode()

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from icrtool import __version__
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import unique_name
-from icrtool.fleet.row import File, Row
 from icrtool.output.files.atomic import make_folders
 from icrtool.output.files.calibration_file import write_calibration
-from icrtool.output.files.json_file import FLEET_FILE, InputFile, logs_of_fleet
-from icrtool.records.regular_file import is_regular, read_regular
+from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet, read_fleet
+from icrtool.records.fleet_document import BUDGET_M, FleetCalibration, FleetFile, FleetLog
+from icrtool.records.regular_file import is_regular
 from icrtool.records.run import Run
 
 CALIBRATIONS = "calibrations"
@@ -30,51 +28,9 @@ MOST_POOLED_S = 86_400.0
 """Of the logs of a robot and group, so much time is calibrated together, evenly spaced over all: about 1 GB."""
 
 
-BUDGET_M = 0.5
-"""Error within which the distance of a pooled calibration counts."""
-
-
-@dataclass(frozen=True, slots=True)
-class PooledCalibration:
-    """The calibration of all logs of one robot in one group.
-
-    Attributes
-    ----------
-    logs : that it is fitted to
-    left_out : logs that are not usable, copies, or beyond `MOST_POOLED_S`
-    file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
-    recommended, multiplier, multiplier_std : of the calibration
-    icrs_m : right, left, x of the calibration
-    within_m : distance over which 95 % of the held-out errors stay within `BUDGET_M`; within_beyond : at least that
-    table : leave-one-log-out table as text
-    """
-
-    robot: str
-    group: str
-    logs: tuple[str, ...]
-    left_out: tuple[str, ...] = ()
-    file: str = ""
-    reason: str = ""
-    recommended: str = ""
-    multiplier: float | None = None
-    multiplier_std: float | None = None
-    icrs_m: tuple[float, ...] = ()
-    within_m: float | None = None
-    within_beyond: bool = False
-    table: str = ""
-    key: str = ""
-
-    @property
-    def within_text(self) -> str:
-        """How far, as ``, within 0.5 m for 14.6 m``; empty where that is not known."""
-        if self.within_m is None:
-            return ""
-        return f", within {BUDGET_M:g} m (95 %) for {'more than ' if self.within_beyond else ''}{self.within_m:.1f} m"
-
-
 def pooled_calibrations(
-    rows: Sequence[Row], directory: Path, place: Path | None = None, *, allow_unusable: bool = False
-) -> Iterator[PooledCalibration]:
+    rows: Sequence[FleetLog], directory: Path, place: Path | None = None, *, allow_unusable: bool = False
+) -> Iterator[FleetCalibration]:
     """Yield the calibration of each robot in each group; one of the same logs as before is not fitted again.
 
     Parameters
@@ -95,13 +51,13 @@ def pooled_calibrations(
             yield known
         else:
             logs = tuple(row.log for row in members)
-            empty = PooledCalibration(robot, group, logs, key=key)
+            empty = FleetCalibration(robot, group, logs, key=key)
             yield _pooled(empty, members, directory, place or directory, name, allow_unusable=allow_unusable)
 
 
-def groups_of(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+def groups_of(rows: Sequence[FleetLog]) -> dict[tuple[str, str], list[FleetLog]]:
     """Return the logs that could be used, by robot and group."""
-    found: dict[tuple[str, str], list[Row]] = {}
+    found: dict[tuple[str, str], list[FleetLog]] = {}
     for row in rows:
         if row.status != "failed":
             found.setdefault((row.robot, row.group), []).append(row)
@@ -133,8 +89,8 @@ def is_fleet(directory: Path) -> bool:
 
 
 def _pooled(
-    one: PooledCalibration, members: Sequence[Row], directory: Path, place: Path, name: str, *, allow_unusable: bool
-) -> PooledCalibration:
+    one: FleetCalibration, members: Sequence[FleetLog], directory: Path, place: Path, name: str, *, allow_unusable: bool
+) -> FleetCalibration:
     from icrtool.calibration.from_runs import calibrate_runs
     from icrtool.output.stored_run import open_run
     from icrtool.output.tables.held_out import held_out_blocks
@@ -180,18 +136,17 @@ def _pooled(
     )  # fmt: skip
 
 
-def _content(inputs: Sequence[File | InputFile]) -> tuple[str, ...]:
+def _content(inputs: Sequence[FleetFile]) -> tuple[str, ...]:
     """Return what copies of a log have in common, whatever their names; of content that is not known, the place."""
     return tuple(sorted(file.sha256 or f"at {file.path}" for file in inputs))
 
 
-def _stored(directory: Path) -> list[PooledCalibration]:
+def _stored(directory: Path) -> tuple[FleetCalibration, ...]:
     """Return the calibrations of an earlier batch in the same folder."""
     try:
-        document: Mapping[str, Any] = json.loads(read_regular(directory / FLEET_FILE, directory))
-        return [msgspec.convert(one, PooledCalibration) for one in document.get("calibrations", [])]
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, msgspec.ValidationError):
-        return []
+        return read_fleet(directory).calibrations
+    except (OSError, ValueError, RecursionError):
+        return ()
 
 
 def _file_name(robot: str, group: str, taken: set[str]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,6 @@ from icrtool.records.dropout_document import (
     DropoutDocument,
     ErrorRow,
     EventCostDocument,
-    GateDocument,
     IntervalsDocument,
     LearnedDocument,
     ModelDocument,
@@ -164,13 +162,7 @@ def report_document(report: DropoutReport) -> DropoutDocument:
         budgets=report.budgets,
         by_turning=report.by_turning,
         ladder=comparison_document(report),
-        gates=tuple(
-            GateDocument(
-                **asdict(one.gate), **{key: getattr(one, key) for key in VERDICT_KEYS}, value_bound_m=one.bound_m,
-                not_checked=one.not_checked or None, unusable=one.unusable or None, verdict=one.line(),
-            )
-            for one in report.verdicts
-        ),
+        gates=report.verdicts,
         passed=report.passed,
         baseline=_baseline_document(report),
         outages=tuple(OutageDocument(*(getattr(one, name) for name in OUTAGE_KEYS)) for one in report.outages),
@@ -180,8 +172,6 @@ def report_document(report: DropoutReport) -> DropoutDocument:
 
 
 HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent")
-
-VERDICT_KEYS = ("value_m", "baseline_m", "margin_m", "margin_low_m", "margin_high_m", "passed")
 
 OUTAGE_KEYS = OutageDocument.__struct_fields__
 

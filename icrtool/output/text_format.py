@@ -117,37 +117,6 @@ def signed(metres: float) -> str:
     return f"{metres:+.3f}".replace("-", "−") if round(metres, 3) else "0.000"
 
 
-MOST_DIGITS = 5
-"""Decimals that are printed at most."""
-
-
-def digits_of(std: float, least: int = 2) -> int:
-    """Return the decimals that a value with this standard deviation needs: two digits of a `std` that begins with 1."""
-    if not 0.0 < std < math.inf:
-        return least
-    exponent = math.floor(math.log10(std))
-    return min(max(least, -exponent + (std < 2 * 10.0**exponent)), MOST_DIGITS)
-
-
-def with_std(value: float, std: float, least: int = 2) -> str:
-    """Return a difference with its standard deviation, as ``+0.004 ± 0.007``, with `least` decimals or more."""
-    digits = digits_of(std, least)
-    return f"{_rounded(value, digits)} ± {std:.{digits}f}"
-
-
-def with_interval(metres: float, low: float, high: float) -> str:
-    """Return a difference [m] with its 95 % interval, as ``+0.01 m (-0.05 to +0.07)``."""
-    if not math.isfinite(low + high):
-        return f"{_rounded(metres, 2)} m (too short for an interval)"
-    value, low_text, high_text = (_rounded(one, digits_of((high - low) / 4)) for one in (metres, low, high))
-    return f"{value} m ({low_text} to {high_text})"
-
-
-def _rounded(value: float, digits: int) -> str:
-    # adding zero takes the sign off a rounded -0.0
-    return f"{round(value, digits) + 0.0:+.{digits}f}"
-
-
 def distance_text(metres: float) -> str:
     """Return a distance as ``398.5 m`` or ``36.00 km``."""
     return f"{metres:.1f} m" if metres < 10_000 else f"{metres / 1000:.2f} km"

@@ -1,4 +1,4 @@
-"""The calibration file: a robot's motion model, its parameters with covariance, and how it was tested."""
+"""Documents of calibrations: the calibration file, the comparison of groups of runs, and the forecast along a path."""
 
 from __future__ import annotations
 
@@ -178,3 +178,147 @@ class CalibrationDocument(Record, frozen=True, kw_only=True):
     held_out_pooled: tuple[PooledScore, ...] = ()
     error_sources: ErrorSources | None = None
     warnings: tuple[str, ...]
+
+
+COMPARE_SCHEMA: Literal["icrtool/compare/1"] = "icrtool/compare/1"
+"""Version of comparisons of groups."""
+
+
+class ErrorsAt(Record, frozen=True):
+    """Errors at one horizon, or differences of errors, with 95 % intervals [m]; None where there is none."""
+
+    horizon_m: float
+    p95_m: float | None
+    p95_low_m: float | None
+    p95_high_m: float | None
+    expected_m: float | None
+    expected_low_m: float | None
+    expected_high_m: float | None
+
+
+class TransferCost(ErrorsAt, frozen=True, kw_only=True):
+    """What the calibration of one group costs in the runs of another: its errors minus those of the tested group's own.
+
+    Both in the same trials; the own calibration is held out.
+    """
+
+    calibrated_on: str
+    tested_on: str
+
+
+class TransferCell(TransferCost, frozen=True, kw_only=True):
+    """Errors of the calibration of one group in the runs of another."""
+
+    trials: int
+
+
+class ErrorDifference(ErrorsAt, frozen=True, kw_only=True):
+    """Held-out errors of two groups, second minus first; `paired`: of trials at the same distance of one route."""
+
+    paired: bool
+
+
+class ParameterDifference(Record, frozen=True):
+    """A quantity of two groups: second minus first, with one standard deviation.
+
+    `significant`: zero lies outside the 95 % interval.
+    """
+
+    quantity: str
+    first: float
+    second: float
+    difference: float
+    std: float
+    significant: bool
+
+
+class ComparedPair(Record, frozen=True):
+    """Two groups: how their parameters differ and their held-out errors, and both in a sentence."""
+
+    first: str
+    second: str
+    parameters: tuple[ParameterDifference, ...]
+    errors: tuple[ErrorDifference, ...]
+    verdict: str
+
+
+class ComparedGroup(Record, frozen=True):
+    """A group of runs and its calibration: the name of its model, and the geometry of the tracks."""
+
+    model: str
+    logs: tuple[CalibrationLog, ...]
+    geometry: dict[str, float]
+
+
+class GroupComparison(Record, frozen=True, kw_only=True):
+    """Groups of runs compared.
+
+    Attributes
+    ----------
+    pairs : the first group with each of the others
+    transfer : the transfer matrix, by row, column and horizon
+    costs : of its cells beside the diagonal; empty in files of earlier versions
+    """
+
+    schema: Literal["icrtool/compare/1"]
+    tool_version: str = ""
+    groups: dict[str, ComparedGroup]
+    pairs: tuple[ComparedPair, ...]
+    transfer: tuple[TransferCell, ...]
+    costs: tuple[TransferCost, ...] = ()
+
+    def cell(self, calibrated_on: str, tested_on: str, horizon_m: float) -> TransferCell:
+        """Return a cell of the matrix."""
+        return next(one for one in self.transfer if _place(one) == (calibrated_on, tested_on, horizon_m))
+
+    def cost(self, calibrated_on: str, tested_on: str, horizon_m: float) -> TransferCost | None:
+        """Return the cost of a cell; None on the diagonal."""
+        return next((one for one in self.costs if _place(one) == (calibrated_on, tested_on, horizon_m)), None)
+
+
+def _place(one: TransferCost) -> tuple[str, str, float]:
+    return one.calibrated_on, one.tested_on, one.horizon_m
+
+
+class ForecastSource(Record, frozen=True):
+    """The calibration that a forecast was made with."""
+
+    name: str
+    model: str
+    created: str
+
+
+class ForecastBudget(Record, frozen=True):
+    """The distance up to which 95 % of the errors stay within a budget; of wheels with a gyro too where it is known."""
+
+    budget_m: float
+    distance_m: float | None
+    distance_gyro_m: float | UnsetType | None = UNSET
+
+
+class ForecastColumns(Record, frozen=True):
+    """The forecast after each metre, as `icrtool.calibration.forecast.Forecast`; with a gyro where that is known."""
+
+    distance_m: list[float | None]
+    east_m: list[float | None]
+    north_m: list[float | None]
+    expected_error_m: list[float | None]
+    p95_error_m: list[float | None]
+    std_east_m: list[float | None]
+    std_north_m: list[float | None]
+    heading_std_deg: list[float | None]
+    expected_error_gyro_m: list[float | None] | UnsetType = UNSET
+    p95_error_gyro_m: list[float | None] | UnsetType = UNSET
+
+
+class ForecastDocument(Record, frozen=True, kw_only=True):
+    """The forecast of errors along a path."""
+
+    schema: Literal["icrtool/forecast/1"]
+    tool_version: str = ""
+    calibration: ForecastSource
+    measured_to_m: float
+    budgets: tuple[ForecastBudget, ...]
+    not_shown: tuple[str, ...]
+    warnings: tuple[str, ...]
+    along: ForecastColumns

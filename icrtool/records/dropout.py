@@ -251,8 +251,7 @@ class BudgetDistance(Record, frozen=True):
         return f"{self.low_m:.1f}-{self.high_m:.1f} m" if self.high_m is not None else f"at least {self.low_m:.1f} m"
 
 
-@dataclass(frozen=True, slots=True)
-class Gate:
+class Gate(Record, frozen=True):
     """One acceptance limit: ``icr.p95@10m <= 3.8``, ``icr.p95@10m <= 1.1 * baseline + 0.1 m``, or on a distance.
 
     Attributes
@@ -272,58 +271,66 @@ class Gate:
     baseline_factor: float = 0.0
     budget_m: float | None = None
 
+    @property
+    def relative(self) -> bool:
+        """Whether it names the baseline."""
+        return bool(self.baseline_factor)
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
+
+class CheckedGate(Gate, frozen=True, kw_only=True):
     """Whether an acceptance limit was kept; numbers are None where there is none.
 
     Attributes
     ----------
-    passed : of a limit relative to the baseline also where the interval of the difference reaches the bound
     value_m : None where the log has no trial of that length
+    baseline_m : the baseline's number
     margin_m : negative where the number exceeds the bound; margin_low_m, margin_high_m : its 95 % confidence interval,
         of a limit relative to the baseline
-    bound_m : that of the gate, with the baseline's share; baseline_m : the baseline's number
-    log : name of the log
-    not_checked : why the limit was not checked; empty where it was
-    unusable : why the run must not be used, which fails every limit; empty where it can be
+    passed : of a limit relative to the baseline also where the interval of the difference reaches the bound
+    value_bound_m : the bound, with the baseline's share
+    not_checked : why the limit was not checked; None where it was
+    unusable : why the run must not be used, which fails every limit; None where it can be
     """
 
-    gate: Gate
-    passed: bool
     value_m: float | None
+    baseline_m: float | None = None
     margin_m: float | None = None
     margin_low_m: float | None = None
     margin_high_m: float | None = None
-    bound_m: float | None = None
-    baseline_m: float | None = None
-    log: str = ""
-    not_checked: str = ""
-    unusable: str = ""
+    passed: bool
+    value_bound_m: float | None = None
+    not_checked: str | None = None
+    unusable: str | None = None
 
-    def line(self) -> str:
+    def line(self, log: str) -> str:
         """Return the verdict in one line, which names the log."""
         word = "pass" if self.passed else "FAIL"
-        log = f" (log {self.log})" if self.log else ""
+        log = f" (log {log})" if log else ""
         if self.not_checked:
-            return f"none  {self.gate.text}: not checked: {self.not_checked}{log}"
+            return f"none  {self.text}: not checked: {self.not_checked}{log}"
         if self.unusable:
-            return f"{word}  {self.gate.text}: do not use this run: {self.unusable}{log}"
+            return f"{word}  {self.text}: do not use this run: {self.unusable}{log}"
         if self.value_m is None:
-            length = f" of {self.gate.horizon_m:g} m" if self.gate.horizon_m is not None else ""
-            return f"{word}  {self.gate.text}: no trial{length} in this log{log}"
-        return f"{word}  {self.gate.text}: {self.value_m:.4g} m{self._bound_text()}{log}"
+            length = f" of {self.horizon_m:g} m" if self.horizon_m is not None else ""
+            return f"{word}  {self.text}: no trial{length} in this log{log}"
+        return f"{word}  {self.text}: {self.value_m:.4g} m{self._bound_text()}{log}"
 
     def _bound_text(self) -> str:
-        numbers = (self.margin_m, self.bound_m, self.baseline_m)
+        numbers = (self.margin_m, self.value_bound_m, self.baseline_m)
         margin_m, bound_m, baseline_m = (math.nan if one is None else one for one in numbers)
         margin = f", margin {margin_m:+.4g} m"
-        if not self.gate.baseline_factor:
+        if not self.relative:
             return margin
         interval = ", no interval"
         if self.margin_low_m is not None:
             interval = f" (95 %: {self.margin_low_m:+.4g} to {self.margin_high_m:+.4g} m)"
         return f", bound {bound_m:.4g} m (baseline {baseline_m:.4g} m){margin}{interval}"
+
+
+class Verdict(CheckedGate, frozen=True, kw_only=True):
+    """A limit that was checked, and the line about it that is printed."""
+
+    verdict: str
 
 
 class TurningSplit(Record, frozen=True):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET, Meta, UnsetType
 
 from icrtool.config import Config
 from icrtool.records.calibration_document import CalibrationDocument
-from icrtool.records.dropout import BudgetDistance, OutageKind, TurningSplit, UsedCalibration
+from icrtool.records.dropout import BudgetDistance, OutageKind, TurningSplit, UsedCalibration, Verdict
 from icrtool.records.plain_data import Record
 from icrtool.records.run_document import DriveDocument, IcrDocument
 from icrtool.records.samples import InputFile
@@ -16,8 +16,12 @@ from icrtool.records.samples import InputFile
 DROPOUT_SCHEMA: Literal["icrtool/dropout/1"] = "icrtool/dropout/1"
 """Version of what report.json holds."""
 
-Number = float | None
+LARGEST_M = 1e12
+"""Of a number in a report: beyond it is damage, whose squares overflow."""
+
+Number = Annotated[float, Meta(ge=-LARGEST_M, le=LARGEST_M)] | None
 Numbers = list[Number]
+Count = Annotated[int, Meta(ge=0, le=10**12)]
 
 
 class RunOfReport(Record, frozen=True):
@@ -60,12 +64,17 @@ class BlocksDocument(Record, frozen=True):
     """Sums over blocks of path, as `icrtool.kernels.open_loop.block_sums.BlockSums`, for later comparisons."""
 
     horizon_m: float
-    trials: list[int]
-    errors_m: list[float]
-    above_p50: list[int]
-    above_p95: list[int]
+    trials: list[Count]
+    errors_m: Numbers
+    above_p50: list[Count]
+    above_p95: list[Count]
     p50_slope_m: Number
     p95_slope_m: Number
+
+    def __post_init__(self) -> None:
+        lengths = {len(column) for column in (self.trials, self.errors_m, self.above_p50, self.above_p95)}
+        if len(lengths) > 1 or min(lengths) < 2:
+            raise ValueError("blocks of unequal number, or fewer than two")
 
 
 class ModelDocument(Record, frozen=True):
@@ -148,29 +157,6 @@ class LadderDocument(Record, frozen=True):
     fits: dict[str, FitDocument] | UnsetType = UNSET
 
 
-class GateDocument(Record, frozen=True):
-    """An acceptance limit and its verdict, as `icrtool.records.dropout.Gate` and `Verdict`."""
-
-    text: str
-    model: str
-    metric: str
-    horizon_m: Number
-    relation: str
-    bound_m: float
-    baseline_factor: float
-    budget_m: Number
-    value_m: Number
-    baseline_m: Number
-    margin_m: Number
-    margin_low_m: Number
-    margin_high_m: Number
-    passed: bool
-    value_bound_m: Number
-    not_checked: str | None
-    unusable: str | None
-    verdict: str
-
-
 class BaselineDocument(Record, frozen=True):
     """What the report was compared with, and what differs beside the numbers."""
 
@@ -242,9 +228,40 @@ class DropoutDocument(Record, frozen=True, kw_only=True):
     budgets: tuple[BudgetDistance, ...]
     by_turning: tuple[TurningSplit, ...]
     ladder: LadderDocument
-    gates: tuple[GateDocument, ...]
+    gates: tuple[Verdict, ...]
     passed: bool
     baseline: BaselineDocument | None
     outages: tuple[OutageDocument, ...]
     worst: tuple[TrialDocument, ...]
     examples: tuple[TrialDocument, ...]
+
+
+class EarlierInput(Record, frozen=True):
+    """A file of the log of an earlier report."""
+
+    sha256: str | None
+
+
+class EarlierRun(Record, frozen=True):
+    """The run of an earlier report; its configuration may have keys of another version."""
+
+    log: str
+    inputs: tuple[EarlierInput, ...]
+    config: dict[str, object]
+
+
+class EarlierModel(Record, frozen=True):
+    """A model's errors in an earlier report; older ones have no blocks."""
+
+    name: str
+    by_horizon: tuple[ErrorRow, ...]
+    blocks: tuple[BlocksDocument, ...] = ()
+
+
+class EarlierReport(Record, frozen=True):
+    """What a comparison needs of a report.json, of whatever version."""
+
+    schema: str
+    tool_version: str
+    run: EarlierRun
+    models: tuple[EarlierModel, ...]

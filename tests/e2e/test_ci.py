@@ -16,7 +16,7 @@ import pytest
 
 from icrtool.cli import main
 from icrtool.fleet.one_log import decode_request, process
-from icrtool.fleet.row import Row
+from icrtool.records.fleet_document import FleetLog
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^ *icrtool ((?!cache warm|batch s3:).*)$", PAGE, re.MULTILINE)
@@ -31,7 +31,7 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return int(left.value.code or 0)
 
 
-def in_this_process(request: bytes, timeout_s: float, stage: object = None) -> Row:
+def in_this_process(request: bytes, timeout_s: float, stage: object = None) -> FleetLog:
     """Process a log of a batch without a process of its own, which would load all libraries again."""
     return process(decode_request(request), lambda _: None)
 

@@ -31,7 +31,9 @@ from icrtool.output.page.comparison_page import comparison_page
 from icrtool.output.page.fleet_page import fleet_page
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import run_page
+from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout_document import DropoutDocument
+from icrtool.records.fleet_document import FleetDocument
 from icrtool.records.run import Run, track_of
 from icrtool.records.samples import GyroSamples
 from icrtool.records.text import LogText
@@ -350,8 +352,8 @@ def test_print_shows_pictures_in_place_of_what_is_interactive(chrome: Browser, f
 @pytest.mark.skipif(not AXE.is_file(), reason="axe-core is not there: make axe")
 def test_a_checker_of_accessibility_finds_no_error(chrome: Browser, file: Path, tmp_path: Path, *, dark: bool) -> None:
     fleet, comparison = tmp_path / "fleet.html", tmp_path / "comparison.html"
-    fleet.write_text(fleet_page(FLEET, tmp_path), encoding="utf-8")
-    comparison.write_text(comparison_page(COMPARISON, "c"), encoding="utf-8")
+    fleet.write_text(page_of_fleet(FLEET, tmp_path), encoding="utf-8")
+    comparison.write_text(comparison_page(msgspec.convert(COMPARISON, GroupComparison), "c"), encoding="utf-8")
     for one in (file, fleet, comparison):
         page = chrome.page(dark=dark)
         page.open(one)
@@ -370,6 +372,7 @@ LOG = {
     "errors": {"icr_p95_10m_m": 0.9, "recommended_within_0.5m_m": 8.0}, "events": None, "warnings": 1, "verdicts": [],
 }  # fmt: skip
 FLEET = {
+    "schema": "icrtool/fleet/1",
     "counts": {"done": 2, "failed": 1, "skipped": 0},
     "gates_failed": 0,
     "tool_version": "1",
@@ -381,21 +384,27 @@ FLEET = {
 }
 
 
+def page_of_fleet(document: dict[str, object], folder: Path) -> str:
+    """The page of what a fleet.json holds."""
+    return fleet_page(msgspec.convert(document, FleetDocument), folder)
+
+
 CHANGE = {"p95_m": 0.1, "p95_low_m": None, "p95_high_m": None, "expected_m": 0.05, "expected_low_m": -0.1,
           "expected_high_m": 0.2}  # fmt: skip
 NAMES = ("grass", HOSTILE)
+LOGGED = {"path": "", "sha256": "", "distance_m": 90.0, "heading_offset_deg": 0.0, "wheels_delay_s": 0.0}
 COMPARISON = {
     "schema": "icrtool/compare/1",
-    "groups": {name: {"model": "icr", "logs": [{"name": name, "distance_m": 90.0}]} for name in NAMES},
+    "groups": {name: {"model": "icr", "logs": [LOGGED | {"name": name}], "geometry": {}} for name in NAMES},
     "pairs": [
         {"first": "grass", "second": HOSTILE, "verdict": f"They differ: {HOSTILE}",
-         "errors": [CHANGE | {"horizon_m": 10.0}],
+         "errors": [CHANGE | {"horizon_m": 10.0, "paired": False}],
          "parameters": [{"quantity": "y_icr_right_m", "first": 0.8, "second": -0.9, "difference": -1.7, "std": 0.1,
                          "significant": True}]}
     ],
     "transfer": [
         CHANGE | {"calibrated_on": one, "tested_on": other, "horizon_m": h, "p95_m": h / 20, "p95_low_m": h / 30,
-                  "p95_high_m": h / 10}
+                  "p95_high_m": h / 10, "trials": 9}
         for one in NAMES for other in NAMES for h in (5.0, 10.0, 20.0)
     ],
     "costs": [CHANGE | {"calibrated_on": "grass", "tested_on": HOSTILE, "horizon_m": 10.0}],
@@ -404,7 +413,7 @@ COMPARISON = {
 
 def test_the_chart_of_a_comparison_follows_the_group_and_the_measure(chrome: Browser, tmp_path: Path) -> None:
     file = tmp_path / "comparison.html"
-    file.write_text(comparison_page(COMPARISON, "c"), encoding="utf-8")
+    file.write_text(comparison_page(msgspec.convert(COMPARISON, GroupComparison), "c"), encoding="utf-8")
     page = chrome.page(width=360, height=780)
     page.open(file)
     labels = "[...document.querySelectorAll('#error-keys label')].map((one) => one.textContent.trim())"
@@ -425,7 +434,7 @@ def test_the_chart_of_a_comparison_follows_the_group_and_the_measure(chrome: Bro
 def test_a_failed_log_is_a_line_on_a_phone(chrome: Browser, tmp_path: Path) -> None:
     file, reason = tmp_path / "report.html", "not a log; a log is an .mcap file, a ROS 1 .bag or a ROS 2 bag directory"
     failed = {**FLEET["logs"][2], "log": "c.bag", "reason": reason}
-    file.write_text(fleet_page({**FLEET, "logs": [*FLEET["logs"][:2], failed]}, tmp_path), encoding="utf-8")
+    file.write_text(page_of_fleet({**FLEET, "logs": [*FLEET["logs"][:2], failed]}, tmp_path), encoding="utf-8")
     page = chrome.page(width=390, height=844)
     page.open(file)
     good, bad = page.evaluate(
@@ -444,9 +453,10 @@ def test_a_phone_shows_multiplier_and_distance_of_the_robot_without_scrolling(ch
     }  # fmt: skip
     # 0.3 m after 20 m, and 0.5 m before that at 8 m, and nowhere
     errors = LOG["errors"] | {"recommended_p95_20m_m": 0.3}
-    far = {**LOG, "errors": errors | {"recommended_within_0.5m_m": 20.0}}
+    name = "recommended_within_0.5m_m"
+    far = {**LOG, "errors": errors | {name: 20.0}, "bounds": [name]}
     logs = [{**LOG, "usable": False, "status": "done"}, {**LOG, "errors": errors}, far]
-    file.write_text(fleet_page({**FLEET, "logs": logs, "calibrations": [robot]}, tmp_path), encoding="utf-8")
+    file.write_text(page_of_fleet({**FLEET, "logs": logs, "calibrations": [robot]}, tmp_path), encoding="utf-8")
     page = chrome.page(width=390, height=844)
     page.open(file)
     for text in ("1.669", "14.2"):
@@ -461,7 +471,7 @@ def test_the_table_of_a_fleet_sorts_and_filters(chrome: Browser, tmp_path: Path)
     (tmp_path / "runs" / "b").mkdir(parents=True)
     (tmp_path / "runs" / "b" / "report.html").touch()
     file = tmp_path / "report.html"
-    file.write_text(fleet_page(FLEET, tmp_path), encoding="utf-8")
+    file.write_text(page_of_fleet(FLEET, tmp_path), encoding="utf-8")
     page = chrome.page()
     page.open(file)
     names = "[...document.querySelectorAll('#table tbody tr:not([hidden]) th')].map((one) => one.textContent)"

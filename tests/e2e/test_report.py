@@ -109,10 +109,12 @@ def test_a_fleet_and_a_comparison_have_pages(icrtool: Command, run_place: Path) 
     numbers = dict.fromkeys(
         ("p95_m", "p95_low_m", "p95_high_m", "expected_m", "expected_low_m", "expected_high_m"), 0.5
     )
-    groups = {name: {"model": "icr", "logs": [{"name": name, "distance_m": 9.0}]} for name in ("old", "<i>new</i>")}
+    log = {"path": "", "sha256": "", "distance_m": 9.0, "heading_offset_deg": 0.0, "wheels_delay_s": 0.0}
+    groups = {name: {"model": "icr", "logs": [log | {"name": name}], "geometry": {}} for name in ("old", "<i>new</i>")}
+    parameter = {"quantity": "multiplier", "first": 1.0, "second": 2.0, "difference": 1.0, "std": 0.1}
     pair = {"first": "old", "second": "<i>new</i>", "verdict": "they differ",
-            "parameters": [{"quantity": "multiplier", "first": 1.0, "second": 2.0, "difference": 1.0, "std": 0.1,
-                            "significant": True}], "errors": [{"horizon_m": 10.0, **numbers}]}  # fmt: skip
+            "parameters": [parameter | {"significant": True}],
+            "errors": [{"horizon_m": 10.0, "paired": False, **numbers}]}  # fmt: skip
     transfer = [{"calibrated_on": "old", "tested_on": "<i>new</i>", "horizon_m": 10.0, "trials": 3, **numbers}]
     compared = {"schema": "icrtool/compare/1", "groups": groups, "pairs": [pair], "transfer": transfer}
     (run_place / "compared.json").write_text(json.dumps(compared), encoding="utf-8")

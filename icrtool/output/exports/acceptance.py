@@ -17,7 +17,7 @@ from icrtool.output.files.atomic import write_file
 from icrtool.output.tables.dropout import format_dropout, shown_horizons
 from icrtool.output.text_blocks import Line, Table
 from icrtool.output.text_format import error_text, run_title, xml_text
-from icrtool.records.dropout import Verdict
+from icrtool.records.fleet_document import FleetVerdict, fleet_verdict
 
 Outcome = DropoutReport | IcrToolError
 """The outcome of one argument: a report, or why there is none."""
@@ -27,7 +27,7 @@ class Suite(NamedTuple):
     """The acceptance limits of a log; `error`: why the log could not be used, empty if it could."""
 
     log: str
-    verdicts: Sequence[Verdict] = ()
+    verdicts: Sequence[FleetVerdict] = ()
     error: str = ""
 
 
@@ -35,7 +35,8 @@ def suite_of(name: str, outcome: Outcome) -> Suite:
     """Return the acceptance limits of a report, or of a log that has none."""
     if isinstance(outcome, IcrToolError):
         return Suite(name, error=str(outcome))
-    return Suite(run_title(outcome.run_document), outcome.verdicts)
+    log = outcome.run_document.log
+    return Suite(run_title(outcome.run_document), [fleet_verdict(one, log) for one in outcome.verdicts])
 
 
 def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-report") -> None:
@@ -84,7 +85,7 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
 
 def format_markdown(report: DropoutReport) -> str:
     """Return one report as Markdown: the verdicts, then the sentences and tables that are printed."""
-    title, verdicts = run_title(report.run_document), [one.line() for one in report.verdicts]
+    title, verdicts = run_title(report.run_document), [one.verdict for one in report.verdicts]
     lines = [f"## {escaped_markdown(title)}", ""]
     if verdicts:
         word = "All acceptance limits are met." if report.passed else "**An acceptance limit is not met.**"
@@ -142,8 +143,8 @@ def _suite(one: Suite, command: str) -> ET.Element:
     suite = ET.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
     for verdict in one.verdicts:
         element, line = (
-            ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate.text)),
-            verdict.line(),
+            ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate)),
+            verdict.line,
         )
         if verdict.not_checked:
             ET.SubElement(element, "skipped", message=xml_text(verdict.not_checked))

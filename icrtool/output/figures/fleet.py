@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from icrtool.records.text import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from icrtool.records.fleet_document import FleetLog
 
 ROW_IN = 0.22
 MOST_ROWS = 40
@@ -30,13 +32,13 @@ class FleetNumbers(NamedTuple):
 
     Attributes
     ----------
-    points : the logs with a date and both lateral ICRs, as fleet.json has them
+    points : the logs with a date and both lateral ICRs
     errors_m : 95 % error after 10 m of each log, by group and name
     model : whose errors they are
     """
 
     title: str
-    points: Sequence[Mapping[str, Any]]
+    points: Sequence[FleetLog]
     errors_m: Mapping[str, Mapping[str, float]]
     model: str
 
@@ -47,7 +49,7 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 
     ranges = {
-        side: [f"{edge([point['icr'][f'y_icr_{side}_m'] for point in fleet.points]):+.2f}" for edge in (min, max)]
+        side: [f"{edge([_icr(point, side) for point in fleet.points]):+.2f}" for edge in (min, max)]
         for side in ("right", "left")
     }
     answer = ", ".join(f"y {side} {' to '.join(ends)} m" for side, ends in ranges.items()).replace("-", "−")
@@ -57,28 +59,33 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     )  # fmt: skip
     panels = figure.subplots(2, 1, sharex=True)
     for axes, side in zip(panels, ("right", "left"), strict=True):
-        for number, robot in enumerate(dict.fromkeys(point["robot"] for point in fleet.points)):
-            mine = [point for point in fleet.points if point["robot"] == robot]
+        for number, robot in enumerate(dict.fromkeys(point.robot for point in fleet.points)):
+            mine = [point for point in fleet.points if point.robot == robot]
             key = f" {drawable(robot or 'robot not named', LONGEST_ROBOT)}"  # matplotlib leaves out "_label"
-            when = date2num([np.datetime64(point["start_utc"].rstrip("Z")) for point in mine])  # type: ignore[no-untyped-call]
+            when = date2num([np.datetime64(point.start_utc.rstrip("Z")) for point in mine])  # type: ignore[no-untyped-call]
             axes.errorbar(
-                when, [point["icr"][f"y_icr_{side}_m"] for point in mine],
-                [point["icr"][f"std_y_icr_{side}_m"] or 0.0 for point in mine],
+                when, [_icr(point, side) for point in mine],
+                [point.icr.get(f"std_y_icr_{side}_m") or 0.0 for point in mine],
                 linestyle="none", marker=MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)],
                 markersize=4.5, capsize=2.0, linewidth=1.0, label=key,
             )  # fmt: skip
         axes.set_ylabel(f"ICR y {side} [m]")
     first, last = panels[-1].get_xlim()
-    if last - first < LEAST_DAYS or len({point["start_utc"] for point in fleet.points}) == 1:
+    if last - first < LEAST_DAYS or len({point.start_utc for point in fleet.points}) == 1:
         middle = (first + last) / 2
         panels[-1].set_xlim(middle - LEAST_DAYS / 2, middle + LEAST_DAYS / 2)
     locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
     panels[-1].xaxis.set_major_locator(locator)
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
-    years = sorted({point["start_utc"][:4] for point in fleet.points})
+    years = sorted({point.start_utc[:4] for point in fleet.points})
     panels[-1].set_xlabel(f"Date, UTC, {' to '.join(dict.fromkeys((years[0], years[-1])))}")
     add_legend(figure, ncols=4)
     return figure
+
+
+def _icr(point: FleetLog, side: str) -> float:
+    value = point.icr[f"y_icr_{side}_m"]
+    return np.nan if value is None else value
 
 
 @styled

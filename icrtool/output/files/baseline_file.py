@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+import msgspec
 
-from icrtool.dropout_analysis.baseline import BaselineReport, BaselineRow
+from icrtool.dropout_analysis.baseline import BaselineReport, baseline_report, known_content
 from icrtool.errors import ConfigError
-from icrtool.kernels.open_loop.block_sums import BlockSums
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
 from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet
-from icrtool.records.dropout import METRICS
+from icrtool.records.dropout_document import EarlierReport
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
 from icrtool.records.text import escaped
-
-LARGEST = 1e12
-"""Of a number in a report [m]: beyond it is damage, whose squares overflow."""
 
 ADVICE = "name a report.json, a run with a dropout report, or the folder of a batch"
 
@@ -114,45 +108,14 @@ def read_report(path: Path, log: str = "", inside: Path | None = None) -> Baseli
         It is not a dropout report.
     """
     try:
-        document = json.loads(read_regular(path, inside))
-        run = document["run"]
-        if not document["schema"].startswith(SCHEMA_FAMILY):
-            raise ValueError(document["schema"])
-        content = _known(one["sha256"] for one in run["inputs"])
-        return BaselineReport(
-            escaped(log or run["log"]), str(path), content, escaped(document["tool_version"]), dict(run["config"]),
-            dict(_rows(document)),
-        )  # fmt: skip
+        document = msgspec.convert(json.loads(read_regular(path, inside)), EarlierReport)
+        if not document.schema.startswith(SCHEMA_FAMILY):
+            raise ValueError(document.schema)
+        return baseline_report(document, str(path), escaped(log or document.run.log))
     except OSError as err:
         raise ConfigError(f"--baseline {path}", "cannot be read", err.strerror or str(err)) from err
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as err:
+    except (ValueError, RecursionError) as err:
         raise ConfigError(f"--baseline {path}", "not a complete dropout report", ADVICE) from err
-
-
-def _rows(document: Mapping[str, Any]) -> Iterator[tuple[tuple[str, float], BaselineRow]]:
-    """Yield the rows of a report."""
-    for model in document["models"]:
-        sums = {float(one["horizon_m"]): _sums(one) for one in model.get("blocks", ())}
-        for row in model["by_horizon"]:
-            values = {metric: _number(row[column]) for metric, (_, column) in METRICS.items()}
-            yield (model["name"], float(row["horizon_m"])), BaselineRow(values, sums.get(float(row["horizon_m"])))
-
-
-def _sums(one: Mapping[str, Any]) -> BlockSums:
-    trials, p50, p95 = (np.array(one[name], np.int64) for name in ("trials", "above_p50", "above_p95"))
-    errors = np.array([_number(error) for error in one["errors_m"]])
-    if not trials.shape == p50.shape == p95.shape == errors.shape or len(errors) < 2:
-        raise ValueError("blocks of unequal number")
-    if min(column.min() for column in (trials, p50, p95)) < 0 or trials.max() > LARGEST:
-        raise ValueError("a number of trials")
-    return BlockSums(trials, errors, p50, p95, _number(one["p50_slope_m"]), _number(one["p95_slope_m"]))
-
-
-def _number(value: float | None) -> float:
-    number = math.nan if value is None else float(value)
-    if abs(number) > LARGEST:
-        raise ValueError("a length")
-    return number
 
 
 def _fleet_baseline(path: Path) -> Baseline:
@@ -161,14 +124,8 @@ def _fleet_baseline(path: Path) -> Baseline:
     present = {log: found for log, found in logs.items() if is_regular(found[0], path)}
     if not present:
         raise ConfigError(f"--baseline {path}", "no dropout report in it", ADVICE)
-    files = {log: _known(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
+    files = {log: known_content(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
     return Baseline(path, {log: file for log, (file, _) in present.items()}, files, (path / FLEET_FILE,))
-
-
-def _known(content: Iterable[str | None]) -> tuple[str, ...]:
-    """Return the SHA-256 of the files of a log; none where one is not known."""
-    found = tuple(content)
-    return () if None in found else tuple(map(str, found))
 
 
 def _report_files(path: Path) -> list[Path]:

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from icrtool.errors import RunError
+from icrtool.records.fleet_document import FleetDocument, FleetLog
 from icrtool.records.plain_data import plain
 from icrtool.records.regular_file import check_folders, read_regular
 from icrtool.records.text import LogText
@@ -21,33 +22,15 @@ FLEET_FAMILY = "icrtool/fleet/"
 """Schema of such a file, of whatever version."""
 
 
-class InputFile(msgspec.Struct, frozen=True):
-    """A file that was read: what identifies its content, None where not all of it was read, and its place."""
+def read_fleet(directory: Path) -> FleetDocument:
+    """Return what the fleet.json of a batch holds.
 
-    sha256: str | None
-    path: str = ""
-
-
-class FleetLog(msgspec.Struct, frozen=True):
-    """What fleet.json holds of a log, as others need it.
-
-    Attributes
-    ----------
-    run : its directory below that of the batch
-    usable : whether its ICRs are
+    Raises
+    ------
+    OSError, ValueError, RecursionError
+        It cannot be read, or is not of this version.
     """
-
-    log: str
-    run: str
-    status: str
-    robot: str
-    group: str
-    inputs: list[InputFile]
-    usable: bool = True
-
-
-class _Fleet(msgspec.Struct, frozen=True):
-    logs: list[FleetLog]
+    return msgspec.convert(json.loads(read_regular(directory / FLEET_FILE, directory)), FleetDocument)
 
 
 def logs_of_fleet(directory: Path) -> list[FleetLog]:
@@ -59,8 +42,7 @@ def logs_of_fleet(directory: Path) -> list[FleetLog]:
         The folder does not hold the result of a batch.
     """
     try:
-        found = msgspec.json.decode(read_regular(directory / FLEET_FILE, directory), type=_Fleet).logs
-        found = [one for one in found if one.status != "failed"]
+        found = [one for one in read_fleet(directory).logs if one.status != "failed"]
         for one in found:
             check_folders(directory / one.run, directory)
     except (OSError, ValueError, RecursionError) as err:

@@ -15,7 +15,7 @@ from icrtool import __version__
 from icrtool.output import text_format
 from icrtool.output.text_format import error_text
 from icrtool.records.plain_data import plain
-from icrtool.records.text import escaped
+from icrtool.records.text import digits_of, escaped, with_std
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -83,8 +83,8 @@ def _environment() -> Environment:
         "distance": lambda value: _with_units(text_format.distance_text(value)),
         "duration": lambda value: _with_units(text_format.duration_text(value)),
         "signed": text_format.signed,
-        "digits": text_format.digits_of,
-        "with_std": lambda *numbers: text_format.with_std(*numbers).replace("-", "−"),
+        "digits": digits_of,
+        "with_std": lambda *numbers: with_std(*numbers).replace("-", "−"),
         "units": _with_units,
         "breakable": _breakable,
         "minus": _minus,

@@ -113,7 +113,7 @@ def brief_dropout(report: DropoutReport, place: str) -> Text:
         blocks.append(labelled_line("left out", f"whole model, controller numbers: {report.no_comparison}"))
     blocks += [labelled_line("Outages", text) for text in _outages(report)]
     blocks += [_error_table(report)]
-    blocks += [Line(one.line(), "good" if one.passed else "bad") for one in report.verdicts]
+    blocks += [Line(one.verdict, "good" if one.passed else "bad") for one in report.verdicts]
     blocks.append(labelled_line("page" if place.endswith(".html") else "written to", place))
     return Text(blocks)
 

@@ -71,7 +71,7 @@ def format_dropout(report: DropoutReport) -> Text:
     if report.outages:
         blocks += ["", _outage_table(report.outages, report)]
     if report.verdicts:
-        blocks += ["", *(Line(one.line(), "good" if one.passed else "bad") for one in report.verdicts)]
+        blocks += ["", *(Line(one.verdict, "good" if one.passed else "bad") for one in report.verdicts)]
     return Text(blocks)
 
 

@@ -1,10 +1,12 @@
-"""A forecast of errors along a path as text, as rows of CSV and as plain data."""
+"""A forecast of errors along a path as text, as rows of CSV and as a document."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
+from msgspec import UNSET
+
+from icrtool import __version__
 from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats
@@ -12,6 +14,8 @@ from icrtool.kernels.within_budget import within_budget
 from icrtool.motion.models import TERMS
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.output.text_format import distance_text, fitted_model_text
+from icrtool.records.calibration_document import ForecastBudget, ForecastColumns, ForecastDocument, ForecastSource
+from icrtool.records.plain_data import known
 from icrtool.records.text import counted
 
 SHOWN_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
@@ -36,20 +40,24 @@ def _columns(forecast: Forecast, gyro: Forecast | None) -> dict[str, Floats]:
 
 def forecast_document(
     forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
-) -> dict[str, Any]:
-    """Return plain data."""
-    budgets = [{"budget_m": budget, "distance_m": reach(forecast, budget)} for budget in budgets_m]
-    if gyro is not None:
-        budgets = [one | {"distance_gyro_m": reach(gyro, one["budget_m"])} for one in budgets]
-    return {
-        "schema": "icrtool/forecast/1",
-        "calibration": {"name": calibration.name, "model": calibration.recommended, "created": calibration.created},
-        "measured_to_m": measured_to_m(calibration),
-        "budgets": budgets,
-        "not_shown": list(calibration.fitted.not_shown),
-        "warnings": list(calibration.warnings),
-        "along": {name: column.tolist() for name, column in _columns(forecast, gyro).items()},
-    }
+) -> ForecastDocument:
+    """Return what ``icrtool forecast --json`` prints."""
+    columns = {name: column.tolist() for name, column in _columns(forecast, gyro).items()}
+    return ForecastDocument(
+        schema="icrtool/forecast/1",
+        tool_version=__version__,
+        calibration=ForecastSource(calibration.name, calibration.recommended, calibration.created),
+        measured_to_m=measured_to_m(calibration),
+        budgets=tuple(
+            ForecastBudget(
+                budget, known(reach(forecast, budget)), UNSET if gyro is None else known(reach(gyro, budget))
+            )
+            for budget in budgets_m
+        ),
+        not_shown=calibration.fitted.not_shown,
+        warnings=calibration.warnings,
+        along=ForecastColumns(**columns),
+    )
 
 
 def measured_to_m(calibration: Calibration) -> float:

@@ -103,12 +103,12 @@ def test_a_gate_without_trials_fails_and_says_so(run: Run) -> None:
         verdict = check_gate(parse_gate(f"icr.p95@900m {relation} 1"), report)
         assert not verdict.passed
         assert verdict.value_m is None
-        assert verdict.line().startswith(f"FAIL  icr.p95@900m {relation} 1: no trial of 900 m in this log")
+        assert verdict.verdict.startswith(f"FAIL  icr.p95@900m {relation} 1: no trial of 900 m in this log")
 
 
 def test_the_verdict_names_number_bound_and_margin(report: DropoutReport) -> None:
     value = float(report.results[0].summary.p95[0])
-    line = check_gate(parse_gate("icr.p95@1m <= 3"), report).line()
+    line = check_gate(parse_gate("icr.p95@1m <= 3"), report).verdict
     assert line.startswith(f"pass  icr.p95@1m <= 3: {value:.4g} m, margin {3 - value:+.4g} m")
     assert report.name in line
 
@@ -200,7 +200,7 @@ def test_every_limit_fails_on_a_run_that_is_not_usable(run: Run) -> None:
     assert [result.name for result in report.results] == ["icr", "no_slip", "icr_final"]
     assert (report.budgets, report.calibration) == ((), None)
     assert [verdict.passed for verdict in report.verdicts] == [False, False]
-    assert all("the robot did not move" in verdict.line() for verdict in report.verdicts)
+    assert all("the robot did not move" in verdict.verdict for verdict in report.verdicts)
     allowed = dropout_report(bad, horizons_m=[5.0], gates=gates, allow_unusable=True)
     assert allowed.result("recommended") is not None
     assert allowed.verdicts[0].passed

@@ -6,20 +6,25 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from icrtool.dropout_analysis.acceptance_limits import check_gate, parse_gate
+from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError, IcrToolError
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import runs_of_fleet
-from icrtool.fleet.row import File, Row
 from icrtool.kernels.open_loop.block_sums import BlockSums, block_sums, difference_half_width
 from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
 from icrtool.output.files.baseline_file import open_baseline, read_report
+from icrtool.output.files.json_file import json_bytes
+from icrtool.records.dropout_document import EarlierInput
+from icrtool.records.fleet_document import FleetFile, FleetLog
 from icrtool.records.run import Run
 from support.edits import edited
 
@@ -133,7 +138,7 @@ def test_a_report_equals_its_own_baseline(report: DropoutReport, written: Path) 
 def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, written: Path) -> None:
     baseline = read_report(written, "earlier")
     gate = parse_gate("icr.p95@2m <= 0.97 * baseline")
-    verdict = check_gate(gate, report, replace(baseline, sha256=("other",)))
+    verdict = check_gate(gate, report, other_document(baseline, inputs=(EarlierInput("other"),)))
     assert verdict.margin_m < 0 < verdict.margin_high_m
     assert verdict.passed
     assert not check_gate(gate, report, baseline, strict=True).passed
@@ -143,23 +148,31 @@ def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, writt
     for part in (
         "0.1 * baseline",
         f"{far.value_m:.4g} m",
-        f"{far.bound_m:.4g} m",
+        f"{far.value_bound_m:.4g} m",
         f"{far.margin_m:+.4g} m",
         report.name,
     ):
-        assert part in far.line()
+        assert part in far.verdict
     unknown = check_gate(gate, report)
     assert unknown.passed
     assert unknown.not_checked
     with pytest.raises(ConfigError, match="over 3 m"):
-        baseline.row(replace(gate, horizon_m=3.0))
+        baseline.row(msgspec.structs.replace(gate, horizon_m=3.0))
+
+
+def other_document(baseline: BaselineReport, **changes: Any) -> BaselineReport:
+    """The baseline, with other facts of its run."""
+    run = msgspec.structs.replace(baseline.document.run, **changes)
+    return replace(baseline, document=msgspec.structs.replace(baseline.document, run=run))
 
 
 def test_what_changed_is_listed(run: Run, report: DropoutReport, written: Path) -> None:
     baseline = read_report(written, "earlier")
-    config = json.loads(json.dumps(baseline.config))
+    config = json.loads(json.dumps(baseline.document.run.config))
     config["filter"]["gate_probability"] = 0.5
-    changes = replace(baseline, tool_version="0.0", config=config, sha256=("x",)).changes(report.run_document)
+    other = other_document(baseline, config=config, inputs=(EarlierInput("x"),))
+    other = replace(other, document=msgspec.structs.replace(other.document, tool_version="0.0"))
+    changes = other.changes(report.run_document)
     assert [
         any(part in change for change in changes) for part in ("another recording", "filter.gate_probability", "0.0")
     ]
@@ -204,7 +217,7 @@ def test_an_edited_baseline_is_refused_in_one_line_or_compared(report: DropoutRe
             baseline = open_baseline(written).find("any", ())
             assert baseline is not None
             for metric in ("p50", "p95", "expected", "max"):
-                check_gate(parse_gate(f"icr.{metric}@2m <= 1.1 * baseline"), report, baseline).line()
+                check_gate(parse_gate(f"icr.{metric}@2m <= 1.1 * baseline"), report, baseline)
             compared += bool(str(baseline.changes(report.run_document)))
         except ConfigError as err:
             refusals.append(str(err))
@@ -215,10 +228,11 @@ def test_an_edited_baseline_is_refused_in_one_line_or_compared(report: DropoutRe
 
 def test_an_edited_fleet_is_refused_in_one_line_or_used(report: DropoutReport, tmp_path: Path) -> None:
     report.write(tmp_path / "runs" / "a" / "dropout", plots=())
-    document = fleet_document([Row("a", "runs/a", "done", robot="r", inputs=(File("a", 1, 1, "sum-a"),))])
+    log = FleetLog("a", "runs/a", "done", robot="r", inputs=(FleetFile("a", 1, 1, "sum-a"),))
+    document = json.loads(json_bytes(fleet_document([log])))
     found, refusals = 0, []
     long_name = {**document, "logs": [{**document["logs"][0], "run": "n" * 300}]}
-    for _, place in (*edited(json.loads(json.dumps(document))), ("", long_name)):
+    for _, place in (*edited(document), ("", long_name)):
         (tmp_path / "fleet.json").write_text(json.dumps(place), encoding="utf-8")
         try:
             found += open_baseline(tmp_path).find("a", ["sum-a"]) is not None

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from icrtool.errors import ConfigError, LogError, OutputError
@@ -19,13 +20,13 @@ from icrtool.fleet.batch import BatchOptions, finished, plan, run_batch
 from icrtool.fleet.fleet_files import write_fleet
 from icrtool.fleet.one_log import ReportOptions, Request
 from icrtool.fleet.processes import default_jobs
-from icrtool.fleet.row import Row
+from icrtool.records.fleet_document import FleetLog
 
 # A worker whose logs behave as they are named; the row is kept as `icrtool.fleet.one_log.process` keeps it.
 SCRIPT = """
 import os, signal, sys, time
-from dataclasses import replace
 from pathlib import Path
+from msgspec.structs import replace
 from icrtool.errors import DataError
 from icrtool.fleet import one_log, processes
 
@@ -75,7 +76,7 @@ def add(season: Path, *names: str) -> None:
         (season / f"{name}.mcap").write_bytes(b"\x89MCAP0\r\n" + name.encode())
 
 
-def run(season: Path, jobs: int = 2, **options: object) -> dict[str, Row]:
+def run(season: Path, jobs: int = 2, **options: object) -> dict[str, FleetLog]:
     report = ReportOptions(page=bool(options.pop("page", True)))
     asked = BatchOptions(report=report, timeout_s=20.0, **options)  # type: ignore[arg-type]
     requests = plan([season], season.parent / "out", asked)
@@ -248,8 +249,10 @@ def test_memory_bounds_how_many_logs_run_at_once(season: Path, monkeypatch: pyte
 
 
 def test_tables_hold_a_row_per_log_and_null_where_nothing_is_known(season: Path, tmp_path: Path) -> None:
-    done = Row("a.mcap", "runs/a", "done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25}, icr={"x_icr_m": 0.1})
-    bad = Row("b\udcff.mcap".encode("utf-8", "backslashreplace").decode(), "runs/b", "failed", reason='a "why", here')
+    done = FleetLog("a.mcap", "runs/a", "done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25}, icr={"x_icr_m": 0.1})
+    bad = FleetLog(
+        "b\udcff.mcap".encode("utf-8", "backslashreplace").decode(), "runs/b", "failed", reason='a "why", here'
+    )
     write_fleet([done, bad], tmp_path)
     with (tmp_path / "fleet.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -281,4 +284,4 @@ def test_a_finished_log_of_a_moved_folder_is_found_by_content(season: Path, tmp_
     assert isinstance(request, Request)
     found = finished(request, tmp_path / "out")
     assert found is not None
-    assert finished(replace(request, row=replace(request.row, key="other")), tmp_path / "out") is None
+    assert finished(replace(request, row=msgspec.structs.replace(request.row, key="other")), tmp_path / "out") is None

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from icrtool.cli.batch import line_of, summary_of
 from icrtool.cli.compare import _groups
 from icrtool.cli.fit import runs_or_logs
 from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, write_fleet
-from icrtool.fleet.roll_up import PooledCalibration, pooled_calibrations, runs_of_fleet
-from icrtool.fleet.row import File, Row
+from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
 from icrtool.output.files.calibration_file import open_calibration
+from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog
 from icrtool.records.run import Run
 from support.documents import with_summary
 
@@ -38,17 +38,17 @@ def place(run: Run, make_run: Callable[..., Run], tmp_path_factory: pytest.TempP
 CONTENT = {"a": "1", "b": "2", "copy": "1", "c": "3"}
 
 
-def rows(*names: str, group: str = "grass", **values: object) -> list[Row]:
+def rows(*names: str, group: str = "grass", **values: object) -> list[FleetLog]:
     """Return rows of logs; "c" is not usable, and no run of it is there to be read."""
     return [
-        Row(name, f"runs/{name}", "done", robot="barn", group=group, key="k",
-            inputs=(File(name, 1, 1, CONTENT.get(name, name)),), **{"usable": name != "c"} | values)
+        FleetLog(name, f"runs/{name}", "done", robot="barn", group=group, key="k",
+            inputs=(FleetFile(name, 1, 1, CONTENT.get(name, name)),), **{"usable": name != "c"} | values)
         for name in names
     ]  # fmt: skip
 
 
 def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    logs = [*rows("a", "b", "c", "copy"), *rows("c", group="ice"), Row("d", "runs/d", "failed", robot="barn")]
+    logs = [*rows("a", "b", "c", "copy"), *rows("c", group="ice"), FleetLog("d", "runs/d", "failed", robot="barn")]
     grass, ice = found = list(pooled_calibrations(logs, place))
     assert (grass.group, grass.logs, grass.left_out) == ("grass", ("a", "b"), ("c", "copy"))
     calibration = open_calibration(place / grass.file)
@@ -78,14 +78,14 @@ def test_of_many_logs_some_are_calibrated_together(place: Path, monkeypatch: pyt
 
 def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     logs = [*rows("a", multiplier=1.5), *rows("b", "copy", group="ice", multiplier=1.5)]
-    logs += [*rows("unusable", usable=False), Row("d", "runs/d", "failed", robot="barn")]
+    logs += [*rows("unusable", usable=False), FleetLog("d", "runs/d", "failed", robot="barn")]
     write_fleet(logs, place)
     groups = {"grass": [place / "runs/a"], "ice": [place / "runs/b", place / "runs/copy"]}
     assert runs_of_fleet(place) == _groups((str(place),)) == groups
     write_fleet([*logs, *rows("a", multiplier=1.5)], place)
     assert runs_of_fleet(place) == groups, "a copy in the same group would be tested on itself"
     assert runs_or_logs(place) == [run for runs in groups.values() for run in runs]
-    write_fleet([*logs, Row("e", "runs/e", "done", robot="other", group="ice", multiplier=1.5)], place)
+    write_fleet([*logs, FleetLog("e", "runs/e", "done", robot="other", group="ice", multiplier=1.5)], place)
     assert list(runs_of_fleet(place)) == ["barn grass", "barn ice", "other ice"]
     with pytest.raises(RunError):
         runs_of_fleet(place / "runs")
@@ -96,7 +96,7 @@ def test_figures_show_what_there_is(tmp_path: Path) -> None:
     dates = ("2024-05-01T10:00:00Z", "2024-05-02T10:00:00Z")
     good = [replace(row, start_utc=date) for row, date in
             zip(rows("a", "$b_x", icr=icr, errors={"icr_p95_10m_m": 0.3}), dates, strict=True)]  # fmt: skip
-    failed = Row("f", "runs/f", "failed", reason="no wheels found; needs a JointState (tried twice)")
+    failed = FleetLog("f", "runs/f", "failed", reason="no wheels found; needs a JointState (tried twice)")
     write_fleet([*good, failed], tmp_path, (), ("png",))
     assert {file.name for file in (tmp_path / "plots").iterdir()} == {"icrs.png", "errors.png"}
     write_fleet(good, tmp_path, (), ("svg",))
@@ -106,8 +106,8 @@ def test_figures_show_what_there_is(tmp_path: Path) -> None:
 
 def test_hostile_names_of_robots_and_groups_stay_text() -> None:
     hostile = "\x1b[2J\nError: \u202e" + "n" * 300
-    found = PooledCalibration(hostile, hostile, ("a",), reason=hostile)
+    found = FleetCalibration(hostile, hostile, ("a",), reason=hostile)
     assert max(map(len, calibrations_text([found]).split("\n"))) < 600
-    row = Row(hostile, "runs/a", "done", robot=hostile, group=hostile)
+    row = FleetLog(hostile, "runs/a", "done", robot=hostile, group=hostile)
     for text in (calibrations_text([found]), line_of(row), summary_of([row], Path(hostile[:50]), "fleet.csv")):
         assert text.replace("\n", "").isprintable()

@@ -25,13 +25,13 @@ from icrtool.errors import LogError
 from icrtool.fleet.manifest import read_manifest
 from icrtool.fleet.recordings import find_recordings
 from icrtool.fleet.roll_up import _content
-from icrtool.fleet.row import File
 from icrtool.logs.containers import address
 from icrtool.logs.containers.channel import Block
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.remote_file import find
 from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.read_log import read_log
+from icrtool.records.fleet_document import FleetFile
 from icrtool.records.urls import UrlPath, place_of, without_secrets
 from support.servers import SECRET, file_server, object_store
 
@@ -373,9 +373,9 @@ def test_ctrl_c_while_a_server_is_silent_ends_the_command_and_leaves_nothing(tmp
 
 
 def test_inputs_that_were_not_wholly_read_are_not_called_copies():
-    one, other = (File(f"s3://field/{name}", 5, 0, None, "same etag") for name in "ab")
+    one, other = (FleetFile(f"s3://field/{name}", 5, 0, None, "same etag") for name in "ab")
     assert _content([one]) != _content([other])
-    assert _content([File("a", 5, 0, "ab" * 32)]) == _content([File("b", 5, 0, "ab" * 32)])
+    assert _content([FleetFile("a", 5, 0, "ab" * 32)]) == _content([FleetFile("b", 5, 0, "ab" * 32)])
 
 
 def test_read_log_takes_an_address(fresh):

@@ -114,7 +114,7 @@ def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutR
 
 def test_verdicts_are_lines_of_the_table(content: DropoutReport) -> None:
     lines = format_dropout(content).splitlines()
-    assert [verdict.line() for verdict in content.verdicts] == lines[-2:]
+    assert [verdict.verdict for verdict in content.verdicts] == lines[-2:]
     assert not content.passed
     assert replace(content, verdicts=content.verdicts[:1]).passed
 
@@ -164,7 +164,7 @@ def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutReport, tmp_p
     assert passed.find("failure") is None
     failure = failed.find("failure")
     assert failure is not None
-    assert failure.get("message") == content.verdicts[1].line()
+    assert failure.get("message") == content.verdicts[1].verdict
     assert second.get("name") == 'a <b> & "c" ?'
     told = third.find("testcase/error")
     assert told is not None

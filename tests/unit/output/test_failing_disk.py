@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 import icrtool
@@ -23,7 +24,6 @@ from icrtool.calibration.record import Calibration
 from icrtool.config import Config
 from icrtool.errors import OutputError
 from icrtool.fleet.fleet_files import write_fleet
-from icrtool.fleet.row import Row
 from icrtool.output.exports.foxglove import write_foxglove
 from icrtool.output.figures.style import new_figure
 from icrtool.output.files.atomic import atomic_file, write_file
@@ -31,6 +31,7 @@ from icrtool.output.files.calibration_file import write_calibration
 from icrtool.output.files.picture_file import save_picture
 from icrtool.output.files.truth_file import log_and_truth
 from icrtool.output.study_directory import write_study
+from icrtool.records.fleet_document import FleetLog
 from icrtool.records.run import Run
 from icrtool.simulation.studies import default_request, run_study
 from support.documents import with_summary
@@ -81,8 +82,10 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
 
     def fleet(place: Path, text: str) -> None:
         place.mkdir(exist_ok=True)
-        row = Row("a", "runs/a", "done", robot=text, start_utc="2026-01-01T00:00:00Z", icr=dict.fromkeys(ICRS, 1.0))
-        write_fleet([row, replace(row, log="b", status="failed", reason=text)], place, plots=("png",))
+        row = FleetLog(
+            "a", "runs/a", "done", robot=text, start_utc="2026-01-01T00:00:00Z", icr=dict.fromkeys(ICRS, 1.0)
+        )
+        write_fleet([row, msgspec.structs.replace(row, log="b", status="failed", reason=text)], place, plots=("png",))
 
     return {
         "run": lambda place, text: named(text).write(place, plots=()),

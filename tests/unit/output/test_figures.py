@@ -17,6 +17,7 @@ from icrtool.output.figures.gnss_difference import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style
 from icrtool.output.figures.transfer import transfer
 from icrtool.output.page.pictures import drawn_pictures
+from icrtool.records.calibration_document import COMPARE_SCHEMA, ComparedGroup, GroupComparison, TransferCell
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.events import ReferenceJump
 from icrtool.records.run import Run
@@ -241,13 +242,18 @@ def test_line_styles_differ_in_grey() -> None:
 
 
 def test_the_picture_of_a_comparison_answers_with_both_errors_and_its_words_stand_apart() -> None:
-    names, at = ["grass", "a very long name of a group", "asphalt"], {"horizon_m": CHOICE_HORIZON_M}
+    names = ["grass", "a very long name of a group", "asphalt"]
     cells = [
-        at | {"calibrated_on": row, "tested_on": column, "p95_m": 0.4 if row == column else 0.9}
+        TransferCell(CHOICE_HORIZON_M, 0.4 if row == column else 0.9, 0.1, 1.2, 0.3, 0.2, 0.4, calibrated_on=row,
+                     tested_on=column, trials=3)
         for row in names for column in names
     ]  # fmt: skip
-    costs = [one | {"p95_low_m": 0.1, "p95_high_m": 1.2} for one in cells if one["p95_m"] == 0.9]
-    figure = transfer({"groups": dict.fromkeys(names), "transfer": cells, "costs": costs})
+    figure = transfer(
+        GroupComparison(
+            schema=COMPARE_SCHEMA, groups=dict.fromkeys(names, ComparedGroup("icr", (), {})), pairs=(),
+            transfer=tuple(cells), costs=tuple(one for one in cells if one.p95_m == 0.9),
+        )
+    )  # fmt: skip
     figure.draw_without_rendering()
     assert "0.90 m off after 10 m (95 %) with another's calibration, 0.40 m with its own" in figure.texts[0].get_text()
     matrix = figure.axes[0]

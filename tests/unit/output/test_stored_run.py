@@ -123,7 +123,7 @@ def test_a_run_read_back_reports_the_same(reference: Any, whole: Run, stored: Ru
     assert format_dropout(read) == format_dropout(fresh)
     assert {outage.kind for outage in read.outages} == {"forced", "real"}
     assert read.comparison is not None
-    assert {verdict.gate.horizon_m for verdict in read.verdicts} <= set(read.horizons_m)
+    assert {verdict.horizon_m for verdict in read.verdicts} <= set(read.horizons_m)
 
 
 def test_the_library_gives_what_the_command_gives(stored: Run, tmp_path: Path) -> None:

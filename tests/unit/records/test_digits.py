@@ -2,7 +2,7 @@
 
 import pytest
 
-from icrtool.output.text_format import digits_of, with_interval, with_std
+from icrtool.records.text import digits_of, with_interval, with_std
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ def test_a_spread_is_never_rounded_to_one_digit_less_than_it_needs(value: float,
 def test_an_interval_has_the_digits_it_needs_and_no_negative_zero() -> None:
     assert with_interval(-0.1213, -0.16, -0.0004) == "-0.12 m (-0.16 to +0.00)"
     assert with_interval(0.0011, -0.0052, 0.0071) == "+0.001 m (-0.005 to +0.007)"
-    assert with_interval(0.5, float("nan"), 0.7) == "+0.50 m (too short for an interval)"
+    assert with_interval(0.5, None, 0.7) == "+0.50 m (too short for an interval)"
 
 
 @pytest.mark.parametrize("std", [0.0, float("nan"), float("inf")])

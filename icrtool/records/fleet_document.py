@@ -1,0 +1,188 @@
+"""fleet.json: what a batch found of each log, and the calibration of each robot and group."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from msgspec import UNSET, UnsetType, field
+
+from icrtool.records.dropout import CheckedGate
+from icrtool.records.plain_data import Record
+
+FLEET_SCHEMA: Literal["icrtool/fleet/1"] = "icrtool/fleet/1"
+"""Version of what fleet.json holds."""
+
+RUNS, ROWS = "runs", ".rows"
+"""Folders of a batch: of the runs, and of the rows of the logs, written as they come."""
+
+BUDGET_M = 0.5
+"""Error within which the distance of a pooled calibration counts."""
+
+SHOWN_ERROR, SHOWN_WITHOUT = "recommended_p95_10m_m", "icr_p95_10m_m"
+"""The error of each log that is printed, drawn, and compared with the baseline; without a held-out one the second."""
+
+Status = Literal["done", "failed"]
+ThisTime = Literal["processed", "skipped"]
+
+
+class FleetVerdict(Record, frozen=True, kw_only=True):
+    """An acceptance limit of a log, as `icrtool.records.dropout.Verdict`; `gate` is its text."""
+
+    gate: str
+    value_m: float | None
+    margin_m: float | None
+    passed: bool
+    line: str
+    relative: bool
+    bound_m: float | None
+    baseline_m: float | None
+    margin_low_m: float | None
+    margin_high_m: float | None
+    not_checked: str
+
+
+def fleet_verdict(one: CheckedGate, log: str) -> FleetVerdict:
+    """Return an acceptance limit under the keys of fleet.json, with the line about it, which names the log."""
+    return FleetVerdict(
+        gate=one.text, value_m=one.value_m, margin_m=one.margin_m, passed=one.passed, line=one.line(log),
+        relative=one.relative, bound_m=one.value_bound_m, baseline_m=one.baseline_m, margin_low_m=one.margin_low_m,
+        margin_high_m=one.margin_high_m, not_checked=one.not_checked or "",
+    )  # fmt: skip
+
+
+class FleetFile(Record, frozen=True):
+    """A file of a log as it was when it was read.
+
+    Attributes
+    ----------
+    mtime_ns : with `bytes` spares hashing it again; 0 of one that is not on a disk
+    sha256 : None where not all of it was read
+    version : what its store states about the content, of one that is not on a disk
+    """
+
+    path: str
+    bytes: int
+    mtime_ns: int
+    sha256: str | None
+    version: str = ""
+
+
+class FleetLog(Record, frozen=True):
+    """What a batch knows of a log.
+
+    Attributes
+    ----------
+    log : path below the common parent
+    run : directory of the run below that of the batch
+    status : of the result
+    this_time : ``skipped``: the result is that of an earlier batch from the same input, configuration and version
+    reason : why it failed, its ICRs are not usable, or that the log is truncated; `usable` : whether they are
+    details : last lines of the process that failed
+    repeatable : whether the same input, configuration and version give this result again
+    icr : final ICRs [m] and, as ``std_…``, their standard deviations
+    multiplier : (y_r - y_l)/b, wheel separation multiplier of a differential-drive controller, with `multiplier_std`
+    errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``
+    bounds : those of the names in `errors` whose distance is a lower bound; none in files of earlier versions
+    outages, warnings : how many
+    baseline : of the same names as `errors`, numbers of the log's report in the baseline
+    changes : how log, configuration and version differ from those of the baseline
+    key : hash of configuration, request and version
+    """
+
+    log: str
+    run: str
+    status: Status
+    reason: str = ""
+    usable: bool = True
+    details: str = ""
+    repeatable: bool = True
+    robot: str = ""
+    group: str = ""
+    tags: tuple[str, ...] = ()
+    start_utc: str = ""
+    duration_s: float | None = None
+    distance_m: float | None = None
+    icr: dict[str, float | None] = field(default_factory=dict)
+    multiplier: float | None = None
+    multiplier_std: float | None = None
+    errors: dict[str, float | None] = field(default_factory=dict)
+    bounds: tuple[str, ...] = ()
+    events: int | None = None
+    outages: int | None = None
+    warnings: int | None = None
+    verdicts: tuple[FleetVerdict, ...] = ()
+    baseline: dict[str, float | None] = field(default_factory=dict)
+    changes: tuple[str, ...] = ()
+    inputs: tuple[FleetFile, ...] = ()
+    key: str = ""
+    tool_version: str = ""
+    took_s: float = 0.0
+    this_time: ThisTime = "processed"
+
+    def shown_error(self, *, baseline: bool = False) -> float | None:
+        """Return the error [m] that stands for the log, or for its baseline."""
+        errors = self.baseline if baseline else self.errors
+        return errors.get(SHOWN_ERROR if SHOWN_ERROR in self.errors else SHOWN_WITHOUT)
+
+    @property
+    def gates_failed(self) -> int:
+        """How many acceptance limits were missed."""
+        return sum(not verdict.passed for verdict in self.verdicts)
+
+
+class FleetCalibration(Record, frozen=True):
+    """The calibration of all logs of one robot in one group.
+
+    Attributes
+    ----------
+    logs : that it is fitted to
+    left_out : logs that are not usable, copies, parts of another, or beyond the time that is calibrated together
+    file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
+    recommended, multiplier, multiplier_std : of the calibration
+    icrs_m : right, left, x of the calibration
+    within_m : distance over which 95 % of the held-out errors stay within `BUDGET_M`; within_beyond : at least that
+    table : leave-one-log-out table as text
+    key : hash of the logs and their content
+    """
+
+    robot: str
+    group: str
+    logs: tuple[str, ...]
+    left_out: tuple[str, ...] = ()
+    file: str = ""
+    reason: str = ""
+    recommended: str = ""
+    multiplier: float | None = None
+    multiplier_std: float | None = None
+    icrs_m: tuple[float, ...] = ()
+    within_m: float | None = None
+    within_beyond: bool = False
+    table: str = ""
+    key: str = ""
+
+    @property
+    def within_text(self) -> str:
+        """How far, as ``, within 0.5 m for 14.6 m``; empty where that is not known."""
+        if self.within_m is None:
+            return ""
+        return f", within {BUDGET_M:g} m (95 %) for {'more than ' if self.within_beyond else ''}{self.within_m:.1f} m"
+
+
+class FleetCounts(Record, frozen=True):
+    """How many logs were done and failed, and how many of them by an earlier batch."""
+
+    done: int
+    failed: int
+    skipped: int
+
+
+class FleetDocument(Record, frozen=True, kw_only=True):
+    """fleet.json; `output`: the folder of the batch, in what ``--json`` prints."""
+
+    schema: Literal["icrtool/fleet/1"]
+    tool_version: str
+    counts: FleetCounts
+    gates_failed: int
+    calibrations: tuple[FleetCalibration, ...] = ()
+    logs: tuple[FleetLog, ...]
+    output: str | UnsetType = UNSET
