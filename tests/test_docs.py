@@ -18,10 +18,8 @@ from click.testing import CliRunner
 import icrtool
 from icrtool.cli.commands import icrtool as command_line
 from icrtool.config import Config, builtin_robots
-from icrtool.logs.streams.heading_sources import HEADING_TYPES
-from icrtool.logs.streams.position_sources import POSITION_TYPES
+from icrtool.logs.streams.message_types import types_of
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
 from icrtool.output.tables.configuration import format_configuration
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -61,13 +59,13 @@ def test_the_readme_names_every_built_in_robot() -> None:
 
 @pytest.mark.parametrize(
     ("role", "types"),
-    [("Wheels", {*WHEEL_TYPES, *PAIR_TYPES}), ("Position", {*POSITION_TYPES}), ("Heading", {*HEADING_TYPES})],
+    [("Wheels", {*types_of("wheels"), *PAIR_TYPES}), ("Position", types_of("gnss")), ("Heading", types_of("heading"))],
 )
 def test_the_page_of_message_types_names_those_that_are_read_and_no_other(role: str, types: set[str]) -> None:
     page = (ROOT / "docs" / "reference" / "message-types.md").read_text(encoding="utf-8")
     section = page.split(f"## {role}\n")[1].split("\n## ")[0]
     named = {name for row in re.findall(r"^\| (.*?) \|", section, re.MULTILINE) for name in re.findall(r"`(.*?)`", row)}
-    assert {name for name in named if re.search(r"^foxglove\.|\w/", name)} - {"tf2_msgs/TFMessage"} == types
+    assert {name for name in named if re.search(r"^foxglove\.|\w/", name)} - {"tf2_msgs/TFMessage"} == {*types}
 
 
 @pytest.mark.parametrize("page", PAGES)

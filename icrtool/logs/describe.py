@@ -10,8 +10,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.read_log import Survey
-from icrtool.logs.streams.heading_sources import HeadingSource
-from icrtool.logs.streams.sources import PositionSource, WheelMotion
+from icrtool.logs.streams.sources import HeadingSource, PositionSource, WheelMotion
 from icrtool.records.plain_data import plain
 from icrtool.records.samples import ROLE_WORDS, Role, StreamChoice, rate_and_jitter
 from icrtool.records.tables import RobotLog

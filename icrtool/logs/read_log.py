@@ -20,9 +20,8 @@ from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.collectors import Collector, collector_for
-from icrtool.logs.messages.topic_table import TopicTable, merge_tables
-from icrtool.logs.streams.heading_sources import HeadingSource
-from icrtool.logs.streams.inertial import GYRO_FIELDS, GYRO_TYPE, Convention, find_gyro, find_gyros
+from icrtool.logs.messages.topic_table import HEADER, TopicTable, merge_tables
+from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE, find_gyro, find_gyros
 from icrtool.logs.streams.select import (
     Candidates,
     Choice,
@@ -32,7 +31,8 @@ from icrtool.logs.streams.select import (
     find_candidates,
     other_references,
 )
-from icrtool.logs.streams.sources import PositionSource, StampedRows, WheelMotion, clock_notes, usable_rows
+from icrtool.logs.streams.sources import Convention, HeadingSource, PositionSource, WheelMotion
+from icrtool.logs.streams.stamps import StampedRows, clock_notes, usable_rows
 from icrtool.logs.streams.transforms import FIELDS, antenna_place, is_static, transform_channels, transform_pose
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.logs.streams.wheel_speeds import ignored_joints, wheel_samples
@@ -133,7 +133,7 @@ def survey_log(
 def drop_used_columns(tables: list[TopicTable]) -> None:
     """Remove the columns that only candidates were made of: half of what a log takes."""
     for table in tables:
-        for name in table.columns.keys() - {*GYRO_FIELDS, *FIELDS}:
+        for name in table.columns.keys() - {*HEADER, *GYRO_AXES, *FIELDS}:
             del table.columns[name]
 
 

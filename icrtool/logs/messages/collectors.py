@@ -11,10 +11,15 @@ from numpy.typing import NDArray
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.decoded_values import MessageDecoder, ValueDecoder, parse_json
+from icrtool.logs.messages.decoded_values import (
+    NMEA_SENTENCE,
+    MessageDecoder,
+    SentenceDecoder,
+    ValueDecoder,
+    parse_json,
+)
 from icrtool.logs.messages.decoder import Decoder, ros_decoder
 from icrtool.logs.messages.definitions import definitions_of, full_name, kind_at
-from icrtool.logs.messages.nmea import NMEA_SENTENCE, SentenceDecoder
 from icrtool.logs.messages.protobuf import ProtobufParser, descriptors_of
 from icrtool.logs.messages.schema import BASE, MOST_ELEMENTS, NAME, SEQUENCE, Definitions, Slot, steps_of
 from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable, merge_tables, time_order

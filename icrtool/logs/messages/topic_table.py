@@ -102,8 +102,12 @@ class SetBack(NamedTuple):
 
 NOT_SET_BACK = SetBack(0, 0.0)
 
-HEADER = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
-"""Fields of a message's header."""
+FRAME = "header.frame_id"
+STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
+"""Fields of a message's stamp: in its header, or where it has none beside its values."""
+
+HEADER = (*STAMPS[0], FRAME, *STAMPS[1])
+"""Fields of a message's header, which are read of every topic."""
 
 NEAR_NS = 2_000_000_000
 """Messages may be stored out of order by less; a header stamp further from log time is another clock's."""

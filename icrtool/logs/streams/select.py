@@ -5,19 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, cast
 
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
 from icrtool.logs.containers.channel import Channel, some_of
 from icrtool.logs.messages.collectors import READ_ENCODINGS
-from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource
-from icrtool.logs.streams.inertial import GYRO_FIELDS, GYRO_TYPE
-from icrtool.logs.streams.position_sources import POSITION_TYPES
-from icrtool.logs.streams.sources import PositionSource, WheelMotion, of_topic
+from icrtool.logs.messages.topic_table import HEADER, TopicTable
+from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE
+from icrtool.logs.streams.message_types import fields_of, read_source, types_of
+from icrtool.logs.streams.sources import HeadingSource, PositionSource, WheelMotion, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
 from icrtool.logs.streams.wheel_speeds import check_joints
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean
@@ -79,28 +77,25 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
     topics, wanted = config.topics, {}
     sides = side_fields(channels, topics)
     for channel in channels:
-        kind = channel.message_type
-        paths: list[str] = []
-        if kind in WHEEL_TYPES and topics.wheel_left is None and topics.wheels in (None, channel.topic):
-            paths += WHEEL_TYPES[kind][0]
-        if kind in POSITION_TYPES and topics.gnss in (None, channel.topic):
-            paths += POSITION_TYPES[kind][0]
-        if kind in HEADING_TYPES and topics.heading in (None, channel.topic):
-            paths += HEADING_TYPES[kind][0]
-        if kind == GYRO_TYPE:
-            paths += GYRO_FIELDS
-        paths += sorted(sides.get(channel.id, ()))
+        paths = sorted(sides.get(channel.id, ()))
+        for role in ROLE_WORDS:
+            if (role != "wheels" or topics.wheel_left is None) and getattr(topics, role) in (None, channel.topic):
+                paths += fields_of(role, channel.message_type)
+        if channel.message_type == GYRO_TYPE:
+            paths += GYRO_AXES
         if paths:
-            wanted[channel.id] = tuple(dict.fromkeys(paths))
+            wanted[channel.id] = tuple(dict.fromkeys([*HEADER, *paths]))
     return wanted
 
 
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
     """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace."""
     topics = config.topics
-    gnss = _read_all(tables, POSITION_TYPES, topics.gnss, PositionSource)
-    heading = _read_all(tables, HEADING_TYPES, topics.heading, HeadingSource)
-    wheels = _wheel_candidates(tables, config)
+    gnss = _read_all(tables, "gnss", config, PositionSource)
+    heading = _read_all(tables, "heading", config, HeadingSource)
+    wheels = pair_candidates(tables, config)
+    if topics.wheel_left is None:
+        wheels = _read_all(tables, "wheels", config, WheelMotion) + wheels
     filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
 
     def completeness(topic: str) -> float:
@@ -125,34 +120,16 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
     return Candidates(tuple(wheels), tuple(gnss), tuple(heading), unread | _empty_topics(tables))
 
 
-def _read_all(
-    tables: Sequence[TopicTable],
-    types: Mapping[str, tuple[tuple[str, ...], Callable[[TopicTable], Kind]]],
-    configured: str | None,
-    unread: type[Kind],
-) -> list[Kind]:
+def _read_all(tables: Sequence[TopicTable], role: Role, config: Config, kind: type[Kind]) -> list[Kind]:
     """Return the topics of one role as sources; a topic whose type lacks a needed field in this log is not usable."""
-    sources = []
+    sources, types = [], types_of(role)
     for table in tables:
-        if table.message_type in types and configured in (None, table.topic) and len(table):
+        if table.message_type in types and getattr(config.topics, role) in (None, table.topic) and len(table):
             try:
-                sources.append(types[table.message_type][1](table))
+                sources.append(cast("Kind", read_source(role, table, config)))
             except DefinitionError as err:
-                sources.append(unread(**of_topic(table), problem=err.why))
+                sources.append(kind(**of_topic(table), problem=err.why))
     return sources
-
-
-def _wheel_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
-    topics = config.topics
-    pairs = pair_candidates(tables, config)
-    if topics.wheel_left is not None:
-        return pairs
-
-    def bound(read: Callable[[TopicTable, Config], WheelMotion]) -> Callable[[TopicTable], WheelMotion]:
-        return lambda table: read(table, config)
-
-    readers = {name: (paths, bound(read)) for name, (paths, read) in WHEEL_TYPES.items()}
-    return _read_all(tables, readers, topics.wheels, WheelMotion) + pairs
 
 
 def _empty_topics(tables: Sequence[TopicTable]) -> dict[str, str]:

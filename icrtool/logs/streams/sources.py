@@ -1,189 +1,16 @@
-"""What every topic that may feed a role has: its clock, how suitable it is, and why it cannot be used."""
+"""Topics that may feed a role: what was read of each, and the fields of messages that it is read from."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from icrtool.config import Config
-from icrtool.errors import DataError
-from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
-from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, SetBack, TopicTable
-from icrtool.records.samples import Role
-
-MOST_PIECES = 10.0
-"""Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
-
-LARGEST_SHARE_BACKWARDS = 0.01
-LARGEST_SHARE_ZERO = 0.01
-
-AROUND = 25
-"""Messages before and after a step of a clock whose median delay to log time decides whether it lasts."""
-
-
-@dataclass(frozen=True, slots=True)
-class StampedRows:
-    """The stamps of a topic's messages.
-
-    Attributes
-    ----------
-    header_ns : (n,) header stamps, None where they are absent or cannot be used
-    log_ns : (n,) log times
-    note : why the header's are not used, empty when they are
-    delay_ns : median of log time minus header stamp, 0 without header stamps
-    replaced : header stamps of another clock that log times stand for
-    set_back : as `TopicTable.set_back`
-    header_back : the largest step by which the clock of the headers was set back, and its last stamp before
-    """
-
-    header_ns: Ints | None
-    log_ns: Ints
-    note: str
-    delay_ns: int
-    replaced: int = 0
-    set_back: SetBack = NOT_SET_BACK
-    header_back: SetBack = NOT_SET_BACK
-
-    def on(self, clock: Literal["header", "log"]) -> Ints:
-        """Return the stamps on a clock; the log's where the header's cannot be used."""
-        return self.header_ns if clock == "header" and self.header_ns is not None else self.log_ns
-
-
-def stamp_rows(table: TopicTable, path: str = "header.stamp") -> StampedRows:
-    """Return the stamps of a topic; header stamps only where they are non-zero, near log time and increasing."""
-    return replace(_usable(table, path), set_back=table.set_back)
-
-
-def _usable(table: TopicTable, path: str) -> StampedRows:
-    log_ns = table.log_time_ns
-    seconds, nanoseconds = table.integers(f"{path}.sec"), table.integers(f"{path}.nanosec")
-    if seconds is None or nanoseconds is None or not len(log_ns):
-        return StampedRows(None, log_ns, "no header", 0)
-    header = seconds * 1_000_000_000 + nanoseconds
-    zeros = np.count_nonzero(header == 0)
-    if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
-        return StampedRows(None, log_ns, f"{100 * zeros / len(header):.0f} % of the header stamps are 0", 0)
-    header, back = _without_steps_back(header, log_ns)
-    return replace(_near_log_time(header, log_ns), header_back=back)
-
-
-def _without_steps_back(header: Ints, log_ns: Ints) -> tuple[Ints, SetBack]:
-    """Return header stamps (n,) of a clock that was set back as if it had not been, and the largest step.
-
-    Log time goes on, so the delay to it grows by the step and stays there; after a message out of place it does not.
-    """
-    steps = np.flatnonzero(np.diff(header) < 0)
-    if not len(steps) or len(steps) > LARGEST_SHARE_BACKWARDS * len(header) + 1:
-        return header, NOT_SET_BACK
-    delay = log_ns - header
-    rows = np.arange(AROUND)
-    before = np.median(delay[np.maximum(steps[:, None] - rows, 0)], axis=1)
-    after = np.median(delay[np.minimum(steps[:, None] + 1 + rows, len(delay) - 1)], axis=1)
-    grown = (after - before).astype(np.int64)
-    lasting = grown > OUT_OF_ORDER_NS
-    if not lasting.any():
-        return header, NOT_SET_BACK
-    largest = int(np.argmax(np.where(lasting, grown, 0)))
-    moved = np.zeros(len(header), np.int64)
-    moved[steps[lasting] + 1] = grown[lasting]
-    return header + np.cumsum(moved), SetBack(int(grown[largest]), 0.0, int(header[steps[largest]]))
-
-
-def _near_log_time(header: Ints, log_ns: Ints) -> StampedRows:
-    """Return header stamps that are near log time and increasing, log times in place of a few others, or why not."""
-    delay = int(np.median(log_ns - header))
-    if abs(delay) > NEAR_NS:
-        return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
-    # A few stamps of another clock (a first message at 0) are replaced by their log times.
-    other = np.abs(log_ns - header - delay) > NEAR_NS
-    header[other] = log_ns[other] - delay
-    backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
-    if backwards > LARGEST_SHARE_BACKWARDS:
-        return StampedRows(None, log_ns, f"{100 * backwards:.0f} % of the header stamps go back", 0)
-    return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)))
-
-
-def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
-    """Yield sentences about clocks of streams that were set back, one for all, and that cannot be used, one for each.
-
-    Raises
-    ------
-    DataError
-        The clock was set back, and times came again: nothing shows which of two samples came first.
-    """
-    yield from _set_back_note(streams, name)
-    if back := [(rows.header_back, role) for role, rows in streams if rows.header_back.step_ns]:
-        step_ns, _, before_ns = max(back)[0]
-        yield (
-            f"{name}: header stamps go back by {step_ns / 1e9:.1f} s after {_time_of_day(before_ns)} "
-            f"({', '.join(role for _, role in back)}): their clock was set back while recording; the later ones are "
-            "moved by as much, which log time shows"
-        )
-    for role, rows in streams:
-        if rows.note and rows.note != "no header":
-            yield f"{name}: {role}: {rows.note}; log time is used"
-        if rows.replaced > 1:
-            counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
-            yield f"{name}: {role}: {counted}; log time is used for them"
-
-
-def _set_back_note(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
-    """Yield the sentence on the log's clock, with the largest step of the streams that show one."""
-    back = [
-        (rows.set_back, role)
-        for role, rows in streams
-        if rows.set_back.pieces > MOST_PIECES or rows.set_back.step_ns > NEAR_NS
-    ]
-    if not back:
-        return
-    # Of streams in which times come again, the largest step: they decide what can be done.
-    largest = max(back, key=lambda one: (one[0].pieces > MOST_PIECES, one[0].step_ns))[0]
-    moment = _time_of_day(largest.before_ns)
-    why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment} ({', '.join(role for _, role in back)})"
-    far = largest.step_ns > NEAR_NS
-    if largest.pieces > MOST_PIECES and far:
-        raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
-    if largest.pieces > MOST_PIECES:
-        yield (
-            f"{name}: {why}: the clock was set back while recording, and samples of that time are mixed, which makes "
-            "errors there too large; fit each part alone (--from, --to)"
-        )
-    else:
-        yield (
-            f"{name}: {why}: the clock was set back, or messages are stored out of order; all are used, sorted by "
-            "time; if it was set back, fit each part alone (--from, --to)"
-        )
-
-
-def _time_of_day(stamp_ns: int) -> str:
-    return f"{np.datetime64(stamp_ns // 1_000_000_000, 's')}Z"
-
-
-def usable_rows(stamps: Ints, usable: Bools) -> Ints | slice:
-    """Return the usable rows (n,) that make stamps strictly increasing; all rows as a slice, which copies nothing."""
-    if usable.all():
-        return increasing(stamps)[0]
-    rows = np.flatnonzero(usable)
-    return rows[increasing(stamps[rows])[0]]
-
-
-def increasing(stamps: Ints) -> tuple[Ints | slice, int, int]:
-    """Return the rows that make stamps strictly increasing, how many went back, and how many were equal.
-
-    Rows are sorted by stamp; of rows with the same stamp the last one stays. All rows in their order are a slice.
-    """
-    steps = np.diff(stamps)
-    if (steps > 0).all():
-        return slice(None), 0, 0
-    backwards = int(np.count_nonzero(steps < 0))
-    order = np.argsort(stamps, kind="stable") if backwards else np.arange(len(stamps))
-    ordered = stamps[order]
-    keep = np.append(np.diff(ordered) > 0, True) if len(ordered) else np.empty(0, np.bool_)
-    return order[keep], backwards, len(stamps) - int(np.count_nonzero(keep))
-
+from icrtool.kernels.arrays import Bools, Bytes, Floats
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.stamps import StampedRows, stamp_rows
 
 NEVER_MOVES = 60.0
 """Subtracted from the score of what never moves: another topic that moves is preferred."""
@@ -199,6 +26,7 @@ class Source:
     ----------
     score : how suitable the type is; why : the reason as text
     problem : why it cannot be used, empty when it can
+    note : what a user must know of it
     """
 
     topic: str
@@ -207,6 +35,12 @@ class Source:
     score: float = 0.0
     why: str = ""
     problem: str = ""
+    note: str = ""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no row can be used, even where the topic is configured."""
+        return True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,23 +65,48 @@ class PositionSource(Source):
 
     @property
     def is_empty(self) -> bool:
-        """Whether no row can be used, even where the topic is configured."""
+        """Whether no row can be used."""
         return not self.usable.any()
 
 
-PositionEntry = tuple[tuple[str, ...], Callable[[TopicTable], PositionSource]]
-"""The fields of a message type to take, and how to read them."""
+Convention = Literal["enu", "ned"]
 
 
-def of_topic(table: TopicTable, stamp: str = "header.stamp") -> dict[str, Any]:
-    """Return what a source has of its topic; `stamp` is the field of its stamps."""
-    return {"topic": table.topic, "message_type": table.message_type, "stamps": stamp_rows(table, stamp)}
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeadingSource(Source):
+    """Headings of one topic.
+
+    Attributes
+    ----------
+    yaw_rad : (n,) as recorded: counter-clockwise from east where `convention` is ``enu``, else clockwise from north
+    variance : (n,) [rad^2], NaN where not stated
+    usable : (n,)
+    convention_why : how the convention is known
+    """
+
+    yaw_rad: Floats = field(default_factory=lambda: np.empty(0))
+    variance: Floats = field(default_factory=lambda: np.empty(0))
+    usable: Bools = field(default_factory=lambda: NO_ROWS)
+    convention: Convention = "enu"
+    convention_why: str = ""
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no row can be used."""
+        return not self.usable.any()
+
+    def heading_rad(self, convention: Convention) -> Floats:
+        """Return headings clockwise from north in (-pi, pi]."""
+        heading = self.yaw_rad if convention == "ned" else math.pi / 2 - self.yaw_rad
+        return np.pi - np.mod(np.pi - heading, 2 * np.pi)
 
 
 Unit = Literal["rad", "m", "counts", "unknown"]
 
 Pair = tuple[Floats, Floats]
 """Of the left and of the right side, (n,) each."""
+
+Sides = tuple[Floats | None, Floats | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -260,7 +119,6 @@ class WheelMotion(Source):
     speed : in `unit` per second; None where not recorded
     twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only that of the body is recorded
     joints : the joints that its messages list by name, where they do
-    note : what a user must know of it
     """
 
     position: Pair | None = None
@@ -268,15 +126,11 @@ class WheelMotion(Source):
     unit: Unit = "rad"
     twist: Floats | None = None
     joints: tuple[str, ...] = ()
-    note: str = ""
 
     @property
     def is_empty(self) -> bool:
-        """Whether no row can be used, even where the topic is configured."""
+        """Whether nothing of both sides is recorded."""
         return self.twist is None and self.position is None and self.speed is None
-
-
-Sides = tuple[Floats | None, Floats | None]
 
 
 def motion_of(motion: WheelMotion, position: Sides = (None, None), speed: Sides = (None, None)) -> WheelMotion:
@@ -302,5 +156,97 @@ def nonzero(values: Floats) -> bool:
     return bool(np.any(values[np.isfinite(values)] != 0.0))
 
 
-WheelEntry = tuple[tuple[str, ...], Callable[[TopicTable, Config], WheelMotion]]
-"""The fields of a message type to take, and how to read them."""
+def of_topic(table: TopicTable) -> dict[str, Any]:
+    """Return what a source has of its topic."""
+    return {"topic": table.topic, "message_type": table.message_type, "stamps": stamp_rows(table)}
+
+
+class Number(NamedTuple):
+    """A number in the messages of a type.
+
+    Attributes
+    ----------
+    names : its field, in each spelling that drivers use (``hAcc``, ``h_acc``)
+    unit : what 1 means: in m, rad, degrees of latitude or longitude
+    largest : recorded numbers beyond it, of either sign, stand for "not known"
+    fine : added where it is known: further digits, or the height of the geoid
+    """
+
+    names: tuple[str, ...]
+    unit: float = 1.0
+    largest: float = math.inf
+    fine: Number | None = None
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields that it is read from."""
+        return (*self.names, *(self.fine.fields if self.fine is not None else ()))
+
+    def of(self, table: TopicTable, *, needed: bool = False) -> Floats:
+        """Return its values (n,); NaN where unknown, or where the type lacks it.
+
+        Raises
+        ------
+        DefinitionError
+            It is needed, and the type, as the log defines it, lacks it.
+        """
+        values = (table.column(*self.names) if needed else table.floats(*self.names)) * self.unit
+        if math.isfinite(self.largest):
+            values = np.where(np.abs(values) <= self.largest * self.unit, values, np.nan)
+        if self.fine is not None:
+            fine = self.fine.of(table)
+            values = values + np.where(np.isfinite(fine), fine, 0.0)
+        return values
+
+
+class Check(NamedTuple):
+    """A field by which messages are valid; all are where the type lacks it.
+
+    Attributes
+    ----------
+    names : the field, in each spelling that drivers use
+    accepted : its numbers or words in valid messages; empty: all but the `refused` ones
+    mask : the bits of a whole number that count
+    least : the least number of a valid message
+    unset : the number that drivers leave in it which never set it: where all messages have it, all are valid
+    """
+
+    names: tuple[str, ...]
+    accepted: frozenset[int | str] = frozenset()
+    refused: frozenset[int] = frozenset()
+    mask: int | None = None
+    least: float = -math.inf
+    unset: float = math.nan
+
+    def of(self, table: TopicTable) -> Bools:
+        """Return which messages (n,) are valid."""
+        if (path := self.names[0]) in table.texts:
+            codes, texts = table.words(path)
+            return np.array([*(text in self.accepted for text in texts), False])[codes]
+        values = table.find(*self.names) if self.mask is None else table.integers(*self.names)
+        if values is None or np.all(values == self.unset):
+            return np.ones(len(table), np.bool_)
+        values = values if self.mask is None else values & self.mask
+        valid = ~np.isin(values, sorted(self.refused)) & ~(values < self.least)
+        if self.accepted:
+            valid &= np.isin(values, [one for one in self.accepted if isinstance(one, int)])
+        return valid
+
+
+def all_valid(table: TopicTable, checks: tuple[Check, ...]) -> Bools:
+    """Return which messages (n,) pass all checks."""
+    valid = np.ones(len(table), np.bool_)
+    for check in checks:
+        valid &= check.of(table)
+    return valid
+
+
+def fields_of_all(*parts: Number | Check | str | None) -> tuple[str, ...]:
+    """Return the fields of numbers, checks and paths."""
+    fields: list[str] = []
+    for one in parts:
+        if isinstance(one, str):
+            fields += [one] if one else []
+        elif one is not None:
+            fields += one.fields if isinstance(one, Number) else one.names
+    return tuple(fields)

@@ -12,8 +12,9 @@ from icrtool.config import TopicsConfig
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.channel import Channel
-from icrtool.logs.messages.topic_table import HEADER, TopicTable
-from icrtool.logs.streams.position_sources import POSITION_TYPES, REFERENCE_FRAMES, REFERENCE_WORDS
+from icrtool.logs.messages.topic_table import FRAME, STAMPS, TopicTable
+from icrtool.logs.streams.message_types import types_of
+from icrtool.logs.streams.positions import REFERENCE_FRAMES, REFERENCE_WORDS
 from icrtool.records.text import LogText
 
 TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
@@ -45,7 +46,7 @@ def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[flo
     ----------
     antenna_topic : topic of the fixes; its header names the antenna's frame
     """
-    frame = next((_plain(t.text("header.frame_id")) for t in tables if t.topic == antenna_topic), "")
+    frame = next((_plain(t.text(FRAME)) for t in tables if t.topic == antenna_topic), "")
     transforms = _transforms([t for t in tables if t.message_type in TYPES])
     if not frame or frame not in transforms:
         return None
@@ -141,7 +142,7 @@ def transform_channels(channels: Sequence[Channel], topics: TopicsConfig) -> dic
     Reading all transforms takes longer than the rest of a log. An odometry that is no reference by name does not count.
     """
     named = any(
-        one.message_type in POSITION_TYPES
+        one.message_type in types_of("gnss")
         and (one.message_type != "nav_msgs/Odometry" or REFERENCE_WORDS.search(one.topic) is not None)
         for one in channels
     )
@@ -189,10 +190,10 @@ def transform_pose(table: TopicTable) -> TopicTable:
         raise DefinitionError(table.topic, f"its {root} never moves against the odometry: that is dead reckoning")
     frame = np.zeros((np.count_nonzero(step), 1), np.int64)
     values = [*stamps[step].T, *frame.T, *place[step].T, *turn[step].T]
-    columns = dict(zip((*HEADER, *_POSE), values, strict=True))
+    columns = dict(zip((*STAMPS[0], FRAME, *_POSE), values, strict=True))
     return replace(
         table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[rows[step]],
-        columns=columns, texts={HEADER[2]: [root]},
+        columns=columns, texts={FRAME: [root]},
     )  # fmt: skip
 
 

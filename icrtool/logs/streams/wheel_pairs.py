@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -16,12 +17,11 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Ints
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.definitions import number_fields
-from icrtool.logs.messages.topic_table import HEADER, TopicTable
-from icrtool.logs.streams.heading_sources import HEADING_TYPES
-from icrtool.logs.streams.position_sources import POSITION_TYPES
-from icrtool.logs.streams.sources import StampedRows, Unit, WheelMotion, motion_of, of_topic, stamp_rows
-from icrtool.logs.streams.wheel_joints import MOST_WHEELS, WHEEL_WORDS, right_twin
-from icrtool.logs.streams.wheel_sources import COMMAND_NOTE, COMMANDED, WHEEL_TYPES
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
+from icrtool.logs.streams.sources import Unit, WheelMotion, motion_of, of_topic
+from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTE, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
 from icrtool.records.text import LogText
 
 _NUMBERS = ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32", "UInt64")
@@ -47,8 +47,6 @@ _ONLY_SIDE = re.compile(
 
 _DRIVER_WORDS = re.compile(r"tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|roboteq|roboclaw", re.IGNORECASE)
 """Words of a message about wheels, beside those of `WHEEL_WORDS`; the last ones are makes of motor controllers."""
-_ELEMENTS = re.compile(r"\[([\d,]+)\]")
-_KNOWN = {*WHEEL_TYPES, *POSITION_TYPES, *HEADING_TYPES}
 MOST_SEARCHED = 1 << 19
 """Characters of the definitions in a log whose fields are searched for sides: those of some hundred types."""
 
@@ -84,19 +82,14 @@ class Side:
         DefinitionError
             The messages have no such field or element.
         """
-        values, elements = self.table.column(stored_path(self.path)), _ELEMENTS.search(self.path)
-        if elements is None:
+        column, places = elements(self.path)
+        values = self.table.column(column)
+        if not places:
             return _unwrapped(values)
-        places = [int(place) for place in elements[1].split(",") if place]
         if values.ndim != 2 or max(places) >= values.shape[1]:
             raise DefinitionError(self.name, "its messages have no such element")
         wheels: NDArray[Any] = np.array([_unwrapped(values[:, place]) for place in places])
         return np.asarray(wheels[0] if len(places) == 1 else wheels.mean(axis=0))
-
-
-def stored_path(path: str) -> str:
-    """Return the column that holds a side's field: elements of an array are read together."""
-    return _ELEMENTS.sub("[*]", path, count=1)
 
 
 def topic_of_side(name: str) -> str:
@@ -115,7 +108,7 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
         for topic, _, path in (topics.wheel_left.partition("."), topics.wheel_right.partition(".")):
             for channel in channels:
                 if channel.topic == topic:
-                    found.setdefault(channel.id, set()).update({*HEADER, stored_path(path or "data")})
+                    found.setdefault(channel.id, set()).update(elements(path or "data")[:1])
         return found
     names: dict[str, dict[str, list[tuple[int, str]]]] = {}
     searched: set[tuple[str, str]] = set()
@@ -129,7 +122,7 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
         for left, places in alike.items():
             right = right_twin(left, alike)
             for number, path in [*places, *alike[right]] if right is not None else places if "[" in left else ():
-                found.setdefault(number, set()).update({*HEADER, path})
+                found.setdefault(number, set()).add(path)
     return found
 
 
@@ -158,7 +151,7 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
     """Return whether a field may be a wheel's motion: a driver's messages hold currents and states, too."""
     if message_type in PAIR_TYPES:
         return path == "data"
-    if message_type in _KNOWN or not _of_wheels(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
+    if message_type in MESSAGE_TYPES or not _of_wheels(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
         return False
     field = path.rpartition(".")[2]
     only_side = bool(_ONLY_SIDE.fullmatch(field) and _SIDE_WORDS.search(field))
@@ -218,7 +211,7 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
     kind = LogText(" + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right))))
     topic = LogText(f"{left.name.raw} + {right.name.raw}")
     commanded = bool(COMMANDED.search(left.name))
-    score, why = 80.0 - (40.0 if commanded else 0.0), "a number of each side" + (" (commanded)" if commanded else "")
+    score, why = 80.0 - (COMMAND if commanded else 0.0), "a number of each side" + (" (commanded)" if commanded else "")
     note = COMMAND_NOTE if commanded else ""
     stamps, times, held = _common_stamps(left.table, right.table)
 
@@ -304,3 +297,28 @@ def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: b
         return integer
     # A position's steps add up to about its range; a speed goes up and down around few values.
     return bool(np.abs(np.diff(finite)).sum() < 3.0 * np.ptp(finite) and np.ptp(finite) > 5.0)
+
+
+def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:
+    """Return the topic whose name is `left_topic` with left replaced by right; None when there is none."""
+    existing = topics if isinstance(topics, AbstractSet | Mapping) else set(topics)
+    for old, new in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
+        if old in left_topic:
+            twin = left_topic.replace(old, new)
+            return twin if twin in existing else None
+    for place, letter in enumerate(left_topic):
+        if letter not in "lL" or not _stands_alone(left_topic, place):
+            continue
+        twin = left_topic[:place] + ("r" if letter == "l" else "R") + left_topic[place + 1 :]
+        if twin in existing:
+            return twin
+    return None
+
+
+def _stands_alone(name: str, place: int) -> bool:
+    """Return whether a letter begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
+    before = name[place - 1] if place else "/"
+    after = name[place + 1] if place + 1 < len(name) else "/"
+    begins = not before.isalpha() or (before.islower() and name[place].isupper())
+    ends = not after.isalpha()
+    return begins or ends

@@ -11,7 +11,8 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.channel import some_of
-from icrtool.logs.streams.sources import Pair, Unit, WheelMotion, increasing
+from icrtool.logs.streams.sources import Pair, Unit, WheelMotion
+from icrtool.logs.streams.stamps import increasing
 from icrtool.records.samples import WheelSamples
 
 _Key = Literal["left_joints", "right_joints"]

@@ -11,9 +11,9 @@ from icrtool.config import load_config
 from icrtool.errors import IcrToolError
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.messages.topic_table import LARGEST, GrowingColumn, TopicTable
-from icrtool.logs.streams.heading_sources import HEADING_TYPES
-from icrtool.logs.streams.position_sources import POSITION_TYPES
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
+from icrtool.logs.streams.message_types import fields_of, read_source, types_of
+from icrtool.logs.streams.sources import HeadingSource, PositionSource
+from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import LogText
 
 CONFIG = load_config(sets=["robot.track_width_m=0.55"])
@@ -58,30 +58,15 @@ def test_what_is_too_large_is_infinite_in_a_column_and_all_else_is_kept() -> Non
     np.testing.assert_array_equal(held(np.full(5, -1.7e308)), np.full(5, -np.inf))
 
 
-@pytest.mark.parametrize("name", HEADING_TYPES)
-def test_headings_of_any_type_are_read_without_a_warning(name: str) -> None:
-    fields, read = HEADING_TYPES[name]
+@pytest.mark.parametrize(("role", "name"), [(role, name) for role in ROLE_WORDS for name in types_of(role)])
+def test_messages_of_any_type_are_read_without_a_warning(role: Role, name: str) -> None:
     for seed in range(60):
         with suppress(IcrToolError):
-            source = read(table_of(name, fields, np.random.default_rng(seed)))
-            assert np.isfinite(source.heading_rad("ned")[source.usable]).all()
-            source.heading_rad("enu")
-
-
-@pytest.mark.parametrize("name", POSITION_TYPES)
-def test_positions_of_any_type_are_read_without_a_warning(name: str) -> None:
-    fields, read = POSITION_TYPES[name]
-    for seed in range(60):
-        with suppress(IcrToolError):
-            source = read(table_of(name, fields, np.random.default_rng(seed)))
-            place = source.geodetic if source.geodetic is not None else source.metric
-            assert place is not None
-            assert np.isfinite(place[source.usable, :2]).all()
-
-
-@pytest.mark.parametrize("name", WHEEL_TYPES)
-def test_wheels_of_any_type_are_read_without_a_warning(name: str) -> None:
-    fields, read = WHEEL_TYPES[name]
-    for seed in range(60):
-        with suppress(IcrToolError):
-            read(table_of(name, fields, np.random.default_rng(seed)), CONFIG)
+            source = read_source(role, table_of(name, fields_of(role, name), np.random.default_rng(seed)), CONFIG)
+            if isinstance(source, HeadingSource):
+                assert np.isfinite(source.heading_rad("ned")[source.usable]).all()
+                source.heading_rad("enu")
+            elif isinstance(source, PositionSource):
+                place = source.geodetic if source.geodetic is not None else source.metric
+                assert place is not None
+                assert np.isfinite(place[source.usable, :2]).all()

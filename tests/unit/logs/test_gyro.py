@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.inertial import find_gyro
+from icrtool.logs.streams.headings import find_gyro
 
 COUNT = 60
 TIMES = 1_760_000_000_000_000_000 + 10_000_000 * np.arange(COUNT)

@@ -33,7 +33,8 @@ from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import read_log, survey_log
-from icrtool.logs.streams.sources import stamp_rows
+from icrtool.logs.streams.message_types import read_source
+from icrtool.logs.streams.stamps import stamp_rows
 from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
 from icrtool.records.text import LogText
 
@@ -433,7 +434,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, open_log, sqlite_bag, unpack
     from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf, schema
-    from icrtool.logs.streams import wheel_joints, wheel_pairs
+    from icrtool.logs.streams import wheel_pairs, wheels
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
@@ -446,7 +447,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         sqlite_bag._LARGEST_MESSAGE_BYTES, decoded_values.LONGEST_MESSAGE_BYTES, protobuf.LONGEST_DESCRIPTORS,
         schema.DEEPEST, schema.MOST_FIELDS,
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
-        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheel_joints.MOST_WHEELS,
+        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheels.MOST_WHEELS,
             wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PAIRS,
         table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
     ]  # fmt: skip
@@ -558,13 +559,11 @@ def test_topics_of_many_joints_take_memory_for_their_messages_only() -> None:
 
 @pytest.mark.parametrize(("side", "problem"), [(32, ""), (33, "33 left and 33 right wheels; at most 32")])
 def test_a_message_of_more_wheels_than_a_robot_has_is_not_of_wheels(side: int, problem: str) -> None:
-    from icrtool.config import Config
-    from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
 
     names = [f"{one}_wheel_{k}" for k in range(side) for one in ("left", "right")]
     rows = [(START_NS + i, joints(START_NS + i, names, [0.1 * i] * len(names))) for i in range(3)]
     table = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, rows)
-    motion = WHEEL_TYPES["sensor_msgs/JointState"][1](table, Config())
+    motion = read_source("wheels", table, Config())
     assert problem in motion.problem
     assert bool(motion.problem) == bool(problem)
 
@@ -579,15 +578,13 @@ def test_of_ever_new_names_the_first_thousands_are_told_apart() -> None:
 
 
 def test_joints_at_infinity_are_left_out() -> None:
-    from icrtool.config import Config
-    from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
     from icrtool.logs.streams.wheel_speeds import wheel_samples
 
     rows = [(START_NS + i * 10**8, [0.1 * i, 0.1 * i if i % 4 else np.inf * (-1) ** i]) for i in range(100)]
     messages = [(stamp, joints(stamp, WHEELS, positions)) for stamp, positions in rows]
     table = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, messages)
     config = load_config(sets=["robot.track_width_m=0.5", "robot.wheel_radius_m=0.1"])
-    motion = WHEEL_TYPES["sensor_msgs/JointState"][1](table, Config())
+    motion = read_source("wheels", table, Config())
     samples, warnings = wheel_samples(motion, motion.stamps.on("log"), config, "x")
     assert np.isfinite(samples.right).all()
     assert any("25 of 100 wheel samples are not finite numbers" in warning for warning in warnings)

@@ -28,19 +28,17 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from icrtool.logs.messages.collectors import DYNAMIC_JOINT_STATE
-from icrtool.logs.messages.nmea import NMEA_SENTENCE
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.decoded_values import NMEA_SENTENCE
+from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.read_log import Survey, survey_log
-from icrtool.logs.streams.heading_sources import HEADING_TYPES
-from icrtool.logs.streams.position_sources import POSITION_TYPES
+from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, types_of
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
+from icrtool.records.samples import ROLE_WORDS, Role
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 10_000_000
 MESSAGES = 31
-ALL_TYPES = {*WHEEL_TYPES, *POSITION_TYPES, *HEADING_TYPES, *PAIR_TYPES}
-TYPES = sorted(name for name in ALL_TYPES if "/" in name and name != NMEA_SENTENCE)
+TYPES = sorted(name for name in {*MESSAGE_TYPES, *PAIR_TYPES} if "/" in name and name != NMEA_SENTENCE)
 """Of ROS, but sentences, of which more columns are made than the message has fields (test_nmea.py)."""
 CONTAINERS = ("bag", "db3", "db3 big-endian", "db3 without definitions", "mcap cdr", "mcap idl", "mcap ros1")
 ROS1 = ("bag", "mcap ros1")
@@ -65,8 +63,8 @@ def topic_of(message_type: str) -> str:
 
 
 def paths_of(message_type: str) -> tuple[str, ...]:
-    paths = [types[message_type][0] for types in (WHEEL_TYPES, POSITION_TYPES, HEADING_TYPES) if message_type in types]
-    return tuple(dict.fromkeys(path for some in paths for path in some)) or ("data",)
+    paths = (path for role in ROLE_WORDS for path in fields_of(role, message_type))
+    return (*HEADER, *(dict.fromkeys(paths) or ("data",)))
 
 
 def camel(text: str) -> str:
@@ -373,7 +371,7 @@ def test_every_wanted_column_is_what_another_library_decodes(
 @pytest.mark.parametrize("message_type", TYPES)
 def test_the_fields_a_reader_asks_for_exist_in_one_spelling_or_the_other(message_type: str) -> None:
     spellings = [make_store(ros1=ros1) for ros1 in (False, True)]
-    optional = {"lateral_velocity", "invalidLlh"} | ({"flags"} if "HPPOSLLH" in message_type else set())
+    optional = {*HEADER, "lateral_velocity", "invalidLlh"} | ({"flags"} if "HPPOSLLH" in message_type else set())
     if message_type == DYNAMIC_JOINT_STATE:
         optional |= {"name[*]", "position[*]", "velocity[*]"}
     for path in set(paths_of(message_type)) - optional:
@@ -387,9 +385,9 @@ def test_every_topic_is_a_candidate_of_its_roles(logs: Callable[[str], Written],
         role: {topic for source in sources for topic in source.topic.split(" + ")}
         for role, sources in (("wheels", found.wheels), ("gnss", found.gnss), ("heading", found.heading))
     }
-    assert topics["wheels"] >= {topic_of(name) for name in TYPES if name in {*WHEEL_TYPES, *PAIR_TYPES}}
-    assert topics["gnss"] == {topic_of(name) for name in TYPES if name in POSITION_TYPES}
-    assert topics["heading"] == {topic_of(name) for name in TYPES if name in HEADING_TYPES}
+    assert topics["wheels"] >= {topic_of(name) for name in TYPES if name in {*types_of("wheels"), *PAIR_TYPES}}
+    assert topics["gnss"] == {topic_of(name) for name in TYPES if name in types_of("gnss")}
+    assert topics["heading"] == {topic_of(name) for name in TYPES if name in types_of("heading")}
     assert found.unread == {}
 
 
@@ -444,14 +442,15 @@ def test_a_type_that_lacks_a_field_is_read_without_it_or_refused_in_words(tmp_pa
         for role, sources in (("wheels", found.wheels), ("gnss", found.gnss), ("heading", found.heading))
         for source in sources
     }
-    for role, types, required in (
-        ("gnss", POSITION_TYPES, {"latitude", "longitude", "lat", "lon", "pose"}),
-        ("heading", HEADING_TYPES, {"orientation", "azimuth", "unit", "quaternion", "pose"}),
-        ("wheels", WHEEL_TYPES, {"name", "linear", "angular", "linear_velocity", "angular_velocity", "twist"}),
-    ):
+    required: dict[Role, set[str]] = {
+        "gnss": {"latitude", "longitude", "lat", "lon", "pose"},
+        "heading": {"orientation", "azimuth", "unit", "quaternion", "pose"},
+        "wheels": {"name", "linear", "angular", "linear_velocity", "angular_velocity", "twist"},
+    }
+    for role, needed in required.items():
         for topic, field in dropped.items():
-            if field in required and topic.split("/")[2] in {topic_of(name).split("/")[2] for name in types}:
-                taken = {path for name in types if topic_of(name) in topic for path in types[name][0]}
+            if field in needed and topic.split("/")[2] in {topic_of(name).split("/")[2] for name in types_of(role)}:
+                taken = {path for name in types_of(role) if topic_of(name) in topic for path in fields_of(role, name)}
                 if any(path.startswith(field) for path in taken):
                     assert field in told[role, topic], (role, topic)
     refused = {f"{topic_of(DYNAMIC_JOINT_STATE)}/without_{field}" for field in ("joint_names", "interface_values")}

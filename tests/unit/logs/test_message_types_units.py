@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from icrtool.config import Config
 from icrtool.errors import DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.heading_sources import HEADING_TYPES, HeadingSource
-from icrtool.logs.streams.position_sources import POSITION_TYPES
-from icrtool.logs.streams.sources import PositionSource, increasing, stamp_rows
+from icrtool.logs.streams.message_types import read_source
+from icrtool.logs.streams.sources import HeadingSource, PositionSource
+from icrtool.logs.streams.stamps import increasing, stamp_rows
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 50_000_000
 ROUNDING_DEG = 1e-12
@@ -37,11 +38,11 @@ def table_of(
 
 
 def position(message_type: str, topic: str = "/topic", **columns: Any) -> PositionSource:
-    return POSITION_TYPES[message_type][1](table_of(message_type, spelled(columns), topic))
+    return read_source("gnss", table_of(message_type, spelled(columns), topic), Config())
 
 
 def heading(message_type: str, topic: str = "/topic", **columns: Any) -> HeadingSource:
-    return HEADING_TYPES[message_type][1](table_of(message_type, spelled(columns), topic))
+    return read_source("heading", table_of(message_type, spelled(columns), topic), Config())
 
 
 def spelled(columns: dict[str, Any]) -> dict[str, Any]:

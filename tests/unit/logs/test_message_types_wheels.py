@@ -17,9 +17,9 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import survey_log
+from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.sources import WheelMotion
 from icrtool.logs.streams.wheel_pairs import Side, pair_motion
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 20_000_000
 CONFIG = load_config()
@@ -78,7 +78,7 @@ def column_table(message_type: str, topic: str = "/topic", **columns: Any) -> To
 
 
 def read(table: TopicTable, config: Any = CONFIG) -> WheelMotion:
-    return WHEEL_TYPES[table.message_type][1](table, config)
+    return read_source("wheels", table, config)
 
 
 def wheels_of(path: Path, *sets: str) -> WheelMotion:
@@ -435,5 +435,5 @@ def test_an_autopilot_s_wheels_are_metres_or_rpm_as_the_topic_states() -> None:
     assert rpm.speed is not None
     assert distance.position[1].tolist() == [30.0, 60.0, 60.0]
     np.testing.assert_allclose(rpm.speed[1], [np.pi, 2 * np.pi, 2 * np.pi])
-    with pytest.raises(DefinitionError, match="fewer than two wheels"):
+    with pytest.raises(DefinitionError, match="fewer than 2 elements"):
         read(column_table(kind, **{"data[*]": [[1.0]]}))

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from icrtool.config import Config
 from icrtool.logs.containers.channel import Block, Channel
 from icrtool.logs.messages.collectors import collector_for
-from icrtool.logs.messages.nmea import GGA, GST, HDT, NMEA_SENTENCE, RMC, parse_sentence
+from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC, parse_sentence
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.heading_sources import HEADING_TYPES
-from icrtool.logs.streams.position_sources import POSITION_TYPES
+from icrtool.logs.streams.message_types import read_source
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.text import LogText
 
@@ -113,7 +113,7 @@ def test_a_sentence_that_ends_early_has_what_it_has() -> None:
 
 
 def test_the_quality_states_how_the_position_was_solved() -> None:
-    source = POSITION_TYPES[NMEA_SENTENCE][1](table_of([gga(quality) for quality in range(10)]))
+    source = read_source("gnss", table_of([gga(quality) for quality in range(10)]), Config())
     assert source.usable.tolist() == [quality not in (0, 6, 7) for quality in range(10)]
     stated = dict(enumerate(source.stated_class.tolist()))
     assert (stated[4], stated[5]) == (FIXED_FIX, FLOAT_FIX)
@@ -124,7 +124,7 @@ def test_the_quality_states_how_the_position_was_solved() -> None:
 def test_the_mode_of_rmc_states_it_too_and_a_void_one_is_no_fix() -> None:
     body = "GPRMC,101500.00,{},4806.000,N,01136.000,E,0.1,,231126,,,{}"
     modes = [("A", "R"), ("A", "F"), ("A", "D"), ("V", "A"), ("A", "N"), ("A", "")]
-    source = POSITION_TYPES[NMEA_SENTENCE][1](table_of([sentence(body.format(*mode)) for mode in modes]))
+    source = read_source("gnss", table_of([sentence(body.format(*mode)) for mode in modes]), Config())
     assert source.usable.tolist() == [True, True, True, False, False, True]
     assert source.stated_class.tolist()[:3] == [FIXED_FIX, FLOAT_FIX, OTHER_FIX]
 
@@ -132,7 +132,7 @@ def test_the_mode_of_rmc_states_it_too_and_a_void_one_is_no_fix() -> None:
 def test_deviations_are_those_of_the_nearest_gst_up_to_one_and_a_half_seconds_away() -> None:
     gst = "GNGST,101500.00,5,0.02,0.01,12,{},0.5,0.02"
     texts = [gga(4)] * 30 + [sentence(gst.format(0.3)), *[gga(4)] * 10, sentence(gst.format(0.4)), *[gga(4)] * 3]
-    source = POSITION_TYPES[NMEA_SENTENCE][1](table_of(texts))
+    source = read_source("gnss", table_of(texts), Config())
     near = 1.5e9 / STEP_NS
     expected = [math.nan if 30 - i >= near else 0.09 for i in range(30)] + [0.09] * 5 + [0.16] * 8
     assert source.variance[:, 0].tolist() == pytest.approx(expected, nan_ok=True)
@@ -141,7 +141,7 @@ def test_deviations_are_those_of_the_nearest_gst_up_to_one_and_a_half_seconds_aw
 
 def test_a_heading_is_clockwise_from_true_north() -> None:
     texts = [sentence("GPHDT,90.0,T"), gga(4), sentence("GPHDT,,T"), sentence("GPHDT,359.5,T")]
-    source = HEADING_TYPES[NMEA_SENTENCE][1](table_of(texts))
+    source = read_source("heading", table_of(texts), Config())
     assert source.convention == "ned"
     assert source.usable.tolist() == [True, False, True]
     np.testing.assert_allclose(np.degrees(source.heading_rad("ned")[source.usable]), [90.0, -0.5])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.logs.streams.inertial import nose_yaw
+from icrtool.logs.streams.headings import nose_yaw
 
 RATE_HZ = 50.0
 YAW_TOLERANCE_RAD = 1e-9

@@ -8,7 +8,7 @@ import pytest
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.messages.topic_table import NOT_SET_BACK, TopicTable, time_order
-from icrtool.logs.streams.sources import StampedRows, clock_notes, stamp_rows
+from icrtool.logs.streams.stamps import StampedRows, clock_notes, stamp_rows
 from icrtool.records.text import LogText
 
 TIMES = np.arange(0, 100_000_000_000, 20_000_000)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from icrtool.logs.streams.wheel_joints import right_twin, side_of, wheel_joints
+from icrtool.logs.streams.wheel_pairs import right_twin
+from icrtool.logs.streams.wheels import side_of, wheel_joints
 
 
 @pytest.mark.parametrize(

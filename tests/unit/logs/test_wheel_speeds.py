@@ -9,8 +9,9 @@ from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
 from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.sources import StampedRows, WheelMotion, motion_of
-from icrtool.logs.streams.wheel_sources import WHEEL_TYPES
+from icrtool.logs.streams.message_types import read_source
+from icrtool.logs.streams.sources import WheelMotion, motion_of
+from icrtool.logs.streams.stamps import StampedRows
 from icrtool.logs.streams.wheel_speeds import wheel_samples
 from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog
@@ -83,7 +84,7 @@ def test_a_dead_encoder_is_named_where_messages_do_not_name_wheels() -> None:
     travel = np.cumsum(np.full(50, 0.1))
     columns = {"position[*]": np.column_stack([travel, travel, travel, np.zeros(50)]), "velocity[*]": np.zeros((50, 4))}
     table = TopicTable("/wheels", "leo_msgs/WheelStates", STEP_NS * np.arange(50, dtype=np.int64), columns, {}, 0)
-    motion = WHEEL_TYPES["leo_msgs/WheelStates"][1](table, CONFIG)
+    motion = read_source("wheels", table, CONFIG)
     assert motion.position is not None
     assert motion.position[1] == pytest.approx(travel)
     assert motion.note.startswith("wheel 3 never turns")
@@ -98,7 +99,7 @@ def joints_motion(positions: Floats) -> WheelMotion:
     }  # fmt: skip
     times = STEP_NS * np.arange(rows, dtype=np.int64)
     table = TopicTable("/joint_states", "sensor_msgs/JointState", times, columns, {"name[*]": names}, 0)
-    return WHEEL_TYPES["sensor_msgs/JointState"][1](table, CONFIG)
+    return read_source("wheels", table, CONFIG)
 
 
 def test_hard_braking_and_a_short_dash_of_a_robot_that_mostly_stands_are_driving() -> None:

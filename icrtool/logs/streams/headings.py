@@ -1,0 +1,402 @@
+"""Messages that hold the robot's heading: yaw in ENU, compass headings, antenna baselines; and turn rates of gyros."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from icrtool.config import Config
+from icrtool.errors import DefinitionError
+from icrtool.kernels.arrays import Bools, Floats
+from icrtool.logs.messages.decoded_values import HDT
+from icrtool.logs.messages.topic_table import FRAME, TopicTable
+from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
+from icrtool.logs.streams.sources import Check, Convention, HeadingSource, Number, all_valid, fields_of_all, of_topic
+from icrtool.logs.streams.stamps import StampedRows, stamp_rows, usable_rows
+from icrtool.records.samples import GyroAxes, GyroSamples, Role
+
+DEGREE = math.pi / 180.0
+LARGEST_DEG = 720.0
+"""A heading beyond this stands for "unknown": Septentrio writes -2e10."""
+
+FUSED_WORTH = 30.0
+"""Of a heading that is fused with the wheels."""
+
+
+def degrees(name: str) -> Number:
+    """Return an angle that is recorded in degrees."""
+    return Number((name,), DEGREE, LARGEST_DEG)
+
+
+@dataclass(frozen=True, slots=True)
+class Bearing:
+    """A message type with an angle that is the heading.
+
+    Attributes
+    ----------
+    what, worth : what it is called where it is chosen, and how suitable it is
+    angle : to rad; std, variance : to rad and rad^2, either or none
+    valid : all must pass for a heading
+    convention, known_by : ``ned``: clockwise from north, ``enu``: counter-clockwise from east; how that is known
+    independent : where half of the messages or more do not pass, they are fused with the wheels
+    """
+
+    role: ClassVar[Role] = "heading"
+    what: str
+    worth: float
+    angle: Number
+    std: Number | None = None
+    variance: Number | None = None
+    valid: tuple[Check, ...] = ()
+    convention: Convention = "ned"
+    known_by: str = "degrees clockwise from north"
+    independent: tuple[Check, ...] = ()
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields that are read."""
+        return fields_of_all(self.angle, self.std, self.variance, *self.valid, *self.independent)
+
+    def read(self, table: TopicTable, _: Config) -> HeadingSource:
+        """Return its headings."""
+        angle = self.angle.of(table, needed=True)
+        variance = np.full(len(table), np.nan)
+        if self.variance is not None:
+            variance = self.variance.of(table)
+        elif self.std is not None:
+            std = self.std.of(table)
+            variance = np.where(std > 0, std, np.nan) ** 2
+        worth = min(self.worth, FUSED_WORTH) if is_fused(table, self.independent) else self.worth
+        return stated(replace(self, worth=worth), table, angle, variance, all_valid(table, self.valid))
+
+
+def stated(row: Bearing, table: TopicTable, angle: Floats, variance: Floats, valid: Bools) -> HeadingSource:
+    """Return the headings of a type: angles [rad] (n,), variances [rad^2] (n,), and which are valid (n,)."""
+    finite = np.isfinite(angle)
+    usable = valid & finite
+    return HeadingSource(
+        **of_topic(table), yaw_rad=np.where(finite, angle, np.nan), variance=np.where(variance > 0, variance, np.nan),
+        usable=usable, convention=row.convention, convention_why=row.known_by, score=row.worth, why=row.what,
+        problem="" if usable.any() else "no valid heading",
+    )  # fmt: skip
+
+
+TRUE_HEADING = Bearing(
+    "heading of the GNSS receiver (HDT)", 88.0, degrees("heading"), known_by="NMEA: clockwise from true north"
+)
+
+
+def read_sentences(table: TopicTable, config: Config) -> HeadingSource:
+    """Return the true headings of HDT."""
+    headings = table.rows(table.column("sentence_kind") == HDT)
+    if not len(headings):
+        raise DefinitionError(table.topic, "none of its sentences is HDT")
+    return TRUE_HEADING.read(headings, config)
+
+
+_NORTHS = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
+_AZIMUTH = Bearing("azimuth", 95.0, Number(("azimuth",)), known_by="stated in the message")
+AZIMUTH_FIELDS = ("azimuth", "variance", "unit", "orientation", "reference")
+
+
+def read_azimuths(table: TopicTable, _: Config) -> HeadingSource:
+    """Return the headings of an Azimuth of the compass stack: the message states unit, orientation and reference."""
+    factor = np.where(table.column("unit") == 1, DEGREE, 1.0)
+    yaw = table.column("azimuth") * factor
+    orientation = table.column("orientation")
+    ned = bool(np.median(orientation) == 1)
+    # Rows of the other orientation are converted: pi/2 - yaw, in both directions.
+    yaw = np.where((orientation == 1) == ned, yaw, np.pi / 2 - yaw)
+    north = _NORTHS.get(float(np.median(table.floats("reference"))), "unknown")
+    row = replace(_AZIMUTH, what=f"{_AZIMUTH.what}, {north} north", convention="ned" if ned else "enu")
+    return stated(row, table, yaw, table.floats("variance") * factor**2, np.ones(len(table), np.bool_))
+
+
+RELPOS_VALID, HEADING_VALID = 1 << 2, 1 << 8
+"""Flags of u-blox: the baseline, and its heading, are valid."""
+
+BASELINE = Bearing(
+    "u-blox moving base: bearing of the antenna baseline", 90.0,
+    Number(("relPosHeading", "rel_pos_heading"), 1e-5 * DEGREE),
+    Number(("accHeading", "acc_heading"), 1e-5 * DEGREE),
+    valid=(Check(("flags",), frozenset({RELPOS_VALID | HEADING_VALID}), mask=RELPOS_VALID | HEADING_VALID),),
+    known_by="u-blox: clockwise from north",
+)  # fmt: skip
+
+_NORTH = Number(("relPosN", "rel_pos_n"), fine=Number(("relPosHPN", "rel_pos_hpn"), 0.01))
+_EAST = Number(("relPosE", "rel_pos_e"), fine=Number(("relPosHPE", "rel_pos_hpe"), 0.01))
+_ACCURACY = Number(("accN", "acc_n"), 0.01), Number(("accE", "acc_e"), 0.01)
+_BASELINE_VALID = Check(("flags",), frozenset({RELPOS_VALID}), mask=RELPOS_VALID)
+"""Of a u-blox baseline, in cm."""
+
+LEAST_BASELINE_CM = 0.005
+"""Half of what the fields of a baseline resolve: a shorter one has no direction."""
+
+BASELINE_FIELDS = fields_of_all(_NORTH, _EAST, *_ACCURACY, _BASELINE_VALID)
+
+
+def read_baselines(table: TopicTable, _: Config) -> HeadingSource:
+    """Return the bearings of the antenna baseline of ublox_msgs/NavRELPOSNED, which states its components."""
+    north, east = (one.of(table, needed=True) for one in (_NORTH, _EAST))
+    length = np.hypot(north, east)
+    measured = (length > LEAST_BASELINE_CM) & np.isfinite(length)
+    accuracy = np.maximum(*(one.of(table) for one in _ACCURACY))
+    std = np.divide(accuracy, length, out=np.full(len(table), np.nan), where=measured)
+    variance = np.where(std > 0, std, np.nan) ** 2
+    return stated(BASELINE, table, np.arctan2(east, north), variance, _BASELINE_VALID.of(table) & measured)
+
+
+INS_WORDS = re.compile(r"\bins\b|vectornav|novatel|sbg|microstrain|xsens|gnss|gps|global|map|filtered", re.IGNORECASE)
+_RAW_WORDS = re.compile(r"raw", re.IGNORECASE)
+_ATTITUDE_WORDS = re.compile(r"quaternion|filter|imu|attitude|orientation|ahrs|xsens|mti", re.IGNORECASE)
+"""Topics of QuaternionStamped that hold an inertial unit's orientation, not a receiver's compass angle."""
+
+RAW, NOT_INS = 10.0, 30.0
+"""Taken off of a topic that is raw, and of an odometry that is of no inertial navigation system."""
+
+UNKNOWN_RAD2 = (2 * np.pi) ** 2
+"""A heading with a standard deviation of a turn is not known yet: drivers of moving bases write 1000."""
+
+
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """A message type with an orientation.
+
+    Attributes
+    ----------
+    what, worth : what it is called where it is chosen, and how suitable it is
+    path : the field of the quaternion
+    covariance : the field of a covariance; size : of its rows; the last one is of yaw
+    rate : the field of the turn rate of a gyro in the same message
+    stuffed : some drivers of GNSS receivers write a compass angle into the quaternion as if it were a yaw
+    odometry : preferred where its name is that of an inertial navigation system
+    """
+
+    role: ClassVar[Role] = "heading"
+    what: str
+    worth: float
+    path: str
+    covariance: str = ""
+    size: int = 6
+    rate: str = ""
+    stuffed: bool = False
+    odometry: bool = False
+
+    @property
+    def _variances(self) -> tuple[str, str]:
+        return f"{self.covariance}[0]", f"{self.covariance}[{self.size**2 - 1}]"
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields that are read."""
+        variances = self._variances if self.covariance else ()
+        return fields_of_all(*(f"{self.path}.{axis}" for axis in "xyzw"), *variances, self.rate)
+
+    def read(self, table: TopicTable, _: Config) -> HeadingSource:
+        """Return the yaw of its orientations."""
+        q = np.array([table.column(f"{self.path}.{axis}") for axis in "xyzw"], np.float64).T
+        yaw, usable, note = nose_yaw(q, table.floats(self.rate) if self.rate in table.columns else None)
+        first, last = (table.floats(path) for path in self._variances)
+        variance = np.where(last > 0, last, np.nan)
+        unknown = variance >= UNKNOWN_RAD2
+        # where all are, the number means nothing
+        usable = usable if unknown[usable].all() else usable & ~unknown
+        convention, why = frame_convention(table)
+        if self.stuffed and not _ATTITUDE_WORDS.search(table.topic):
+            convention, why = "ned", "compass angle as yaw"
+        problem = ""
+        if self.size == 3 and np.all(first == -1.0):
+            problem = "holds no orientation (covariance -1, REP-145)"
+        elif not usable.any():
+            problem = "no valid quaternion"
+        elif float(np.ptp(yaw[usable])) == 0.0:
+            problem = "its orientation never changes"
+        elif GOAL_WORDS.search(table.topic):
+            problem = GOAL
+        off = NOT_INS if self.odometry and not INS_WORDS.search(table.topic) else 0.0
+        off += RAW if _RAW_WORDS.search(table.topic) else 0.0
+        return HeadingSource(
+            **of_topic(table), yaw_rad=yaw, variance=variance, usable=usable, convention=convention, convention_why=why,
+            score=self.worth - off, why=self.what, problem=problem, note=note,
+        )  # fmt: skip
+
+
+QUATERNION_NORM_TOLERANCE = 0.1
+UPRIGHT_COSINE = math.cos(math.radians(45.0))
+"""A sensor whose z axis is further than 45 deg from vertical is mounted on its side; its yaw is no heading."""
+
+LEVEL_COSINE = math.cos(math.radians(30.0))
+TILTED_SHARE = 0.01
+"""Largest share of the time in which no axis of the sensor is upright, for a robot on the ground."""
+
+CLEAR_CORRELATION = 0.5
+STRETCHES = 200
+MOST_LOOKED_AT = 5000
+
+ORDERS: tuple[tuple[tuple[int, int, int, int], str], ...] = (
+    ((1, 2, 3, 0), "its quaternion is written w first: read as w, x, y, z"),
+    ((3, 1, 2, 0), "its quaternion has x and w swapped: swapped back"),
+)
+"""Positions of x, y, z, w among the four fields, where a driver filled them in another order."""
+
+
+def frame_convention(table: TopicTable) -> tuple[Convention, str]:
+    """Return the convention of a message's frame, and how it is known."""
+    frame = table.text(FRAME)
+    if frame.lower().endswith("_ned") or frame.lower() == "ned":
+        return "ned", f"frame {frame} (REP-145)"
+    return "enu", "REP-103"
+
+
+def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, Bools, str]:
+    """Return yaw [rad] (n,), which rows are rotations (n,), and a note where the sensor is not mounted upright.
+
+    Yaw is that of the sensor's x axis seen from above. In a sensor mounted on its side another axis is level all the
+    time: that axis is used, and has a constant angle to the robot's forward axis.
+
+    Parameters
+    ----------
+    q : (n, 4) the fields x, y, z, w
+    yaw_rate_radps : (n,) of a gyro in the same message; a quaternion in another order must turn with it
+    """
+    with np.errstate(over="ignore"):
+        norm = np.sqrt(np.einsum("ij,ij->i", q, q))
+    usable = np.abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
+    unit = q / np.where(usable, norm, np.nan)[:, None]
+    if usable.all():
+        order, note = _written_order(unit, yaw_rate_radps)
+    else:
+        order, note = _written_order(unit[usable], None if yaw_rate_radps is None else yaw_rate_radps[usable])
+    x, y, z, w = (unit[:, place] for place in order)
+    upright = float(np.median(np.abs(1 - 2 * (x * x + y * y))[usable])) if usable.any() else 1.0
+    if upright >= UPRIGHT_COSINE:
+        return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), usable, note
+    axes = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z)],
+            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z)],
+            [2 * (x * z + w * y), 2 * (y * z - w * x)],
+        ]
+    )
+    vertical = _vertical(x, y, z, w)
+    level = int(np.argmin([np.median(np.abs(v[usable])) for v in vertical]))
+    note = (
+        f"mounted on its side: its {'xyz'[level]} axis is level and is used as heading, with an offset to be estimated"
+    )
+    return np.arctan2(axes[level, 1], axes[level, 0]), usable, note
+
+
+def _written_order(unit: Floats, yaw_rate_radps: Floats | None) -> tuple[Sequence[int], str]:
+    """Return the positions of x, y, z, w, and a note where they are not in this order.
+
+    On the ground one axis of the sensor stays upright, whatever the mounting. If no axis does, and another order of the
+    components gives a level sensor all the time, that order is used.
+    """
+    as_named = (0, 1, 2, 3)
+    some = unit[:: max(1, len(unit) // MOST_LOOKED_AT)]
+    if len(some) < 2 or (_tilted_share(some, UPRIGHT_COSINE) < TILTED_SHARE).any():
+        return as_named, ""
+    for order, note in ORDERS:
+        meant = unit[:, order]
+        if _tilted_share(meant[:: max(1, len(unit) // MOST_LOOKED_AT)], LEVEL_COSINE)[2] < TILTED_SHARE and _turns_with(
+            meant, yaw_rate_radps
+        ):
+            return order, note
+    return as_named, ""
+
+
+def _tilted_share(unit: Floats, cosine: float) -> Floats:
+    """Return, for each axis of the sensor (3,), the share of the time in which it is not upright."""
+    share: Floats = (np.abs(_vertical(*unit.T)) < cosine).mean(axis=1)
+    return share
+
+
+def _vertical(x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
+    """Return the vertical component of the sensor's axes (3, n)."""
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:
+    """Return whether yaw changes correlate with the gyro's; True where there is no gyro or it does not turn."""
+    if yaw_rate_radps is None or not np.isfinite(yaw_rate_radps).all() or np.ptp(yaw_rate_radps) == 0:
+        return True
+    x, y, z, w = unit.T
+    yaw = np.unwrap(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
+    # Over many samples: from one to the next there is more noise than turning.
+    edges = np.unique(np.linspace(0, len(yaw) - 1, STRETCHES + 1).astype(np.int64))
+    turned, measured = np.diff(yaw[edges]), np.add.reduceat(yaw_rate_radps, edges[:-1])
+    if len(turned) < 3 or float(np.ptp(turned)) == 0 or float(np.ptp(measured)) == 0:
+        return False
+    return float(np.corrcoef(turned, measured)[0, 1]) > CLEAR_CORRELATION
+
+
+GYRO_TYPE = "sensor_msgs/Imu"
+GYRO_AXES = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
+
+FASTEST_RADPS = math.radians(1000.0)
+"""No robot turns faster than this [rad/s]."""
+
+MOST_BAD = 0.01
+"""A topic is not used where a larger share of its rates is not finite."""
+
+
+NOTHING_KNOWN: Mapping[str, StampedRows] = {}
+
+
+def find_gyro(
+    tables: Sequence[TopicTable],
+    wheels_topic: str,
+    heading_topic: str,
+    clock: Literal["header", "log"],
+    known: Mapping[str, StampedRows] = NOTHING_KNOWN,
+) -> GyroSamples | None:
+    """Return the turn rates of the best inertial unit, None without one.
+
+    Parameters
+    ----------
+    tables : all topics that were read
+    wheels_topic, heading_topic : the unit that is also the source of the heading is preferred, then one in the wheels'
+        namespace, then the one with more samples
+    clock : the clock of the other streams
+    known : stamps of topics that were read before
+    """
+    home = wheels_topic.strip("/").split("/")[0]
+    found = []
+    for table, (rate,), sound in _units(tables, GYRO_AXES[2:]):
+        near = table.topic == heading_topic, table.topic.strip("/").split("/")[0] == home, len(rate)
+        found.append((near, table.topic, rate, sound, table))
+    if not found:
+        return None
+    _, topic, rate, sound, table = max(found, key=lambda one: one[:2])
+    stamps = (known.get(topic) or stamp_rows(table)).on(clock)
+    rows = usable_rows(stamps, sound)
+    sign = 1.0 if frame_convention(table)[0] == "ned" else -1.0
+    return GyroSamples(topic, stamps[rows], sign * rate[rows])
+
+
+def find_gyros(
+    tables: Sequence[TopicTable], clock: Literal["header", "log"], known: Mapping[str, StampedRows] = NOTHING_KNOWN
+) -> tuple[GyroAxes, ...]:
+    """Return the turn rates of every inertial unit, about all three axes; parameters as of `find_gyro`."""
+    found = []
+    for table, axes, sound in _units(tables, GYRO_AXES):
+        stamps = (known.get(table.topic) or stamp_rows(table)).on(clock)
+        rows = usable_rows(stamps, sound)
+        found.append(GyroAxes(table.topic, stamps[rows], np.array([rates[rows] for rates in axes]).T))
+    return tuple(found)
+
+
+def _units(tables: Sequence[TopicTable], axes: Sequence[str]) -> Iterator[tuple[TopicTable, list[Floats], Bools]]:
+    """Yield the inertial units that measure about some axes, with the rates (n,) about each, and which are sound."""
+    for table in tables:
+        if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in axes):
+            continue
+        rates = [table.floats(axis) for axis in axes]
+        sound: Bools = np.logical_and.reduce([np.abs(one) <= FASTEST_RADPS for one in rates])
+        if np.count_nonzero(~sound) <= MOST_BAD * len(sound) and any(np.ptp(one[sound]) for one in rates):
+            yield table, rates, sound

@@ -1,0 +1,409 @@
+"""Messages that hold the motion of the wheels, in one form: position or speed of two sides, or a body twist."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.config import Config
+from icrtool.errors import DefinitionError
+from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.logs.containers.channel import some_of
+from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.positions import REFERENCE_WORDS
+from icrtool.logs.streams.sources import Sides, Unit, WheelMotion, motion_of, nonzero, of_topic
+from icrtool.records.samples import Role
+
+ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
+"""Positions that stay within one turn, and jump by nearly one turn this often, are recorded modulo a turn."""
+
+Quantity = Literal["position", "speed"]
+QUANTITIES: tuple[Quantity, ...] = ("position", "speed")
+
+MOST_WHEELS = 32
+"""Of a side. A message that lists more is not of wheels, or was made to take time."""
+
+
+def of_wheels(
+    motion: WheelMotion, wheels: Callable[[Quantity], NDArray[Any] | None], lefts: int, names: Sequence[str]
+) -> WheelMotion:
+    """Return a motion with the mean over the wheels of each side, those left out that have no encoder, or a dead one.
+
+    Parameters
+    ----------
+    wheels : returns the positions, or the speeds, of each wheel (n, k), the left ones first; None where not recorded
+    lefts : how many are left
+    names : (k,)
+    """
+    means: dict[str, Sides] = {}
+    dead: set[int] = set()
+    # One after the other: the columns of all wheels of a long log are large.
+    for quantity in QUANTITIES:
+        values = wheels(quantity)
+        if values is not None:
+            turns_modulo = quantity == "position" and motion.unit == "rad"
+            means[quantity], stuck = _side_means(_unwound(values) if turns_modulo else values, lefts)
+            dead |= stuck
+    note = f"{some_of([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
+    return motion_of(replace(motion, note=note if dead else ""), **means)
+
+
+def _side_means(values: NDArray[Any], lefts: int) -> tuple[Sides, set[int]]:
+    """Return the mean over the wheels of each side that have finite values, None where none has; and the dead ones.
+
+    A wheel that never changes while another one of its side does has a dead encoder.
+    """
+    with np.errstate(invalid="ignore"):  # infinite ones are left out later
+        changes = np.fmax.reduce(values, axis=0) > np.fmin.reduce(values, axis=0)
+    means: list[Floats | None] = []
+    dead: set[int] = set()
+    for side in (range(lefts), range(lefts, len(changes))):
+        dead |= {wheel for wheel in side if not changes[wheel] and changes[side].any()}
+        finite = [wheel for wheel in side if wheel not in dead and np.isfinite(values[:, wheel]).any()]
+        if len(finite) == 1:
+            means.append(values[:, finite[0]].astype(np.float64, copy=False))
+        elif finite:
+            of_side = values.T[finite].astype(np.float64, copy=False)
+            of_side[np.isinf(of_side)] = np.nan  # infinity less infinity would warn
+            means.append(of_side.mean(axis=0))
+        else:
+            means.append(None)
+    return (means[0], means[1]), dead
+
+
+def _unwound(positions: Floats) -> Floats:
+    """Return joint positions [rad] (n, k); those recorded modulo one turn are unwrapped.
+
+    This is done before a side is averaged: a front and a rear wheel do not begin a turn at the same time.
+    """
+    unwound = positions
+    with np.errstate(invalid="ignore"):  # infinite ones are left out later
+        spread = np.fmax.reduce(positions, axis=0, initial=-np.inf) - np.fmin.reduce(positions, axis=0, initial=np.inf)
+    for place in np.flatnonzero(spread <= ONE_TURN_RAD).tolist():
+        column = positions[:, place]
+        finite = np.flatnonzero(np.isfinite(column))
+        steps = np.abs(np.diff(column[finite]))
+        wraps = steps > np.pi
+        if np.count_nonzero(wraps) >= FEWEST_WRAPS and float(steps[wraps].min()) > LEAST_WRAP_RAD:
+            unwound = unwound.copy("K") if unwound is positions else unwound
+            unwound[finite, place] = np.unwrap(column[finite])
+    return unwound
+
+
+@dataclass(frozen=True, slots=True)
+class Joints:
+    """A message type that lists joints by name, in any order; other joints may be listed in between.
+
+    Attributes
+    ----------
+    what, worth : what it is called where it is chosen, and how suitable it is
+    names, position, speed : fields of the lists
+    """
+
+    role: ClassVar[Role] = "wheels"
+    what: str
+    worth: float
+    names: str
+    position: str
+    speed: str
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields that are read."""
+        return self.names, self.position, self.speed
+
+    def read(self, table: TopicTable, config: Config) -> WheelMotion:
+        """Return the motion of those joints that are wheels."""
+        codes, texts = table.words(self.names)
+        motion = WheelMotion(**of_topic(table), joints=tuple(texts))
+        left, right = _wheels_among(texts, config)
+        if not (left and right):
+            advice = "name them in wheels.{left,right}_joints"
+            named = f"no left and right wheel among its joints {some_of(texts)}; {advice}"
+            return replace(motion, problem=named if texts else "lists no joints")
+        lefts, rights = len(left), len(right)
+        if max(lefts, rights) > MOST_WHEELS:
+            problem = f"lists {lefts} left and {rights} right wheels; at most {MOST_WHEELS} of a side are read"
+            return replace(motion, problem=problem)
+        # Joints by their place among the wheels, left ones first; -1 for all others.
+        wheel = np.full(len(texts) + 1, -1)
+        wheel[left + right] = np.arange(lefts + rights)
+        # All messages list the same joints in the same order: one row stands for them.
+        same = codes.strides[0] == 0
+        wheels = np.broadcast_to(wheel[codes[:1]], codes.shape) if same else wheel[codes]
+        alike = _rows_alike(wheels[:1] if same else wheels, lefts, rights)
+        if not alike.any():
+            return replace(motion, problem="left and right wheels come in different messages")
+        if not alike.all():
+            table, wheels = table.rows(alike), wheels[alike]
+            motion = replace(motion, **of_topic(table))
+        why = f"{self.what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
+        paths = {"position": self.position, "speed": self.speed}
+        return of_wheels(
+            replace(motion, score=self.worth, why=why),
+            lambda quantity: _by_wheel(table.find(paths[quantity]), wheels, lefts + rights),
+            lefts,
+            [texts[i] for i in left + right],
+        )
+
+
+def _wheels_among(texts: Sequence[str], config: Config) -> tuple[list[int], list[int]]:
+    left, right = wheel_joints(texts)
+    given = config.wheels
+    if given.left_joints:
+        left = [i for i, name in enumerate(texts) if name in given.left_joints]
+    if given.right_joints:
+        right = [i for i, name in enumerate(texts) if name in given.right_joints]
+    return left, right
+
+
+def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
+    """Return the rows (n,) that list the set of wheels most rows list, of those sets with both sides.
+
+    A mean over wheels that changes its members would jump.
+    """
+    listed = np.zeros((lefts + rights, len(wheels)), np.bool_).T
+    for rows, wheel, _ in _listed_wheels(wheels):
+        listed[rows, wheel] = True
+    both: Bools = np.logical_and(listed[:, :lefts].any(axis=1), listed[:, lefts:].any(axis=1))
+    sets = listed[both]
+    if len(sets) and np.any(sets != sets[0]):
+        _, which, count = np.unique(sets, axis=0, return_inverse=True, return_counts=True)
+        both[both] = which.reshape(-1) == int(np.argmax(count))
+    return both
+
+
+def _by_wheel(values: NDArray[Any] | None, wheels: Ints, count: int) -> Floats | None:
+    """Return the value of each wheel in each message (n, count), NaN where it is not listed."""
+    if values is None:
+        return None
+    by_wheel = np.full((count, len(wheels)), np.nan).T
+    for rows, wheel, place in _listed_wheels(wheels[:, : values.shape[1]]):
+        by_wheel[rows, wheel] = values[rows, place]
+    return by_wheel
+
+
+def _listed_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]:
+    """Yield rows, the wheel that they list (one, or one per row), and its position in the list."""
+    for place, listed in enumerate(wheels.T):
+        if len(listed) and (listed.strides[0] == 0 or (listed == listed[0]).all()):
+            if listed[0] >= 0:
+                yield slice(None), int(listed[0]), place
+        else:
+            rows = np.flatnonzero(listed >= 0)
+            yield rows, listed[rows], place
+
+
+_ELEMENTS = re.compile(r"\[([\d,]+)\]")
+
+
+def elements(path: str) -> tuple[str, list[int]]:
+    """Return the column that holds a field, and the places in it: ``data[0,2]`` is of ``data[*]``."""
+    found = _ELEMENTS.search(path)
+    places = [int(place) for place in found[1].split(",") if place] if found is not None else []
+    return _ELEMENTS.sub("[*]", path, count=1), places
+
+
+@dataclass(frozen=True, slots=True)
+class FixedWheels:
+    """A message type that has the wheels of each side in fields of their own, or at fixed places of lists.
+
+    Attributes
+    ----------
+    what, worth : what it is called where it is chosen, and how suitable it is
+    position, speed : fields of the left and of the right side; of several places in a list the mean is taken
+    unit : of the positions, and of the speeds per second; factor : of the recorded numbers to it
+    """
+
+    role: ClassVar[Role] = "wheels"
+    what: str
+    worth: float
+    position: tuple[str, ...] = ()
+    speed: tuple[str, ...] = ()
+    unit: Unit = "rad"
+    factor: float = 1.0
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields that are read."""
+        return tuple(elements(path)[0] for path in (*self.position, *self.speed))
+
+    def read(self, table: TopicTable, _: Config) -> WheelMotion:
+        """Return the motion of both sides."""
+        motion = WheelMotion(**of_topic(table), unit=self.unit, score=self.worth, why=self.what)
+        paths = {"position": self.position, "speed": self.speed}
+        lefts, rights = (len(elements(path)[1]) or 1 for path in self.position or self.speed)
+        names = [f"wheel {i}" for i in range(lefts + rights)]
+        return of_wheels(motion, lambda quantity: self._wheels(table, paths[quantity]), lefts, names)
+
+    def _wheels(self, table: TopicTable, paths: tuple[str, ...]) -> Floats | None:
+        """Return the values (n, k) of each wheel, the left ones first, None where the type lacks a side."""
+        wheels: list[NDArray[Any]] = []
+        for column, places in map(elements, paths):
+            values = table.find(column)
+            if values is None:
+                return None
+            if places and (values.ndim != 2 or max(places) >= values.shape[1]):
+                raise DefinitionError(table.topic, f"{column} holds fewer than {max(places) + 1} elements")
+            wheels += [values[:, place] for place in places] or [values]
+        return (np.array(wheels, np.float64) * self.factor).T if wheels else None
+
+
+_HALF_COUNTER = 1 << 31
+TICK_FIELDS = (
+    "wheel_tick_factor", "valid_wheels",
+    *(f"wheel_{what}_{place}" for what in ("ticks", "direction") for place in ("fl", "fr", "rl", "rr")),
+)  # fmt: skip
+
+
+def read_ticks(table: TopicTable, _: Config) -> WheelMotion:
+    """Return the motion in xbot_msgs/WheelTick: counters that count up, with the direction of each wheel beside them.
+
+    A step counts with the direction stated behind it, as in OpenMower's own xbot_positioning. Its driver leaves
+    `valid_wheels` at 0, and the rear wheels are meant.
+    """
+    valid = table.integers("valid_wheels")
+    bits = int(np.bitwise_or.reduce(valid)) if valid is not None else 0
+    axles = [place for place, both in (("f", 3), ("r", 12)) if bits & both == both] or ["r"]
+
+    def travelled(place: str) -> Floats:
+        ticks, direction = table.integers(f"wheel_ticks_{place}"), table.column(f"wheel_direction_{place}")
+        if ticks is None:
+            raise DefinitionError(table.topic, f"its {table.message_type} has no whole numbers wheel_ticks_{place}")
+        steps = np.abs(np.mod(np.diff(ticks) + _HALF_COUNTER, 2 * _HALF_COUNTER) - _HALF_COUNTER)
+        return np.concatenate([[0.0], np.cumsum(np.where(direction[1:] != 0, -steps, steps))])
+
+    per_metre = float(np.median(table.floats("wheel_tick_factor")))
+    known = per_metre > 0
+    sides = [sum(travelled(f"{axle}{side}") for axle in axles) / len(axles) for side in "lr"]
+    left, right = (np.asarray(side) / (per_metre if known else 1.0) for side in sides)
+    unit: Unit = "m" if known else "counts"
+    why = f"ticks of the {' and '.join({'f': 'front', 'r': 'rear'}[axle] for axle in axles)} wheels"
+    return motion_of(WheelMotion(**of_topic(table), unit=unit, score=90.0, why=why), (left, right))
+
+
+AUTOPILOT_FIELDS = ("data[*]",)
+_BOTH = ("data[0]", "data[1]")
+"""Wheel 0 is the left one in the configuration that comes with MAVROS."""
+
+_AUTOPILOT_RPM = FixedWheels(
+    "wheel speeds [rpm] of the autopilot: 0 left, 1 right", 80.0, speed=_BOTH, factor=2 * np.pi / 60
+)
+_AUTOPILOT_M = FixedWheels("wheel distances [m] of the autopilot: 0 left, 1 right", 90.0, _BOTH, unit="m")
+
+
+def read_autopilot(table: TopicTable, config: Config) -> WheelMotion:
+    """Return the motion in mavros_msgs/WheelOdomStamped: metres or rpm of each wheel, as its topic states."""
+    return (_AUTOPILOT_RPM if "rpm" in table.topic.lower() else _AUTOPILOT_M).read(table, config)
+
+
+COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.IGNORECASE)
+COMMAND_NOTE = "commanded speeds, not measured ones: what the wheels did not do of them is in the ICRs and delays"
+COMMAND = 40.0
+"""Taken off of a topic with commanded speeds."""
+
+_FUSED = re.compile(
+    r"filter|fused|combined|ekf|ukf|visual|(?<![a-z])vi?o(?![a-z])|camera|stereo|zed|realsense|t265|vins|rtab|mavros|amcl",
+    re.IGNORECASE,
+)
+"""Names of odometry and twists that are fused with other sensors: used only where there is nothing better."""
+
+SIDEWAYS_SHARE = 0.2
+"""A twist with more than this sideways, and no turn, is a velocity in east and north, not in the body frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Twist:
+    """A message type with the velocity of the body.
+
+    Attributes
+    ----------
+    what, worth : what it is called where it is chosen, and how suitable it is
+    forward, sideways, turn : fields of the speeds [m/s] and of the turn rate [rad/s, counter-clockwise]
+    fused : taken off where the name is that of a topic fused with others; 0: a base's own, whatever its name
+    """
+
+    role: ClassVar[Role] = "wheels"
+    what: str
+    worth: float
+    forward: str = "linear.x"
+    sideways: str = "linear.y"
+    turn: str = "angular.z"
+    fused: float = 0.0
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields that are read."""
+        return self.forward, self.sideways, self.turn
+
+    def read(self, table: TopicTable, _: Config) -> WheelMotion:
+        """Return the twist; that of a position reference, or in east and north, is refused."""
+        twist = np.column_stack([table.column(self.forward), table.column(self.turn)]).astype(np.float64)
+        across = table.floats(self.sideways)
+        forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], across))
+        score, why, note = self.worth, f"{self.what}, converted to wheel speeds with the track width", ""
+        score -= self.fused if _FUSED.search(table.topic) else 0.0
+        if COMMANDED.search(table.topic):
+            score, why, note = score - COMMAND, f"{why} (commanded)", COMMAND_NOTE
+        problem = ""
+        if not nonzero(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
+            problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
+        elif self.fused and REFERENCE_WORDS.search(table.topic):
+            problem = "its name is that of a position reference, not of wheels"
+        return motion_of(
+            WheelMotion(**of_topic(table), unit="m", twist=twist, score=score, why=why, note=note, problem=problem)
+        )
+
+
+def body_twist(prefix: str, worth: float, what: str = "body twist", fused: float = 45.0) -> Twist:
+    """Return the row of a type that has a twist at a path."""
+    return Twist(what, worth, f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z", fused)
+
+
+WHEEL_WORDS = re.compile(r"wheel|track(?!er|ing)|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
+_OTHER_JOINTS = re.compile(
+    r"(arm|pan|tilt|lift)\d*|(gripper|flipper|finger|steer|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension).*"
+)
+"""Words in the name of a joint that is not a wheel. Only complete words count: "panther" is not "pan"."""
+
+_TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_LEFT_TOKENS = {"l", "left", "fl", "rl", "bl", "ml", "lf", "lb", "lr", "lm", "lh", "lwheel", "wl"}
+_RIGHT_TOKENS = {"r", "right", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh", "rwheel", "wr"}
+
+
+def side_of(name: str) -> str:
+    """Return ``left``, ``right`` or an empty string for a joint's name."""
+    lowered = name.lower()
+    if ("left" in lowered) != ("right" in lowered):
+        return "left" if "left" in lowered else "right"
+    tokens = set(_words(name))
+    left, right = bool(tokens & _LEFT_TOKENS), bool(tokens & _RIGHT_TOKENS)
+    if left == right:
+        return ""
+    return "left" if left else "right"
+
+
+def _words(name: str) -> list[str]:
+    """Return the words of a name, lower case: ``wheel_FL_joint``, ``frontLeftWheel``, ``panther/rl_wheel_joint``."""
+    return [word.lower() for word in _TOKENS.findall(name.replace("_", " "))]
+
+
+def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Return the positions of the left and of the right wheel joints among the names of a message."""
+    sides = [(i, *_side_of_wheel(name)) for i, name in enumerate(names)]
+    any_named = any(named for _, side, named in sides if side)
+    left, right = ([i for i, side, named in sides if side == one and named >= any_named] for one in ("left", "right"))
+    return left, right
+
+
+@lru_cache(4096)
+def _side_of_wheel(name: str) -> tuple[str, bool]:
+    """Return the side of a joint that may be a wheel, empty for others, and whether its name is that of a wheel."""
+    elsewhere = any(_OTHER_JOINTS.fullmatch(word) for word in _words(name))
+    return "" if elsewhere else side_of(name), bool(WHEEL_WORDS.search(name))
