@@ -15,6 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
+from urllib.request import Request, urlopen
 
 SECRET = "d0ntPr1ntTh1s"
 """Of the credentials: stands in no output."""
@@ -154,17 +155,19 @@ def counting_proxy(target: int) -> Iterator[Proxy]:
         for one in (source, sink):
             with suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
-        if count:
-            source.close()
-            sink.close()
+
+    def connect(client: socket.socket) -> None:
+        with client, suppress(OSError), socket.create_connection(("127.0.0.1", target)) as server:
+            back = threading.Thread(target=pass_on, args=(server, client), kwargs={"count": True}, daemon=True)
+            back.start()
+            pass_on(client, server, count=False)
+            back.join()
 
     def serve() -> None:
         with suppress(OSError):
             while True:
                 client, _ = listening.accept()
-                server = socket.create_connection(("127.0.0.1", target))
-                for pair in ((client, server, False), (server, client, True)):
-                    threading.Thread(target=pass_on, args=pair[:2], kwargs={"count": pair[2]}, daemon=True).start()
+                threading.Thread(target=connect, args=(client,), daemon=True).start()
 
     threading.Thread(target=serve, daemon=True).start()
     try:
@@ -177,8 +180,10 @@ def counting_proxy(target: int) -> Iterator[Proxy]:
 def object_store() -> Iterator[Proxy]:
     """Run moto's server, with a bucket `field`, behind a proxy; address and credentials are set as a user sets them."""
     import boto3
+    import s3fs
     from moto.server import ThreadedMotoServer
 
+    s3fs.S3FileSystem.clear_instance_cache()
     server = ThreadedMotoServer(port=0, verbose=False)
     server.start()
     _, port = server.get_host_and_port()
@@ -195,6 +200,8 @@ def object_store() -> Iterator[Proxy]:
             yield proxy
             proxy.client.close()
         finally:
+            # What moto holds outlives its server.
+            urlopen(Request(f"http://127.0.0.1:{port}/moto-api/reset", method="POST")).close()
             for name, value in before.items():
                 if value is None:
                     del os.environ[name]

@@ -89,7 +89,7 @@ def fetched(place: Path, needed: Needed) -> Iterator[Path]:
         yield place
         return
     with _scratch(place) as folder:
-        _Store(place).fetch(folder, needed, None)
+        _Store(place, "read").fetch(folder, needed, None)
         with _named(place, folder):
             yield folder
 
@@ -121,7 +121,8 @@ def lies_there(place: UrlPath, name: str) -> bool:
 class _Store:
     """A folder, or a file, at an address that is written."""
 
-    def __init__(self, place: UrlPath) -> None:
+    def __init__(self, place: UrlPath, done: str = "written") -> None:
+        self._what_is_done = done
         if place.scheme.startswith("http"):
             raise OutputError(place, "results are not written to a web server", "name a folder, or s3://, gs://, az://")
         self._place = place
@@ -204,7 +205,7 @@ class _Store:
     def _done(self, request: Callable[[], Result]) -> Result:
         """Return the answer to a request."""
         with reported(self._place), _as_output(self._place):
-            return asked(self._place, request, done="written")
+            return asked(self._place, request, done=self._what_is_done)
 
 
 @contextmanager

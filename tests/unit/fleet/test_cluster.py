@@ -2,37 +2,53 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
 import pytest
 
-pytest.importorskip("distributed", reason="needs the extra icrtool[cluster]")
-pytestmark = pytest.mark.stress
+from icrtool.output.stored_run import open_run
+from support.servers import object_store
 
+pytest.importorskip("distributed", reason="needs the extra icrtool[cluster]")
 ROOT = Path(__file__).parents[3]
 LOGS = 5
 
 
-def start(*arguments: str, **options: object) -> subprocess.Popen[bytes]:
+def start(*arguments: str, TMPDIR: str = tempfile.gettempdir(), **options: object) -> subprocess.Popen[bytes]:
     paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": paths}
+    environment = {**os.environ, "PYTHONPATH": paths, "TMPDIR": TMPDIR}
     return subprocess.Popen([sys.executable, "-P", *arguments], env=environment, **options)  # type: ignore[call-overload]
 
 
 @pytest.fixture
+def store():
+    """An object store, whose address and credentials the processes that are started next have in their environment."""
+    pytest.importorskip("s3fs", reason="needs the extra icrtool[cloud]")
+    pytest.importorskip("moto.server", reason="needs moto, of the extra icrtool[dev]")
+    with object_store() as found:
+        yield found
+
+
+@pytest.fixture
 def cluster(tmp_path: Path):
+    """A scheduler and two workers, each with a working directory and a folder for temporary files of its own."""
     file = tmp_path / "scheduler.json"
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     begin = ("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
     processes = [start(*begin, "--scheduler-file", str(file), **quiet)]
     worker = ("-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny")
-    processes += [start(*worker, "--no-dashboard", **quiet) for _ in range(2)]
+    for number in range(2):
+        own = tmp_path / f"worker {number}"
+        (own / "temporary").mkdir(parents=True)
+        processes.append(start(*worker, "--no-dashboard", cwd=own, TMPDIR=str(own / "temporary"), **quiet))
     for _ in range(600):
         if file.exists():
             break
@@ -43,6 +59,45 @@ def cluster(tmp_path: Path):
         process.wait()
 
 
+@pytest.mark.parametrize("logs", [4, pytest.param(20, marks=pytest.mark.stress)])
+def test_workers_that_share_no_folder_give_all_of_a_bucket_to_a_bucket(
+    tmp_path: Path, store, cluster, logs: int
+) -> None:  # fmt: skip
+    address, processes = cluster
+    drive = ("--duration", "30", "-o", str(tmp_path / "drive.mcap"), "-q")
+    assert start("-m", "icrtool", "simulate", *drive).wait(300) == 0
+    for number in range(logs):
+        store.client.upload_file(str(tmp_path / "drive.mcap"), "field", f"season/{number:02}.mcap")
+    (tmp_path / "drive.mcap").unlink()
+    (tmp_path / "client").mkdir()
+    arguments = ("-m", "icrtool", "batch", "s3://field/season", "-o", "s3://field/out", "--plots", "none",
+                 "--robot", "pentzer-tracked", "--no-ladder", "--no-page")  # fmt: skip
+    batch = start(*arguments, "--json", "--scheduler", address, stdout=subprocess.PIPE, cwd=tmp_path / "client")
+
+    def there(prefix: str) -> list[str]:
+        found = store.client.list_objects_v2(Bucket="field", Prefix=f"out/{prefix}").get("Contents", [])
+        return [one["Key"].removeprefix("out/") for one in found]
+
+    # In the middle of a log of this worker: of two, one is at work while the other one writes a row.
+    while len(there(".rows/")) < logs // 4 and batch.poll() is None:
+        time.sleep(0.02)
+    assert len(there(".rows/")) < logs
+    processes[1].send_signal(signal.SIGKILL)
+    document = json.loads(batch.communicate(timeout=500)[0])
+    assert batch.returncode == 0
+    names = [f"{number:02}" for number in range(logs)]
+    assert [row["log"] for row in document["logs"]] == [f"{name}.mcap" for name in names]
+    assert document["counts"] == {"done": logs, "failed": 0, "skipped": 0}
+    table = store.client.get_object(Bucket="field", Key="out/fleet.csv")["Body"].read().decode().splitlines()
+    rows = list(csv.DictReader(table))
+    assert [row["log"] for row in rows] == [f"{name}.mcap" for name in names]
+    assert len({row["y_icr_right_m"] for row in rows}) == 1, "all are copies"
+    for name in names:
+        assert len(open_run(f"s3://field/out/runs/{name}").states) > 2900
+    assert not list((tmp_path / "client").iterdir())
+
+
+@pytest.mark.stress
 def test_a_worker_killed_in_the_middle_loses_no_row_and_doubles_none(tmp_path: Path, cluster) -> None:
     address, processes = cluster
     for number in range(LOGS):
@@ -64,6 +119,7 @@ def test_a_worker_killed_in_the_middle_loses_no_row_and_doubles_none(tmp_path: P
     assert document["counts"] == {"done": LOGS, "failed": 0, "skipped": 0}
 
 
+@pytest.mark.stress
 @pytest.mark.parametrize("lost", ["scheduler", "workers"])
 def test_a_cluster_that_is_lost_gives_a_row_for_each_log_and_all_tables(tmp_path: Path, cluster, lost: str) -> None:
     address, processes = cluster
