@@ -25,7 +25,7 @@ from icrtool.kernels.track import Track
 from icrtool.motion.models import NO_SLIP, FittedModel
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.dropout import MeasuredHeading
-from icrtool.records.memory import give_back_freed
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import Run, width_or_usual_m
 
 FILTER_LABELS = {"icr": "ICR, momentary", "icr_final": "ICR, final"}

@@ -7,7 +7,7 @@ the configured wheel radius.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from msgspec import UNSET
 from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
 from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.motion.models import FIVE, FittedModel, TrackGeometry, wheel_motion
+from icrtool.motion.models import FIVE, FittedModel, TrackGeometry, find_model, wheel_motion
 from icrtool.records.calibration_document import (
     CALIBRATION_SCHEMA,
     CalibratedRobot,
@@ -32,12 +32,11 @@ from icrtool.records.calibration_document import (
     HeldOutScore,
     PooledScore,
 )
-from icrtool.records.late_output import call_output
 from icrtool.records.plain_data import plain
-from icrtool.records.run import WarmStart
+from icrtool.records.run import WarmStart, call_output
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument
 from icrtool.records.tables import RobotLog
-from icrtool.records.text import counted
+from icrtool.records.text import counted, escaped_texts
 
 
 class Odometry(NamedTuple):
@@ -260,3 +259,64 @@ def _parameters(one: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterD
     unseen = one.not_shown
     found = {name: ParameterDocument(at, std, "not shown" if name in unseen else "shown") for name, at, std in rows}
     return one.model.terms, found, one.covariance.tolist()
+
+
+LARGEST = 1e6
+"""Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
+
+
+def read_calibration(stored: Mapping[str, Any]) -> Calibration:
+    """Return the calibration that plain data of a file hold.
+
+    Raises
+    ------
+    ValueError
+        They are not those of a calibration.
+    """
+    return calibration_of(msgspec.convert(escaped_texts(stored), CalibrationDocument))
+
+
+def calibration_of(document: CalibrationDocument) -> Calibration:
+    """Return the calibration of a document.
+
+    Raises
+    ------
+    LookupError, ValueError
+        Its terms or numbers are not those of a motion model.
+    """
+    fitted, gyro = _fitted(document.model, document), document.gyro
+    errors = msgspec.structs.asdict(document.controller)
+    found = Calibration(
+        robot=document.robot,
+        fitted=fitted,
+        others={name: _fitted(name, one) for name, one in document.models.items()},
+        gyro=None if gyro is None else replace(_fitted(gyro.model, gyro), wheels=fitted),
+        logs=document.logs,
+        held_out=document.held_out,
+        pooled=document.held_out_pooled,
+        controller=None if errors["pose_variance"] is UNSET else msgspec.convert(errors, ControllerErrors),
+        warnings=document.warnings,
+        created=document.created or "",
+        tool_version=document.tool_version,
+        sources=document.error_sources,
+        gyro_sources=None if gyro is None else gyro.error_sources,
+    )
+    with np.errstate(all="ignore"):
+        geometry, covariance = found.geometry()
+        if not (np.isfinite(geometry).all() and np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
+            raise ValueError("its parameters give no geometry of the tracks")
+    return found
+
+
+def _fitted(name: str, document: CalibrationDocument | FittedDocument | GyroDocument) -> FittedModel:
+    model = find_model(name)
+    k = len(model.terms)
+    if document.terms != model.terms:
+        raise ValueError(f"terms of {name}")
+    parameters = np.array([document.parameters[term].value for term in model.terms], np.float64)
+    covariance = np.array(document.covariance, np.float64).reshape(k, k)
+    if (np.diag(covariance) < 0).any():
+        raise ValueError(f"variances of {name}")
+    if not (np.abs(parameters).max(initial=0) < LARGEST and np.abs(covariance).max(initial=0) < LARGEST):
+        raise ValueError(f"parameters of {name}")
+    return FittedModel(model, parameters, covariance)

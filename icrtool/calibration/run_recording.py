@@ -13,7 +13,7 @@ from icrtool.motion.models import Lever
 from icrtool.motion.recording import Recording
 from icrtool.motion.turns import GyroLine, fit_gyro_line
 from icrtool.records.dropout import MeasuredHeading
-from icrtool.records.memory import give_back_freed
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import Run, track_of
 
 

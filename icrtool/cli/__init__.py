@@ -8,7 +8,7 @@ import sys
 from contextlib import suppress
 
 from icrtool.cli.interrupts import INTERRUPTED, end_at_once
-from icrtool.records.memory import use_one_arena
+from icrtool.records.process_resources import use_one_arena
 
 __all__ = ["main"]
 

@@ -69,8 +69,8 @@ def call_all_kernels() -> None:
     from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
     from icrtool.kernels.open_loop.trials import FrozenIcrs
     from icrtool.logs.writing.log import WriteOptions, write_log
+    from icrtool.records.process_resources import unfinished
     from icrtool.records.run import track_of
-    from icrtool.records.unfinished import unfinished
     from icrtool.simulation.drives import DrivePlan, Sensors
     from icrtool.simulation.record import simulate
     from icrtool.simulation.studies import default_request, run_study

@@ -20,8 +20,7 @@ from icrtool.records.urls import UrlPath
 
 if TYPE_CHECKING:
     from icrtool.config import Config
-    from icrtool.records.late_output import FigureSet
-    from icrtool.records.run import Run, WarmStart
+    from icrtool.records.run import FigureSet, Run, WarmStart
 
 RUNS = Path("icrtool-runs")
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from icrtool.records.unfinished import remove_unfinished
+from icrtool.records.process_resources import remove_unfinished
 
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a program that Ctrl-C ended."""

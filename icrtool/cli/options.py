@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.dropout import Verdict
     from icrtool.records.fleet_document import FleetVerdict
-    from icrtool.records.late_output import FigureSet
+    from icrtool.records.run import FigureSet
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

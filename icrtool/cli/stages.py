@@ -8,7 +8,7 @@ import time
 from types import TracebackType
 from typing import Self
 
-from icrtool.records.memory import give_back_freed
+from icrtool.records.process_resources import give_back_freed
 
 CLEAR = "\r\x1b[K"
 REFRESH_S = 0.1

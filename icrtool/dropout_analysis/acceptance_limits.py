@@ -10,8 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from msgspec.structs import asdict, astuple
 
-from icrtool.dropout_analysis.baseline import BaselineReport
-from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.errors import ConfigError
 from icrtool.kernels.open_loop.block_sums import BlockSums, difference_half_width
 from icrtool.kernels.within_budget import within_budget

@@ -15,20 +15,16 @@ from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate, verdict_on
-from icrtool.dropout_analysis.baseline import BaselineReport
-from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
-from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
-from icrtool.dropout_analysis.real_outages import real_outages
-from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.slip_events import leave_out_events, with_event_cost
-from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
+from icrtool.dropout_analysis.example_trials import example_trials, split_by_turning, worst_trials
+from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
+from icrtool.dropout_analysis.reference import with_smoothed_reference
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.dropout_analysis.starts import Starts
-from icrtool.dropout_analysis.straight_and_turning import split_by_turning
 from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
-from icrtool.records.dropout import DEFAULT_SEED, CheckedGate, Gate, Outage, UsedCalibration
-from icrtool.records.memory import give_back_freed
+from icrtool.records.dropout import DEFAULT_SEED, CheckedGate, EventCost, Gate, Outage, UsedCalibration
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type
 
 
@@ -184,3 +180,27 @@ def _compare(compared: Run, run: Run) -> tuple[ComparedModels | None, str]:
         return compare_models(compared, measured_headings(run)), ""
     except DataError as err:
         return None, f"{err.why}, {err.advice}"
+
+
+def leave_out_events(run: Run) -> Run:
+    """Return the run with a gap in place of each slip event: no trial, window or forced outage crosses a gap."""
+    return replace(run, in_gap=run.in_gap | run.slipping)
+
+
+def with_event_cost(report: DropoutReport, run: Run, *, starts: Starts, seed: int) -> DropoutReport:
+    """Return the report of `leave_out_events` with what the slip events cost.
+
+    Parameters
+    ----------
+    run : with its slip events
+    """
+    horizons: Sequence[float] = report.horizons_m.tolist()
+    whole = dropout(run, horizons, starts=starts, seed=seed)
+    cost = EventCost(
+        events=len(run.sensors.events),
+        trials=whole.counts.trials - report.counts.trials,
+        with_events={result.name: result.summary for result in whole.results},
+    )
+    # starts at a gap, at an outage or at a standstill are counted as without the option
+    counts = whole.counts._replace(trials=report.counts.trials)
+    return replace(report, counts=counts, event_cost=cost)

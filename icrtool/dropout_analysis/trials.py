@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.dropout_analysis.reference_error import reference_error
+from icrtool.dropout_analysis.reference import reference_error
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
@@ -31,7 +31,7 @@ from icrtool.kernels.open_loop.trials import FrozenIcrs, Intervals, Summary, Tri
 from icrtool.kernels.track import Track
 from icrtool.motion.recording import MOST_TRIALS, ErrorsOf, Trials
 from icrtool.records.dropout import DEFAULT_SEED, HeadingErrors, LearnedSplit, ModelResult, ReferenceErrors
-from icrtool.records.memory import give_back_freed
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type, no_slip_icrs, track_of
 
 LARGEST_TABLE_BYTES = 96 << 20

@@ -12,8 +12,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter_records import REFERENCE_STEP_S, FilterInputs, FilterParameters
-from icrtool.records.events import SlipEvent, intervals_in
-from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData
+from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData, SlipEvent, intervals_in
 from icrtool.records.run import WarmStart, width_or_usual_m
 
 

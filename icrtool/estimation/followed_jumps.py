@@ -10,8 +10,7 @@ import msgspec
 import numpy as np
 
 from icrtool.kernels.arrays import Ints
-from icrtool.records.events import ReferenceJump
-from icrtool.records.measurements import SensorData
+from icrtool.records.measurements import ReferenceJump, SensorData
 from icrtool.records.run import MeasurementOutcome
 
 NEAR_S = 1.0

@@ -14,7 +14,7 @@ from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kin
 from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import PathKnots, path_at, window_residuals
 from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs, wheel_motion
-from icrtool.records.memory import give_back_freed
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.tables import States
 
 WINDOW_M, WINDOW_IN_SEPARATIONS = 2.0, 3.0

@@ -26,8 +26,7 @@ from icrtool.estimation.run_warnings import (
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.records.events import ReferenceJump, SlipEvent
-from icrtool.records.measurements import Fixes, FixStatistics, Measurements
+from icrtool.records.measurements import Fixes, FixStatistics, Measurements, ReferenceJump, SlipEvent
 from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, no_slip_icrs, track_of_states
 from icrtool.records.run_document import (

@@ -26,16 +26,14 @@ from icrtool.fleet.recordings import as_text
 from icrtool.logs.containers.channel import truncation
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
-from icrtool.records.late_output import FigureSet
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS
+from icrtool.records.run import ICR_COLUMNS, FigureSet
 from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
 from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
-    from icrtool.dropout_analysis.baseline import BaselineReport
-    from icrtool.dropout_analysis.report import DropoutReport
+    from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
     from icrtool.dropout_analysis.trials import ErrorSink
     from icrtool.records.dropout import BudgetDistance
     from icrtool.records.run import Run, WarmStart

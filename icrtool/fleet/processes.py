@@ -33,8 +33,7 @@ from icrtool.errors import ConfigError
 from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
 from icrtool.logs.containers.split_files import files_of_log
 from icrtool.records.fleet_document import FleetLog
-from icrtool.records.memory import give_back_freed
-from icrtool.records.unfinished import remove_unfinished
+from icrtool.records.process_resources import give_back_freed, remove_unfinished
 
 if TYPE_CHECKING:
     from distributed import Client

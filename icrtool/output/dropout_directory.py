@@ -44,8 +44,8 @@ from icrtool.records.dropout_document import (
     SummaryRow,
     TrialDocument,
 )
-from icrtool.records.late_output import FigureSet
 from icrtool.records.plain_data import rows_of
+from icrtool.records.run import FigureSet
 
 REPORT_FILE = "report.json"
 TRIALS_FILE = "trials.parquet"

@@ -10,8 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from icrtool.records.late_output import FigureSet
-from icrtool.records.memory import give_back_freed
+from icrtool.records.process_resources import give_back_freed
+from icrtool.records.run import FigureSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -21,9 +21,8 @@ from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_meas
 from icrtool.output.files.own_files import check_directory, own_files
 from icrtool.output.files.remote_place import lies_there
 from icrtool.output.files.states_file import StatesFormat, write_states
-from icrtool.records.late_output import FigureSet
 from icrtool.records.regular_file import read_regular
-from icrtool.records.run import Run
+from icrtool.records.run import FigureSet, Run
 from icrtool.records.run_document import EVENT_COLUMNS, EventDocument
 from icrtool.records.urls import UrlPath
 

@@ -25,7 +25,7 @@ from icrtool.output.run_directory import (
     STATES_FILES,
     is_run_directory,
 )
-from icrtool.records.memory import give_back_freed
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_regular
 from icrtool.records.run import Run
 from icrtool.records.run_document import RUN_SCHEMA, RunDocument

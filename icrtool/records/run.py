@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, fields
 from html import escape
 from pathlib import Path
@@ -13,9 +14,7 @@ from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.kernels.filter_records import GATED, RECOVERED, USED
 from icrtool.kernels.track import Track
-from icrtool.records.events import intervals_in
-from icrtool.records.late_output import FigureSet, call_output
-from icrtool.records.measurements import SensorData
+from icrtool.records.measurements import SensorData, intervals_in
 from icrtool.records.plain_data import plain
 from icrtool.records.tables import Icrs, States
 
@@ -33,6 +32,8 @@ STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 USUAL_WIDTH_M = 0.6
 """Track width of a small field robot [m], used where that of the robot is not known."""
 
+FigureSet = Literal["default", "all"]
+"""The figures that a run and its report are written with: those that answer a question, or the paper's too."""
 
 MAKE_RUN = "icrtool.fit(log) makes one, icrtool.open_run(directory) reads one"
 """What to call for a run."""
@@ -286,3 +287,12 @@ def track_of_states(
         table.t_s, held, table.v_left_mps, table.v_right_mps, table.north_m, table.east_m, table.heading_rad,
         table.distance_m, in_outage=in_outage, jump=jumping, slipping=slipping,
     )  # fmt: skip
+
+
+def call_output(module: str, function: str, *arguments: object, **options: object) -> Any:  # noqa: ANN401 - the type is that of the function called
+    """Return ``icrtool.output.MODULE.FUNCTION(*arguments, **options)``.
+
+    A record holds data and knows no code that uses it, yet a notebook expects ``run.write(path)``. Such methods look
+    their function up here by name, so that importing a record imports nothing of the layer above it.
+    """
+    return getattr(importlib.import_module(f"icrtool.output.{module}"), function)(*arguments, **options)

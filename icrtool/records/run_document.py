@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from icrtool.config import Config
-from icrtool.records.events import ReferenceJump, SlipKind
-from icrtool.records.measurements import Finding, HeadingFacts, IcrStart, Triple, WheelFacts
+from icrtool.records.measurements import Finding, HeadingFacts, IcrStart, ReferenceJump, SlipKind, Triple, WheelFacts
 from icrtool.records.plain_data import Record
 from icrtool.records.samples import InputFile, StreamChoice
 

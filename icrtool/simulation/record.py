@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.records.sensor_columns import SensorColumns
+from icrtool.records.samples import SensorColumns
 from icrtool.simulation.drives import DrivePlan, Readings, Sensors, Truth, check_drive, drive_plan, sense
 
 START_NS = 1_760_000_000_000_000_000

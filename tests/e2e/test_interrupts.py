@@ -24,7 +24,7 @@ COMMAND = """
 import signal, sys
 from pathlib import Path
 from icrtool.cli.interrupts import end_at_once
-from icrtool.records.unfinished import unfinished
+from icrtool.records.process_resources import unfinished
 
 def command():
     half = Path(sys.argv[1])
@@ -66,7 +66,7 @@ COMPUTING = """
 import hashlib, os, signal, sys, threading
 from pathlib import Path
 from icrtool.cli.interrupts import end_at_once
-from icrtool.records.unfinished import unfinished
+from icrtool.records.process_resources import unfinished
 
 def command():
     folder = Path(sys.argv[1])

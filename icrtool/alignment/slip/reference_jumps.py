@@ -15,7 +15,7 @@ import numpy as np
 
 from icrtool.alignment.slip.slip_windows import ComparedWindows, Knots, Motion, compare
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.records.events import ReferenceJump
+from icrtool.records.measurements import ReferenceJump
 
 JUMP_SIGMAS = 6.0
 JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3

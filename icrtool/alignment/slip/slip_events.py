@@ -15,8 +15,7 @@ from icrtool.alignment.slip.reference_jumps import decide_jumps, without_jumps
 from icrtool.alignment.slip.slip_extent import Extent, find_extent
 from icrtool.alignment.slip.slip_windows import ComparedWindows, Knots, Motion, compare, fit_motion, lay_knots, spans_of
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.records.events import ReferenceJump, SlipEvent
-from icrtool.records.measurements import SensorData
+from icrtool.records.measurements import ReferenceJump, SensorData, SlipEvent
 
 WINDOWS_S = (0.5, 1.0, 2.0)
 LONGEST_WINDOW_S = 16.0

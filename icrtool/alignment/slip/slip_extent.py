@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.alignment.slip.slip_windows import ComparedWindows
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.records.events import SlipKind
+from icrtool.records.measurements import SlipKind
 
 SHORTEST_EVENT_S = 0.5
 FEWEST_STEPS = 2

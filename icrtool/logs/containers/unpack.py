@@ -28,7 +28,7 @@ from icrtool.errors import LogError
 from icrtool.logs.containers.channel import CUT_OFF, some_of
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATIO, ZSTD_MAGIC
 from icrtool.logs.containers.one_recording import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
-from icrtool.records import unfinished
+from icrtool.records import process_resources
 from icrtool.records.regular_file import open_regular
 
 _PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED})?$|\.db3-wal$|^metadata\.yaml$")
@@ -60,14 +60,14 @@ class ScratchFolder:
     def __init__(self) -> None:
         self.path = Path(tempfile.gettempdir()) / f"icrtool-{secrets.token_hex(8)}"
         # before it is there: a signal may come at any time
-        unfinished.begin(self.path)
+        process_resources.begin(self.path)
         self.path.mkdir(mode=0o700)
         self._remove = weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
 
     def close(self) -> None:
         """Remove it."""
         self._remove()
-        unfinished.end(self.path)
+        process_resources.end(self.path)
 
 
 class Unpacked(NamedTuple):

@@ -20,8 +20,8 @@ from icrtool.logs.writing.messages import (
     load_typestore,
     serialise_topics,
 )
-from icrtool.records.sensor_columns import SensorColumns
-from icrtool.records.unfinished import unfinished
+from icrtool.records.process_resources import unfinished
+from icrtool.records.samples import SensorColumns
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

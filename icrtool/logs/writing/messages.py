@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
     from icrtool.kernels.arrays import Ints
-    from icrtool.records.sensor_columns import SensorColumns
+    from icrtool.records.samples import SensorColumns
 
 Container = Literal["mcap", "bag", "db3"]
 WheelMessages = Literal["joint_states", "odometry", "float64_pair", "ticks", "jackal_feedback", "twist_stamped"]

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
-from icrtool.dropout_analysis.baseline import BaselineReport
-from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.kernels.open_loop.block_sums import difference_half_width
 from icrtool.output.files.atomic import write_file

@@ -24,8 +24,8 @@ from icrtool.output.files.own_files import (
     reported,
     write_own_files,
 )  # fmt: skip
+from icrtool.records.process_resources import end, unfinished, with_parents
 from icrtool.records.regular_file import check_folders
-from icrtool.records.unfinished import end, unfinished, with_parents
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from icrtool.dropout_analysis.baseline import BaselineReport, baseline_report, known_content
+from icrtool.dropout_analysis.report import BaselineReport, baseline_report, known_content
 from icrtool.errors import ConfigError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
 from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet

@@ -32,7 +32,7 @@ def open_calibration(file: Path | str) -> Calibration:
     RunError
         It cannot be read, or is not a calibration.
     """
-    from icrtool.calibration.stored import read_calibration
+    from icrtool.calibration.record import read_calibration
 
     path = Path(file)
     try:

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Ints
-from icrtool.records.events import ReferenceJump, SlipEvent
-from icrtool.records.measurements import Fixes, SensorData
+from icrtool.records.measurements import Fixes, ReferenceJump, SensorData, SlipEvent
 from icrtool.records.regular_file import open_regular
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from icrtool.calibration.record import Calibration
-from icrtool.calibration.stored import calibration_of
+from icrtool.calibration.record import Calibration, calibration_of
 from icrtool.errors import DataError
 from icrtool.output.exports.controllers import controller_rows, format_export
 from icrtool.output.tables.brief import reach_rows, to_drive, trust

@@ -16,8 +16,8 @@ import numpy as np
 from msgspec import UNSET
 
 from icrtool.calibration.pooled import calibrated
+from icrtool.calibration.record import calibration_of
 from icrtool.calibration.run_recording import turning_recording_of
-from icrtool.calibration.stored import calibration_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints

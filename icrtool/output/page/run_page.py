@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from icrtool.dropout_analysis.reference import with_smoothed_reference
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.motion.models import TERMS
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, report_document

@@ -15,8 +15,7 @@ from scipy.optimize import nnls
 from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonnegative, radius
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
 from icrtool.calibration.pooled import calibrate_recordings, predictor
-from icrtool.calibration.record import Calibration, ErrorSources
-from icrtool.calibration.stored import read_calibration
+from icrtool.calibration.record import Calibration, ErrorSources, read_calibration
 from icrtool.errors import DataError, IcrToolError
 from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
 from icrtool.motion.recording import cut_trials

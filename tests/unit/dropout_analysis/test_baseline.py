@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from icrtool.dropout_analysis.acceptance_limits import check_gate, parse_gate
-from icrtool.dropout_analysis.baseline import BaselineReport
 from icrtool.dropout_analysis.dropout_report import dropout_report
-from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.errors import ConfigError, IcrToolError
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import runs_of_fleet

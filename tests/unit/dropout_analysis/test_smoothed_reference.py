@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from icrtool.config import parse_config
-from icrtool.dropout_analysis.smoothed_reference import with_smoothed_reference
+from icrtool.dropout_analysis.reference import with_smoothed_reference
 from icrtool.dropout_analysis.trials import dropout, models_of
 from icrtool.estimation.filter_setup import MIDDLE_OF_THE_TURN
 from icrtool.estimation.fit import fit

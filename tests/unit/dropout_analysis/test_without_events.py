@@ -14,7 +14,7 @@ from icrtool.estimation.fit import fit
 from icrtool.kernels.open_loop.direct import trial_ends
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
-from icrtool.records.events import SlipEvent
+from icrtool.records.measurements import SlipEvent
 from icrtool.records.run import Run, track_of
 from support.drives import make_log
 

@@ -17,8 +17,7 @@ from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GATED, FilterInputs
 from icrtool.kernels.smoother import run_smoother
 from icrtool.motion.recording import cut_windows
-from icrtool.records.events import SlipEvent
-from icrtool.records.measurements import SensorData
+from icrtool.records.measurements import SensorData, SlipEvent
 from icrtool.records.tables import RobotLog
 from support.drives import EPOCH_NS, ICRS, make_log
 from support.matrix_filter import run_ekf_plain

@@ -15,8 +15,7 @@ import pytest
 
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
-from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
-from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError

@@ -15,8 +15,7 @@ from matplotlib.text import Text
 
 from icrtool.dropout_analysis.acceptance_limits import budget_distances
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
-from icrtool.dropout_analysis.forced_outages import force_outages, plan_outages
-from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout, models_of
 from icrtool.output.figure_catalogue import draw_figures

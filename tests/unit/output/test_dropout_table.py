@@ -13,7 +13,7 @@ import pytest
 from icrtool.config import Config
 from icrtool.dropout_analysis.acceptance_limits import BudgetDistance, budget_distances, check_gate, parse_gate
 from icrtool.dropout_analysis.example_trials import worst_trials
-from icrtool.dropout_analysis.real_outages import real_outages
+from icrtool.dropout_analysis.outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError

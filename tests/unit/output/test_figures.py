@@ -19,7 +19,7 @@ from icrtool.output.figures.transfer import transfer
 from icrtool.output.page.pictures import drawn_pictures
 from icrtool.records.calibration_document import COMPARE_SCHEMA, ComparedGroup, GroupComparison, TransferCell
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.events import ReferenceJump
+from icrtool.records.measurements import ReferenceJump
 from icrtool.records.run import Run
 from support.barn import configured, simulate
 

@@ -9,8 +9,7 @@ import pytest
 
 from icrtool.alignment.slip.slip_events import find_disagreements
 from icrtool.kernels.arrays import Floats
-from icrtool.records.events import ReferenceJump
-from icrtool.records.measurements import SensorData
+from icrtool.records.measurements import ReferenceJump, SensorData
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX
 from support.slip_drives import START_NS, WIDTH_M, drive
 

@@ -10,8 +10,7 @@ import pytest
 
 from icrtool.alignment.slip.slip_events import find_disagreements
 from icrtool.kernels.arrays import Floats
-from icrtool.records.events import SlipEvent
-from icrtool.records.measurements import Fixes, SensorData
+from icrtool.records.measurements import Fixes, SensorData, SlipEvent
 from icrtool.records.samples import HeadingSamples, WheelSamples
 from support.slip_drives import RATE_HZ, SECONDS, START_NS, WIDTH_M, Y_LEFT, Y_RIGHT, curves, drive
 

@@ -25,7 +25,7 @@ from icrtool.output.page.columns import packed, packed_sums
 from icrtool.output.page.pictures import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
 from icrtool.output.tables.brief import brief_dropout
-from icrtool.records.events import ReferenceJump
+from icrtool.records.measurements import ReferenceJump
 from icrtool.records.run import Run
 from icrtool.records.run_document import EventDocument
 from support.barn import configured, simulate

@@ -1,10 +1,13 @@
-"""The reference's own error: what open-loop trials would show if the motion model were perfect."""
+"""What trials are compared with: the filter's estimate or the smoother's; and the error that it has itself."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.errors import RunError
 from icrtool.kernels.track import Track
 from icrtool.records.dropout import ReferenceErrors
 from icrtool.records.run import Run
@@ -70,3 +73,27 @@ def _spread(run: Run) -> tuple[float, float]:
     noise = run.document.filter
     position, heading = noise.nis_gnss_mean, noise.nis_heading_mean
     return max((position or 0.0) / GNSS_NIS, 1.0), max((heading or 0.0) / HEADING_NIS, 1.0)
+
+
+def with_smoothed_reference(run: Run) -> Run:
+    """Return a run whose positions and headings are the smoother's.
+
+    Raises
+    ------
+    RunError
+        The run has no smoothed states.
+
+    Notes
+    -----
+    Starts, their ICRs, the wheel speeds and the path length stay the filter's: only where a trial begins, where it
+    points, and what its end is compared with change.
+    """
+    smoothed = run.smoothed
+    if smoothed is None:
+        raise RunError(run.directory or run.name, "it has no smoothed states", "run icrtool fit --smooth")
+    table = replace(
+        run.table,
+        north_m=smoothed.north_m, east_m=smoothed.east_m, heading_rad=smoothed.heading_rad,
+        std_north_m=smoothed.std_north_m, std_east_m=smoothed.std_east_m, std_heading_rad=smoothed.std_heading_rad,
+    )  # fmt: skip
+    return replace(run, table=table)
