@@ -46,7 +46,7 @@ PUBLISHED = (
     "sold_as_fixed",
     "gyro_course",
     "wheels_course",
-    "change{n}_rise_{icr}_s",
+    "change*_rise_*_s",
     "rise_{name}_s",
     '"way_m"',
 )

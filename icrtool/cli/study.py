@@ -19,21 +19,12 @@ from icrtool.cli.terminal import show
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.simulation.drives import Sensors
-    from icrtool.simulation.studies import StudyName, StudyRequest
+    from icrtool.simulation.study_records import StudyName, StudyRequest
 
-STUDIES = (
+NAMES = (
     "convergence", "initial", "icr-change", "turn-radius", "input-noise", "input-bias", "input-source", "gnss", "rate",
     "consistency",
 )  # fmt: skip
-
-VARIES = {
-    "input-noise": ("--input-noise", "input_noise_mps"),
-    "input-bias": ("--input-bias", "input_bias_mps"),
-    "gnss": ("--gnss", "gnss_std_m"),
-    "rate": ("--rate", "rate"),
-    "turn-radius": ("--radius", "radius_m"),
-}
-"""The option that a study varies itself, and its name; --values sets its values."""
 
 
 def values_text(text: str) -> tuple[float, ...]:
@@ -42,7 +33,7 @@ def values_text(text: str) -> tuple[float, ...]:
 
 
 @click.command("study")
-@click.argument("name", metavar="NAME", type=click.Choice(STUDIES))
+@click.argument("name", metavar="NAME", type=click.Choice(NAMES))
 @click.option("-o", "--output", metavar="DIR", type=options.FILE,
               help="Study directory; default icrtool-runs/study-NAME.")  # fmt: skip
 @click.option("--runs", metavar="N", type=click.IntRange(min=1),
@@ -112,16 +103,18 @@ def _request(name: StudyName, config: Config, given: dict[str, Any]) -> StudyReq
     """Return the study's defaults, changed by the options."""
     from icrtool.simulation.drives import DrivePlan
     from icrtool.simulation.paths import PathPlan
-    from icrtool.simulation.studies import KINDS, StudyRequest, default_request
+    from icrtool.simulation.studies import STUDIES, default_request
+    from icrtool.simulation.study_records import StudyRequest
 
-    option, own = VARIES.get(name, ("", ""))
-    if given.get(own) is not None:
+    study = STUDIES[name]
+    if given.get(study.varied) is not None:
+        option = next(one.opts[0] for one in command.params if one.name == study.varied)
         raise click.UsageError(f"{option} is what study {name} varies; --values V,V,... sets where")
-    if given["values"] is not None and not KINDS[name].varies:
+    if given["values"] is not None and not study.varies:
         raise click.UsageError(f"study {name} varies no number; it takes no --values")
     request = default_request(name, config)
-    plan, path = request.plan, request.plan.path
-    plan = replace(plan, **given_fields(DrivePlan, given), path=replace(path, **given_fields(PathPlan, given)))
+    path = replace(request.path, **given_fields(PathPlan, given))
+    plan = replace(request.plan, **given_fields(DrivePlan, given), path=path)
     if given["icrs_m"] is None and config.robot.track_width_m is not None:
         plan = replace(plan, icrs_m=default_icrs(config))
     check_changes(plan.changes, plan.duration_s)

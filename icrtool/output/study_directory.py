@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from icrtool import __version__
 from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import json_bytes, schema_of
 from icrtool.output.files.own_files import check_directory
-from icrtool.simulation.studies import KINDS, Column, StudyResult
+from icrtool.simulation.study_records import Column, StudyResult
 
 STUDY_SCHEMA = "icrtool/study/1"
 STUDY_FILE = "study.json"
@@ -63,23 +61,17 @@ def is_study_directory(directory: Path) -> bool:
 
 def study_document(result: StudyResult) -> dict[str, Any]:
     """Return what study.json holds."""
-    kind = KINDS[result.request.name]
     return {
         "schema": STUDY_SCHEMA,
         "tool_version": __version__,
         "study": result.request.name,
-        "about": kind.about,
-        "paper_figures": kind.figures,
+        "about": result.study.about,
+        "paper_figures": result.study.figures,
         "settings": result.request.settings(),
-        "findings": [
-            {"what": one.what, "ours": list(one.ours), "unit": one.unit, "paper": one.paper} for one in result.findings
-        ],
-        "levels": list(result.levels),
+        "findings": [one._asdict() for one in result.findings],
+        "levels": result.records(),
     }
 
 
 def _cells(values: Column) -> list[Any]:
-    if isinstance(values, list):
-        return values
-    found: list[Any] = (values.astype(int) if values.dtype == np.bool_ else values).tolist()
-    return found
+    return values if isinstance(values, list) else values.tolist()

@@ -1,37 +1,43 @@
-"""Studies: the paper's simulations (Pentzer 2014, Section 5) over many seeds, on the paper's robot or on one's own."""
+"""Studies: the paper's simulations (Pentzer 2014, Section 5) over many seeds, on the paper's robot or on one's own.
+
+A study is a row of `STUDIES`: what varies, what is measured of each run, which numbers are reported of it, and which of
+them is the answer. `run_study` carries out each; `icrtool.output.figures.study` draws it.
+"""
 
 from __future__ import annotations
 
-import importlib
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, cast
-
-import numpy as np
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any, cast
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.filter_records import GUARDED, PRINTED, UNGUARDED
+from icrtool.records.tables import Icrs
+from icrtool.simulation import study_measures as measured
 from icrtool.simulation.drives import DrivePlan, Sensors, check_drive
-from icrtool.simulation.paths import PathKind, PathPlan
-from icrtool.simulation.study_runs import Progress
-
-StudyName = Literal[
-    "convergence",
-    "initial",
-    "icr-change",
-    "turn-radius",
-    "input-noise",
-    "input-bias",
-    "input-source",
-    "gnss",
-    "rate",
-    "consistency",
-]
-
-Preset = Literal["paper", "field"]
-Column = Floats | Ints | Bools | list[str]
+from icrtool.simulation.paths import PathPlan
+from icrtool.simulation.study_measures import FATES, consistency_of, trace
+from icrtool.simulation.study_records import (
+    Level,
+    Number,
+    Setting,
+    Study,
+    StudyName,
+    StudyNumber,
+    StudyRequest,
+    StudyResult,
+    extreme_medians,
+    mean,
+    median,
+    percent,
+    percent_finite,
+    range_of_means,
+    spread,
+)
+from icrtool.simulation.study_runs import Progress, Scenario, run_scenarios
 
 PAPER_TRACK_WIDTH_M = 0.51
 """Pentzer 2014, Section 5: the robot of the simulations."""
@@ -42,177 +48,333 @@ STUDY_STEP_S = 0.005
 MOST_RUNS = 100_000
 """Runs of a setting."""
 
+SHOWN_S = 20.0
+"""First seconds of a run that the picture of convergence shows."""
 
-@dataclass(frozen=True, slots=True)
-class StudyNumber:
-    """One number of a study, and the number in the paper.
+GUARDS = {"no guard": UNGUARDED, "guard, printed derivatives": PRINTED, "guard": GUARDED}
+"""Eqs. 8-10; Eqs. 32-34 with Eqs. 28-29 as printed; Eqs. 32-34 with their true derivatives, as icrtool uses them."""
 
-    Attributes
+MODEL_ICR_STD_M = 0.1
+"""Initial standard deviation of the ICRs in case ``model``: small enough for an EKF to be nearly linear."""
+
+WORDS = {"nees": "NEES", "nis_gnss": "NIS of fixes", "nis_heading": "NIS of headings"}
+
+
+# What varies
+
+
+def in_preset(request: StudyRequest, preset: str) -> Scenario:
+    """Return the scenario of a request in a preset, before anything is varied."""
+    return Scenario(request.plan, request.sensors, request.config.with_filter(preset=preset))
+
+
+def by_preset(
+    change: Callable[[Scenario, Any], Scenario], choices: Sequence[str] = ()
+) -> Callable[[StudyRequest], Iterator[Setting]]:
+    """Return what gives a setting for each preset, and for each of the choices or of the values of a request.
+
+    Parameters
     ----------
-    what : the quantity
-    ours : 5th percentile, median, 95th percentile; or one number; NaN where there is none
-    unit : of `ours`
-    paper : the paper's number as text; empty where it has none
+    change : what a preset's scenario becomes for a value
     """
 
-    what: str
-    ours: tuple[float, ...]
-    unit: str
-    paper: str = ""
+    def vary(request: StudyRequest) -> Iterator[Setting]:
+        for preset in request.presets:
+            for value in choices or request.paths or request.values:
+                yield Setting(preset, value, change(in_preset(request, preset), value), {"value": value})
+
+    return vary
 
 
-@dataclass(frozen=True, slots=True)
-class StudyRequest:
-    """The settings of a study.
+def sensing(base: Scenario, **sensors: Any) -> Scenario:
+    """Return a scenario with other sensors."""
+    return replace(base, sensors=replace(base.sensors, **sensors))
 
-    Attributes
-    ----------
-    plan, sensors : the drive and its sensors; a study varies one of their settings
-    config : filter and robot
-    presets : the filter presets to compare
-    values : settings of what is varied; empty where nothing is
-    paths : the kinds of path to compare, where a study compares them
-    vary_path : every run of a ``curved`` path has another phase
+
+def driving(base: Scenario, **path: Any) -> Scenario:
+    """Return a scenario with another path."""
+    return replace(base, plan=replace(base.plan, path=replace(cast(PathPlan, base.plan.path), **path)))
+
+
+def at_rate(base: Scenario, rate: float) -> Scenario:
+    """Return a scenario recorded at another rate of wheels and heading, and of the fixes where theirs is higher."""
+    gnss_rate = min(rate, base.sensors.gnss_rate_hz)
+    return sensing(base, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
+
+
+def from_source(base: Scenario, name: str) -> Scenario:
+    """Return a scenario with encoders, or with the commands that the motors get at a low rate and follow with a lag.
+
+    The bias is between command and track; the drives are the same.
     """
-
-    name: StudyName
-    plan: DrivePlan
-    sensors: Sensors
-    config: Config
-    presets: tuple[Preset, ...]
-    runs: int
-    seed: int = 0
-    values: tuple[float, ...] = ()
-    paths: tuple[PathKind, ...] = ()
-    vary_path: bool = True
-
-    def settings(self) -> dict[str, Any]:
-        """Return the settings for study.json: every parameter, as plain data."""
-        from dataclasses import asdict
-
-        plan = {**asdict(self.plan), "path": asdict(cast(PathPlan, self.plan.path))}
-        return {
-            "runs": self.runs,
-            "seed": self.seed,
-            "values": list(self.values),
-            "presets": list(self.presets),
-            "paths": list(self.paths),
-            "vary_path": self.vary_path,
-            "drive": plan,
-            "sensors": asdict(self.sensors),
-            "config": self.config.effective(),
-        }
+    if name == "encoder":
+        return sensing(base, wheels="encoder", input_bias_mps=0.0)
+    return sensing(base, wheels="commanded", wheel_rate_hz=base.plan.command_rate_hz)
 
 
-@dataclass(frozen=True, slots=True)
-class StudyResult:
-    """The results of a study.
+def on_circle(base: Scenario, radius: float) -> Scenario:
+    """Return a scenario on a circle, with inflation.
 
-    Attributes
-    ----------
-    columns : one row a run: the CSV
-    levels : one record a setting, with the statistics over its runs
-    findings : numbers to compare with the paper's
-    curves : further arrays for the figure, by name
+    The faster track keeps one speed: at radius 0 the robot spins, and the wider the circle, the slower it turns.
     """
-
-    request: StudyRequest
-    columns: dict[str, Column]
-    levels: tuple[dict[str, Any], ...]
-    findings: tuple[StudyNumber, ...]
-    curves: dict[str, Floats] = field(default_factory=dict)
+    outer, path = abs(base.plan.icrs_m[1]), cast(PathPlan, base.plan.path)
+    speed = path.speed_mps * (radius / (radius + outer) if radius else 1.0)
+    return replace(driving(base, kind="circle", radius_m=radius, speed_mps=speed), inflate=True)
 
 
-@dataclass(frozen=True, slots=True)
-class StudyKind:
-    """A kind of study: what it varies, and the function that carries it out.
+def by_start(request: StudyRequest) -> Iterator[Setting]:
+    """Vary the guard and, on a grid, both initial y ICRs."""
+    base, given = in_preset(request, request.presets[0]), request.config.filter.initial_x_icr_m
+    x = given if given is not None else (1.0 if request.presets[0] == "paper" else 0.0)
+    for (name, guard), right, left in product(GUARDS.items(), request.values, request.values):
+        order = "proper start" if right > left else "inverted start" if right < left else ""
+        start = {"start_y_icr_right_m": right, "start_y_icr_left_m": left}
+        config = starting_at(base.config, (right, left, x))
+        yield Setting(name, order, replace(base, guard=guard, config=config), start)
 
-    Attributes
-    ----------
-    figures : figures of the paper
-    about : one line
-    varies : what its values are, with unit; empty where it takes none
-    home : module and function that carry it out
+
+def by_case(request: StudyRequest) -> Iterator[Setting]:
+    """Draw the truth from the filter's own model, or drive exact kinematics with each preset.
+
+    Notes
+    -----
+    Case ``model``: the truth obeys Eq. 14 with process noise drawn from Q (Eq. 30) and measurements drawn from R
+    (Eq. 31), and the filter starts from the prior of the truth. Then NEES and NIS are chi-squared (Bar-Shalom, Li,
+    Kirubarajan 2001, Section 5.4). Cases ``paper`` and ``field``: constant ICRs, preset's start.
     """
+    base = in_preset(request, "paper")
+    start = starting_at(base.config, request.plan.icrs_m, initial_icr_std_m=MODEL_ICR_STD_M)
+    yield Setting("model", "", replace(base, config=start, model_icr_std_m=MODEL_ICR_STD_M), {})
+    for preset in request.presets:
+        yield Setting(preset, "", in_preset(request, preset), {})
 
-    figures: str
-    about: str
-    varies: str
-    home: tuple[str, str]
+
+def starting_at(config: Config, icrs_m: Icrs, **settings: float) -> Config:
+    """Return the configuration with other initial ICRs, and other settings of the filter."""
+    names = ("initial_y_icr_right_m", "initial_y_icr_left_m", "initial_x_icr_m")
+    return config.with_filter(**dict(zip(names, icrs_m, strict=True)), **settings)
 
 
-KINDS: dict[StudyName, StudyKind] = {
-    "convergence": StudyKind(
-        "4, 5", "convergence time of the ICRs, by kind of path", "", ("study_sweeps", "study_convergence")
+def changed(icrs_m: Icrs, number: int) -> Icrs:
+    """Return the ICRs after change 1, 2, …: alternately wider and narrower. The paper does not state its values."""
+    right, left, x = icrs_m
+    width = right - left
+    if number % 2:
+        return 1.5 * right, 0.7 * left, x + 0.2 * width
+    return 0.8 * right, 1.2 * left, x - 0.1 * width
+
+
+# Which numbers are reported
+
+
+def largest(values: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the largest of the values that a study varies."""
+    return (max(values),)
+
+
+def extreme(values: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the smallest and the largest of the values that a study varies."""
+    return min(values), max(values)
+
+
+def shown_path(paths: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the kind of path whose runs the picture of convergence shows."""
+    return ("curved" if "curved" in paths else paths[0],)
+
+
+def only(*chosen: float | str) -> Callable[[Sequence[Any]], tuple[Any, ...]]:
+    """Return what chooses values by name."""
+    return lambda _: chosen
+
+
+def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
+    """Return NEES, NIS and coverage of each case, beside what they should be."""
+    numbers = []
+    for level in levels:
+        name, case, by_run = level.setting.series, consistency_of(level.found), level.metrics()
+        for what, words in WORDS.items():
+            low, high = case[what]["band"]
+            expected = f"{case[what]['expected']:g}, {low:.3f}-{high:.3f} in 95 %"
+            numbers.append(StudyNumber(f"{name}: {words}, mean", (case[what]["mean"],), "", expected))
+            numbers.append(StudyNumber(f"{name}: {words}, median run", (by_run[what]["p50"],), ""))
+        for what, part in (("pose", case["coverage_pct"][:3]), ("ICRs", case["coverage_pct"][3:])):
+            label = f"{name}: {what} within 2 sigma, least and most"
+            numbers.append(StudyNumber(label, (min(part), max(part)), "%", "95.4 %"))
+    return numbers
+
+
+WINDING = {"path": PathPlan("curved", radius_m=2.0), "duration_s": 200.0}
+NOISES = tuple(round(0.05 * step, 2) for step in range(11))
+PATHS = ("circle", "curved", "lawnmower", "spins")
+PATH_TIMES = {"circle": "2.9-12.8 s, driven (Figs. 15, 17)", "": "5-15 s, driven"}
+STARTS = only("proper start", "inverted start")
+START_FATES = {"no guard": "those with y_icr_right > 0 (Fig. 6)", "": "all (Fig. 7)"}
+CHANGE_TIMES = {"inflated": "0.03-0.17 s (Fig. 9)", "": "100-140 s (Fig. 8)"}
+RADIUS_TIMES = {0.0: "0.1 s (Fig. 10)", 2.0: "1.8 s (Fig. 10)"}
+RTK_ERROR = {0.01: "within 3.8 m for 95 % (RTK, tracked, Fig. 29)"}
+ERROR = "error_{icr}_m"
+
+STUDIES: dict[StudyName, Study] = {
+    "convergence": Study(
+        about="convergence time of the ICRs, by kind of path",
+        figures="4, 5",
+        request={"presets": ("paper",), "runs": 200, "paths": PATHS},
+        vary=by_preset(lambda base, kind: driving(base, kind=kind)),
+        measures=(measured.measure_times, measured.measure_errors, trace(end_s=SHOWN_S)),
+        numbers=(Number("{value} ({series}): all three ICRs converged after", "settle_s", spread, "s", PATH_TIMES),),
+        title="Time to settle on a path of kind {value}: {answer}",
+        answer=Number("{series}", "settle_s", median, "s", at=shown_path),
     ),
-    "initial": StudyKind(
-        "6, 7", "which initial ICRs converge, without and with the sign guard", "initial y ICRs [m]",
-        ("study_initial", "study_initial"),
+    "initial": Study(
+        about="which initial ICRs converge, without and with the sign guard",
+        figures="6, 7",
+        varies="initial y ICRs [m]",
+        request={"presets": ("paper",), "runs": 4, "values": tuple(2.0 - 0.5 * step for step in range(9))},
+        vary=by_start,
+        measures=(measured.measure_fate, trace()),
+        numbers=(
+            Number("{series}, {value}: converged", "converged", percent, "%", START_FATES, STARTS),
+            Number("{series}, {value}: ends inverted", "inverted", percent, "%", at=STARTS),
+        ),
+        title="Guarded runs converge: {answer}",
+        answer=Number("{value}", "converged", percent, "%", at=STARTS, series="guard"),
+        summary=lambda found: {fate: float(found[fate].mean()) for fate in FATES},
     ),
-    "icr-change": StudyKind(
-        "8, 9", "time to follow a change of the ICRs, without and with covariance inflation", "",
-        ("study_changes", "study_icr_change"),
+    "icr-change": Study(
+        about="time to follow a change of the ICRs, without and with covariance inflation",
+        figures="8, 9",
+        request={"runs": 20},
+        drive={"path": PathPlan("figure-eight", speed_mps=0.5, radius_m=1.0), "duration_s": 525.0},
+        changes_s=(175.0, 350.0),
+        vary=by_preset(lambda base, name: replace(base, inflate=name == "inflated"), ("not inflated", "inflated")),
+        measures=(measured.measure_changes, trace(), measured.zoom),
+        numbers=(
+            Number("{series}, {value}: convergence time (10-90 %)", "change*_rise_*_s", spread, "s", CHANGE_TIMES),
+            Number("{series}, {value}: all three stay within 10 % after", "change*_settle_s", spread, "s"),
+            Number("{series}, {value}: … in so many of the changes", "change*_settle_s", percent_finite, "%"),
+            Number("{series}, {value}: ends inverted", "inverted", percent, "%"),
+        ),
+        title="Time to follow a change, inflated: {answer}",
+        answer=Number("{series}", "change*_settle_s", median, "s", at=only("inflated")),
     ),
-    "turn-radius": StudyKind(
-        "10", "convergence after a change, by radius of the turn", "turn radius [m]",
-        ("study_changes", "study_turn_radius"),
+    "turn-radius": Study(
+        about="convergence after a change, by radius of the turn",
+        figures="10",
+        varies="turn radius [m]",
+        varied="radius_m",
+        request={"values": tuple(0.25 * step for step in range(9))},
+        drive={"path": PathPlan("circle"), "duration_s": 60.0},
+        changes_s=(20.0,),
+        vary=by_preset(on_circle),
+        measures=(measured.measure_one_change,),
+        numbers=(
+            Number("{series}: radius {value:g} m: an ICR stays within 10 % after, mean", "settle_*_s", mean, "s",
+                   RADIUS_TIMES, extreme),
+            Number("{series}: radius {value:g} m: all three do", "settle_s", spread, "s", at=extreme),
+            Number("{series}: radius {value:g} m: ends inverted", "inverted", percent, "%", at=extreme),
+        ),
+        title="Time to settle at radius {value:g} m: {answer}",
+        answer=Number("{series}", "settle_s", median, "s", at=largest),
     ),
-    "input-noise": StudyKind(
-        "12", "ICR error by noise of the track speeds", "input noise [m/s]", ("study_sweeps", "study_input_noise")
+    "input-noise": Study(
+        about="ICR error by noise of the track speeds",
+        figures="12",
+        varies="input noise [m/s]",
+        varied="input_noise_mps",
+        request={"runs": 20, "values": NOISES},
+        drive=WINDING,
+        vary=by_preset(lambda base, value: sensing(base, input_noise_mps=value)),
+        measures=(measured.measure_errors,),
+        numbers=(
+            Number("{series}: error of {icr} at {value:g} m/s", ERROR, spread, "m", "Fig. 12's axis: -1 to 1 m",
+                   largest),
+        ),
+        title="Noise of {value:g} m/s moves y right by {answer}",
+        answer=Number("{series}", "error_y_icr_right_m", median, "m", at=largest),
     ),
-    "input-bias": StudyKind(
-        "13", "ICR error by bias of the track speeds", "input bias [m/s]", ("study_sweeps", "study_input_bias")
+    "input-bias": Study(
+        about="ICR error by bias of the track speeds",
+        figures="13",
+        varies="input bias [m/s]",
+        varied="input_bias_mps",
+        request={"runs": 20, "values": NOISES},
+        drive=WINDING,
+        vary=by_preset(lambda base, value: sensing(base, input_bias_mps=value)),
+        measures=(measured.measure_errors,),
+        numbers=(
+            Number("{series}: error of {icr} at {value:g} m/s", ERROR, spread, "m", "Fig. 13's axis: -0.1 to 0.02 m",
+                   largest),
+        ),
+        title="A bias of {value:g} m/s moves y right by {answer}",
+        answer=Number("{series}", "error_y_icr_right_m", median, "m", at=largest),
     ),
-    "input-source": StudyKind(
-        "11", "encoders against commanded speeds", "", ("study_sweeps", "study_input_source")
+    "input-source": Study(
+        about="encoders against commanded speeds",
+        figures="11",
+        drive={**WINDING, "command_rate_hz": 10.0, "motor_lag_s": 0.1},
+        sensors={"input_bias_mps": 0.03},
+        vary=by_preset(from_source, ("encoder", "commanded")),
+        measures=(measured.measure_errors, trace()),
+        numbers=(Number("{series}: error of {icr}, {value} speeds", ERROR, spread, "m"),),
+        title="Commanded speeds move y right by {answer}",
+        answer=Number("{series}", "error_y_icr_right_m", median, "m", at=only("commanded")),
     ),
-    "gnss": StudyKind(
-        "35-37", "ICR error and open-loop error by noise of the GNSS", "GNSS noise [m]", ("study_sweeps", "study_gnss")
+    "gnss": Study(
+        about="ICR error and open-loop error by noise of the GNSS",
+        figures="35-37",
+        varies="GNSS noise [m]",
+        varied="gnss_std_m",
+        request={"runs": 20, "values": (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)},
+        drive={"path": PathPlan("lawnmower"), "duration_s": 300.0},
+        vary=by_preset(lambda base, value: sensing(base, gnss_std_m=value)),
+        measures=(measured.measure_errors, measured.measure_times, measured.measure_open_loop),
+        numbers=(
+            Number("no slip: open loop after 10 m, p95", "blind_no_slip_10m_p95_m",
+                   lambda found: spread(found[:1]), "m"),
+            Number("{series}: GNSS {value:g} m: open loop after 10 m, p95", "blind_icr_10m_p95_m", spread, "m",
+                   RTK_ERROR, lambda noises: (min(noises), 0.3)),
+            Number("{series}: GNSS {value:g} m: rms error of y_icr_right", "rms_y_icr_right_m", spread, "m",
+                   at=lambda noises: (min(noises), 0.3)),
+        ),
+        title="GNSS of {value:g} m: 10 m without it cost {answer}",
+        answer=Number("{series}", "blind_icr_10m_p95_m", median, "m", at=largest),
     ),
-    "rate": StudyKind(
-        "", "whether logs of any rate give the same ICRs", "rate of wheels and heading [Hz]",
-        ("study_sweeps", "study_rate"),
+    "rate": Study(
+        about="whether logs of any rate give the same ICRs",
+        varies="rate of wheels and heading [Hz]",
+        varied="rate",
+        request={"values": (10.0, 20.0, 50.0, 100.0, 200.0)},
+        sensors={"wheels": "encoder"},
+        vary=by_preset(at_rate),
+        measures=(measured.measure_errors,),
+        numbers=(
+            Number("{series}: {icr} differs between rates by at most", ERROR, range_of_means, "m"),
+            Number("{series}: stated std of {icr}, least and greatest", "std_{icr}_m", extreme_medians, "m"),
+        ),
+        title="Between rates, x_icr differs by {answer}",
+        answer=Number("{series}", "error_x_icr_m", range_of_means, "m"),
     ),
-    "consistency": StudyKind(
-        "", "whether the filter's covariance is right: NEES, NIS, coverage", "",
-        ("study_consistency", "study_consistency"),
+    "consistency": Study(
+        about="whether the filter's covariance is right: NEES, NIS, coverage",
+        request={"runs": 200},
+        vary=by_case,
+        measures=(measured.measure_consistency,),
+        numbers=consistency_numbers,
+        title="Mean NEES, 6 expected: {answer}",
+        answer=Number("{series}", "nees", mean),
+        summary=consistency_of,
     ),
 }  # fmt: skip
 
 
-def default_request(name: StudyName, config: Config) -> StudyRequest:  # noqa: PLR0911 - one a study
+def default_request(name: StudyName, config: Config) -> StudyRequest:
     """Return a study with the paper's parameters, and the configuration's robot for the start of preset ``field``."""
     if config.robot.track_width_m is None:
         config = replace(config, robot=replace(config.robot, track_width_m=PAPER_TRACK_WIDTH_M))
-    plan, sensors = DrivePlan(step_s=STUDY_STEP_S), Sensors(wheels="ideal", heading_resolution_rad=0.0)
-    both: tuple[Preset, ...] = ("paper", "field")
-    base = StudyRequest(name, plan, sensors, config, both, runs=40)
-    winding = replace(plan, path=PathPlan("curved", radius_m=2.0), duration_s=200.0)
-    noises = tuple(round(0.05 * step, 2) for step in range(11))
-    match name:
-        case "convergence":
-            return replace(base, presets=("paper",), runs=200, paths=("circle", "curved", "lawnmower", "spins"))
-        case "initial":
-            grid = tuple(2.0 - 0.5 * step for step in range(9))
-            return replace(base, presets=("paper",), runs=4, values=grid)
-        case "icr-change":
-            tight = PathPlan("figure-eight", speed_mps=0.5, radius_m=1.0)
-            return replace(base, plan=replace(plan, path=tight, duration_s=525.0), runs=20)
-        case "turn-radius":
-            circle = replace(plan, path=PathPlan("circle"), duration_s=60.0)
-            return replace(base, plan=circle, values=tuple(0.25 * step for step in range(9)))
-        case "input-noise" | "input-bias":
-            return replace(base, plan=winding, runs=20, values=noises)
-        case "input-source":
-            commanded = replace(winding, command_rate_hz=10.0, motor_lag_s=0.1)
-            return replace(base, plan=commanded, sensors=replace(sensors, input_bias_mps=0.03))
-        case "gnss":
-            mower = replace(plan, path=PathPlan("lawnmower"), duration_s=300.0)
-            return replace(base, plan=mower, runs=20, values=(0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0))
-        case "rate":
-            return replace(base, sensors=replace(sensors, wheels="encoder"), values=(10.0, 20.0, 50.0, 100.0, 200.0))
-        case "consistency":
-            return replace(base, runs=200)
+    study = STUDIES[name]
+    plan = DrivePlan(step_s=STUDY_STEP_S, **study.drive)
+    sensors = Sensors(**{"wheels": "ideal", "heading_resolution_rad": 0.0, **study.sensors})
+    return StudyRequest(name, plan, sensors, config, **study.request)
 
 
 def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyResult:
@@ -232,33 +394,18 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
     if not all(math.isfinite(value) for value in request.values):
         raise ConfigError("values", f"{request.values} holds a value that is not finite")
     check_drive(request.plan, request.sensors)
-    module, function = KINDS[request.name].home
-    study: Callable[[StudyRequest, Progress | None], StudyResult] = getattr(
-        importlib.import_module(f"icrtool.simulation.{module}"), function
-    )
-    return study(request, progress)
+    study = STUDIES[request.name]
+    if study.changes_s and not request.plan.changes:
+        request = replace(request, plan=_with_changes(request.plan, study.changes_s))
+    settings = list(study.vary(request))
+    found = run_scenarios([one.scenario for one in settings], request.runs, request.seed, study.measures, progress)
+    return StudyResult(request, study, tuple(map(Level, settings, found)))
 
 
-def table_of(settings: Sequence[Mapping[str, float | str]], found: Sequence[Mapping[str, Floats]]) -> dict[str, Column]:
-    """Return the columns of the CSV, a row a run: the settings of each level, and the numbers (runs,) found of it."""
-    runs = len(next(iter(found[0].values())))
-    columns: dict[str, Column] = {}
-    for name in settings[0]:
-        values = [one[name] for one in settings for _ in range(runs)]
-        is_text = any(isinstance(value, str) for value in values)
-        columns[name] = [str(value) for value in values] if is_text else np.array(values, np.float64)
-    columns["run"] = np.tile(np.arange(runs), len(settings))
-    numbers = [name for name, values in found[0].items() if values.ndim == 1]
-    return columns | {name: np.concatenate([one[name] for one in found]) for name in numbers}
-
-
-def statistics(values: Floats) -> dict[str, float]:
-    """Return count, mean, std, median, 5th and 95th percentile of values (runs,); NaN are ignored."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return {"count": 0, "mean": math.nan, "std": math.nan, "p5": math.nan, "p50": math.nan, "p95": math.nan}
-    low, middle, high = (float(value) for value in np.percentile(finite, [5, 50, 95]))
-    return {
-        "count": len(finite), "mean": float(finite.mean()), "std": float(finite.std()),
-        "p5": low, "p50": middle, "p95": high,
-    }  # fmt: skip
+def _with_changes(plan: DrivePlan, times_s: Sequence[float]) -> DrivePlan:
+    """Return a drive whose ICRs change at the usual times, as far as it goes."""
+    if plan.duration_s <= times_s[0]:
+        why = f"{plan.duration_s:g} s end before the first change, at {times_s[0]:g} s"
+        raise ConfigError("duration", why, "drive longer, or give earlier times with --change")
+    changes = ((time, changed(plan.icrs_m, number)) for number, time in enumerate(times_s, start=1))
+    return replace(plan, changes=tuple(change for change in changes if change[0] < plan.duration_s))

@@ -1,52 +1,88 @@
-"""Numbers of each run of a study: ICR errors, convergence times, NIS, open-loop errors without GNSS. One row a run."""
+"""What is measured of each run of a study: named numbers, the columns of its CSV, and arrays for its picture."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kinematics import drive
-from icrtool.simulation.study_runs import StudyRun
+from icrtool.simulation.study_runs import Measure, StudyRun
 
 ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")
+STATES = ("north", "east", "heading", *ICR_NAMES)
+FATES = ("converged", "inverted", "elsewhere")
+
+Found = dict[str, float | Floats]
 
 SETTLED_SHARE = 0.1
 SETTLED_M = 0.02
 """An estimate has settled when its error stays below a tenth of its initial error, or below 2 cm."""
 
+CONVERGED_M = 0.1
+"""A run has converged where all three ICRs, averaged over its last tenth, are within this distance of the truth [m]."""
+
+LAST_SHARE = 10
+
 TRACE_POINTS = 400
+ZOOM_S = 10.0
 
 TRIAL_M = 10.0
 TRIAL_STARTS = 40
 """Open-loop trials per run; their starts are evenly spaced."""
 
+SETTLED_S = 10.0
+"""Covariances count after this time: before, the initial values of the presets still have an effect."""
 
-def measure_errors(run: StudyRun) -> dict[str, float | Floats]:
+LEAST_STD = 1e-12
+"""Avoids division by zero."""
+
+
+def measure_errors(run: StudyRun) -> Found:
     """Return, over the second half of a run, mean error and its rms, with the stated std, by ICR; and NIS."""
     half = len(run.t_s) // 2
     error = run.x[half:, 3:] - run.truth[half:, 3:]
-    numbers = {"inverted": inverted(run)}
+    numbers: Found = {"inverted": inverted(run)}
     for place, name in enumerate(ICR_NAMES):
         numbers[f"final_{name}_m"] = run.x[-1, 3 + place]
         numbers[f"std_{name}_m"] = run.std[-1, 3 + place]
         numbers[f"error_{name}_m"] = error[:, place].mean()
         numbers[f"rms_{name}_m"] = np.sqrt((error[:, place] ** 2).mean())
-    numbers["nis_gnss"] = float(np.nanmean(run.gnss_nis))
-    numbers["nis_heading"] = float(np.nanmean(run.heading_nis))
-    return {**numbers}
+    return numbers | _mean_nis(run)
 
 
-def measure_times(run: StudyRun, since_s: float = 0.0, until_s: float = np.inf) -> dict[str, float | Floats]:
+def _mean_nis(run: StudyRun) -> Found:
+    return {"nis_gnss": float(np.nanmean(run.gnss_nis)), "nis_heading": float(np.nanmean(run.heading_nis))}
+
+
+def measure_times(run: StudyRun, since_s: float = 0.0, until_s: float = np.inf) -> Found:
     """Return convergence and settling times [s] of every ICR after `since_s`; NaN: not before `until_s`."""
     begin = max(int(np.searchsorted(run.t_s, since_s - 1e-9)) - 1, 0)
     end = int(np.searchsorted(run.t_s, until_s - 1e-9))
     t = run.t_s[begin:end] - max(since_s, run.t_s[0])
-    times = {}
+    times: Found = {}
     for place, name in enumerate(ICR_NAMES):
         value, target = run.x[begin:end, 3 + place], float(run.truth[end - 1, 3 + place])
         times[f"rise_{name}_s"] = convergence_time(t, value, target)
         times[f"settle_{name}_s"] = settling_time(t, value, target)
     return {**times, "settle_s": float(np.max([times[f"settle_{name}_s"] for name in ICR_NAMES]))}
+
+
+def measure_changes(run: StudyRun) -> Found:
+    """Return whether a run ended inverted, and its times after every change of the ICRs, until the next one."""
+    plan = run.scenario.plan
+    spans = enumerate(pairwise([*(time for time, _ in plan.changes), plan.duration_s]), start=1)
+    times = {f"change{n}_{name}": time for n, span in spans for name, time in measure_times(run, *span).items()}
+    return {"inverted": inverted(run), **times}
+
+
+def measure_one_change(run: StudyRun) -> Found:
+    """Return whether a run ended inverted, and its times after the first change of the ICRs."""
+    return {"inverted": inverted(run), **measure_times(run, run.scenario.plan.changes[0][0])}
 
 
 def convergence_time(t: Floats, value: Floats, target: float) -> float:
@@ -86,21 +122,45 @@ def inverted(run: StudyRun) -> float:
     return float(not run.x[-1, 3] > run.x[-1, 4])
 
 
-def trace(run: StudyRun, until_s: float = np.inf) -> Floats:
-    """Return time and ICR estimates, (about 400, 4) [s, m, m, m], from the start until `until_s`."""
-    last = int(np.searchsorted(run.t_s, until_s, side="right")) - 1
-    rows = np.unique(np.linspace(0, last, TRACE_POINTS).astype(np.int64))
-    return np.column_stack([run.t_s[rows], run.x[rows, 3:]])
+def measure_fate(run: StudyRun) -> Found:
+    """Return which of `FATES` a run had, as 1 and 0, and the ICRs at its end."""
+    last = max(1, len(run.x) // LAST_SHARE)
+    error = np.abs(run.x[-last:, 3:] - run.truth[-last:, 3:]).mean(axis=0)
+    near, wrong = float((error < CONVERGED_M).all()), inverted(run)
+    fates = dict(zip(FATES, (near, wrong * (1 - near), (1 - wrong) * (1 - near)), strict=True))
+    return {**fates, **{f"final_{name}_m": run.x[-1, 3 + place] for place, name in enumerate(ICR_NAMES)}}
 
 
-def open_loop_p95(run: StudyRun, track_width_m: float) -> dict[str, float | Floats]:
+def trace(begin_s: float = 0.0, end_s: float = np.inf, name: str = "trace") -> Measure:
+    """Return what keeps time, ICR estimates and left track speed between two times, as array `name`.
+
+    It is (about 400, 5) [s, m, m, m, m/s].
+    """
+
+    def kept(run: StudyRun) -> Found:
+        first = max(int(np.searchsorted(run.t_s, begin_s, "right")) - 1, 0)
+        last = int(np.searchsorted(run.t_s, end_s, "right")) - 1
+        rows = np.unique(np.linspace(first, last, TRACE_POINTS).astype(np.int64))
+        return {name: np.column_stack([run.t_s[rows], run.x[rows, 3:], run.v_left[rows]])}
+
+    return kept
+
+
+def zoom(run: StudyRun) -> Found:
+    """Return the trace around the first change of the ICRs, as array ``zoom``."""
+    change_s = run.scenario.plan.changes[0][0]
+    return trace(change_s - 1.0, change_s + ZOOM_S, "zoom")(run)
+
+
+def measure_open_loop(run: StudyRun) -> Found:
     """Return the 95th percentile of the open-loop error after 10 m [m]: with the final ICRs, and without slip.
 
     Notes
     -----
     Section 6.4 with the ICRs the filter ended with, over starts all along the true path.
     """
-    no_slip = np.array([track_width_m / 2, -track_width_m / 2, 0.0])
+    half_width = (run.scenario.config.robot.track_width_m or np.nan) / 2
+    no_slip = np.array([half_width, -half_width, 0.0])
     models = {"blind_icr_10m_p95_m": run.x[-1, 3:], "blind_no_slip_10m_p95_m": no_slip}
     return {name: float(np.percentile(_open_loop_errors(run, icrs), 95)) for name, icrs in models.items()}
 
@@ -122,3 +182,75 @@ def _open_loop_errors(run: StudyRun, icrs: Floats) -> Floats:
         end = drive(t, v_left, v_right, icrs[None, :], np.zeros(len(t), np.int64), truth.pose[first])[-1]
         errors.append(float(np.hypot(*(end - truth.pose[int(ends[first])])[:2])))
     return np.array(errors)
+
+
+def measure_consistency(run: StudyRun) -> Found:
+    """Return mean NEES and NIS, the errors at the end in their standard deviations; and those of all stops.
+
+    The arrays: ``stops_s`` (s,), ``all nees`` (s,), of those that count ``settled nees`` (c,), and over their standard
+    deviations ``ratio`` (c, 6); ``all nis_gnss`` (m,), ``all nis_heading`` (h,).
+    """
+    stops_s = run.t_s[run.stops]
+    nees, ratio = errors_over_std(run.x[run.stops] - run.truth[run.stops], run.P)
+    settled = stops_s >= min(SETTLED_S, stops_s[-1])
+    at_end = {f"end_error_over_std_{state}": float(error) for state, error in zip(STATES, ratio[-1], strict=True)}
+    return {
+        "nees": float(nees[settled].mean()), **_mean_nis(run), **at_end,
+        "stops_s": stops_s, "all nees": nees, "settled nees": nees[settled], "ratio": ratio[settled],
+        "all nis_gnss": run.gnss_nis, "all nis_heading": run.heading_nis,
+    }  # fmt: skip
+
+
+def errors_over_std(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """Return NEES (...) and error over its std (..., 6), of errors (..., 6) with covariances (..., 6, 6).
+
+    Notes
+    -----
+    The heading error is wrapped. The covariance is scaled to correlations first: metres and radians differ by orders.
+    """
+    error = error.copy()
+    error[..., 2] = np.angle(np.exp(1j * error[..., 2]))
+    std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), LEAST_STD**2))
+    ratio = error / std
+    correlation = covariance / (std[..., :, None] * std[..., None, :])
+    nees = (ratio * np.linalg.solve(correlation, ratio[..., None])[..., 0]).sum(axis=-1)
+    return nees, ratio
+
+
+def chi2_band(degrees: int, runs: int) -> tuple[float, float]:
+    """Return the 95 % band of the mean of `runs` chi-squared values that together have `degrees` degrees of freedom."""
+    from scipy.stats import chi2
+
+    low, high = chi2.ppf([0.025, 0.975], degrees)
+    return float(low) / runs, float(high) / runs
+
+
+def consistency_of(found: Mapping[str, Floats]) -> dict[str, Any]:
+    """Return what `measure_consistency` shows of a case: means with their 95 % bands, coverage and rms by state."""
+    nees, ratio, runs = found["settled nees"], found["ratio"], len(found["nees"])
+    low, high = chi2_band(6 * runs, runs)
+    by_stop = nees.mean(axis=0)
+    in_band = 100 * float(((by_stop >= low) & (by_stop <= high)).mean())
+    case: dict[str, Any] = {
+        "nees": {"mean": float(nees.mean()), "expected": 6.0, "band": (low, high), "stops_in_band_pct": in_band}
+    }
+    for what, degrees in (("nis_gnss", 2), ("nis_heading", 1)):
+        finite = found[f"all {what}"][np.isfinite(found[f"all {what}"])]
+        band = chi2_band(degrees * len(finite), len(finite))
+        case[what] = {"mean": float(finite.mean()), "expected": float(degrees), "band": band}
+    return case | {
+        "states": list(STATES),
+        "by_run": {what: statistics(found[what]) for what in case},
+        "coverage_pct": (100 * (np.abs(ratio) <= 2).mean(axis=(0, 1))).tolist(),
+        "rms_error_over_std": np.sqrt((ratio**2).mean(axis=(0, 1))).tolist(),
+    }
+
+
+def statistics(values: Floats) -> dict[str, float]:
+    """Return count, mean, std, median, 5th and 95th percentile of values (runs,); NaN are ignored."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return {"count": 0, "mean": math.nan, "std": math.nan, "p5": math.nan, "p50": math.nan, "p95": math.nan}
+    low, middle, high = np.percentile(finite, [5, 50, 95]).tolist()
+    mean, std = float(finite.mean()), float(finite.std())
+    return {"count": len(finite), "mean": mean, "std": std, "p5": low, "p50": middle, "p95": high}

@@ -18,20 +18,14 @@ from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GUARDED
 from icrtool.kernels.kinematics import model_states
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
-from icrtool.records.tables import Icrs, RobotLog
-from icrtool.simulation.drives import (
-    DrivePlan,
-    Readings,
-    Sensors,
-    Truth,
-    check_drive,
-    drive_plan,
-    sample_times,
-    sense,
-)
+from icrtool.records.tables import RobotLog
+from icrtool.simulation.drives import DrivePlan, Readings, Sensors, Truth, check_drive, drive_plan, sample_times, sense
 from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
 
 Progress = Callable[[float], None]
+
+STOP_EVERY_S = 5.0
+"""The whole covariance is kept so often [s], and at the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +35,6 @@ class Scenario:
     Attributes
     ----------
     config : its filter section is used, and its robot for the start of preset ``field``
-    vary_path : every run of a ``curved`` path has another phase
     inflate : inflate the ICR covariance at the drive's ICR changes (Section 5.2)
     guard : sign guard, of `icrtool.kernels.kinematics`; other than GUARDED the filter takes the Euler steps of Eq. 14
     model_icr_std_m : the truth obeys the filter's model, Eq. 14 with process noise drawn from Q (Eq. 30), from ICRs
@@ -51,7 +44,6 @@ class Scenario:
     plan: DrivePlan
     sensors: Sensors
     config: Config
-    vary_path: bool = True
     inflate: bool = False
     guard: int = GUARDED
     model_icr_std_m: float | None = None
@@ -63,7 +55,9 @@ class StudyRun:
 
     Attributes
     ----------
+    scenario : what was run
     t_s : (k,) times of the recorded states, on the truth's clock
+    v_left : (k,) speed of the left track as the filter got it
     x : (k, 6) states; std : (k, 6) square roots of the diagonal of P
     truth : (k, 6) true states
     stops : (s,) rows at which the whole covariance was kept; P : (s, 6, 6)
@@ -71,7 +65,9 @@ class StudyRun:
     gnss_nis : (m,), heading_nis : (h,), NaN where unseen
     """
 
+    scenario: Scenario
     t_s: Floats
+    v_left: Floats
     x: Floats
     std: Floats
     truth: Floats
@@ -86,23 +82,8 @@ Measure = Callable[[StudyRun], dict[str, float | Floats]]
 """Reduces a run to numbers, or arrays as large in all runs of a scenario."""
 
 
-def with_start(config: Config, icrs_m: Icrs, std_m: float | None = None) -> Config:
-    """Return the configuration with other initial ICRs, and their standard deviation where given."""
-    names = ("initial_y_icr_right_m", "initial_y_icr_left_m", "initial_x_icr_m")
-    change: dict[str, float] = dict(zip(names, icrs_m, strict=True))
-    if std_m is not None:
-        change["initial_icr_std_m"] = std_m
-    return config.with_filter(**change)
-
-
 def run_scenarios(
-    scenarios: Sequence[Scenario],
-    runs: int,
-    seed: int,
-    measure: Measure,
-    *,
-    stops_s: tuple[float, ...] = (),
-    progress: Progress | None = None,
+    scenarios: Sequence[Scenario], runs: int, seed: int, measures: Sequence[Measure], progress: Progress | None = None
 ) -> list[dict[str, Floats]]:
     """Simulate and filter every scenario `runs` times, on all cores (the kernels free the GIL).
 
@@ -110,19 +91,19 @@ def run_scenarios(
     ----------
     seed : run i of every scenario draws from the generator seeded (seed, i): scenarios differ by their setting alone,
         and a run does not depend on how many there are or on the number of cores
-    measure : what to keep of a run
-    stops_s : times at which the whole covariance is kept; it is kept at the end in any case
+    measures : what to keep of a run
 
     Returns
     -------
-    list of the columns of `measure`, (runs, ...), a scenario each
+    list of the columns of `measures`, (runs, ...), a scenario each
     """
     for scenario in scenarios:
         check_drive(scenario.plan, scenario.sensors)
     jobs = [(scenario, run) for scenario in scenarios for run in range(runs)]
 
     def work(job: tuple[Scenario, int]) -> dict[str, float | Floats]:
-        return measure(_filtered(*job, seed, stops_s))
+        run = _filtered(*job, seed)
+        return {name: value for measure in measures for name, value in measure(run).items()}
 
     done = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -134,7 +115,7 @@ def run_scenarios(
     return [{name: np.array([one[name] for one in some]) for name in some[0]} for some in of_scenarios]
 
 
-def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...]) -> StudyRun:
+def _filtered(scenario: Scenario, run: int, seed: int) -> StudyRun:
     simulate = _simulate if scenario.model_icr_std_m is None else _simulate_model
     readings, truth, motion = simulate(scenario, np.random.default_rng((seed, run)))
     changes = tuple(time for time, _ in scenario.plan.changes) if scenario.inflate else ()
@@ -145,11 +126,14 @@ def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...
         setup = setup._replace(parameters=euler)
     first = int(np.searchsorted(setup.data.wheel_t, setup.t0))
     times = readings.wheel_t[first:]
+    stops_s = np.arange(STOP_EVERY_S, scenario.plan.duration_s, STOP_EVERY_S)
     stops = np.unique(np.append(np.searchsorted(times, stops_s, side="right") - 1, len(times) - 1))
     stops = stops[stops >= 0]
     out = run_ekf(*setup, stops.tolist())
     return StudyRun(
+        scenario=scenario,
         t_s=times,
+        v_left=readings.v_left_mps[first:],
         x=out.x,
         std=np.sqrt(np.maximum(out.variance, 0.0)),
         truth=truth[first:],
@@ -162,9 +146,12 @@ def _filtered(scenario: Scenario, run: int, seed: int, stops_s: tuple[float, ...
 
 
 def _simulate(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, Floats, Truth]:
-    """Return the measurements of a drive, its true states at the wheel stamps (n, 6), and its motion."""
+    """Return the measurements of a drive, its true states at the wheel stamps (n, 6), and its motion.
+
+    Every run of a ``curved`` path has another phase.
+    """
     plan, phase = scenario.plan, rng.uniform(0.0, 2 * np.pi)
-    if scenario.vary_path and isinstance(plan.path, PathPlan):
+    if isinstance(plan.path, PathPlan):
         plan = replace(plan, path=replace(plan.path, phase_rad=phase))
     motion = drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz)
     readings = sense(motion, scenario.sensors, plan.duration_s, rng)

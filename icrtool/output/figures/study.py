@@ -1,162 +1,258 @@
-"""The picture of a study: dispatch, and the one most studies share (an ICR quantity over what was varied)."""
+"""The picture of a study: a column of panels for each preset, guard or case, in four forms.
+
+They are a quantity over what varies, values along time, a distribution over the runs, and shares over a grid.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from matplotlib.lines import Line2D
 
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.study_runs import draw_convergence, draw_icr_change, icr_keys
-from icrtool.output.figures.study_special import draw_consistency, draw_initial
-from icrtool.output.figures.style import ICR_LOOKS, NO_SLIP, new_figure, styled
-from icrtool.output.tables.study import capital, runs_text, study_title
-from icrtool.simulation.studies import KINDS, StudyName, StudyResult
-from icrtool.simulation.study_measures import ICR_NAMES
+from icrtool.output.figures.style import ICR_LOOKS, NO_SLIP, add_legend, new_figure, styled
+from icrtool.output.tables.study import capital, study_subtitle, study_title
+from icrtool.simulation.studies import shown_path
+from icrtool.simulation.study_measures import FATES, STATES, chi2_band, consistency_of
+from icrtool.simulation.study_records import Level, StudyName, StudyResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-OPEN_LOOP: dict[str, Any] = {"color": "#1b7837", "linestyle": "-", "marker": "D", "markersize": 3.5}
+PANEL_IN = 2.1
 
-Rows = tuple[tuple[str, str, bool], ...]
-"""Metric pattern, axis label, whether there is one for every ICR."""
+MARKS = 9
+"""Marks on a line, so that lines are distinguished without colours."""
 
-ROWS: dict[StudyName, Rows] = {
-    "turn-radius": (("settle_{icr}_s", "Within 10 % after [s]", True), ("inverted", "Ends inverted [%]", False)),
-    "input-noise": (("error_{icr}_m", "ICR error [m]", True),),
-    "input-bias": (("error_{icr}_m", "ICR error [m]", True),),
-    "gnss": (("rms_{icr}_m", "ICR error, rms [m]", True), ("open_loop", "10 m without GNSS, p95 [m]", False)),
-    "rate": (("error_{icr}_m", "ICR error [m]", True),),
-}
-LOGARITHMIC = frozenset({"gnss", "rate"})
-PANEL_IN = 2.3
-LEAST_RANGE_M = 0.02
+LEAST_RANGE_M, LEAST_VIEW_M = 0.02, 0.6
+BEYOND = 1.6
+"""A panel of starts shows this many times the largest start."""
+
+FATE_COLORS = np.array([(0.57, 0.77, 0.93), (0.50, 0.0, 0.10), (0.90, 0.90, 0.90)])
+"""Red, green, blue by `FATES`, mixed by the share of the runs."""
+
+LOOKS: tuple[dict[str, Any], ...] = (
+    *({key: value for key, value in look.items() if key != "label"} for look in ICR_LOOKS.values()),
+    {"color": "#1b7837", "linestyle": "-", "marker": "D", "markersize": 3.5},
+)
+"""Of lines that are no ICRs, in turn."""
+
+OPEN_LOOP = {"label": "open loop, final ICRs", **LOOKS[3]}
+OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **NO_SLIP.keywords()}
+PATH_COLORS = ("#2166ac", "#e08214", "#1b7837", "#b2182b")
+TRUTH: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (4, 2))}
+
+Draw = Callable[["Axes", StudyResult, list[Level]], None]
+"""Draws the levels of one series."""
 
 
 @styled
 def study_figure(result: StudyResult) -> Figure:
     """Return the picture of a study."""
-    special: dict[StudyName, Callable[[StudyResult], Figure]] = {
-        "convergence": draw_convergence,
-        "icr-change": draw_icr_change,
-        "initial": draw_initial,
-        "consistency": draw_consistency,
-        "input-source": draw_input_source,
-    }
-    return special.get(result.request.name, draw_sweep)(result)
-
-
-def subtitle(result: StudyResult) -> str:
-    """Return what was studied, on which path, and how often."""
-    request = result.request
-    path = request.plan.path
-    what = f"{getattr(path, 'speed_mps', 0):g} m/s, {runs_text(request)}"
-    if request.name != "turn-radius":
-        what = f"{getattr(path, 'kind', '')} path, {what}"
-    return f"{capital(KINDS[request.name].about)}; {what}"
-
-
-def draw_sweep(result: StudyResult) -> Figure:
-    """Draw metrics over what was varied: medians, bars from the 5th to the 95th percentile; one column a preset."""
-    rows, presets = ROWS[result.request.name], result.request.presets
+    rows = PICTURES[result.request.name]
+    names = dict.fromkeys(level.setting.series for level in result.levels)
+    of_series = [[level for level in result.levels if level.setting.series == name] for name in names]
+    columns = [list(result.levels)] if result.request.name in TOGETHER else of_series
     figure = new_figure(
-        study_title(result), subtitle(result), height_in=1.5 + PANEL_IN * len(rows), margins_in=(0.85, 0.2, 0.8, 0.95),
-        wspace=0.12, hspace=0.18,
+        study_title(result), study_subtitle(result), height_in=1.7 + PANEL_IN * len(rows),
+        margins_in=(0.85, 0.2, 0.75, 1.2), wspace=0.12, hspace=0.5,
     )  # fmt: skip
-    panels = figure.subplots(len(rows), len(presets), squeeze=False, sharex=True, sharey="row")
-    for column, preset in enumerate(presets):
-        levels = [level for level in result.levels if level["series"] == preset]
-        for row, (metric, label, by_icr) in enumerate(rows):
-            axes = panels[row][column]
-            _draw_metric(axes, levels, metric, by_icr=by_icr)
-            if column == 0:
-                axes.set_ylabel(label)
-            if metric.startswith("error"):
-                axes.set_ylim(*_error_range(result))
-        panels[0][column].set_title(f"preset {preset}", loc="left")
-        axes = panels[-1][column]
-        axes.set_xlabel(capital(KINDS[result.request.name].varies))
-        if result.request.name in LOGARITHMIC:
-            values = [level["value"] for level in levels]
-            axes.set_xscale("log")
-            axes.set_xticks(values, [f"{value:g}" for value in values], fontsize=7.5)
-            axes.minorticks_off()
-    if result.request.name == "gnss":
-        for axes in panels.ravel():
-            # On a drive without a turn nothing is missed, and zero has no logarithm.
-            if all((np.asarray(line.get_ydata()) > 0).any() for line in axes.lines):
-                axes.set_yscale("log")
-    figure.legend(handles=_keys(result), ncols=5, columnspacing=1.6)
+    panels = figure.subplots(len(rows), len(columns), squeeze=False, sharey="row")
+    for column, levels in enumerate(columns):
+        name = levels[0].setting.series
+        if len(columns) > 1:
+            panels[0][column].set_title(f"preset {name}" if name in ("paper", "field") else name, loc="left")
+        for row, (label, draw) in enumerate(rows):
+            draw(panels[row][column], result, levels)
+            panels[row][0].set_ylabel(label)
+    add_legend(figure, title=NOTES.get(result.request.name, NOTE), ncols=5)
     return figure
 
 
-def _error_range(result: StudyResult) -> tuple[float, float]:
-    """Return a range [m] that shows all medians; bars of settings where a run diverged are cut at the frame."""
-    medians = [level["metrics"][f"error_{icr}_m"]["p50"] for level in result.levels for icr in ICR_NAMES]
-    finite = [value for value in medians if np.isfinite(value)]
-    reach = max(LEAST_RANGE_M, float(np.ptp([*finite, 0.0])))
-    return min([*finite, 0.0]) - 0.3 * reach, max([*finite, 0.0]) + 0.3 * reach
+def over(
+    axes: Axes, result: StudyResult, levels: Sequence[Level], columns: dict[str, dict[str, Any]], *, log: str = ""
+) -> None:
+    """Draw columns over what varies: medians, and bars from the 5th to the 95th percentile.
+
+    Parameters
+    ----------
+    columns : how each is drawn
+    log : the axes that are logarithmic
+    """
+    values = [level.setting.value for level in levels]
+    for place, (column, look) in enumerate(columns.items()):
+        found = [level.metrics()[column] for level in levels]
+        _points(axes, values, [(one["p5"], one["p50"], one["p95"]) for one in found], look, 0.15 * (place - 1))
+    axes.set_xlabel(capital(result.study.varies))
+    if "x" in log:
+        axes.set_xscale("log")
+        axes.set_xticks(values, [f"{value:g}" for value in values], fontsize=7.5)
+        axes.minorticks_off()
+    # On a drive without a turn nothing is missed, and zero has no logarithm.
+    if "y" in log and all((np.asarray(line.get_ydata()) > 0).any() for line in axes.lines):
+        axes.set_yscale("log")
 
 
-def _draw_metric(axes: Axes, levels: list[dict[str, Any]], metric: str, *, by_icr: bool) -> None:
-    x = np.array([level["value"] for level in levels])
-    if by_icr:
-        if metric.startswith("error"):
-            axes.axhline(0.0, color="0.6", linewidth=0.8)
-        for icr, look in ICR_LOOKS.items():
-            _bars(axes, x, [level["metrics"][metric.format(icr=icr)] for level in levels], look)
-    elif metric == "open_loop":
-        _bars(axes, x, [level["metrics"]["blind_icr_10m_p95_m"] for level in levels], OPEN_LOOP)
-        no_slip = [level["metrics"]["blind_no_slip_10m_p95_m"]["p50"] for level in levels]
-        axes.plot(x, no_slip, **NO_SLIP.keywords())
-    else:
-        axes.plot(
-            x, [100 * level["metrics"][metric]["mean"] for level in levels], color="black", marker="o", markersize=3.5
+def _points(axes: Axes, values: Sequence[Any], found: Sequence[Any], look: dict[str, Any], shift: float) -> None:
+    """Draw (low, middle, high) over numbers; over names beside one another."""
+    x: Any = values
+    if isinstance(values[0], str):
+        axes.set_xticks(range(len(values)), [str(value).replace("_", " ") for value in values])
+        x, look = np.arange(len(values)) + shift, look | {"linestyle": "none"}
+    low, middle, high = np.array(found).T
+    look = {"linewidth": 1.5} | look
+    axes.errorbar(x, middle, [middle - low, high - middle], elinewidth=0.8, capsize=2.0, **look)
+
+
+def errors(axes: Axes, result: StudyResult, levels: Sequence[Level], *, log: str = "") -> None:
+    """Draw the ICR errors over what varies; bars of settings where a run diverged are cut at the frame."""
+    columns = _by_icr("error_{icr}_m")
+    over(axes, result, levels, columns, log=log)
+    medians = [level.metrics()[column]["p50"] for level in result.levels for column in columns]
+    finite = [value for value in (*medians, 0.0) if np.isfinite(value)]
+    reach = 0.3 * max(LEAST_RANGE_M, float(np.ptp(finite)))
+    axes.axhline(0.0, color="0.6", linewidth=0.8)
+    axes.set_ylim(min(finite) - reach, max(finite) + reach)
+
+
+def _by_icr(column: str) -> dict[str, dict[str, Any]]:
+    return {column.format(icr=icr): look for icr, look in ICR_LOOKS.items()}
+
+
+def inversions(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
+    """Draw how many of the runs end inverted, over what varies."""
+    shares = [100 * level.metrics()["inverted"]["mean"] for level in levels]
+    axes.plot([level.setting.value for level in levels], shares, color="black", marker="o", markersize=3.5)
+    axes.set(ylim=(-4, 104), xlabel=capital(result.study.varies))
+
+
+def along(axes: Axes, t: Floats, values: Floats, look: dict[str, Any]) -> None:
+    """Draw median and 5 to 95 % of values (runs, k) along time t (k,) [s]."""
+    low, middle, high = np.nanpercentile(values, [5, 50, 95], axis=0)
+    if len(values) > 1:
+        axes.fill_between(t, low, high, color=look["color"], alpha=0.18, linewidth=0)
+    axes.plot(t, middle, linewidth=1.2, markevery=max(1, len(t) // MARKS), **look)
+    axes.set(xlabel="Time [s]", xlim=(t[0], t[-1]))
+
+
+def estimates(axes: Axes, _result: StudyResult, levels: Sequence[Level], value: str = "", name: str = "trace") -> None:
+    """Draw the ICR estimates of one level along time, and the truth."""
+    value = value or str(shown_path([level.setting.value for level in levels])[0])
+    level = next(one for one in levels if one.setting.value == value)
+    traces, plan = level.found[name], level.setting.scenario.plan
+    t = traces[0, :, 0]
+    truth = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)])
+    edges = [t[0], *(time for time, _ in plan.changes), max(t[-1], plan.duration_s)]
+    for place, look in enumerate(ICR_LOOKS.values()):
+        along(axes, t, traces[..., 1 + place], look | {"linestyle": "-"})
+        axes.step(edges, [*truth[:, place], truth[-1, place]], where="post", color=look["color"], **TRUTH)
+    reach = 0.8 * max(LEAST_VIEW_M, float(np.ptp(truth)))
+    axes.set_ylim(truth.min() - reach, truth.max() + reach)
+
+
+def starts(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
+    """Draw y_icr_right of one run along time, from each start whose y_icr_left is nearest to the truth."""
+    right, left, _ = result.request.plan.icrs_m
+    near = min(sorted(result.request.values), key=lambda value: abs(value - left))
+    for level in levels:
+        if level.names["start_y_icr_left_m"] == near:
+            trace = level.found["trace"][:1]
+            along(axes, trace[0, :, 0], trace[..., 1], {"color": "0.35"})
+    axes.axhline(right, color=LOOKS[0]["color"], **TRUTH)
+    reach = BEYOND * max(map(abs, result.request.values))
+    axes.set_ylim(-reach, reach)
+    axes.set_title(f"start y left {near:g} m", loc="left")
+
+
+def fates(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
+    """Draw the outcome of every start over both initial y ICRs; the dashed line is where they are equal."""
+    values = sorted(set(result.request.values))
+    picture = np.zeros((len(values), len(values), 3))
+    for level in levels:
+        place = tuple(
+            values.index(cast(float, level.names[f"start_{name}_m"])) for name in ("y_icr_right", "y_icr_left")
         )
-        axes.set_ylim(-4, 104)
+        picture[place] = np.array([level.found[fate].mean() for fate in FATES]) @ FATE_COLORS
+    half = (values[-1] - values[0]) / max(2 * (len(values) - 1), 1) or 0.5
+    span = (values[0] - half, values[-1] + half)
+    axes.imshow(picture, origin="lower", extent=(*span, *span), aspect="auto")
+    axes.plot(span, span, color="black", **TRUTH)
+    axes.grid(visible=False)
+    axes.set_xlabel("Initial y left [m]")
+    for fate, color in zip(FATES, FATE_COLORS, strict=True):
+        axes.fill_between([], [], color=color, label=fate)
 
 
-def _bars(axes: Axes, x: Floats, found: list[dict[str, Any]], look: dict[str, Any]) -> None:
-    middle, low, high = (np.array([one[name] for one in found]) for name in ("p50", "p5", "p95"))
-    span = np.array([middle - low, high - middle])
-    axes.errorbar(x, middle, span, linewidth=1.5, elinewidth=0.8, capsize=2.0, **look)
+def speeds(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
+    """Draw the left track speed of one run along time, as the filter gets it."""
+    for level, look in zip(levels, LOOKS, strict=False):
+        trace = level.found["trace"][:1]
+        along(axes, trace[0, :, 0], trace[..., 4], look | {"label": level.setting.value, "marker": ""})
 
 
-def _keys(result: StudyResult) -> list[Line2D]:
-    keys = icr_keys()
-    if result.request.name == "gnss":
-        keys.append(Line2D([], [], label="open loop, final ICRs", **OPEN_LOOP))
-        keys.append(Line2D([], [], label="open loop, no slip", **NO_SLIP.keywords()))
-    return keys
+def shares(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
+    """Draw which share of the runs has settled, over time."""
+    for number, level in enumerate(levels):
+        times = np.sort(level.found["settle_s"])
+        settled = np.maximum(times[np.isfinite(times)], 0.01)
+        look: dict[str, Any] = {"color": PATH_COLORS[number % 4], "linestyle": ("-", "--", ":", "-.")[number % 4]}
+        share = 100 * np.arange(len(settled) + 1) / len(times)
+        axes.step([*settled[:1], *settled], share[: 2 * len(settled)], where="post", label=level.setting.value, **look)
+    axes.axvspan(5.0, 15.0, color="0.92", zorder=0, label="the paper's driven robots")
+    axes.set(xscale="log", ylim=(0, 103), xlabel="All three ICRs within 10 % of the truth after [s]")
 
 
-def draw_input_source(result: StudyResult) -> Figure:
-    """Draw the two inputs over time (Fig. 11), and the ICR errors with either."""
-    figure = new_figure(
-        study_title(result), subtitle(result), height_in=5.6, margins_in=(0.85, 0.2, 0.85, 0.8), hspace=0.42
-    )  # fmt: skip
-    top, bottom = figure.subplots(2, 1)
-    curves = result.curves
-    until = min(100.0, result.request.plan.duration_s)
-    for name, color, width, order in (("encoder", "0.65", 0.6, 2), ("commanded", "#b2182b", 1.2, 3)):
-        seen = curves[f"{name}_t"] <= until
-        top.step(
-            curves[f"{name}_t"][seen], curves[f"{name}_v"][seen], where="post", color=color, linewidth=width,
-            label=name, zorder=order,
-        )  # fmt: skip
-    top.set(xlabel="Time [s]", ylabel="Left track speed [m/s]")
-    top.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
-    names = [f"{level['value']}\n{level['series']}" for level in result.levels]
-    for shift, icr in zip((-0.15, 0.0, 0.15), ICR_NAMES, strict=True):
-        x = np.arange(len(names), dtype=np.float64) + shift
-        found = [level["metrics"][f"error_{icr}_m"] for level in result.levels]
-        _bars(bottom, x, found, ICR_LOOKS[icr] | {"linestyle": "none"})
-    bottom.axhline(0.0, color="0.6", linewidth=0.8)
-    bottom.set_xticks(np.arange(len(names)), names)
-    bottom.set_ylabel("ICR error [m]")
-    figure.legend(handles=_keys(result), ncols=3)
-    return figure
+def nees(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
+    """Draw the mean NEES along time, and its 95 % band."""
+    runs = len(levels[0].found["nees"])
+    axes.axhspan(*chi2_band(6 * runs, runs), color="#d9ead3", zorder=0.5, label="95 % band")
+    for level, look in zip(levels, LOOKS, strict=False):
+        mean = level.found["all nees"].mean(axis=0, keepdims=True)
+        along(axes, level.found["stops_s"][0], mean, look | {"label": level.setting.series})
+    axes.set_yscale("log")
+
+
+def coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
+    """Draw how much of the time 2 sigma hold the truth, by state."""
+    for place, (level, look) in enumerate(zip(levels, LOOKS, strict=False)):
+        held = consistency_of(level.found)["coverage_pct"]
+        _points(axes, STATES, [(one, one, one) for one in held], look, 0.15 * (place - 1))
+    axes.axhline(95.4, color="black", **TRUTH)
+
+
+SETTLED: Draw = partial(over, columns=_by_icr("settle_{icr}_s"))
+RMS: Draw = partial(over, columns=_by_icr("rms_{icr}_m"), log="xy")
+WITHOUT_GNSS: Draw = partial(
+    over, columns={"blind_icr_10m_p95_m": OPEN_LOOP, "blind_no_slip_10m_p95_m": OPEN_LOOP_NO_SLIP}, log="xy"
+)
+BEFORE, AFTER = (partial(estimates, value=value) for value in ("not inflated", "inflated"))
+
+PICTURES: dict[StudyName, tuple[tuple[str, Draw], ...]] = {
+    "convergence": (("ICR estimate [m]", estimates), ("Runs [%]", shares)),
+    "initial": (("Initial y right [m]", fates), ("y right [m]", starts)),
+    "icr-change": (
+        ("ICRs, not inflated [m]", BEFORE), ("ICRs, inflated [m]", AFTER),
+        ("… first change [m]", partial(AFTER, name="zoom")),
+    ),
+    "turn-radius": (("Within 10 % after [s]", SETTLED), ("Ends inverted [%]", inversions)),
+    "input-noise": (("ICR error [m]", errors),),
+    "input-bias": (("ICR error [m]", errors),),
+    "input-source": (("Left track speed [m/s]", speeds), ("ICR error [m]", errors)),
+    "gnss": (("ICR error, rms [m]", RMS), ("10 m without GNSS, p95 [m]", WITHOUT_GNSS)),
+    "rate": (("ICR error [m]", partial(errors, log="x")),),
+    "consistency": (("NEES, mean (6 expected)", nees), ("Within 2 sigma [%]", coverage)),
+}  # fmt: skip
+"""The rows of panels of each picture: name of the y axis, and what is drawn."""
+
+TOGETHER: frozenset[StudyName] = frozenset({"consistency"})
+"""Pictures whose series share a panel."""
+
+NOTE = "lines: median; bars and bands: 5 to 95 % of the runs"
+NOTES: dict[StudyName, str] = {
+    "initial": "colours: share of the runs; above the dashed line the start is proper",
+    "consistency": "model: truth drawn from Q and R; paper and field: exact kinematics, preset's start",
+}
+"""What stands above the legend."""

@@ -1,72 +1,75 @@
-"""A study as text: what was found by setting, and beside it what the paper reports."""
+"""A study as text: what was found by setting, and beside it what the paper reports; and the titles of its picture."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from itertools import groupby
 
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.records.text import counted
-from icrtool.simulation.studies import KINDS, StudyNumber, StudyRequest, StudyResult
+from icrtool.simulation.study_measures import ICR_NAMES
+from icrtool.simulation.study_records import Level, StudyNumber, StudyRequest, StudyResult
 
-ERRORS = tuple(
-    (f"error_{icr}_m", name) for icr, name in (("y_icr_right", "y right"), ("y_icr_left", "y left"), ("x_icr", "x"))
-)
-SETTLE = (("settle_s", "all within 10 % [s]"),)
-INVERTED = (("inverted", "inverted"),)
+ERRORS = {f"error_{icr}_m": name for icr, name in zip(ICR_NAMES, ("y right", "y left", "x"), strict=True)}
+SETTLE = {"settle_s": "all within 10 % [s]"}
+INVERTED = {"inverted": "inverted"}
 
-SHOWN: dict[str, tuple[tuple[str, str], ...]] = {
-    "convergence": SETTLE + INVERTED,
-    "icr-change": (("change1_settle_s", "change 1 [s]"), ("change2_settle_s", "change 2 [s]"), *INVERTED),
-    "turn-radius": SETTLE + INVERTED,
-    "input-noise": ERRORS + INVERTED,
-    "input-bias": ERRORS + INVERTED,
-    "input-source": ERRORS + INVERTED,
-    "gnss": (("rms_y_icr_right_m", "rms y right [m]"), ("blind_icr_10m_p95_m", "10 m without GNSS [m]"), *INVERTED),
+SHOWN: dict[str, dict[str, str]] = {
+    "convergence": SETTLE | INVERTED,
+    "icr-change": {"change1_settle_s": "change 1 [s]", "change2_settle_s": "change 2 [s]"} | INVERTED,
+    "turn-radius": SETTLE | INVERTED,
+    "input-noise": ERRORS | INVERTED,
+    "input-bias": ERRORS | INVERTED,
+    "input-source": ERRORS | INVERTED,
+    "gnss": {"rms_y_icr_right_m": "rms y right [m]", "blind_icr_10m_p95_m": "10 m without GNSS [m]"} | INVERTED,
     "rate": ERRORS,
 }
 """Metrics by study, with the heading of their column; the studies left out have no settings to list."""
 
 
 def format_study(result: StudyResult) -> Text:
-    """Return the tables of a study; no line end."""
-    request, kind = result.request, KINDS[result.request.name]
-    figures = f" (Fig{'s' if len(kind.figures) > 2 else ''}. {kind.figures})" if kind.figures else ""
-    path = request.plan.path
+    """Return the tables of a study, of at most 80 columns but for the paper's numbers; no line end."""
+    request, study = result.request, result.study
+    figures = f" (Fig{'s' if len(study.figures) > 2 else ''}. {study.figures})" if study.figures else ""
     icrs = ", ".join(f"{icr:+.3f}" for icr in request.plan.icrs_m)
-    driven = f"{getattr(path, 'kind', 'path')} at {getattr(path, 'speed_mps', 0):g} m/s, ICRs {icrs} m"
-    blocks: list[Block] = [
-        f"{request.name}{figures}: {kind.about}",
-        f"{runs_text(request)} each, seed {request.seed}; {driven}",
-        "",
-    ]
-    if request.name in SHOWN:
-        blocks += [*_level_blocks(result), ""]
-    findings = [(one.what, finding_text(one), one.paper) for one in result.findings]
-    return Text([*blocks, Table("l", findings, ("", "ours", "expected" if request.name == "consistency" else "paper"))])
+    driven = f"{request.path.kind} at {request.path.speed_mps:g} m/s, ICRs {icrs} m"
+    blocks: list[Block] = [f"{request.name}{figures}: {study.about}"]
+    blocks += [f"{runs_text(request)} each, seed {request.seed}; {driven}", ""]
+    if shown := {name: head for name, head in SHOWN.get(request.name, {}).items() if name in result.columns}:
+        errors = "; errors [m]" if shown.keys() >= ERRORS.keys() else ""
+        varies = f"by preset and {study.varies or 'setting'}"
+        rows = [row for level in result.levels for row in _level_rows(level, shown)]
+        blocks += [Table("lr", rows, ("", varies.rpartition(" ")[2], *shown.values()))]
+        blocks += [f"{varies}{errors}; median, and below it [5 %, 95 %] of the runs", ""]
+    return Text([*blocks, _findings_table(result)])
 
 
-def _level_blocks(result: StudyResult) -> list[Block]:
-    """Return one row a setting: median and, in brackets, the 5th and 95th percentile over its runs."""
-    shown = [metric for metric in SHOWN[result.request.name] if metric[0] in result.levels[0]["metrics"]]
-    rows = []
-    for level in result.levels:
-        value = level["value"]
-        cells = (_cell(name, level["metrics"][name], result.request.runs) for name, _ in shown)
-        rows.append((level["series"], value if isinstance(value, str) else f"{value:g}", *cells))
-    head = ("preset", KINDS[result.request.name].varies or "setting", *(heading for _, heading in shown))
-    errors = any(name.startswith("error") for name, _ in shown)
-    return [Table("l", rows, head), f"{'errors [m]: ' if errors else ''}median [5 %, 95 %] over the runs"]
+def _level_rows(level: Level, shown: dict[str, str]) -> list[list[str]]:
+    """Return the medians of a setting, and below them the 5th and 95th percentiles over its runs."""
+    value = level.setting.value
+    first, second = [level.setting.series, value if isinstance(value, str) else f"{value:g}"], ["", ""]
+    for name in shown:
+        found = level.metrics()[name]
+        form, never = "+.3f" if name in ERRORS else ".3g", len(level.found[name]) - found["count"]
+        if name == "inverted":
+            middle, around = f"{100 * found['mean']:.0f} %", ""
+        elif not found["count"]:
+            middle, around = "never", ""
+        else:
+            middle = f"{found['p50']:{form}}{f', never in {never}' if never else ''}"
+            around = f"[{found['p5']:{form}}, {found['p95']:{form}}]"
+        first.append(middle)
+        second.append(around)
+    return [first, second] if any(second) else [first]
 
 
-def _cell(name: str, found: dict[str, Any], runs: int) -> str:
-    if name == "inverted":
-        return f"{100 * found['mean']:.0f} %"
-    if not found["count"]:
-        return "never"
-    form = "+.3f" if name.startswith("error") else ".3g"
-    never = f", never in {runs - found['count']}" if found["count"] < runs else ""
-    return f"{found['p50']:{form}} [{found['p5']:{form}}, {found['p95']:{form}}]{never}"
+def _findings_table(result: StudyResult) -> Table:
+    """Return the numbers beside the paper's, those of one setting below its name."""
+    rows: list[tuple[str, str, str]] = []
+    for head, group in groupby(result.findings, lambda one: one.what.rpartition(": ")[0]):
+        rows.append((head, "", ""))
+        rows += [(f"  {one.what.rpartition(': ')[2]}", finding_text(one), one.paper) for one in group]
+    return Table("l", rows, ("", "ours", "expected" if result.request.name == "consistency" else "paper"))
 
 
 def finding_text(finding: StudyNumber) -> str:
@@ -94,10 +97,21 @@ def runs_text(request: StudyRequest) -> str:
 
 
 def study_title(result: StudyResult) -> str:
-    """Return a study's name, with the robot's where it has one, and the true ICRs."""
-    robot = result.request.config.robot.name
-    icrs = ", ".join(f"{icr:+.2f}".replace("-", "−") for icr in result.request.plan.icrs_m)
-    return f"Study {result.request.name}  ({f'{robot}, ' if robot else ''}ICRs {icrs} m)"
+    """Return the answer of a study with its number, by series."""
+    study = result.study
+    answer = ", ".join(f"{finding_text(one)} ({one.what})" for one in result.answer)
+    value = study.answer.at([level.setting.value for level in result.levels])[0]
+    return study.title.format(answer=answer, value=value)
+
+
+def study_subtitle(result: StudyResult) -> str:
+    """Return a study's name, with the robot's where it has one, the true ICRs, the path and the runs."""
+    request, robot = result.request, result.request.config.robot.name
+    icrs = ", ".join(f"{icr:+.2f}".replace("-", "−") for icr in request.plan.icrs_m)
+    return (
+        f"{request.name}{f', {robot}' if robot else ''}: ICRs {icrs} m, {request.path.kind} path, "
+        f"{request.path.speed_mps:g} m/s, {runs_text(request)}"
+    )
 
 
 def capital(text: str) -> str:

@@ -34,6 +34,7 @@ from icrtool.output.study_directory import write_study
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.run import Run
 from icrtool.simulation.studies import default_request, run_study
+from icrtool.simulation.study_records import Level
 from support.documents import with_summary
 
 Writer = Callable[[Path, str], object]
@@ -61,6 +62,10 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
     request = default_request("rate", Config())
     study = run_study(replace(request, runs=1, values=(50.0,), plan=replace(request.plan, duration_s=5.0)))
     table = calibration.summary()
+
+    def named_levels(text: str) -> Iterator[Level]:
+        for level in study.levels:
+            yield level._replace(setting=level.setting._replace(names={text: 1.0}))
 
     def named(text: str) -> Run:
         return with_summary(run, log=text)
@@ -91,7 +96,7 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
         "run": lambda place, text: named(text).write(place, plots=()),
         "run with pictures": lambda place, text: named(text).write(place, states="parquet"),
         "report": dropout,
-        "study": lambda place, text: write_study(replace(study, columns={text: [1.0]}), place),
+        "study": lambda place, text: write_study(replace(study, levels=tuple(named_levels(text))), place),
         "calibration": lambda place, text: write_calibration(table | {"why": text}, place),
         "picture": lambda place, text: save_picture(
             new_figure(text, "", width_in=3.0, height_in=2.0), place.with_suffix(".png")

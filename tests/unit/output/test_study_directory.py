@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from icrtool.cli.terminal import show
 from icrtool.config import Config, load_config
 from icrtool.errors import DataError, OutputError
+from icrtool.output.figures.study import study_figure
 from icrtool.output.files.truth_file import log_and_truth, read_speeds, truth_path, write_truth
 from icrtool.output.study_directory import check_study_target, write_study
 from icrtool.output.tables.study import finding_text, format_study, runs_text
+from icrtool.output.text_blocks import Table
 from icrtool.simulation.drives import DrivePlan, Sensors
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.record import simulate
-from icrtool.simulation.studies import KINDS, StudyNumber, StudyResult, default_request, run_study
+from icrtool.simulation.studies import STUDIES, default_request, run_study
+from icrtool.simulation.study_records import StudyNumber, StudyResult
 
-WIDEST = 120
 PNG = b"\x89PNG"
 
 
+@cache
 def small(name, robot: str | None = None) -> StudyResult:
     request = default_request(name, load_config(robot=robot) if robot else Config())
     settings = (1.0, -1.0) if name == "initial" else request.values[:2]  # noqa: PD011 - the values of a study, no pandas
@@ -33,7 +39,7 @@ def small(name, robot: str | None = None) -> StudyResult:
     return run_study(replace(request, runs=2, values=settings, paths=request.paths[:2], plan=plan))
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", STUDIES)
 def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> None:
     result = small(name)
     write_study(result, tmp_path / "study")
@@ -50,9 +56,35 @@ def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> N
         if not isinstance(values, list):
             np.testing.assert_array_equal(table[column].to_numpy(), np.asarray(values))
     assert (tmp_path / "study" / f"{name}.png").read_bytes().startswith(PNG)
-    text = format_study(result)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_number_of_the_table_is_whole_on_a_terminal_of_80_columns(
+    name, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = format_study(small(name))
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("NO_COLOR", "1")
+    show(text)
+    shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
     assert text.startswith(name)
-    assert max(map(len, text.splitlines())) <= WIDEST + 20
+    assert max(map(len, shown.splitlines())) <= 80
+    cells = [cell for block in text.blocks if isinstance(block, Table) for row in block.rows for cell in row[:-1]]
+    inverted = [
+        row[-1] for block in text.blocks if isinstance(block, Table) if "r" in block.align for row in block.rows
+    ]
+    assert [cell for cell in (*cells, *inverted) if cell not in shown] == []
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_the_title_of_a_picture_states_the_answer_with_its_number(name) -> None:
+    result = small(name)
+    figure = study_figure(result)
+    title, subtitle = (text.get_text() for text in figure.texts[:2])
+    assert [finding_text(one) for one in result.answer if finding_text(one) not in title] == []
+    assert subtitle.startswith(f"{name}: ICRs")
+    assert "…" not in title + subtitle
 
 
 def test_an_old_study_is_replaced_and_anything_else_is_left_alone(tmp_path: Path) -> None:

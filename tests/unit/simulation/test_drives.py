@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from icrtool.cli.drive_options import PATHS
-from icrtool.cli.study import STUDIES, VARIES
+from icrtool.cli.study import NAMES, command
 from icrtool.errors import ConfigError
 from icrtool.kernels.kinematics import body_velocity
 from icrtool.simulation.drives import DrivePlan, Sensors, TrackSpeeds, check_drive, drive_plan, sample_times, sense
@@ -221,8 +221,11 @@ def test_what_cannot_be_driven_is_refused_in_words(plan: DrivePlan, words: str) 
 
 
 def test_the_command_knows_the_paths_and_studies_there_are() -> None:
-    from icrtool.simulation.studies import KINDS, StudyName
+    from icrtool.simulation.studies import STUDIES
+    from icrtool.simulation.study_records import StudyName
 
     assert get_args(PathKind) == PATHS
-    assert set(STUDIES) == set(get_args(StudyName)) == set(KINDS)
-    assert set(VARIES) == {name for name, kind in KINDS.items() if kind.varies} - {"initial"}
+    assert set(NAMES) == set(get_args(StudyName)) == set(STUDIES)
+    varied = {study.varied for study in STUDIES.values()} - {""}
+    assert varied <= {option.name for option in command.params}
+    assert {name for name, study in STUDIES.items() if study.varies and not study.varied} == {"initial"}

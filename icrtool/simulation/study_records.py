@@ -1,0 +1,281 @@
+"""What a study is, what it is asked for and what it found; the numbers that are reported of its levels."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, NamedTuple, cast
+
+import numpy as np
+
+from icrtool.config import Config
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.simulation.drives import DrivePlan, Sensors
+from icrtool.simulation.paths import PathKind, PathPlan
+from icrtool.simulation.study_measures import ICR_NAMES, statistics
+from icrtool.simulation.study_runs import Measure, Scenario
+
+StudyName = Literal[
+    "convergence",
+    "initial",
+    "icr-change",
+    "turn-radius",
+    "input-noise",
+    "input-bias",
+    "input-source",
+    "gnss",
+    "rate",
+    "consistency",
+]
+
+Preset = Literal["paper", "field"]
+Column = Floats | Ints | list[float | str]
+
+
+@dataclass(frozen=True, slots=True)
+class StudyRequest:
+    """The settings of a study.
+
+    Attributes
+    ----------
+    plan, sensors : the drive and its sensors; a study varies one of their settings
+    config : filter and robot
+    presets : the filter presets to compare
+    values : settings of what is varied; empty where nothing is
+    paths : the kinds of path to compare, where a study compares them
+    """
+
+    name: StudyName
+    plan: DrivePlan
+    sensors: Sensors
+    config: Config
+    presets: tuple[Preset, ...] = ("paper", "field")
+    runs: int = 40
+    seed: int = 0
+    values: tuple[float, ...] = ()
+    paths: tuple[PathKind, ...] = ()
+
+    @property
+    def path(self) -> PathPlan:
+        """The path; no study drives given track speeds."""
+        return cast(PathPlan, self.plan.path)
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings for study.json: every parameter, as plain data."""
+        plain = asdict(self)
+        return {
+            **{name: plain[name] for name in ("runs", "seed", "values", "presets", "paths", "sensors")},
+            "drive": plain["plan"],
+            "config": self.config.effective(),
+        }
+
+
+class Setting(NamedTuple):
+    """One setting of a study.
+
+    Attributes
+    ----------
+    series : the preset, guard or case
+    value : what varies within a series; empty where nothing does
+    scenario : how it is run
+    names : the columns of the CSV that name it, beside ``series``
+    """
+
+    series: str
+    value: float | str
+    scenario: Scenario
+    names: Mapping[str, float | str]
+
+
+class Level(NamedTuple):
+    """A setting, and what was found in its runs (runs, ...) by name; numbers a run are columns of the CSV."""
+
+    setting: Setting
+    found: Mapping[str, Floats]
+
+    @property
+    def names(self) -> dict[str, float | str]:
+        """The columns of the CSV that name the setting."""
+        return {"series": self.setting.series, **self.setting.names}
+
+    def numbers(self) -> dict[str, Floats]:
+        """Return the numbers a run (runs,)."""
+        return {name: values for name, values in self.found.items() if values.ndim == 1}
+
+    def metrics(self) -> dict[str, dict[str, float]]:
+        """Return the statistics of each number over the runs."""
+        return {name: statistics(values) for name, values in self.numbers().items()}
+
+
+class Number(NamedTuple):
+    """A number that a study reports of its levels.
+
+    Attributes
+    ----------
+    what : its name, with {series}, {value} and {icr}; the levels of one name are put together
+    columns : pattern of the columns it is made of, with {icr}
+    how : its computation, from the columns (runs,) of each level
+    unit : of the number
+    paper : the paper's number as text, or that by value or series; by an empty key for all others
+    at : which of the values it is reported of
+    series : the only series it is reported of; empty: all
+    """
+
+    what: str
+    columns: str
+    how: Callable[[Sequence[Floats]], tuple[float, ...]]
+    unit: str = ""
+    paper: str | Mapping[Any, str] = ""
+    at: Callable[[Sequence[Any]], Sequence[Any]] = tuple
+    series: str = ""
+
+
+class StudyNumber(NamedTuple):
+    """One number of a study, and the number in the paper.
+
+    Attributes
+    ----------
+    what : the quantity
+    ours : 5th percentile, median, 95th percentile; or one number; NaN where there is none
+    unit : of `ours`
+    paper : the paper's number as text; empty where it has none
+    """
+
+    what: str
+    ours: tuple[float, ...]
+    unit: str
+    paper: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A study.
+
+    Attributes
+    ----------
+    about : one line
+    vary : the settings of a request
+    measures : what is measured of each run
+    numbers : what is reported of the levels
+    title, answer : title of the picture, with {answer} and {value}, and the number that it gives of each series
+    figures : figures of the paper
+    varies : what its values are, with unit; empty where it takes none
+    varied : the option of the command that they are values of
+    changes_s : the ICRs change at these times, where no others are given
+    request, drive, sensors : settings of the request, the drive and the sensors that are not the usual ones
+    summary : what study.json holds of a level beside the statistics of its numbers
+    """
+
+    about: str
+    vary: Callable[[StudyRequest], Iterable[Setting]]
+    measures: tuple[Measure, ...]
+    numbers: tuple[Number, ...] | Callable[[Sequence[Level]], list[StudyNumber]]
+    title: str
+    answer: Number
+    figures: str = ""
+    varies: str = ""
+    varied: str = ""
+    changes_s: tuple[float, ...] = ()
+    request: Mapping[str, Any] = field(default_factory=dict)
+    drive: Mapping[str, Any] = field(default_factory=dict)
+    sensors: Mapping[str, Any] = field(default_factory=dict)
+    summary: Callable[[Mapping[str, Floats]], dict[str, Any]] = lambda _: {}
+
+
+@dataclass(frozen=True, slots=True)
+class StudyResult:
+    """The results of a study: a level for each setting."""
+
+    request: StudyRequest
+    study: Study
+    levels: tuple[Level, ...]
+
+    @property
+    def columns(self) -> dict[str, Column]:
+        """One row a run: the CSV."""
+        runs, levels = self.request.runs, self.levels
+        columns: dict[str, Column] = {
+            name: [level.names[name] for level in levels for _ in range(runs)] for name in levels[0].names
+        }
+        columns["run"] = np.tile(np.arange(runs), len(levels))
+        return columns | {name: np.concatenate([one.found[name] for one in levels]) for name in levels[0].numbers()}
+
+    @property
+    def findings(self) -> list[StudyNumber]:
+        """Numbers to compare with the paper's."""
+        numbers = self.study.numbers
+        return numbers(self.levels) if callable(numbers) else reported(numbers, self.levels)
+
+    @property
+    def answer(self) -> list[StudyNumber]:
+        """The number that answers the study's question, by series."""
+        return reported([self.study.answer], self.levels)
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return what study.json holds of the levels."""
+        return [{**one.names, **self.study.summary(one.found), "metrics": one.metrics()} for one in self.levels]
+
+
+def reported(numbers: Sequence[Number], levels: Sequence[Level]) -> list[StudyNumber]:
+    """Return numbers of levels, in the order of the levels, the ICRs and `numbers`."""
+    pooled: dict[str, tuple[Number, Level, dict[int, Floats]]] = {}
+    at = [number.at([level.setting.value for level in levels]) for number in numbers]
+    for place, level in enumerate(levels):
+        series, value, *_ = level.setting
+        for icr in ICR_NAMES:
+            for number, values in zip(numbers, at, strict=True):
+                if value in values and number.series in ("", series):
+                    what = number.what.format(series=series, value=value, icr=icr)
+                    names = fnmatch.filter(level.numbers(), number.columns.format(icr=icr))
+                    columns = np.concatenate([level.found[name] for name in names])
+                    pooled.setdefault(what, (number, level, {}))[2][place] = columns
+    return [
+        StudyNumber(what, number.how(list(by_level.values())), number.unit, _paper(number.paper, level))
+        for what, (number, level, by_level) in pooled.items()
+    ]
+
+
+def _paper(paper: str | Mapping[Any, str], level: Level) -> str:
+    if isinstance(paper, str):
+        return paper
+    return next((paper[key] for key in (level.setting.value, level.setting.series, "") if key in paper), "")
+
+
+def spread(values: Sequence[Floats]) -> tuple[float, ...]:
+    """Return the 5th percentile, the median and the 95th percentile of the columns of several levels."""
+    found = statistics(np.concatenate(values))
+    return found["p5"], found["p50"], found["p95"]
+
+
+def median(values: Sequence[Floats]) -> tuple[float, ...]:
+    """Return the median of the columns; a run without a number counts as beyond all others, NaN is beyond half."""
+    middle = float(np.median(np.nan_to_num(np.concatenate(values), nan=np.inf)))
+    return (middle if math.isfinite(middle) else math.nan,)
+
+
+def mean(values: Sequence[Floats]) -> tuple[float, ...]:
+    """Return the mean of the columns."""
+    return (statistics(np.concatenate(values))["mean"],)
+
+
+def percent(values: Sequence[Floats]) -> tuple[float, ...]:
+    """Return the mean of columns of 0 and 1 as a percentage."""
+    return (100 * float(np.concatenate(values).mean()),)
+
+
+def percent_finite(values: Sequence[Floats]) -> tuple[float, ...]:
+    """Return how many of the values exist."""
+    return percent([np.isfinite(one).astype(np.float64) for one in values])
+
+
+def range_of_means(values: Sequence[Floats]) -> tuple[float, ...]:
+    """Return the largest difference between the means of levels."""
+    return (float(np.ptp([one.mean() for one in values])),)
+
+
+def extreme_medians(values: Sequence[Floats]) -> tuple[float, ...]:
+    """Return the least and the greatest median of a level."""
+    medians = [float(np.median(one)) for one in values]
+    return min(medians), max(medians)
