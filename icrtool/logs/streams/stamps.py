@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,18 @@ LARGEST_SHARE_BACKWARDS = 0.01
 LARGEST_SHARE_ZERO = 0.01
 
 AROUND = 25
-"""Messages before and after a step of a clock whose median delay to log time decides whether it lasts."""
+"""Messages before and after a step of a clock whose median delay to log time shows its size."""
+
+
+class ClockSet(NamedTuple):
+    """The largest step by which the clock of header stamps was set: its size, its sense, the last stamp before."""
+
+    size_ns: int
+    back: bool
+    before_ns: int
+
+
+NEVER_SET = ClockSet(0, back=False, before_ns=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +46,7 @@ class StampedRows:
     delay_ns : median of log time minus header stamp, 0 without header stamps
     replaced : header stamps of another clock that log times stand for
     set_back : as `TopicTable.set_back`
-    header_back : the largest step by which the clock of the headers was set back, and its last stamp before
+    clock_set : of the headers; their stamps are those of a clock that was not set
     """
 
     header_ns: Ints | None
@@ -44,7 +55,7 @@ class StampedRows:
     delay_ns: int
     replaced: int = 0
     set_back: SetBack = NOT_SET_BACK
-    header_back: SetBack = NOT_SET_BACK
+    clock_set: ClockSet = NEVER_SET
 
     def on(self, clock: Literal["header", "log"]) -> Ints:
         """Return the stamps on a clock; the log's where the header's cannot be used."""
@@ -65,30 +76,36 @@ def _usable(table: TopicTable) -> StampedRows:
     zeros = np.count_nonzero(header == 0)
     if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
         return StampedRows(None, log_ns, f"{100 * zeros / len(header):.0f} % of the header stamps are 0", 0)
-    header, back = _without_steps_back(header, log_ns)
-    return replace(_near_log_time(header, log_ns), header_back=back)
+    header, clock_set = _without_clock_steps(header, log_ns)
+    return replace(_near_log_time(header, log_ns), clock_set=clock_set)
 
 
-def _without_steps_back(header: Ints, log_ns: Ints) -> tuple[Ints, SetBack]:
-    """Return header stamps (n,) of a clock that was set back as if it had not been, and the largest step.
+def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
+    """Return header stamps (n,) of a clock that was set as if it had not been, and the largest step.
 
-    Log time goes on, so the delay to it grows by the step and stays there; after a message out of place it does not.
+    Log time goes on, so the delay to it changes by the step and stays so; after a message out of place it does not.
+    A step ahead counts where the whole stretch before it was later, too: a connection that was slow for a while and
+    then lost messages is no clock.
     """
-    steps = np.flatnonzero(np.diff(header) < 0)
+    jump = np.diff(header)
+    steps = np.flatnonzero((jump < 0) | (jump - np.diff(log_ns) > OUT_OF_ORDER_NS))
     if not len(steps) or len(steps) > LARGEST_SHARE_BACKWARDS * len(header) + 1:
-        return header, NOT_SET_BACK
+        return header, NEVER_SET
     delay = log_ns - header
     rows = np.arange(AROUND)
     before = np.median(delay[np.maximum(steps[:, None] - rows, 0)], axis=1)
     after = np.median(delay[np.minimum(steps[:, None] + 1 + rows, len(delay) - 1)], axis=1)
     grown = (after - before).astype(np.int64)
-    lasting = grown > OUT_OF_ORDER_NS
+    of_stretch = np.diff([np.median(part) for part in np.split(delay, steps + 1)])
+    lasting = (grown > OUT_OF_ORDER_NS) | ((grown < -OUT_OF_ORDER_NS) & (of_stretch < grown / 2))
+    lasting &= (grown > 0) == (jump[steps] < 0)
     if not lasting.any():
-        return header, NOT_SET_BACK
-    largest = int(np.argmax(np.where(lasting, grown, 0)))
+        return header, NEVER_SET
+    largest = int(np.argmax(np.where(lasting, np.abs(grown), 0)))
     moved = np.zeros(len(header), np.int64)
     moved[steps[lasting] + 1] = grown[lasting]
-    return header + np.cumsum(moved), SetBack(int(grown[largest]), 0.0, int(header[steps[largest]]))
+    found = ClockSet(abs(int(grown[largest])), back=bool(grown[largest] > 0), before_ns=int(header[steps[largest]]))
+    return header + np.cumsum(moved), found
 
 
 def _near_log_time(header: Ints, log_ns: Ints) -> StampedRows:
@@ -106,7 +123,7 @@ def _near_log_time(header: Ints, log_ns: Ints) -> StampedRows:
 
 
 def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
-    """Yield sentences about clocks of streams that were set back, one for all, and that cannot be used, one for each.
+    """Yield sentences about clocks of streams that were set, one for all, and that cannot be used, one for each.
 
     Raises
     ------
@@ -114,12 +131,13 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         The clock was set back, and times came again: nothing shows which of two samples came first.
     """
     yield from _set_back_note(streams, name)
-    if back := [(rows.header_back, role) for role, rows in streams if rows.header_back.step_ns]:
-        step_ns, _, before_ns = max(back)[0]
+    if found := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:
+        size_ns, is_back, before_ns = max(found)[0]
+        sense = "back" if is_back else "ahead"
         yield (
-            f"{name}: header stamps go back by {step_ns / 1e9:.1f} s after {_time_of_day(before_ns)} "
-            f"({', '.join(role for _, role in back)}): their clock was set back while recording; the later ones are "
-            "moved by as much, which log time shows"
+            f"{name}: header stamps go {sense} by {size_ns / 1e9:.1f} s after {_time_of_day(before_ns)} "
+            f"({', '.join(role for _, role in found)}): their clock was set {'back' if is_back else 'forward'} while "
+            "recording; the later ones are moved by as much, which log time shows"
         )
     for role, rows in streams:
         if rows.note and rows.note != "no header":

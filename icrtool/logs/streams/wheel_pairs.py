@@ -245,8 +245,8 @@ def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, In
     """Return the stamps of the left side, and the times of both sides: of headers where both have them, else logged."""
     rows = stamp_rows(left), stamp_rows(right)
     headers = [one.header_ns for one in rows if one.header_ns is not None and (np.diff(one.header_ns) >= 0).all()]
-    back = max(one.header_back for one in rows)
-    stamps = replace(rows[0], set_back=max(one.set_back for one in rows), header_back=back)
+    clock_set = max(one.clock_set for one in rows)
+    stamps = replace(rows[0], set_back=max(one.set_back for one in rows), clock_set=clock_set)
     if len(headers) == 2:
         return stamps, headers[0], headers[1]
     note = rows[0].note or rows[1].note or "the header stamps of a side go back"
