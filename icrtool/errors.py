@@ -46,6 +46,10 @@ class LogError(IcrToolError):
     """A log that cannot be read."""
 
 
+class LogChangedError(LogError):
+    """A log that was written to while it was read."""
+
+
 class DefinitionError(LogError):
     """A message type whose layout is not known."""
 

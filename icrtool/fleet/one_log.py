@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from icrtool import __version__
 from icrtool.config import Config
-from icrtool.errors import IcrToolError, OutputError
+from icrtool.errors import IcrToolError, LogChangedError, OutputError
 from icrtool.fleet.recordings import as_text
 from icrtool.logs.containers.channel import truncation
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
@@ -226,10 +226,10 @@ def process(request: Request, stage: Stage) -> FleetLog:
     try:
         row = _results(request, stage)
     except IcrToolError as err:
-        # A full disk may not be full the next time; the log's own errors come again.
+        # A full disk may not be full the next time, nor a log be written to; the log's own errors come again.
         path = path_of(request.path)
         reason = err.beside(str(path), str(folder / request.row.run), log_name(path))
-        row = failed(request, reason, repeatable=not isinstance(err, OutputError))
+        row = failed(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
     except OSError as err:
         # The log was removed meanwhile, or its disk fails.
         place = escaped(str(err.filename or path_of(request.path)))

@@ -16,7 +16,7 @@ from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import WHOLE, Channel, Container, Cut
-from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.containers.open_log import check_unchanged, open_log, states_of
 from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
 from icrtool.logs.messages.collectors import Collector, collector_for
@@ -94,11 +94,12 @@ def survey_log(
     Raises
     ------
     LogError
-        The log cannot be opened.
+        The log cannot be opened, or was written to while it was read.
     """
     config = config if config is not None else Config()
     path = place_of(path) if isinstance(path, str) else path
     begin, stop = moment(start, "start"), moment(end, "end")
+    before = states_of(path)
     container = open_log(path, progress)
     ended = Event()
     try:
@@ -117,6 +118,7 @@ def survey_log(
         channels, transfer = tuple(container.channels), container.transfer()
     finally:
         container.close()
+    check_unchanged(path, before, inputs.result())
     drop_used_columns(tables)
     return Survey(
         name=LogText(log_name(path)),
@@ -151,7 +153,7 @@ def read_log(
     ----------
     path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``, each also compressed or in an archive; ``-`` for
         standard input; an address (``s3://bucket/drive.mcap``); ``drive_{0..3}.bag`` for the files of a split
-        recording; or a ``.csv`` of `icrtool.records.frames`
+        recording; or a ``.csv`` of `icrtool.records.frames`, also compressed
     config : topics, robot and frames; default: all found by type and content
     progress : called with the share of the bytes that are read, 0 to 1
     start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
@@ -160,7 +162,7 @@ def read_log(
     Raises
     ------
     LogError
-        The log cannot be read.
+        The log cannot be read, or was written to meanwhile.
     MissingStreamError
         No wheels or no position in it; a heading may be missing.
     ConfigError

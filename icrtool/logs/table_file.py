@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,23 +10,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.split_files import file_sha256
+from icrtool.logs.containers.one_recording import PACKED
+from icrtool.logs.containers.open_log import check_unchanged, plain_file, states_of
+from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.cut import Moment, longest_part, moment, nanoseconds
-from icrtool.records.samples import InputFile
 from icrtool.records.tables import RobotLog
+from icrtool.records.urls import UrlPath
 
 if TYPE_CHECKING:
     import pandas as pd
 
-SUFFIX = ".csv"
+_NAME = re.compile(rf"\.csv(?:{PACKED})?$", re.IGNORECASE)
 
 LONGEST_HEAD_BYTES = 1 << 18
 """Of the line that names the columns: pandas takes a minute for a million of them."""
 
 
 def is_table(path: Path) -> bool:
-    """Return whether a path names a table."""
-    return path.suffix.lower() == SUFFIX and path.is_file()
+    """Return whether a path, or an address, names a table."""
+    return _NAME.search(path.name) is not None and (path.is_file() or isinstance(path, UrlPath))
 
 
 def csv_frame(path: Path) -> pd.DataFrame:
@@ -50,7 +53,7 @@ def csv_frame(path: Path) -> pd.DataFrame:
 
 
 def read_table(path: Path, start: Moment | None = None, end: Moment | None = None) -> RobotLog:
-    """Read a CSV file: a row for each stamp, with the columns that were measured then; others are empty.
+    """Read a CSV file, also compressed: a row for each stamp, with the columns that were measured then.
 
     Raises
     ------
@@ -62,9 +65,11 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
     import pandas as pd
 
     begin, stop = moment(start, "start"), moment(end, "end")
+    before = states_of(path)
     try:
-        digest = file_sha256(path)
-        table = csv_frame(path)
+        with plain_file(path) as (file, read):
+            table = csv_frame(file)
+        check_unchanged(path, before, [read])
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
     except ValueError as err:
@@ -79,5 +84,5 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
             inside &= stamps >= nanoseconds(begin, first) if begin is not None else True
             inside &= stamps < nanoseconds(stop, first) if stop is not None else True
             table = table[inside]
-    log = RobotLog.from_frames(table, table, table, table, path.stem)
-    return longest_part(replace(log, inputs=(InputFile(str(path), path.stat().st_size, digest),)))
+    log = RobotLog.from_frames(table, table, table, table, log_name(path))
+    return longest_part(replace(log, inputs=(read,)))

@@ -1,11 +1,15 @@
-"""Decompression with a limit: the size that a chunk states is checked before memory is allocated."""
+"""Decompression: of chunks, whose stated size is checked before memory is allocated, and of streams, piece by piece."""
 
 from __future__ import annotations
 
 import bz2
+import lzma
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from functools import cache, partial
+from gzip import GzipFile
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -27,6 +31,12 @@ STORED = ("", "none")
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE_BYTES = 1 << 24
 """Decompressed at once: libraries hold twice as much while they do. Of a message that states no size: at most."""
+
+
+_INPUT_BYTES = 1 << 20
+"""That a decoder of a stream is given at once."""
+
+_BEHIND = b"icrtool: behind the last frame"
 
 
 class DecompressionError(Exception):
@@ -217,3 +227,93 @@ def _unpack(data: bytes, compression: str, inflation: Inflation) -> bytes:
     except (zstandard.ZstdError, MemoryError) as err:
         raise DecompressionError(str(err)) from err
     return out
+
+
+class Readable(Protocol):
+    """What is read from start to end."""
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`; none at the end."""
+        ...
+
+
+class _Frames:
+    """What a decoder of the standard library, or of lz4, makes of frames that follow one another."""
+
+    def __init__(self, make: Callable[[], Any], source: Readable) -> None:
+        self._make, self._source, self._decoder = make, source, make()
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`."""
+        while True:
+            data = b""
+            if self._decoder.eof:
+                if not (data := self._decoder.unused_data or self._source.read(_INPUT_BYTES)):
+                    return b""
+                self._decoder = self._make()
+            elif self._decoder.needs_input and not (data := self._source.read(_INPUT_BYTES)):
+                raise EOFError("no end mark")
+            if out := self._decoder.decompress(data, max_length=count):
+                return bytes(out)
+
+
+class _Zstd:
+    """What zstandard makes of frames that follow one another.
+
+    Its reader does not show whether the last frame has ended: a frame of our own behind it comes out only then.
+    """
+
+    def __init__(self, source: Readable) -> None:
+        import zstandard
+
+        self._source, self._behind, self._held = source, zstandard.compress(_BEHIND), b""
+        decoder = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
+        self._decoded = decoder.stream_reader(_Reads(self._packed), read_across_frames=True)  # type: ignore[arg-type]  # reads alone are needed
+
+    def _packed(self, count: int) -> bytes:
+        if not (piece := self._source.read(count)):
+            piece, self._behind = self._behind, b""
+        return piece
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`."""
+        while piece := self._decoded.read(count):
+            together = self._held + piece
+            ready, self._held = together[: -len(_BEHIND)], together[-len(_BEHIND) :]
+            if ready:
+                return ready
+        if self._held != _BEHIND:
+            raise EOFError("no end mark")
+        return b""
+
+
+class _Reads(NamedTuple):
+    """What has a method `read`."""
+
+    read: Callable[[int], bytes]
+
+
+def _lz4(source: Readable) -> Readable:
+    import lz4.frame
+
+    return _Frames(lz4.frame.LZ4FrameDecompressor, source)
+
+
+DECODERS: dict[bytes, Callable[[Readable], Readable]] = {
+    ZSTD_MAGIC: _Zstd,
+    b"\x1f\x8b": lambda source: GzipFile(fileobj=source, mode="rb"),  # type: ignore[call-overload]  # as above
+    b"BZh": partial(_Frames, bz2.BZ2Decompressor),
+    b"\x04\x22\x4d\x18": _lz4,
+    b"\xfd7zXZ\0": partial(_Frames, partial(lzma.LZMADecompressor, memlimit=LARGEST_CHUNK_BYTES)),
+}
+
+
+@cache
+def decoding_errors() -> tuple[type[Exception], ...]:
+    """Return what decoders raise of data that is damaged or cut off."""
+    import zstandard
+
+    return (
+        OSError, EOFError, RuntimeError, ValueError, NotImplementedError, zlib.error, lzma.LZMAError,
+        zipfile.BadZipFile, zstandard.ZstdError,
+    )  # fmt: skip

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import stat
 import sys
-from collections.abc import Callable, Generator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from threading import Event
 from typing import BinaryIO
 
-from icrtool.errors import LogError
+from icrtool.errors import LogChangedError, LogError
 from icrtool.logs.containers.bag_directory import BagDirectory
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems
 from icrtool.logs.containers.chunked_file import NotByRangesError
 from icrtool.logs.containers.mcap_file import McapFile, is_mcap
-from icrtool.logs.containers.remote_file import RemoteFile, fetch_folder
+from icrtool.logs.containers.remote_file import RemoteFile, changed_since, fetch_folder
 from icrtool.logs.containers.ros1_bag import Ros1Bag, is_ros1_bag
-from icrtool.logs.containers.split_files import STANDARD_INPUT, inputs_of, split_files
+from icrtool.logs.containers.split_files import STANDARD_INPUT, files_of_log, inputs_of, split_files
 from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
 from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save, unpack
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
@@ -124,6 +124,70 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
         raise LogError(path, "no such file or directory") from err
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
+
+
+FileState = tuple[int, int, int] | None
+
+
+def states_of(path: Path) -> dict[str, FileState]:
+    """Return what changes where a file of a log is written to, by their paths; nothing of an address."""
+    return {} if isinstance(path, UrlPath) else {str(file): _state(file) for file in files_of_log(path)}
+
+
+def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterable[InputFile]) -> None:
+    """Refuse a log that was written to while it was read.
+
+    Parameters
+    ----------
+    before : of `states_of`, before it was opened
+    inputs : the files as they were read
+
+    Raises
+    ------
+    LogChangedError
+        It was.
+    """
+    if isinstance(path, UrlPath):
+        changed = changed_since(path, inputs)
+    else:
+        changed = any(_state(Path(one.path)) != before.get(one.path) for one in inputs)
+    if changed:
+        raise LogChangedError(path, "changed while it was read", "is it being recorded? read it when it is whole")
+
+
+def _state(file: Path) -> FileState:
+    try:
+        status = file.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+@contextmanager
+def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
+    """Give a file on disk, fetched and decompressed where it is at an address or compressed; and what was read for it.
+
+    Raises
+    ------
+    LogError
+        It cannot be read, or decompressed to its end.
+    OSError
+        It cannot be read.
+    """
+    file, scratch = path, ScratchFolder()
+    try:
+        if isinstance(path, UrlPath):
+            file = scratch.path / (path.name or "file")
+            read = RemoteFile(path).fetch(file, None)
+        else:
+            (read,) = inputs_of([path], Event())
+        if _is_packed_file(file):
+            file, problem = unpack(file, scratch.path / "unpacked")
+            if problem:
+                raise LogError(path, "does not decompress", problem)
+        yield file, read
+    finally:
+        scratch.close()
 
 
 def _open(path: Path, share: Callable[[float], None] | None) -> Container:

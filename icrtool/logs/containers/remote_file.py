@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Event, local
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
@@ -157,11 +158,7 @@ class RemoteFile:
     @property
     def version(self) -> dict[str, str]:
         """What the store states about the content: ``version``, or else ``etag``; none where it states neither."""
-        for key, names in (("version", ("VersionId", "generation")), ("etag", ("ETag", "etag", "Last-Modified"))):
-            stated = next((str(self._about[name]) for name in names if self._about.get(name)), "null")
-            if stated != "null":
-                return {key: stated.strip('"')}
-        return {}
+        return _version_of(self._about)
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:  # noqa: ARG002 - nothing is read for it
         """Return the file without a SHA-256: not all of it is read."""
@@ -174,6 +171,37 @@ class RemoteFile:
     def close(self) -> None:
         """Forget what is held."""
         self._held = local()
+
+
+def _version_of(about: dict[str, Any]) -> dict[str, str]:
+    for key, names in (("version", ("VersionId", "generation")), ("etag", ("ETag", "etag", "Last-Modified"))):
+        stated = next((str(about[name]) for name in names if about.get(name)), "null")
+        if stated != "null":
+            return {key: stated.strip('"')}
+    return {}
+
+
+def changed_since(path: UrlPath, inputs: Iterable[InputFile]) -> bool:
+    """Return whether the files at an address are not those that they were when they were opened.
+
+    Parameters
+    ----------
+    inputs : the files as they were
+    """
+    files, name = filesystem(path)
+    files.invalidate_cache()
+    about = asked(path, lambda: files.info(name))
+    if about.get("type") == "directory":
+        found = asked(path, lambda: files.ls(name, detail=True))
+        now = {str(address_of(files.unstrip_protocol(one["name"]), path)): one for one in found}
+    else:
+        now = {str(path): about}
+    for one in inputs:
+        stated = now.get(one.path, {})
+        version = {key: value for key in ("version", "etag") if (value := getattr(one, key)) is not UNSET}
+        if stated.get("size") not in {one.bytes, None} or _version_of(stated) != version:
+            return True
+    return False
 
 
 def _has(held: Held | None, at: int, end: int) -> bool:

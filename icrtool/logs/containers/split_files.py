@@ -103,7 +103,7 @@ def log_name(path: Path) -> str:
     name = named.name
     if not named.is_dir():
         plain = unpacked_name(name)
-        name = Path(plain).stem if plain == name or Path(plain).suffix in LOG_SUFFIXES else plain
+        name = Path(plain).stem if plain == name or Path(plain).suffix in {*LOG_SUFFIXES, ".csv"} else plain
     return name if name.strip(".") else "log"
 
 

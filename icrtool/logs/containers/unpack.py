@@ -6,27 +6,22 @@ directory in an archive; what stands in an archive may be compressed again.
 
 from __future__ import annotations
 
-import bz2
 import hashlib
-import lzma
 import re
 import secrets
 import shutil
 import tempfile
 import weakref
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
-from functools import cache, partial
-from gzip import GzipFile
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from tarfile import AREGTYPE, CONTTYPE, REGTYPE, SUPPORTED_TYPES, TarError, TarInfo
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.channel import CUT_OFF, some_of
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, LARGEST_RATIO, ZSTD_MAGIC
+from icrtool.logs.containers.decompress import DECODERS, LARGEST_CHUNK_BYTES, LARGEST_RATIO, Readable, decoding_errors
 from icrtool.logs.containers.one_recording import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
 from icrtool.records import process_resources
 from icrtool.records.regular_file import open_regular
@@ -40,18 +35,7 @@ _MOST_ENTRIES = 100_000
 _LARGEST_EXTRA_BYTES, _LARGEST_READ_BYTES = 1 << 16, 1 << 22
 """Of a long name in a tar archive; of what zipfile reads at once, such as the directory of an archive."""
 
-_LARGEST_WINDOW_BYTES = 1 << 27
-"""Of memory that a decoder takes."""
-
 _BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
-
-
-class Readable(Protocol):
-    """What is read from start to end."""
-
-    def read(self, count: int, /) -> bytes:
-        """Return the next bytes, at most `count`; none at the end."""
-        ...
 
 
 class ScratchFolder:
@@ -79,7 +63,7 @@ class Unpacked(NamedTuple):
 
 def is_packed(start: bytes) -> bool:
     """Return whether a file is compressed or an archive, by its first 512 bytes."""
-    return start.startswith((_ZIP, *_DECODERS)) or _is_tar(start)
+    return start.startswith((_ZIP, *DECODERS)) or _is_tar(start)
 
 
 def save(source: Readable, place: Path) -> str:
@@ -163,7 +147,7 @@ class _Stream:
             return b""
         try:
             piece = self._read(count)
-        except _damage() as err:
+        except decoding_errors() as err:
             if isinstance(err, OSError) and err.errno is not None:
                 raise  # of the disk, not of the data
             self._budget.stop(f"{CUT_OFF} or damaged ({err})")
@@ -199,7 +183,7 @@ class _Stream:
     def decompressed(self) -> _Stream:
         """Return the stream that it is when decompressed, itself where it is not compressed."""
         start = self.start()
-        made = next((decoder for magic, decoder in _DECODERS.items() if start.startswith(magic)), None)
+        made = next((decoder for magic, decoder in DECODERS.items() if start.startswith(magic)), None)
         return self if made is None else _Stream(made(self), self._budget)
 
     def write_to(self, place: Path, watch: Callable[[], None] | None) -> None:
@@ -341,56 +325,3 @@ def _zip_entries(file: BufferedReader, budget: _Budget) -> Iterator[tuple[str, _
                     yield info.filename, _Stream(content, budget)
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, ValueError) as err:
         budget.stop(err)
-
-
-class _Frames:
-    """What a decoder of the standard library, or of lz4, makes of frames that follow one another."""
-
-    def __init__(self, make: Callable[[], Any], source: Readable) -> None:
-        self._make, self._source, self._decoder = make, source, make()
-
-    def read(self, count: int, /) -> bytes:
-        """Return the next bytes, at most `count`."""
-        while True:
-            data = b""
-            if self._decoder.eof:
-                if not (data := self._decoder.unused_data or self._source.read(_PIECE_BYTES)):
-                    return b""
-                self._decoder = self._make()
-            elif self._decoder.needs_input and not (data := self._source.read(_PIECE_BYTES)):
-                raise EOFError("no end mark")
-            if out := self._decoder.decompress(data, max_length=count):
-                return bytes(out)
-
-
-def _zstd(source: Readable) -> Readable:
-    import zstandard
-
-    decoder = zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW_BYTES)
-    return decoder.stream_reader(source, read_across_frames=True)  # type: ignore[arg-type]  # reads alone are needed
-
-
-def _lz4(source: Readable) -> Readable:
-    import lz4.frame
-
-    return _Frames(lz4.frame.LZ4FrameDecompressor, source)
-
-
-_DECODERS: dict[bytes, Callable[[Readable], Readable]] = {
-    ZSTD_MAGIC: _zstd,
-    b"\x1f\x8b": lambda source: GzipFile(fileobj=source, mode="rb"),  # type: ignore[call-overload]  # as above
-    b"BZh": partial(_Frames, bz2.BZ2Decompressor),
-    b"\x04\x22\x4d\x18": _lz4,
-    b"\xfd7zXZ\0": partial(_Frames, partial(lzma.LZMADecompressor, memlimit=_LARGEST_WINDOW_BYTES)),
-}
-
-
-@cache
-def _damage() -> tuple[type[Exception], ...]:
-    """Return what decoders raise of data that is damaged or cut off."""
-    import zstandard
-
-    return (
-        OSError, EOFError, RuntimeError, ValueError, NotImplementedError, zlib.error, lzma.LZMAError,
-        zipfile.BadZipFile, zstandard.ZstdError,
-    )  # fmt: skip

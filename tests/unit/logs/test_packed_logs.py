@@ -25,17 +25,22 @@ import lz4.frame
 import pytest
 import zstandard
 
-from icrtool.errors import LogError
+from icrtool.config import load_config
+from icrtool.errors import LogChangedError, LogError
 from icrtool.fleet.recordings import find_recordings
+from icrtool.logs import table_file
 from icrtool.logs.containers import unpack
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.read_log import read_log
 
 SAMPLES = Path(__file__).parents[3] / "sample_logs"
 MCAP, BAG, DIRECTORY = (
     SAMPLES / name for name in ("wheeled_lawnmower.mcap", "tracked_curved.bag", "wheeled_figure_eight")
 )
 DB3 = DIRECTORY / "wheeled_figure_eight.db3"
+CONFIG = load_config(robot="segway-rmp400")
+ROWS = range(100)
 PACKERS: dict[str, Callable[[bytes], bytes]] = {
     ".gz": gzip.compress,
     ".bz2": bz2.compress,
@@ -295,6 +300,60 @@ def command(*arguments: str, temporary: Path, **options) -> subprocess.Popen[byt
         stderr=subprocess.PIPE,
         **options,
     )
+
+
+TABLE = b"t_s,v_left_mps,v_right_mps,north_m,east_m,yaw_rad\n" + b"".join(
+    b"%d,1,1,%d,0,0\n" % (k, k) for k in range(100)
+)
+
+
+@pytest.mark.parametrize("packing", PACKERS)
+def test_a_compressed_table_is_the_table(tmp_path, packing):
+    plain, packed = tmp_path / "drive.csv", tmp_path / f"drive.csv{packing}"
+    plain.write_bytes(TABLE)
+    packed.write_bytes(PACKERS[packing](TABLE))
+    expected, found = read_log(plain), read_log(packed)
+    assert found.wheels.left.tolist() == expected.wheels.left.tolist()
+    assert found.gnss.north_m.tolist() == expected.gnss.north_m.tolist()
+    (one,) = found.inputs
+    assert (one.path, one.sha256) == (str(packed), hashlib.sha256(packed.read_bytes()).hexdigest())
+    assert found.name == "drive"
+    packed.write_bytes(packed.read_bytes()[:-10])
+    with pytest.raises(LogError, match="does not decompress"):
+        read_log(packed)
+
+
+def append(file: Path) -> None:
+    with file.open("ab") as stream:
+        stream.write(b"\0")
+
+
+@pytest.mark.parametrize("log", [MCAP, BAG, DB3, DIRECTORY, "a.mcap.gz"])
+def test_a_log_that_is_written_to_while_it_is_read_is_refused(tmp_path, log):
+    if log == "a.mcap.gz":
+        place = file = tmp_path / log
+        file.write_bytes(gzip.compress(MCAP.read_bytes()))
+    else:
+        place = tmp_path / log.name
+        (shutil.copytree if log.is_dir() else shutil.copy)(log, place)
+        file = place / DB3.name if log.is_dir() else place
+    assert len(read_log(place, CONFIG).wheels.stamp_ns)
+    with pytest.raises(LogChangedError, match="changed while it was read"):
+        read_log(place, CONFIG, progress=lambda share: append(file))
+
+
+def test_a_table_that_is_written_to_while_it_is_read_is_refused(tmp_path, monkeypatch):
+    file = tmp_path / "drive.csv"
+    file.write_bytes(TABLE)
+    whole = table_file.csv_frame
+
+    def while_it_is_written(path: Path) -> object:
+        append(file)
+        return whole(path)
+
+    monkeypatch.setattr(table_file, "csv_frame", while_it_is_written)
+    with pytest.raises(LogChangedError):
+        read_log(file)
 
 
 def test_standard_input_gives_the_numbers_of_the_file(tmp_path, temporary):

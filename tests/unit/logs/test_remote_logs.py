@@ -21,6 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
 from icrtool.cli.compare import _named
+from icrtool.config import load_config
 from icrtool.errors import LogError
 from icrtool.fleet.manifest import read_manifest
 from icrtool.fleet.recordings import find_recordings
@@ -41,6 +42,8 @@ MCAP, BAG, DIRECTORY = (
 )
 DB3 = DIRECTORY / "wheeled_figure_eight.db3"
 PICTURE_BYTES = 400_000
+CONFIG = load_config(robot="segway-rmp400")
+ROWS = range(100)
 TOKEN = f"sig={SECRET}"
 ROBOT = ("--robot", "segway-rmp400")
 pytest.importorskip("fsspec", reason="needs the extra icrtool[cloud]")
@@ -221,6 +224,33 @@ def test_a_connection_that_stays_broken_is_one_line_without_secrets(monkeypatch)
     assert TOKEN not in str(caught.value)
     with pytest.raises(LogError, match="cannot be read"):
         open_log(UrlPath(f"{server.url}/{MCAP.name}?{TOKEN}"))
+
+
+@pytest.mark.parametrize("key", ["mon/a.mcap", "tue/b.bag", "wed/c", "packed/d.mcap.gz"])
+def test_an_object_that_is_replaced_while_it_is_read_is_refused(fresh, key):
+    assert len(read_log(f"s3://field/{key}", CONFIG).wheels.stamp_ns)
+    name = f"{key}/c.db3" if key == "wed/c" else key
+    content = fresh.client.get_object(Bucket="field", Key=name)["Body"].read()
+    done = []
+
+    def replace(_share: float) -> None:
+        if not done:
+            done.append(fresh.client.put_object(Bucket="field", Key=name, Body=content[:-1] + b"x"))
+
+    with pytest.raises(LogError, match=r"changed while it was read|gave|does not decompress"):
+        read_log(f"s3://field/{key}", CONFIG, progress=replace)
+    fresh.client.put_object(Bucket="field", Key=name, Body=content)
+
+
+def test_a_table_in_a_bucket_is_read_compressed_too(fresh):
+    table = b"t_s,v_left_mps,v_right_mps,north_m,east_m,yaw_rad\n" + b"".join(
+        b"%d,1,1,%d,0,0\n" % (k, k) for k in range(100)
+    )
+    fresh.client.put_object(Bucket="field", Key="tables/a.csv.gz", Body=gzip.compress(table))
+    log = read_log("s3://field/tables/a.csv.gz")
+    assert log.gnss.north_m.tolist() == list(ROWS)
+    assert (log.name, log.inputs[0].path) == ("a", "s3://field/tables/a.csv.gz")
+    fresh.client.delete_object(Bucket="field", Key="tables/a.csv.gz")
 
 
 def test_a_file_that_is_not_there_or_not_allowed_is_said_so(fresh):
