@@ -15,7 +15,6 @@ from icrtool.errors import OutputError
 from icrtool.fleet.recordings import as_text
 from icrtool.fleet.roll_up import CALIBRATIONS, MOST_POOLED_S
 from icrtool.output.figure_catalogue import FIGURES
-from icrtool.output.files import disk
 from icrtool.output.files.atomic import atomic_file, make_folders, write_file
 from icrtool.output.files.csv_file import csv_bytes
 from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, json_bytes, schema_of
@@ -34,6 +33,7 @@ from icrtool.records.fleet_document import (
     FleetLog,
 )
 from icrtool.records.plain_data import rows_of
+from icrtool.records.process_resources import remove
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.text import LogText, counted, escaped
 
@@ -192,7 +192,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, formats: tuple[str, ..
         save_picture(figure, file, folder)
     for name in (name for name, entry in FIGURES.items() if entry.of == "fleet"):
         for old in {directory / f"{name}.{form}" for form in PLOT_FORMATS} - set(drawn):
-            disk.remove(old)
+            remove(old)
 
 
 def _write_parquet(columns: Mapping[str, Sequence[object]], file: Path) -> None:

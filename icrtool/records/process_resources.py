@@ -62,13 +62,19 @@ def remove_unfinished() -> None:
     """Remove all that is being written; called where no other code of this process will do it any more."""
     for path in list(_paths):
         for _ in range(TRIES):
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
+            remove(path)
             if not path.exists():
                 break
     _remove_empty(list(_parents))
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a directory, as far as that is possible."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def _remove_empty(directories: list[Path]) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import sys
 from io import BufferedReader
 from typing import TYPE_CHECKING
 
@@ -19,10 +18,9 @@ if TYPE_CHECKING:
 LARGEST_DOCUMENT_BYTES = 1 << 28
 """Of a file that is read into memory whole: the run.json of a long drive has some MB."""
 
-# Windows has neither; there links are looked for before, and pipes are no files.
+# Windows has neither; there pipes are no files.
 _FILE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-_FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
 
 NOT_REGULAR = "not a regular file"
 SAVE_IT = "save what it gives to a file, and name that"
@@ -50,7 +48,11 @@ def open_regular(path: Path, inside: Path | None = None) -> BufferedReader:
     OSError
         It cannot be opened.
     """
-    handle = os.open(path, _FILE) if inside is None else _open_inside(path, inside)
+    if inside is not None:
+        check_folders(path, inside)
+        if path.is_symlink():
+            raise NotRegularFileError(path, "a link, which is not followed")
+    handle = os.open(path, _FILE if inside is None else _FILE | _NO_LINK)
     try:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise NotRegularFileError(path)
@@ -106,29 +108,6 @@ def check_folders(path: Path, inside: Path) -> None:
         place = place / name
         if place.is_symlink() and (place != path or place.is_dir()):
             raise NotRegularFileError(place, f"{name} is a link, which is not followed")
-
-
-def _open_inside(path: Path, inside: Path) -> int:
-    *folders, name = _parts(path, inside)
-    if sys.platform == "win32":
-        check_folders(path, inside)
-        if path.is_symlink():
-            raise NotRegularFileError(path, "a link, which is not followed")
-        return os.open(path, _FILE)
-    folder = os.open(inside, _FOLDER)
-    try:
-        for each in folders:
-            inner = os.open(each, _FOLDER | _NO_LINK, dir_fd=folder)
-            os.close(folder)
-            folder = inner
-        return os.open(name, _FILE | _NO_LINK, dir_fd=folder)
-    except OSError as err:
-        # Linux: ELOOP for a link, ENOTDIR for one where a directory is expected.
-        if err.errno in (errno.ELOOP, errno.EMLINK, errno.ENXIO):
-            raise NotRegularFileError(path, "a link, which is not followed") from err
-        raise
-    finally:
-        os.close(folder)
 
 
 def _parts(path: Path, inside: Path) -> tuple[str, ...]:

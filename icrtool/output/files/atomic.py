@@ -24,7 +24,7 @@ from icrtool.output.files.own_files import (
     reported,
     write_own_files,
 )  # fmt: skip
-from icrtool.records.process_resources import end, unfinished, with_parents
+from icrtool.records.process_resources import end, remove, unfinished, with_parents
 from icrtool.records.regular_file import check_folders
 
 
@@ -46,12 +46,10 @@ def atomic_file(file: Path, inside: Path | None = None, ours: IsOurFile | None =
     """
     with reported(file):
         place = place_of_file(file, inside, ours)
-        with _hidden(place) as partial:
-            partial.touch(exist_ok=False)
-            with disk.locked(partial):
-                yield partial
-                disk.sync(partial)
-                partial.replace(place_of_file(file, inside, ours))
+        with _hidden(place, lambda new: new.touch(exist_ok=False)) as partial:
+            yield partial
+            disk.sync(partial)
+            partial.replace(place_of_file(file, inside, ours))
         disk.sync(place.parent)
 
 
@@ -118,7 +116,7 @@ def atomic_directory(
     """
     check_directory(directory, ours, kind=kind, inside=inside)
     place = real_place(directory)
-    with reported(directory), with_parents(place) as made, hidden_directory(place) as partial:
+    with reported(directory), with_parents(place) as made, _hidden(place, Path.mkdir) as partial:
         for parent in made:
             disk.sync(parent.parent)
         yield partial
@@ -141,25 +139,28 @@ def hidden_directory(place: Path) -> Iterator[Path]:
     OSError
         It cannot be made.
     """
-    with _hidden(place) as partial:
-        partial.mkdir()
-        with disk.locked(partial):
-            yield partial
+    with _hidden(place, Path.mkdir) as partial:
+        yield partial
 
 
 @contextmanager
-def _hidden(place: Path) -> Iterator[Path]:
-    """Give a hidden name beside a place, and remove what has it at the end; what killed processes left is removed."""
+def _hidden(place: Path, make: Callable[[Path], None]) -> Iterator[Path]:
+    """Make a file or directory under a hidden name beside a place, and remove what has that name at the end.
+
+    What killed processes left there is removed too.
+    """
     # What was renamed aside is needed as long as nothing is in its place.
     for left in disk.hidden(place, ".partial") + (disk.hidden(place, ".old") if place.exists() else []):
         if disk.is_abandoned(left):
-            disk.remove(left)
+            remove(left)
     partial = disk.hidden_name(place)
-    try:
-        with unfinished(partial):
-            yield partial
-    finally:
-        disk.remove(partial)
+    with unfinished(partial):
+        try:
+            make(partial)
+            with disk.locked(partial):
+                yield partial
+        finally:
+            remove(partial)
 
 
 def put(partial: Path, place: Path, aside: Path | None = None) -> None:
@@ -190,4 +191,4 @@ def put(partial: Path, place: Path, aside: Path | None = None) -> None:
             raise
     with unfinished(old):
         disk.sync(place.parent)
-        disk.remove(old)
+        remove(old)

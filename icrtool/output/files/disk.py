@@ -12,15 +12,14 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
 
 if sys.platform != "win32":
     import fcntl
 
-NO_EXCHANGE = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
-"""What a kernel or a file system answers that cannot exchange; network file systems are among them."""
+NO_SYNC = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 NO_LINK = {errno.EPERM, errno.EXDEV, errno.EMLINK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EACCES}
 
@@ -63,9 +62,7 @@ def _hidden_begin(place: Path) -> str:
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Lock a file or directory, where that is possible, until the block or the process ends."""
-    handle = None
-    with suppress(OSError):
-        handle = _lock(path)
+    handle = _lock(path)
     try:
         yield
     finally:
@@ -74,53 +71,42 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def is_abandoned(path: Path) -> bool:
-    """Return whether no living process writes what `locked` locked."""
+    """Return whether no living process writes what `locked` locked; where there are no locks its age decides."""
     try:
-        os.close(_lock(path))
+        handle = _lock(path)
     except BlockingIOError:
         return False
-    except OSError:  # no locks here, or not ours to open: its age decides
+    if handle is None:
         return path.exists() and time.time() - path.stat().st_mtime > LONGEST_WRITE_S
+    os.close(handle)
     return True
 
 
-def _lock(path: Path) -> int:
+def _lock(path: Path) -> int | None:
+    """Return the handle that holds a lock; None where there are no locks, or the path is not ours to open."""
     if sys.platform == "win32":
-        raise OSError(errno.ENOSYS, "no locks", str(path))
-    handle = os.open(path, _LOOK)
+        return None
+    handle = None
     try:
+        handle = os.open(path, _LOOK)
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(handle)
-        raise
+    except OSError as err:
+        if handle is not None:
+            os.close(handle)
+        if isinstance(err, BlockingIOError):
+            raise
+        return None
     return handle
 
 
 def exchange(one: Path, other: Path) -> bool:
-    """Give two directories each other's names in one step.
-
-    Returns
-    -------
-    bool
-        Whether it was done; False where the platform or the file system has no such call.
-
-    Raises
-    ------
-    OSError
-        It has one, and it failed.
-    """
+    """Give two directories each other's names in one step, and return whether that was possible here."""
     if sys.platform not in ("linux", "darwin"):
         return False
-    libc = ctypes.CDLL(None, use_errno=True)
+    libc, names = ctypes.CDLL(None), (os.fsencode(one), os.fsencode(other))
     if hasattr(libc, "renameat2"):
-        failed = libc.renameat2(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE)
-    elif hasattr(libc, "renamex_np"):
-        failed = libc.renamex_np(os.fsencode(one), os.fsencode(other), RENAME_EXCHANGE)
-    else:
-        return False
-    if failed and (number := ctypes.get_errno()) not in NO_EXCHANGE:
-        raise OSError(number, os.strerror(number), str(one))
-    return not failed
+        return not libc.renameat2(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE)
+    return hasattr(libc, "renamex_np") and not libc.renamex_np(*names, RENAME_EXCHANGE)
 
 
 def link(source: Path, target: Path) -> None:
@@ -144,7 +130,7 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     except OSError as err:
         # Some network file systems have no sync for directories; a file whose sync fails is not written.
-        if err.errno not in NO_EXCHANGE or not path.is_dir():
+        if err.errno not in NO_SYNC or not path.is_dir():
             raise
     finally:
         os.close(handle)
@@ -160,12 +146,3 @@ def sync_tree(directory: Path) -> None:
         list(pool.map(sync, files))
     for path in directories:
         sync(path)
-
-
-def remove(path: Path) -> None:
-    """Remove a file or a directory; what cannot be removed is hidden, and is left to the next run."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)

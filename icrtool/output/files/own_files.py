@@ -10,10 +10,13 @@ import os
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Literal
+
+import msgspec
 
 from icrtool.errors import OutputError
 from icrtool.output.files import disk
+from icrtool.records.plain_data import Record
 from icrtool.records.regular_file import check_folders, open_regular, read_regular
 from icrtool.records.text import escaped, listed
 
@@ -24,9 +27,7 @@ IsOurFile = Callable[[bytes], bool]
 """Whether a file, of which the first bytes are given, is one that we wrote and may replace."""
 
 OWN_FILES = ".icrtool-files"
-"""List of the files that were written with a directory: JSON with the keys of `OwnFiles`, and `schema`."""
-
-SCHEMA = "icrtool/files/1"
+"""List of the files that were written with a directory: `OwnFiles` as JSON."""
 
 EXPORTED_MCAP = b"icrtool export"
 """Library in the header of an MCAP file that `icrtool export` wrote: it is no log of somebody's."""
@@ -161,8 +162,8 @@ def restore(directory: Path, ours: IsOurs) -> None:
             max(aside, key=lambda path: path.stat().st_mtime_ns).rename(place)
 
 
-class OwnFiles(NamedTuple):
-    """What icrtool wrote in a directory.
+class OwnFiles(Record, frozen=True):
+    """What icrtool wrote in a directory, as its list states.
 
     Attributes
     ----------
@@ -174,18 +175,15 @@ class OwnFiles(NamedTuple):
     kind: str = ""
     files: frozenset[str] = frozenset()
     made_from: frozenset[str] = frozenset()
+    schema: Literal["icrtool/files/1"] = "icrtool/files/1"
 
 
 def own_files(directory: Path) -> OwnFiles:
     """Return what the list of a directory states; nothing where it has none."""
     try:
-        document = json.loads(read_regular(directory / OWN_FILES, directory))
-        if document["schema"] == SCHEMA:
-            files, sources = (frozenset(map(str, document.get(key, ()))) for key in ("files", "made_from"))
-            return OwnFiles(str(document["kind"]), files, sources)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        pass
-    return OwnFiles()
+        return msgspec.convert(json.loads(read_regular(directory / OWN_FILES, directory)), OwnFiles)
+    except (OSError, ValueError, RecursionError):
+        return OwnFiles()
 
 
 def files_in(directory: Path) -> list[PurePosixPath]:
@@ -196,7 +194,7 @@ def files_in(directory: Path) -> list[PurePosixPath]:
 
 def write_own_files(directory: Path, own: OwnFiles) -> None:
     """Write the list of a directory that is about to be put in place."""
-    document = {"schema": SCHEMA, "kind": own.kind, "files": sorted(own.files), "made_from": sorted(own.made_from)}
+    document = {"schema": own.schema, "kind": own.kind, "files": sorted(own.files), "made_from": sorted(own.made_from)}
     (directory / OWN_FILES).write_text(json.dumps(document, indent=0) + "\n", encoding="utf-8")
 
 

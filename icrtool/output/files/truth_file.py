@@ -13,6 +13,7 @@ from icrtool.output.files import disk
 from icrtool.output.files.atomic import hidden_directory, put
 from icrtool.output.files.csv_file import read_numbers
 from icrtool.output.files.own_files import reported, restore
+from icrtool.records.process_resources import remove
 from icrtool.simulation.drives import TrackSpeeds
 from icrtool.simulation.record import TruthTable
 
@@ -50,7 +51,7 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
             yield fresh / log.name, fresh / truth.name
             disk.sync_tree(fresh)
             # Killed from here on, it leaves a log without its truth, never with that of another log.
-            disk.remove(truth)
+            remove(truth)
             if log.is_dir():
                 put(fresh / log.name, log, fresh)
             else:
