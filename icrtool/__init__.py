@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.trials import dropout
     from icrtool.errors import IcrToolError
     from icrtool.logs.read_log import read_log
-    from icrtool.output.files.calibration_file import open_calibration
+    from icrtool.output.files.documents import open_calibration
     from icrtool.output.page.run_page import write_page
     from icrtool.output.stored_run import open_run
     from icrtool.records.run import Run, WarmStart
@@ -81,7 +81,7 @@ _HOMES = {
     "dropout_report": "icrtool.dropout_analysis.dropout_report",
     "fit": "icrtool.calibration.fit",
     "load_config": "icrtool.config",
-    "open_calibration": "icrtool.output.files.calibration_file",
+    "open_calibration": "icrtool.output.files.documents",
     "open_run": "icrtool.output.stored_run",
     "read_log": "icrtool.logs.read_log",
     "write_page": "icrtool.output.page.run_page",

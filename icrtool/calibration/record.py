@@ -184,7 +184,7 @@ class Calibration:
         OutputError
             Something that is not a calibration is there, or it cannot be written.
         """
-        file: Path = call_output("files.calibration_file", "write_calibration", self.document(), Path(path))
+        file: Path = call_output("files.documents", "write_calibration", self.document(), Path(path))
         return file
 
     def __repr__(self) -> str:

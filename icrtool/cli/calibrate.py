@@ -51,7 +51,7 @@ def command(
       icrtool calibrate icrtool-runs -o calibration.json
     """  # noqa: D301 - click reads the escape
     from icrtool.errors import IcrToolError
-    from icrtool.output.files.calibration_file import calibration_file, write_calibration
+    from icrtool.output.files.documents import calibration_file, write_calibration
 
     config = options.load(config_file, robot, sets)
     sources = tuple(one for source in sources for one in runs_or_logs(source))
@@ -147,7 +147,7 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
     from icrtool.output.figures.calibration import residuals_figure
-    from icrtool.output.files.picture_file import save_picture
+    from icrtool.output.files.formats import save_picture
     from icrtool.output.stored_run import log_of
 
     log = read_log(source if run.directory is None else log_of(run), run.config)

@@ -44,8 +44,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.calibration.transfer import compare_groups
     from icrtool.output.files.atomic import write_file
-    from icrtool.output.files.json_file import json_bytes
-    from icrtool.output.files.picture_file import save_picture
+    from icrtool.output.files.formats import json_bytes, save_picture
     from icrtool.output.tables.transfer import brief_transfer, format_transfer, transfer_csv
 
     config = options.load(config_file, robot, sets)

@@ -108,7 +108,7 @@ def command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.files.calibration_file import open_calibration
+    from icrtool.output.files.documents import open_calibration
 
     config = options.load(config_file, robot, sets)
     dropout, given = config.dropout, config.given

@@ -119,7 +119,7 @@ def _write_foxglove(run: Run, output: Path) -> None:
     from icrtool.output.exports.foxglove import write_foxglove
     from icrtool.output.exports.foxglove_layout import foxglove_layout, is_layout
     from icrtool.output.files.atomic import atomic_file, write_file
-    from icrtool.output.files.json_file import json_bytes
+    from icrtool.output.files.formats import json_bytes
     from icrtool.output.files.own_files import check_place
 
     layout = output.with_name(f"{output.stem}.layout.json")
@@ -161,7 +161,7 @@ def read_calibration(source: Path | None, *, force: bool = False, advice: str = 
     from icrtool.output.stored_run import newest_run, open_run
 
     if source is not None and source.is_file():
-        from icrtool.output.files.calibration_file import open_calibration
+        from icrtool.output.files.documents import open_calibration
 
         return source.name, open_calibration(source)
     from icrtool.calibration.from_runs import calibrate

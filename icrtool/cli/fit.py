@@ -164,7 +164,7 @@ def _other_robot(source: Path | None, start: WarmStart | None, config: Config) -
 def _warm_start(source: Path) -> WarmStart:
     """Return the ICRs that a run ended with, or those of a calibration file."""
     if source.is_file():
-        from icrtool.output.files.calibration_file import open_calibration
+        from icrtool.output.files.documents import open_calibration
 
         return open_calibration(source).warm_start()
     from icrtool.output.stored_run import open_run

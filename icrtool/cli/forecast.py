@@ -47,7 +47,7 @@ def command(
       icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
     """  # noqa: D301 - click reads the escape
     from icrtool.output.files.atomic import write_file
-    from icrtool.output.files.picture_file import save_picture
+    from icrtool.output.files.formats import save_picture
     from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast, measured_to_m
 
     _, calibration = read_calibration(calibration_file)
@@ -79,7 +79,7 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
         with_gyro = with_gyro and recording.track.gyro is not None
         forecast = partial(forecast_drive, calibration, recording)
     else:
-        from icrtool.output.files.csv_file import read_numbers
+        from icrtool.output.files.formats import read_numbers
 
         plan = read_numbers(path, ("east_m", "north_m"), ("speed_mps",), most_bytes=LARGEST_PLAN_BYTES)
         forecast = partial(forecast_plan, calibration, plan["east_m"], plan["north_m"], plan.get("speed_mps"))

@@ -28,7 +28,7 @@ def print_json(command: str, document: msgspec.Struct | Mapping[str, object]) ->
     document : a record, or plain data and numpy's; numbers that are not finite become null
     """
     from icrtool import __version__
-    from icrtool.output.files.json_file import json_bytes
+    from icrtool.output.files.formats import json_bytes
     from icrtool.records.plain_data import plain
 
     own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}

@@ -69,7 +69,7 @@ class _NewFile(click.Path):
         """Return the path."""
         path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]  # as path_type asks
         if self._picture:
-            from icrtool.output.files.picture_file import check_picture
+            from icrtool.output.files.formats import check_picture
 
             check_picture(path)
         else:
@@ -135,7 +135,7 @@ def plot_formats(text: str) -> tuple[str, ...]:
     formats = tuple(part.strip().lower() for part in text.split(",") if part.strip())
     if formats == ("none",):
         return ()
-    from icrtool.output.run_directory import PLOT_FORMATS
+    from icrtool.output.files.formats import PLOT_FORMATS
 
     unknown = [part for part in formats if part not in PLOT_FORMATS]
     if unknown or not formats:

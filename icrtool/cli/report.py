@@ -55,10 +55,12 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
 def _page_of(source: Path, *, coordinates: bool) -> str:
     """Return the page of a run, a fleet or a comparison."""
     from icrtool.errors import RunError
-    from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, read_fleet, schema_of
+    from icrtool.output.files.documents import read_fleet
+    from icrtool.output.files.formats import schema_of
     from icrtool.output.page.comparison_page import comparison_in, comparison_page, read_comparison
     from icrtool.output.page.fleet_page import fleet_page
     from icrtool.output.run_directory import is_run_directory
+    from icrtool.records.fleet_document import FLEET_FAMILY, FLEET_FILE
     from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
 
     if is_run_directory(source):

@@ -112,7 +112,7 @@ def finished(request: Request, folder: Path) -> FleetLog | None:
     ----------
     folder : on disk, of the results
     """
-    from icrtool.output.files.checksums import CHECKSUM_FILE
+    from icrtool.output.files.formats import CHECKSUM_FILE
     from icrtool.output.run_directory import PAGE_FILE
 
     try:

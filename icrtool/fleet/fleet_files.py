@@ -16,12 +16,13 @@ from icrtool.fleet.recordings import as_text
 from icrtool.fleet.roll_up import CALIBRATIONS, MOST_POOLED_S
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files.atomic import atomic_file, make_folders, write_file
-from icrtool.output.files.csv_file import csv_bytes
-from icrtool.output.files.json_file import FLEET_FAMILY, FLEET_FILE, json_bytes, schema_of
+from icrtool.output.files.formats import PLOT_FORMATS, csv_bytes, json_bytes, schema_of
 from icrtool.output.files.own_files import check_place, is_page
-from icrtool.output.run_directory import PAGE_FILE, PLOT_FORMATS
+from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records.fleet_document import (
+    FLEET_FAMILY,
+    FLEET_FILE,
     FLEET_SCHEMA,
     ROWS,
     RUNS,
@@ -171,7 +172,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, formats: tuple[str, ..
     """
     from icrtool.output.figure_catalogue import figures_of
     from icrtool.output.figures.fleet import FleetNumbers
-    from icrtool.output.files.picture_file import save_picture
+    from icrtool.output.files.formats import save_picture
 
     points: list[FleetLog] = []
     errors: dict[str, dict[str, float]] = {}

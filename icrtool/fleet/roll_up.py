@@ -15,9 +15,8 @@ from icrtool import __version__
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import unique_name
 from icrtool.output.files.atomic import make_folders
-from icrtool.output.files.calibration_file import write_calibration
-from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet, read_fleet
-from icrtool.records.fleet_document import BUDGET_M, FleetCalibration, FleetFile, FleetLog
+from icrtool.output.files.documents import logs_of_fleet, read_fleet, write_calibration
+from icrtool.records.fleet_document import BUDGET_M, FLEET_FILE, FleetCalibration, FleetFile, FleetLog
 from icrtool.records.regular_file import is_regular
 from icrtool.records.run import Run
 

@@ -18,9 +18,7 @@ from icrtool.kernels.open_loop.block_sums import FEWEST_BLOCKS, HORIZONS_A_BLOCK
 from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
 from icrtool.kernels.open_loop.trials import Summary
 from icrtool.output.files.atomic import atomic_directory
-from icrtool.output.files.checksums import list_anew
-from icrtool.output.files.csv_file import csv_bytes
-from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, schema_of
 from icrtool.output.files.own_files import files_in
 from icrtool.output.files.states_file import trials_file
 from icrtool.output.run_directory import is_run_directory

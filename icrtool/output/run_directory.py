@@ -14,9 +14,7 @@ import msgspec
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import file_sha256, files_of_log
 from icrtool.output.files.atomic import atomic_directory
-from icrtool.output.files.checksums import file_b2sum, write_sums
-from icrtool.output.files.csv_file import csv_bytes
-from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.output.files.formats import PLOT_FORMATS, csv_bytes, file_b2sum, json_bytes, schema_of, write_sums
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.files.own_files import check_directory, own_files
 from icrtool.output.files.remote_place import lies_there
@@ -36,8 +34,6 @@ SMOOTHED_FILES: dict[str, StatesFormat] = {"smoothed.csv": "csv", "smoothed.parq
 
 MOST_CSV_STATES = 1_000_000
 """With more states, states.csv would have over 300 MB, and take longer to read than the log."""
-
-PLOT_FORMATS = ("png", "svg", "pdf")
 
 SCHEMA_FAMILY = "icrtool/run/"
 

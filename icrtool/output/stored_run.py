@@ -14,7 +14,7 @@ import numpy as np
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, RunError
 from icrtool.logs.containers.split_files import numbered_file, split_path
-from icrtool.output.files.checksums import CHECKSUM_FILE, file_b2sum, read_sums
+from icrtool.output.files.formats import CHECKSUM_FILE, file_b2sum, read_sums
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
 from icrtool.output.files.remote_place import fetched
 from icrtool.output.files.states_file import StatesFileError, StatesFormat, read_states

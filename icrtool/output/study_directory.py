@@ -7,8 +7,7 @@ from typing import Any
 
 from icrtool import __version__
 from icrtool.output.files.atomic import atomic_directory
-from icrtool.output.files.csv_file import csv_bytes
-from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.output.files.formats import csv_bytes, json_bytes, schema_of
 from icrtool.output.files.own_files import check_directory
 from icrtool.simulation.study_records import Column, StudyResult
 

@@ -12,6 +12,12 @@ from icrtool.records.plain_data import Record
 FLEET_SCHEMA: Literal["icrtool/fleet/1"] = "icrtool/fleet/1"
 """Version of what fleet.json holds."""
 
+FLEET_FILE = "fleet.json"
+"""What a batch found, in its folder."""
+
+FLEET_FAMILY = "icrtool/fleet/"
+"""Schema of such a file, of whatever version."""
+
 RUNS, ROWS = "runs", ".rows"
 """Folders of a batch: of the runs, and of the rows of the logs, written as they come."""
 

@@ -10,7 +10,7 @@ import pytest
 
 import icrtool as library
 from icrtool.calibration.from_runs import calibrate_runs
-from icrtool.output.files.checksums import CHECKSUM_FILE, file_b2sum
+from icrtool.output.files.formats import CHECKSUM_FILE, file_b2sum
 from icrtool.output.run_directory import RUN_FILE
 
 LOGS = Path(__file__).resolve().parents[2] / "sample_logs"

@@ -25,7 +25,7 @@ from icrtool.motion.fit import own_constants
 from icrtool.motion.models import controller_model
 from icrtool.motion.recording import Trials, cut_windows, predicted_path
 from icrtool.output.dropout_directory import report_document
-from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.formats import json_bytes
 from icrtool.output.page import drive_data
 from icrtool.output.page.comparison_page import comparison_page
 from icrtool.output.page.fleet_page import fleet_page

@@ -16,7 +16,7 @@ from icrtool.calibration.error_growth import TWIST_OVER_M
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.output.exports.twist_model import format_twist
-from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.formats import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import controller_error_text
 from icrtool.records.calibration_document import ControllerErrors

@@ -12,7 +12,7 @@ from icrtool.calibration.controller_numbers import POSE_AFTER_M
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
 from icrtool.motion.models import TERMS, Term, wheel_motion
-from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.formats import json_bytes
 from icrtool.records.plain_data import plain
 
 TWIST_SCHEMA = "icrtool/twist/1"

@@ -13,8 +13,9 @@ import msgspec
 from icrtool.dropout_analysis.report import BaselineReport, baseline_report, known_content
 from icrtool.errors import ConfigError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
-from icrtool.output.files.json_file import FLEET_FILE, logs_of_fleet
+from icrtool.output.files.documents import logs_of_fleet
 from icrtool.records.dropout_document import EarlierReport
+from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
 from icrtool.records.text import escaped
 

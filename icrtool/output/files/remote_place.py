@@ -15,9 +15,9 @@ from icrtool.errors import IcrToolError, LogError, OutputError
 from icrtool.logs.containers.address import asked, filesystem
 from icrtool.logs.containers.unpack import ScratchFolder
 from icrtool.output.files.atomic import make_folders, write_file
-from icrtool.output.files.checksums import CHECKSUM_FILE
-from icrtool.output.files.json_file import FLEET_FILE
+from icrtool.output.files.formats import CHECKSUM_FILE
 from icrtool.output.files.own_files import OWN_FILES, reported
+from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.urls import UrlPath
 
 Result = TypeVar("Result")

@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.errors import DataError, OutputError
 from icrtool.output.files import disk
 from icrtool.output.files.atomic import hidden_directory, put
-from icrtool.output.files.csv_file import read_numbers
+from icrtool.output.files.formats import read_numbers
 from icrtool.output.files.own_files import reported, restore
 from icrtool.records.process_resources import remove
 from icrtool.simulation.drives import TrackSpeeds

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from icrtool.motion.models import FAMILY
-from icrtool.output.files.json_file import schema_of
+from icrtool.output.files.formats import schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS
 from icrtool.output.page.pictures import drawn_pictures
 from icrtool.output.page.render import render

@@ -18,8 +18,7 @@ from icrtool.errors import RunError
 from icrtool.motion.models import TERMS
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, report_document
 from icrtool.output.files.atomic import write_file
-from icrtool.output.files.checksums import CHECKSUM_FILE, read_sums
-from icrtool.output.files.json_file import schema_of
+from icrtool.output.files.formats import CHECKSUM_FILE, read_sums, schema_of
 from icrtool.output.files.own_files import is_page
 from icrtool.output.page.answer import answer_of
 from icrtool.output.page.drive_data import drive_data, in_order, main_rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from icrtool.output.files.csv_file import csv_bytes
+from icrtool.output.files.formats import csv_bytes
 from icrtool.output.text_blocks import Block, Table, Text
 from icrtool.records.calibration_document import ErrorsAt, GroupComparison, TransferCell
 from icrtool.records.dropout import CHOICE_HORIZON_M

@@ -19,7 +19,7 @@ from icrtool.calibration.record import Calibration, ErrorSources, read_calibrati
 from icrtool.errors import DataError, IcrToolError
 from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
 from icrtool.motion.recording import cut_trials
-from icrtool.output.files.csv_file import read_numbers
+from icrtool.output.files.formats import read_numbers
 from icrtool.output.tables.forecast import forecast_csv, reach
 from support.recordings import WIDTH_M, draw_parameters, make_recording, trials_from_all
 

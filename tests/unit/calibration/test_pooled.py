@@ -20,7 +20,7 @@ from icrtool.kernels.arrays import Bools
 from icrtool.motion.fit import Pool, own_constants
 from icrtool.motion.models import FAMILY, MODELS
 from icrtool.motion.recording import Recording, Trials, Windows, cut_trials, cut_windows, predicted_path
-from icrtool.output.files.calibration_file import open_calibration, write_calibration
+from icrtool.output.files.documents import open_calibration, write_calibration
 from icrtool.output.tables.held_out import format_result
 from icrtool.records.calibration_document import CalibratedRobot
 from icrtool.records.dropout import MeasuredHeading

@@ -16,7 +16,7 @@ from icrtool.calibration.transfer import compare_calibrations, compare_groups
 from icrtool.errors import ConfigError
 from icrtool.motion.models import MODELS
 from icrtool.motion.recording import Recording
-from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.formats import json_bytes
 from icrtool.output.tables.transfer import format_transfer, transfer_csv
 from icrtool.records.calibration_document import GroupComparison
 from support.recordings import make_recording

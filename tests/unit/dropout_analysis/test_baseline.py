@@ -21,7 +21,7 @@ from icrtool.fleet.roll_up import runs_of_fleet
 from icrtool.kernels.open_loop.block_sums import BlockSums, block_sums, difference_half_width
 from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
 from icrtool.output.files.baseline_file import open_baseline, read_report
-from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.formats import json_bytes
 from icrtool.records.dropout_document import EarlierInput
 from icrtool.records.fleet_document import FleetFile, FleetLog
 from icrtool.records.run import Run

@@ -27,7 +27,7 @@ from icrtool.output.dropout_directory import (
     write_tables,
 )
 from icrtool.output.files import disk
-from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.formats import json_bytes
 from icrtool.output.files.states_file import trials_file
 from icrtool.records.run import Run
 from support.contract import SUMMARY_COLUMNS

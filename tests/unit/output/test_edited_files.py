@@ -15,8 +15,8 @@ import pytest
 
 import icrtool
 from icrtool.errors import IcrToolError
-from icrtool.output.files.calibration_file import open_calibration
-from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.documents import open_calibration
+from icrtool.output.files.formats import json_bytes
 from icrtool.output.files.states_file import COLUMNS, INTEGER_COLUMNS
 from icrtool.output.run_directory import events_csv
 from icrtool.output.stored_run import log_of

@@ -8,7 +8,7 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.output.files.json_file import json_bytes
+from icrtool.output.files.formats import json_bytes
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 
 

@@ -1,4 +1,4 @@
-"""The calibration file: written whole or not at all, read back as a `Calibration`."""
+"""Calibration files, written whole or not at all and read back, and the fleet.json of a batch."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.atomic import write_file
-from icrtool.output.files.json_file import json_bytes, schema_of
+from icrtool.output.files.formats import json_bytes, schema_of
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationDocument
-from icrtool.records.regular_file import read_regular
+from icrtool.records.fleet_document import FLEET_FILE, FleetDocument, FleetLog
+from icrtool.records.regular_file import check_folders, read_regular
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
+
 
 FILE_NAME = "calibration.json"
 
@@ -87,3 +91,31 @@ def calibration_file(place: Path, inside: Path | None = None) -> Path:
     if file.exists() and not replaced and schema_of(file) != CALIBRATION_SCHEMA:
         raise OutputError(file, "a file that is not a calibration is there", "it is left alone; name another place")
     return file
+
+
+def read_fleet(directory: Path) -> FleetDocument:
+    """Return what the fleet.json of a batch holds.
+
+    Raises
+    ------
+    OSError, ValueError, RecursionError
+        It cannot be read, or is not of this version.
+    """
+    return msgspec.convert(json.loads(read_regular(directory / FLEET_FILE, directory)), FleetDocument)
+
+
+def logs_of_fleet(directory: Path) -> list[FleetLog]:
+    """Return the logs of a batch that could be used.
+
+    Raises
+    ------
+    RunError
+        The folder does not hold the result of a batch.
+    """
+    try:
+        found = [one for one in read_fleet(directory).logs if one.status != "failed"]
+        for one in found:
+            check_folders(directory / one.run, directory)
+    except (OSError, ValueError, RecursionError) as err:
+        raise RunError(directory, f"its {FLEET_FILE} cannot be read ({err})", "name the folder of a batch") from err
+    return found

@@ -1,0 +1,208 @@
+"""The formats of our files: JSON, CSV, pictures, and the list of their sums, by which an edited one is recognised."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import hashlib
+import io
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from icrtool.errors import DataError, OutputError, RunError
+from icrtool.kernels.arrays import Floats
+from icrtool.output.files.atomic import write_file
+from icrtool.output.files.own_files import check_place
+from icrtool.records.plain_data import plain
+from icrtool.records.regular_file import open_regular, read_regular
+from icrtool.records.text import LogText, table_cell
+
+if TYPE_CHECKING:
+    import msgspec
+    from matplotlib.figure import Figure
+
+
+def schema_of(file: Path, inside: Path | None = None) -> str:
+    """Return the schema that a JSON file states, for example ``icrtool/run/1``; empty where it states none.
+
+    Parameters
+    ----------
+    inside : as in `open_regular`
+    """
+    try:
+        schema = json.loads(read_regular(file, inside))["schema"]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return ""
+    return schema if isinstance(schema, str) else ""
+
+
+def json_bytes(document: msgspec.Struct | Mapping[str, Any]) -> bytes:
+    """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
+    text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
+    # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.
+    return (text + "\n").encode("utf-8", errors="backslashreplace")
+
+
+def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return plain data with the texts of a log unescaped: JSON has escapes of its own."""
+    if isinstance(value, dict):
+        return {key: _as_in_the_log(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_as_in_the_log(item) for item in value]
+    return value.raw if isinstance(value, LogText) else value
+
+
+def csv_bytes(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes:
+    """Return a table as CSV: numbers in their shortest exact form, empty where there is none, text as `table_cell`."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_cell(value) for value in row] for row in rows)
+    return text.getvalue().encode("utf-8", errors="backslashreplace")
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, str):
+        return table_cell(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_numbers(
+    path: Path, needed: Sequence[str], optional: Sequence[str] = (), *, most_bytes: int | None = None
+) -> dict[str, Floats]:
+    """Read columns of numbers (n,) by name; an empty cell is NaN, other columns are passed over.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read, is larger than `most_bytes`, lacks a column that is needed, or has fewer than two rows.
+    """
+    try:
+        with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig", newline="") as file:
+            if most_bytes is not None and path.stat().st_size > most_bytes:
+                raise DataError(path, f"larger than {most_bytes / 1e6:g} MB", "leave out some of its rows")
+            reader = csv.DictReader(file, skipinitialspace=True)
+            found = tuple(reader.fieldnames or ())
+            if missing := [name for name in needed if name not in found]:
+                raise DataError(path, f"no column {missing[0]}", f"it holds {', '.join(found) or 'nothing'}")
+            names = [*needed, *(name for name in optional if name in found)]
+            rows = [[float(row[name] or "nan") for name in names] for row in reader]
+    except OSError as err:
+        raise DataError(path, "cannot be read", err.strerror or str(err)) from err
+    except (UnicodeDecodeError, csv.Error, ValueError, TypeError) as err:
+        raise DataError(path, "not a table of numbers", str(err)) from err
+    if len(rows) < 2:
+        raise DataError(path, f"{len(rows)} rows", "at least two are needed")
+    return dict(zip(names, np.array(rows, np.float64).T.copy(), strict=True))
+
+
+PLOT_FORMATS = ("png", "svg", "pdf")
+
+
+def check_picture(file: Path) -> None:
+    """Refuse a place or a format that cannot be written, before any work is done for it.
+
+    Raises
+    ------
+    OutputError
+        Another suffix than png, svg, pdf, or no such folder.
+    """
+    if file.suffix.removeprefix(".").lower() not in PLOT_FORMATS:
+        raise OutputError(file, "its suffix is no format of a picture", f"end it in .{', .'.join(PLOT_FORMATS)}")
+    check_place(file)
+
+
+def save_picture(figure: Figure, file: Path, inside: Path | None = None) -> None:
+    """Write a figure; the suffix gives the format.
+
+    Parameters
+    ----------
+    inside : as in `icrtool.output.files.atomic.atomic_file`
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    form = file.suffix.removeprefix(".").lower()
+    from icrtool.output.figures.style import picture_bytes
+
+    write_file(file, picture_bytes(figure, form), inside)
+
+
+CHECKSUM_FILE = "B2SUMS"
+"""In a run: the sums of its files as ``b2sum --check`` reads them.
+
+It lists every file of the run and of its dropout report, but not the page. The list is true at every moment: while a
+report is replaced it does not name its files.
+"""
+
+LARGEST_RUN_FILE_BYTES = 1 << 33
+"""Of a file of a run: 70 h at 100 Hz. A file may be far larger than what is on the disk, and take hours to read."""
+
+
+def file_b2sum(path: Path, inside: Path | None = None) -> str:
+    """Return the BLAKE2b sum (hex) of a file: as safe as SHA-256, at twice its speed on most machines.
+
+    Parameters
+    ----------
+    inside : as in `open_regular`
+
+    Raises
+    ------
+    OSError
+        The file cannot be read, or is larger than `LARGEST_RUN_FILE_BYTES`.
+    """
+    with open_regular(path, inside) as file:
+        if os.fstat(file.fileno()).st_size > LARGEST_RUN_FILE_BYTES:
+            raise OSError(errno.EFBIG, f"larger than {LARGEST_RUN_FILE_BYTES} bytes", str(path))
+        return hashlib.file_digest(file, hashlib.blake2b).hexdigest()
+
+
+def read_sums(directory: Path) -> dict[str, str]:
+    """Return the BLAKE2b sums (hex) of the files of a run, by their path below it.
+
+    Raises
+    ------
+    RunError
+        Its list of them cannot be read.
+    """
+    try:
+        lines = read_regular(directory / CHECKSUM_FILE, directory).decode().splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        raise RunError(directory, f"no readable {CHECKSUM_FILE}", "fit the log again") from err
+    return {name: sum_ for sum_, _, name in (line.partition("  ") for line in lines)}
+
+
+def write_sums(directory: Path, sums: Mapping[str, str]) -> None:
+    """Write the list of a run.
+
+    Raises
+    ------
+    OutputError
+        The disk does not take it.
+    """
+    write_file(directory / CHECKSUM_FILE, "".join(f"{sum_}  {name}\n" for name, sum_ in sums.items()), directory)
+
+
+def list_anew(directory: Path, part: str, names: Iterable[str] = ()) -> None:
+    """Have the list of a run name other files of a part of it; a directory without a list stays so.
+
+    Parameters
+    ----------
+    part : a directory of the run; of what is listed below it nothing stays
+    names : of its files, relative to it; none: while it is being replaced
+    """
+    if not os.path.lexists(directory / CHECKSUM_FILE):
+        return
+    before = read_sums(directory)
+    sums = {name: sum_ for name, sum_ in before.items() if not name.startswith(f"{part}/")}
+    sums |= {f"{part}/{name}": file_b2sum(directory / part / name, directory) for name in names}
+    if sums != before:
+        write_sums(directory, sums)
