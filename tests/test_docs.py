@@ -18,7 +18,7 @@ from click.testing import CliRunner
 import icrtool
 from icrtool.cli.commands import icrtool as command_line
 from icrtool.config import Config, builtin_robots
-from icrtool.logs.streams.message_types import types_of
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
 from icrtool.output.tables.configuration import format_configuration
 
@@ -59,7 +59,11 @@ def test_the_readme_names_every_built_in_robot() -> None:
 
 @pytest.mark.parametrize(
     ("role", "types"),
-    [("Wheels", {*types_of("wheels"), *PAIR_TYPES}), ("Position", types_of("gnss")), ("Heading", types_of("heading"))],
+    [
+        ("Wheels", {*MESSAGE_TYPES["wheels"], *PAIR_TYPES}),
+        ("Position", MESSAGE_TYPES["gnss"]),
+        ("Heading", MESSAGE_TYPES["heading"]),
+    ],
 )
 def test_the_page_of_message_types_names_those_that_are_read_and_no_other(role: str, types: set[str]) -> None:
     page = (ROOT / "docs" / "reference" / "message-types.md").read_text(encoding="utf-8")

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,21 +16,12 @@ from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.messages.decoded_values import HDT
 from icrtool.logs.messages.topic_table import FRAME, TopicTable
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
-from icrtool.logs.streams.sources import Check, Convention, HeadingSource, Number, all_valid, fields_of_all, of_topic
+from icrtool.logs.streams.sources import Convention, HeadingSource, all_valid, fields_in, number, of_topic
 from icrtool.logs.streams.stamps import StampedRows, stamp_rows, usable_rows
-from icrtool.records.samples import GyroAxes, GyroSamples, Role
-
-DEGREE = math.pi / 180.0
-LARGEST_DEG = 720.0
-"""A heading beyond this stands for "unknown": Septentrio writes -2e10."""
+from icrtool.records.samples import GyroAxes, GyroSamples
 
 FUSED_WORTH = 30.0
 """Of a heading that is fused with the wheels."""
-
-
-def degrees(name: str) -> Number:
-    """Return an angle that is recorded in degrees."""
-    return Number((name,), DEGREE, LARGEST_DEG)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,39 +31,42 @@ class Bearing:
     Attributes
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is
-    angle : to rad; std, variance : to rad and rad^2, either or none
-    valid : all must pass for a heading
+    angle, std, variance : to rad and rad^2, as `number` reads them; std and variance: either or none. Degrees of 720
+        and more stand for "unknown": Septentrio writes -2e10
+    valid : checks that all must pass for a heading
     convention, known_by : ``ned``: clockwise from north, ``enu``: counter-clockwise from east; how that is known
     independent : where half of the messages or more do not pass, they are fused with the wheels
     """
 
-    role: ClassVar[Role] = "heading"
     what: str
     worth: float
-    angle: Number
-    std: Number | None = None
-    variance: Number | None = None
-    valid: tuple[Check, ...] = ()
+    angle: str = "heading < 720 * deg"
+    std: str = ""
+    variance: str = ""
+    valid: tuple[str, ...] = ()
     convention: Convention = "ned"
     known_by: str = "degrees clockwise from north"
-    independent: tuple[Check, ...] = ()
+    independent: tuple[str, ...] = ()
 
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        return fields_of_all(self.angle, self.std, self.variance, *self.valid, *self.independent)
+        return fields_in((self.angle, self.std, self.variance), (*self.valid, *self.independent))
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
         """Return its headings."""
-        angle = self.angle.of(table, needed=True)
-        variance = np.full(len(table), np.nan)
-        if self.variance is not None:
-            variance = self.variance.of(table)
-        elif self.std is not None:
-            std = self.std.of(table)
-            variance = np.where(std > 0, std, np.nan) ** 2
+        angle = number(self.angle).of(table, needed=True)
+        if self.variance:
+            variance = number(self.variance).of(table)
+        else:
+            variance = squared(number(self.std).of(table)) if self.std else np.full(len(table), np.nan)
         worth = min(self.worth, FUSED_WORTH) if is_fused(table, self.independent) else self.worth
         return stated(replace(self, worth=worth), table, angle, variance, all_valid(table, self.valid))
+
+
+def squared(std: Floats) -> Floats:
+    """Return variances (n,) of standard deviations, NaN where these are not positive."""
+    return np.where(std > 0, std, np.nan) ** 2
 
 
 def stated(row: Bearing, table: TopicTable, angle: Floats, variance: Floats, valid: Bools) -> HeadingSource:
@@ -86,9 +80,7 @@ def stated(row: Bearing, table: TopicTable, angle: Floats, variance: Floats, val
     )  # fmt: skip
 
 
-TRUE_HEADING = Bearing(
-    "heading of the GNSS receiver (HDT)", 88.0, degrees("heading"), known_by="NMEA: clockwise from true north"
-)
+TRUE_HEADING = Bearing("heading of the GNSS receiver (HDT)", 88.0, known_by="NMEA: clockwise from true north")
 
 
 def read_sentences(table: TopicTable, config: Config) -> HeadingSource:
@@ -100,13 +92,13 @@ def read_sentences(table: TopicTable, config: Config) -> HeadingSource:
 
 
 _NORTHS = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
-_AZIMUTH = Bearing("azimuth", 95.0, Number(("azimuth",)), known_by="stated in the message")
+_AZIMUTH = Bearing("azimuth", 95.0, known_by="stated in the message")
 AZIMUTH_FIELDS = ("azimuth", "variance", "unit", "orientation", "reference")
 
 
 def read_azimuths(table: TopicTable, _: Config) -> HeadingSource:
     """Return the headings of an Azimuth of the compass stack: the message states unit, orientation and reference."""
-    factor = np.where(table.column("unit") == 1, DEGREE, 1.0)
+    factor = np.where(table.column("unit") == 1, math.radians(1.0), 1.0)
     yaw = table.column("azimuth") * factor
     orientation = table.column("orientation")
     ned = bool(np.median(orientation) == 1)
@@ -117,38 +109,30 @@ def read_azimuths(table: TopicTable, _: Config) -> HeadingSource:
     return stated(row, table, yaw, table.floats("variance") * factor**2, np.ones(len(table), np.bool_))
 
 
-RELPOS_VALID, HEADING_VALID = 1 << 2, 1 << 8
-"""Flags of u-blox: the baseline, and its heading, are valid."""
-
 BASELINE = Bearing(
-    "u-blox moving base: bearing of the antenna baseline", 90.0,
-    Number(("relPosHeading", "rel_pos_heading"), 1e-5 * DEGREE),
-    Number(("accHeading", "acc_heading"), 1e-5 * DEGREE),
-    valid=(Check(("flags",), frozenset({RELPOS_VALID | HEADING_VALID}), mask=RELPOS_VALID | HEADING_VALID),),
-    known_by="u-blox: clockwise from north",
+    "u-blox moving base: bearing of the antenna baseline", 90.0, "relPosHeading|rel_pos_heading * 1e-5 * deg",
+    "accHeading|acc_heading * 1e-5 * deg", valid=("flags & 260 == 260",), known_by="u-blox: clockwise from north",
 )  # fmt: skip
+"""Flags: 4 the baseline is valid, 256 its heading."""
 
-_NORTH = Number(("relPosN", "rel_pos_n"), fine=Number(("relPosHPN", "rel_pos_hpn"), 0.01))
-_EAST = Number(("relPosE", "rel_pos_e"), fine=Number(("relPosHPE", "rel_pos_hpe"), 0.01))
-_ACCURACY = Number(("accN", "acc_n"), 0.01), Number(("accE", "acc_e"), 0.01)
-_BASELINE_VALID = Check(("flags",), frozenset({RELPOS_VALID}), mask=RELPOS_VALID)
-"""Of a u-blox baseline, in cm."""
+_COMPONENTS = "relPosN|rel_pos_n + relPosHPN|rel_pos_hpn * 0.01", "relPosE|rel_pos_e + relPosHPE|rel_pos_hpe * 0.01"
+_ACCURACIES, _BASELINE_VALID = ("accN|acc_n * 0.01", "accE|acc_e * 0.01"), ("flags & 4 == 4",)
+BASELINE_FIELDS = fields_in((*_COMPONENTS, *_ACCURACIES), _BASELINE_VALID)
+"""Of the baseline by its components to the north and to the east, in cm."""
 
 LEAST_BASELINE_CM = 0.005
 """Half of what the fields of a baseline resolve: a shorter one has no direction."""
 
-BASELINE_FIELDS = fields_of_all(_NORTH, _EAST, *_ACCURACY, _BASELINE_VALID)
-
 
 def read_baselines(table: TopicTable, _: Config) -> HeadingSource:
     """Return the bearings of the antenna baseline of ublox_msgs/NavRELPOSNED, which states its components."""
-    north, east = (one.of(table, needed=True) for one in (_NORTH, _EAST))
+    north, east = (number(one).of(table, needed=True) for one in _COMPONENTS)
     length = np.hypot(north, east)
     measured = (length > LEAST_BASELINE_CM) & np.isfinite(length)
-    accuracy = np.maximum(*(one.of(table) for one in _ACCURACY))
+    accuracy = np.maximum(*(number(one).of(table) for one in _ACCURACIES))
     std = np.divide(accuracy, length, out=np.full(len(table), np.nan), where=measured)
-    variance = np.where(std > 0, std, np.nan) ** 2
-    return stated(BASELINE, table, np.arctan2(east, north), variance, _BASELINE_VALID.of(table) & measured)
+    valid = all_valid(table, _BASELINE_VALID) & measured
+    return stated(BASELINE, table, np.arctan2(east, north), squared(std), valid)
 
 
 INS_WORDS = re.compile(r"\bins\b|vectornav|novatel|sbg|microstrain|xsens|gnss|gps|global|map|filtered", re.IGNORECASE)
@@ -177,7 +161,6 @@ class Orientation:
     odometry : preferred where its name is that of an inertial navigation system
     """
 
-    role: ClassVar[Role] = "heading"
     what: str
     worth: float
     path: str
@@ -195,7 +178,8 @@ class Orientation:
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
         variances = self._variances if self.covariance else ()
-        return fields_of_all(*(f"{self.path}.{axis}" for axis in "xyzw"), *variances, self.rate)
+        rate = (self.rate,) if self.rate else ()
+        return (*(f"{self.path}.{axis}" for axis in "xyzw"), *variances, *rate)
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
         """Return the yaw of its orientations."""

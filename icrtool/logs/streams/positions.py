@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Floats
 from icrtool.logs.messages.decoded_values import GGA, GST, RMC
 from icrtool.logs.messages.topic_table import FRAME, TopicTable
-from icrtool.logs.streams.sources import NEVER_MOVES, Check, Number, PositionSource, all_valid, fields_of_all, of_topic
-from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, Role
+from icrtool.logs.streams.sources import NEVER_MOVES, PositionSource, all_valid, fields_in, number, of_topic
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 
 GBAS = 2
 """NavSatStatus: 2 is fixed or float, drivers differ. A log without any of these states nothing about the solution."""
@@ -90,7 +90,15 @@ def _of_word(text: str) -> int:
     return FIXED_FIX if text.endswith(("_INT", "RTKFIXED", "RTK_DIRECT_INS")) else OTHER_FIX
 
 
-def stated_variance(table: TopicTable, covariance: tuple[str, ...], std: tuple[Number, ...]) -> Floats:
+def _stated_class(table: TopicTable, solution: Solution | None) -> Bytes | None:
+    return solution.of(table) if solution is not None else None
+
+
+def _fields(solution: Solution | None) -> tuple[str, ...]:
+    return (solution.name,) if solution is not None else ()
+
+
+def stated_variance(table: TopicTable, covariance: tuple[str, ...], std: tuple[str, ...]) -> Floats:
     """Return north, east, covariance of both [m^2] (n, 3), NaN where not stated.
 
     Parameters
@@ -100,7 +108,7 @@ def stated_variance(table: TopicTable, covariance: tuple[str, ...], std: tuple[N
     """
     variance = np.full((len(table), 3), np.nan)
     if std:
-        north, east = std[0].of(table), std[-1].of(table)
+        north, east = number(std[0]).of(table), number(std[-1]).of(table)
         stated = (north > 0) & (east > 0)
         with np.errstate(over="ignore"):
             variance[stated] = np.column_stack([north**2, east**2, np.zeros(len(table))])[stated]
@@ -142,8 +150,6 @@ STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
 GOOD_STD_M, NOT_GOOD = 0.3, 35.0
 """A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference; taken off of others."""
 
-LATITUDE, LONGITUDE, ALTITUDE = Number(("latitude",)), Number(("longitude",)), Number(("altitude",))
-
 
 @dataclass(frozen=True, slots=True)
 class Fix:
@@ -153,35 +159,32 @@ class Fix:
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is as reference
     latitude, longitude : to degrees; height : to m above the ellipsoid
-    std : standard deviation [m] to the north and to the east; one for both
+    std : standard deviation [m] to the north and to the east; one for both. These are as `number` reads them
     covariance : the field of a covariance (3, 3) of east, north, up, which has precedence
-    valid : all must pass for a fix
+    valid : checks that all must pass for a fix
     solution : how it was solved
     """
 
-    role: ClassVar[Role] = "gnss"
     what: str
     worth: float
-    latitude: Number = LATITUDE
-    longitude: Number = LONGITUDE
-    height: Number = ALTITUDE
-    std: tuple[Number, ...] = ()
+    latitude: str = "latitude"
+    longitude: str = "longitude"
+    height: str = "altitude"
+    std: tuple[str, ...] = ()
     covariance: str = ""
-    valid: tuple[Check, ...] = ()
+    valid: tuple[str, ...] = ()
     solution: Solution | None = None
 
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
         covariance = (*_places(self.covariance, 3), COVARIANCE_TYPE) if self.covariance else ()
-        solution = self.solution.name if self.solution is not None else None
-        return fields_of_all(
-            self.latitude, self.longitude, self.height, *self.std, *covariance, *self.valid, solution
-        )  # fmt: skip
+        numbers = (self.latitude, self.longitude, self.height, *self.std)
+        return (*fields_in(numbers, self.valid), *covariance, *_fields(self.solution))
 
     def read(self, table: TopicTable, _: Config) -> PositionSource:
         """Return its positions; rows without a fix, not finite, far from the others or at 0, 0 are not usable."""
-        latitude, longitude = (one.of(table, needed=True) for one in (self.latitude, self.longitude))
+        latitude, longitude = (number(one).of(table, needed=True) for one in (self.latitude, self.longitude))
         variance = stated_variance(table, _places(self.covariance, 3), self.std)
         no_fix, finite = ~all_valid(table, self.valid), np.isfinite(latitude) & np.isfinite(longitude)
         with np.errstate(invalid="ignore"):
@@ -206,11 +209,11 @@ class Fix:
         counts = ", ".join(f"{reason} {count}" for reason, count in rejected.items())
         return PositionSource(
             **of_topic(table),
-            geodetic=np.column_stack([latitude, longitude, _plausible(self.height.of(table), usable)]),
+            geodetic=np.column_stack([latitude, longitude, _plausible(number(self.height).of(table), usable)]),
             variance=variance, usable=usable, rejected=rejected, score=score,
             why=f"{what}, states ±{std:.2g} m" if np.isfinite(std) else f"{what}, states no accuracy",
             problem="" if usable.any() else f"no usable fix ({counts})",
-            stated_class=self.solution.of(table) if self.solution is not None else None,
+            stated_class=_stated_class(table, self.solution),
         )  # fmt: skip
 
 
@@ -245,8 +248,8 @@ GST_NEAR_NS = 1_500_000_000
 """Receivers send GST with each fix, or once a second."""
 
 SENTENCE_FIX = Fix(
-    "GNSS fix", 84.0, std=(Number(("north_std",)), Number(("east_std",))),
-    valid=(Check(("quality",), frozenset(NMEA_QUALITY)),), solution=Solution("quality", NMEA_QUALITY),
+    "GNSS fix", 84.0, std=("north_std", "east_std"), valid=(f"quality == {'|'.join(map(str, NMEA_QUALITY))}",),
+    solution=Solution("quality", NMEA_QUALITY),
 )  # fmt: skip
 
 
@@ -299,25 +302,22 @@ class Pose:
     independent : where half of the messages or more do not pass, they are fused with the wheels
     """
 
-    role: ClassVar[Role] = "gnss"
     what: str
     worth: float
     path: str = "pose"
     covariance: str = ""
-    std: tuple[Number, ...] = ()
-    valid: tuple[Check, ...] = ()
+    std: tuple[str, ...] = ()
+    valid: tuple[str, ...] = ()
     solution: Solution | None = None
     odometry: bool = False
-    independent: tuple[Check, ...] = ()
+    independent: tuple[str, ...] = ()
 
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        solution = self.solution.name if self.solution is not None else None
-        return fields_of_all(
-            *(f"{self.path}.position.{axis}" for axis in "xyz"), *_places(self.covariance, 6),
-            *self.std, *self.valid, *self.independent, solution,
-        )  # fmt: skip
+        places = (f"{self.path}.position.{axis}" for axis in "xyz")
+        numbers = fields_in(self.std, (*self.valid, *self.independent))
+        return (*places, *_places(self.covariance, 6), *numbers, *_fields(self.solution))
 
     def read(self, table: TopicTable, _: Config) -> PositionSource:
         """Return its positions; those of goals, of dead reckoning and of frames whose z is not up are refused."""
@@ -331,7 +331,7 @@ class Pose:
             **of_topic(table), metric=np.column_stack([y, x]),
             variance=stated_variance(table, _places(self.covariance, 6), self.std),
             usable=usable, rejected=rejected, score=self.worth, why=self.what, problem=self._problem(table, places),
-            stated_class=self.solution.of(table) if self.solution is not None else None,
+            stated_class=_stated_class(table, self.solution),
         )  # fmt: skip
 
     def _problem(self, table: TopicTable, places: Floats) -> str:
@@ -357,7 +357,7 @@ class Pose:
         return problem
 
 
-def is_fused(table: TopicTable, independent: tuple[Check, ...]) -> bool:
+def is_fused(table: TopicTable, independent: tuple[str, ...]) -> bool:
     """Return whether half of the messages or more do not pass the checks of independent ones."""
     return 2 * int(np.count_nonzero(all_valid(table, independent))) <= len(table)
 

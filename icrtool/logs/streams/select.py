@@ -13,7 +13,7 @@ from icrtool.logs.containers.channel import Channel, some_of
 from icrtool.logs.messages.collectors import READ_ENCODINGS
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE
-from icrtool.logs.streams.message_types import fields_of, read_source, types_of
+from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, WheelMotion, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
 from icrtool.logs.streams.wheel_speeds import check_joints
@@ -122,9 +122,13 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
 
 def _read_all(tables: Sequence[TopicTable], role: Role, config: Config, kind: type[Kind]) -> list[Kind]:
     """Return the topics of one role as sources; a topic whose type lacks a needed field in this log is not usable."""
-    sources, types = [], types_of(role)
+    sources = []
     for table in tables:
-        if table.message_type in types and getattr(config.topics, role) in (None, table.topic) and len(table):
+        if (
+            table.message_type in MESSAGE_TYPES[role]
+            and getattr(config.topics, role) in (None, table.topic)
+            and len(table)
+        ):
             try:
                 sources.append(cast("Kind", read_source(role, table, config)))
             except DefinitionError as err:

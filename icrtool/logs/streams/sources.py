@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -161,26 +163,32 @@ def of_topic(table: TopicTable) -> dict[str, Any]:
     return {"topic": table.topic, "message_type": table.message_type, "stamps": stamp_rows(table)}
 
 
+_NUMBER = re.compile(r"(\S+?)(?: < (\S+))?((?: \* \S+)*)(?: \+ (.+))?")
+_CHECK = re.compile(r"(\S+?)(?: & (\d+))? (==|!=|>=) (\S+)(?: unless (\S+))?")
+UNITS = {"deg": math.radians(1.0), "rad": math.degrees(1.0)}
+"""Of a bearing that is recorded in degrees, and of a latitude that is recorded in radians."""
+
+
 class Number(NamedTuple):
     """A number in the messages of a type.
 
     Attributes
     ----------
-    names : its field, in each spelling that drivers use (``hAcc``, ``h_acc``)
-    unit : what 1 means: in m, rad, degrees of latitude or longitude
-    largest : recorded numbers beyond it, of either sign, stand for "not known"
+    names : its field, in each spelling that drivers use
+    largest : recorded numbers as large, of either sign, stand for "not known"
+    unit : what 1 means: in m, radians, degrees of latitude or longitude
     fine : added where it is known: further digits, or the height of the geoid
     """
 
-    names: tuple[str, ...]
-    unit: float = 1.0
-    largest: float = math.inf
-    fine: Number | None = None
+    names: list[str]
+    largest: float
+    unit: float
+    fine: Number | None
 
     @property
-    def fields(self) -> tuple[str, ...]:
+    def fields(self) -> list[str]:
         """The fields that it is read from."""
-        return (*self.names, *(self.fine.fields if self.fine is not None else ()))
+        return [*self.names, *(self.fine.fields if self.fine is not None else ())]
 
     def of(self, table: TopicTable, *, needed: bool = False) -> Floats:
         """Return its values (n,); NaN where unknown, or where the type lacks it.
@@ -190,13 +198,24 @@ class Number(NamedTuple):
         DefinitionError
             It is needed, and the type, as the log defines it, lacks it.
         """
-        values = (table.column(*self.names) if needed else table.floats(*self.names)) * self.unit
+        values = table.column(*self.names).astype(np.float64) if needed else table.floats(*self.names)
         if math.isfinite(self.largest):
-            values = np.where(np.abs(values) <= self.largest * self.unit, values, np.nan)
+            values = np.where(np.abs(values) < self.largest, values, np.nan)
+        values = values * self.unit
         if self.fine is not None:
             fine = self.fine.of(table)
             values = values + np.where(np.isfinite(fine), fine, 0.0)
         return values
+
+
+@cache
+def number(text: str) -> Number:
+    """Return the number that a text describes: ``h_accuracy < 65535 * 0.01``, ``lat * 1e-7 + latHp|lat_hp * 1e-9``."""
+    if (found := _NUMBER.fullmatch(text)) is None:
+        raise ValueError(f"{text!r} describes no number")
+    names, largest, units, fine = found.groups()
+    unit = math.prod(UNITS[one] if one in UNITS else float(one) for one in units.split(" * ") if one)
+    return Number(names.split("|"), float(largest or "inf"), unit, number(fine) if fine else None)
 
 
 class Check(NamedTuple):
@@ -205,48 +224,51 @@ class Check(NamedTuple):
     Attributes
     ----------
     names : the field, in each spelling that drivers use
-    accepted : its numbers or words in valid messages; empty: all but the `refused` ones
     mask : the bits of a whole number that count
-    least : the least number of a valid message
+    relation, values : ``==`` one of these numbers or words, ``!=`` none of them, ``>=`` the number
     unset : the number that drivers leave in it which never set it: where all messages have it, all are valid
     """
 
-    names: tuple[str, ...]
-    accepted: frozenset[int | str] = frozenset()
-    refused: frozenset[int] = frozenset()
-    mask: int | None = None
-    least: float = -math.inf
-    unset: float = math.nan
+    names: list[str]
+    mask: int | None
+    relation: str
+    values: list[int | str]
+    unset: float
 
     def of(self, table: TopicTable) -> Bools:
         """Return which messages (n,) are valid."""
         if (path := self.names[0]) in table.texts:
             codes, texts = table.words(path)
-            return np.array([*(text in self.accepted for text in texts), False])[codes]
+            return np.array([*(text in self.values for text in texts), False])[codes]
         values = table.find(*self.names) if self.mask is None else table.integers(*self.names)
         if values is None or np.all(values == self.unset):
             return np.ones(len(table), np.bool_)
         values = values if self.mask is None else values & self.mask
-        valid = ~np.isin(values, sorted(self.refused)) & ~(values < self.least)
-        if self.accepted:
-            valid &= np.isin(values, [one for one in self.accepted if isinstance(one, int)])
-        return valid
+        numbers = [one for one in self.values if isinstance(one, int)]
+        if self.relation == ">=":
+            return ~np.asarray(values < numbers[0])
+        return np.isin(values, numbers, invert=self.relation == "!=")
 
 
-def all_valid(table: TopicTable, checks: tuple[Check, ...]) -> Bools:
+@cache
+def check(text: str) -> Check:
+    """Return the check that a text describes: ``flags & 1 == 1``, ``ins_status == INS_SOLUTION_GOOD|3``."""
+    if (found := _CHECK.fullmatch(text)) is None:
+        raise ValueError(f"{text!r} describes no check")
+    names, mask, relation, values, unset = found.groups()
+    of_any = [int(one) if one.lstrip("-").isdecimal() else one for one in values.split("|")]
+    return Check(names.split("|"), int(mask) if mask else None, relation, of_any, float(unset or "nan"))
+
+
+def all_valid(table: TopicTable, checks: tuple[str, ...]) -> Bools:
     """Return which messages (n,) pass all checks."""
     valid = np.ones(len(table), np.bool_)
-    for check in checks:
-        valid &= check.of(table)
+    for one in checks:
+        valid &= check(one).of(table)
     return valid
 
 
-def fields_of_all(*parts: Number | Check | str | None) -> tuple[str, ...]:
-    """Return the fields of numbers, checks and paths."""
-    fields: list[str] = []
-    for one in parts:
-        if isinstance(one, str):
-            fields += [one] if one else []
-        elif one is not None:
-            fields += one.fields if isinstance(one, Number) else one.names
-    return tuple(fields)
+def fields_in(numbers: tuple[str, ...], checks: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Return the fields that numbers and checks are read from; an empty text is no number."""
+    fields = [name for one in numbers if one for name in number(one).fields]
+    return (*fields, *(name for one in checks for name in check(one).names))

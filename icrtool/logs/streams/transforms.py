@@ -13,7 +13,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.topic_table import FRAME, STAMPS, TopicTable
-from icrtool.logs.streams.message_types import types_of
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.positions import REFERENCE_FRAMES, REFERENCE_WORDS
 from icrtool.records.text import LogText
 
@@ -142,7 +142,7 @@ def transform_channels(channels: Sequence[Channel], topics: TopicsConfig) -> dic
     Reading all transforms takes longer than the rest of a log. An odometry that is no reference by name does not count.
     """
     named = any(
-        one.message_type in types_of("gnss")
+        one.message_type in MESSAGE_TYPES["gnss"]
         and (one.message_type != "nav_msgs/Odometry" or REFERENCE_WORDS.search(one.topic) is not None)
         for one in channels
     )

@@ -151,7 +151,11 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
     """Return whether a field may be a wheel's motion: a driver's messages hold currents and states, too."""
     if message_type in PAIR_TYPES:
         return path == "data"
-    if message_type in MESSAGE_TYPES or not _of_wheels(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
+    if (
+        any(message_type in types for types in MESSAGE_TYPES.values())
+        or not _of_wheels(f"{topic} {message_type} {path}")
+        or _OTHER_WORDS.search(path)
+    ):
         return False
     field = path.rpartition(".")[2]
     only_side = bool(_ONLY_SIDE.fullmatch(field) and _SIDE_WORDS.search(field))

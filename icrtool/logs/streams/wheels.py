@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from icrtool.logs.containers.channel import some_of
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
 from icrtool.logs.streams.sources import Sides, Unit, WheelMotion, motion_of, nonzero, of_topic
-from icrtool.records.samples import Role
 
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
 """Positions that stay within one turn, and jump by nearly one turn this often, are recorded modulo a turn."""
@@ -106,7 +105,6 @@ class Joints:
     names, position, speed : fields of the lists
     """
 
-    role: ClassVar[Role] = "wheels"
     what: str
     worth: float
     names: str
@@ -221,7 +219,6 @@ class FixedWheels:
     unit : of the positions, and of the speeds per second; factor : of the recorded numbers to it
     """
 
-    role: ClassVar[Role] = "wheels"
     what: str
     worth: float
     position: tuple[str, ...] = ()
@@ -288,7 +285,6 @@ def read_ticks(table: TopicTable, _: Config) -> WheelMotion:
     return motion_of(WheelMotion(**of_topic(table), unit=unit, score=90.0, why=why), (left, right))
 
 
-AUTOPILOT_FIELDS = ("data[*]",)
 _BOTH = ("data[0]", "data[1]")
 """Wheel 0 is the left one in the configuration that comes with MAVROS."""
 
@@ -329,7 +325,6 @@ class Twist:
     fused : taken off where the name is that of a topic fused with others; 0: a base's own, whatever its name
     """
 
-    role: ClassVar[Role] = "wheels"
     what: str
     worth: float
     forward: str = "linear.x"

@@ -11,7 +11,7 @@ from icrtool.config import load_config
 from icrtool.errors import IcrToolError
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.messages.topic_table import LARGEST, GrowingColumn, TopicTable
-from icrtool.logs.streams.message_types import fields_of, read_source, types_of
+from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
 from icrtool.logs.streams.sources import HeadingSource, PositionSource
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import LogText
@@ -58,7 +58,7 @@ def test_what_is_too_large_is_infinite_in_a_column_and_all_else_is_kept() -> Non
     np.testing.assert_array_equal(held(np.full(5, -1.7e308)), np.full(5, -np.inf))
 
 
-@pytest.mark.parametrize(("role", "name"), [(role, name) for role in ROLE_WORDS for name in types_of(role)])
+@pytest.mark.parametrize(("role", "name"), [(role, name) for role in ROLE_WORDS for name in MESSAGE_TYPES[role]])
 def test_messages_of_any_type_are_read_without_a_warning(role: Role, name: str) -> None:
     for seed in range(60):
         with suppress(IcrToolError):

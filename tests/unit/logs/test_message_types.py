@@ -31,14 +31,14 @@ from icrtool.logs.messages.collectors import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.decoded_values import NMEA_SENTENCE
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.read_log import Survey, survey_log
-from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, types_of
+from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
 from icrtool.records.samples import ROLE_WORDS, Role
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 10_000_000
 MESSAGES = 31
-TYPES = sorted(name for name in {*MESSAGE_TYPES, *PAIR_TYPES} if "/" in name and name != NMEA_SENTENCE)
+TYPES = sorted(name for name in {*PAIR_TYPES}.union(*MESSAGE_TYPES.values()) if "/" in name and name != NMEA_SENTENCE)
 """Of ROS, but sentences, of which more columns are made than the message has fields (test_nmea.py)."""
 CONTAINERS = ("bag", "db3", "db3 big-endian", "db3 without definitions", "mcap cdr", "mcap idl", "mcap ros1")
 ROS1 = ("bag", "mcap ros1")
@@ -385,9 +385,9 @@ def test_every_topic_is_a_candidate_of_its_roles(logs: Callable[[str], Written],
         role: {topic for source in sources for topic in source.topic.split(" + ")}
         for role, sources in (("wheels", found.wheels), ("gnss", found.gnss), ("heading", found.heading))
     }
-    assert topics["wheels"] >= {topic_of(name) for name in TYPES if name in {*types_of("wheels"), *PAIR_TYPES}}
-    assert topics["gnss"] == {topic_of(name) for name in TYPES if name in types_of("gnss")}
-    assert topics["heading"] == {topic_of(name) for name in TYPES if name in types_of("heading")}
+    assert topics["wheels"] >= {topic_of(name) for name in TYPES if name in {*MESSAGE_TYPES["wheels"], *PAIR_TYPES}}
+    assert topics["gnss"] == {topic_of(name) for name in TYPES if name in MESSAGE_TYPES["gnss"]}
+    assert topics["heading"] == {topic_of(name) for name in TYPES if name in MESSAGE_TYPES["heading"]}
     assert found.unread == {}
 
 
@@ -449,8 +449,12 @@ def test_a_type_that_lacks_a_field_is_read_without_it_or_refused_in_words(tmp_pa
     }
     for role, needed in required.items():
         for topic, field in dropped.items():
-            if field in needed and topic.split("/")[2] in {topic_of(name).split("/")[2] for name in types_of(role)}:
-                taken = {path for name in types_of(role) if topic_of(name) in topic for path in fields_of(role, name)}
+            if field in needed and topic.split("/")[2] in {
+                topic_of(name).split("/")[2] for name in MESSAGE_TYPES[role]
+            }:
+                taken = {
+                    path for name in MESSAGE_TYPES[role] if topic_of(name) in topic for path in fields_of(role, name)
+                }
                 if any(path.startswith(field) for path in taken):
                     assert field in told[role, topic], (role, topic)
     refused = {f"{topic_of(DYNAMIC_JOINT_STATE)}/without_{field}" for field in ("joint_names", "interface_values")}
