@@ -19,8 +19,8 @@ from icrtool.logs.containers.channel import WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import check_unchanged, open_log, states_of
 from icrtool.logs.containers.split_files import log_name
 from icrtool.logs.cut import Moment, cut_of, longest_part, moment
-from icrtool.logs.messages.collectors import Collector, collector_for
-from icrtool.logs.messages.topic_table import HEADER, TopicTable, merge_tables
+from icrtool.logs.messages.collectors import collector_for
+from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE, find_gyro, find_gyros
 from icrtool.logs.streams.select import (
     Candidates,
@@ -269,8 +269,10 @@ def _collect(
 ) -> tuple[list[TopicTable], dict[str, str]]:
     """Return the columns of all channels that some role may need, read in one pass over the log."""
     unread: dict[str, str] = {}
-    collectors: dict[int, Collector | None] = {}
+    collectors: dict[int, TopicCollector | None] = {}
+    by_topic: dict[tuple[str, str], TopicCollector] = {}
     by_id = {channel.id: channel for channel in container.channels}
+    topics = {channel.id: (channel.topic, channel.message_type) for channel in container.channels}
     wanted = fields_to_take(container.channels, config)
     static = {channel.id: FIELDS for channel in container.channels if is_static(channel)}
     moving = transform_channels(container.channels, config.topics)
@@ -286,17 +288,21 @@ def _collect(
                 try:
                     if number not in collectors:
                         # A definition is compiled when its first message comes: a log may declare any number of topics.
-                        collectors[number] = collector_for(by_id[number], wanted[number])
+                        collectors[number] = None
+                        before = by_topic.get(topics[number])
+                        by_topic[topics[number]] = collector_for(by_id[number], wanted[number], before)
+                        collectors[number] = by_topic[topics[number]]
                     if (collector := collectors[number]) is not None:
                         collector.feed(block, number)
                 except DefinitionError as err:
-                    unread[by_id[number].topic], collectors[number] = str(err), None
+                    unread[by_id[number].topic] = str(err)
             if progress is not None:
                 progress(container.share_read())
-    tables = [collector.table() for number in wanted if (collector := collectors.get(number)) is not None]
-    silent = [by_id[number] for number in wanted if number not in collectors]
-    tables += [_empty_table(channel) for channel in silent]
-    tables = merge_tables(tables)
+    for number in wanted.keys() - collectors.keys():
+        by_topic.setdefault(topics[number], TopicCollector(by_id[number]))
+    tables = [
+        by_topic[topic].table() for topic in dict.fromkeys(topics[number] for number in wanted) if topic in by_topic
+    ]
     for place, table in enumerate(tables):
         if table.topic in {by_id[number].topic for number in moving} and len(table):
             try:
@@ -304,10 +310,6 @@ def _collect(
             except DefinitionError as err:
                 unread[table.topic] = err.why
     return tables, unread
-
-
-def _empty_table(channel: Channel) -> TopicTable:
-    return TopicTable(channel.topic, channel.message_type, np.empty(0, np.int64), {}, {}, 0)
 
 
 def _stream(

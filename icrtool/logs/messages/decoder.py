@@ -22,10 +22,10 @@ from icrtool.logs.messages.definitions import definitions_of
 from icrtool.logs.messages.schema import (
     COUNTED,
     MOST_ELEMENTS,
+    MOST_TAKEN,
     NUMBERS,
     SIZES,
     TEXT,
-    Definitions,
     Layout,
     Operation,
     Slot,
@@ -96,7 +96,7 @@ class _Run:
     """A run of a layout's program over one message."""
 
     def __init__(self, layout: Layout, message: bytes) -> None:
-        self._message, self._stop, self._cdr, self._most = message, len(message), layout.cdr, layout.most
+        self._message, self._stop, self._cdr = message, len(message), layout.cdr
         self._base = self._at = 4 if layout.cdr else 0
         self._steps_left = min(
             _STEPS_PER_BYTE * len(message) + _LEAST_STEPS + 2 * len(layout.program), _MOST_STEPS
@@ -117,13 +117,15 @@ class _Run:
         self.shape = Shape(readable, self._at if readable else len(message), same, self._big, self._taken)
 
     def _program(self, program: Sequence[Operation], *, taking: bool) -> None:
-        for kind, size, count, slot, body, is_constant in program:
+        for kind, size, count, slot, counter, body, is_constant in program:
             self._steps_left -= 1
             if self._steps_left < 0:
                 raise _UnreadableError
             number = self._length() if count == COUNTED else count
+            if counter >= 0 and taking:
+                self._taken[counter].append(self._at - 4)
             if kind == TEXT:
-                if taking and slot >= 0:
+                if taking and slot >= 0 and len(self._taken[slot]) < MOST_TAKEN:
                     length = number - 1 if self._cdr and number else number
                     self._taken[slot].append((self._at, min(length, LONGEST_TEXT)))
                 self._at += number
@@ -134,20 +136,22 @@ class _Run:
                 if end > self._stop:
                     raise _UnreadableError
                 if taking and slot >= 0:
-                    some = min(number, self._most) if count == COUNTED else number
+                    some, taken = number, len(self._taken[slot])
+                    if taken or count == COUNTED:
+                        some = min(number, MOST_ELEMENTS, MOST_TAKEN - taken)
                     self._taken[slot] += range(self._at, self._at + size * some, size)
                 self._at = end
             else:
-                self._loop(body, number, is_constant=is_constant)
+                self._loop(body, number, is_constant=is_constant, taking=taking)
 
-    def _loop(self, body: Sequence[Operation], number: int, *, is_constant: bool) -> None:
+    def _loop(self, body: Sequence[Operation], number: int, *, is_constant: bool, taking: bool) -> None:
         # At least one byte is counted for an element: a loop over elements without fields must end, too.
         if number > self._stop - self._at:
             raise _UnreadableError
         before = self._at, self._steps_left
         for i in range(min(number, 2) if is_constant else number):
             before = self._at, self._steps_left
-            self._program(body, taking=i < self._most)
+            self._program(body, taking=taking and i < MOST_ELEMENTS)
         if is_constant and number > 2:
             self._at += (number - 2) * (self._at - before[0])
             self._steps_left += (number - 2) * (self._steps_left - before[1])
@@ -308,7 +312,7 @@ class Decoded:
             return np.empty((0, 0) if "[*]" in path else 0, np.int64)
         width = max((len(shape.taken[slot.number]) for shape in self.shapes if shape.readable), default=0)
         numbers: Ints = np.full((len(self.start), width), -1, np.int64)
-        for shape, rows in self._by_shape():
+        for shape, rows in self.by_shape():
             codes = [self._codes(at, length, rows, known) for at, length in shape.taken[slot.number]]
             if len(self.shapes) == 1 and all(len(one) == 1 for one in codes):
                 numbers = np.broadcast_to(np.array(codes, np.int64).reshape(1, width), numbers.shape)
@@ -320,7 +324,7 @@ class Decoded:
     def texts(self, path: str) -> list[bytes]:
         """Return a text field's text of each message (n,)."""
         number, found = self.layout.slots[path].number, np.full(len(self.start), b"", object)
-        for shape, rows in self._by_shape():
+        for shape, rows in self.by_shape():
             at, length = shape.taken[number][0]
             if length:
                 found[rows] = _unaligned(self.data, np.dtype((np.void, length)))[self.start[rows] + at].tolist()
@@ -336,7 +340,7 @@ class Decoded:
         is_one = length == 0 or bool((texts == texts[0]).all())
         return text_numbers(texts[: 1 if is_one else None].tolist(), known)
 
-    def _by_shape(self) -> Iterator[tuple[Shape, Ints | slice]]:
+    def by_shape(self) -> Iterator[tuple[Shape, Ints | slice]]:
         """Yield each shape with the rows that have it."""
         if len(self.shapes) == 1:
             yield self.shapes[0], slice(None)
@@ -371,15 +375,8 @@ def _types(kind: str) -> tuple[np.dtype[Any], np.dtype[Any]]:
     return np.dtype(f"<{letter}{SIZES[kind]}"), np.dtype(np.float64 if letter == "f" else np.int64)
 
 
-def ros_decoder(
-    channel: Channel, wanted: Sequence[str], definitions: Definitions | None = None, most: int = MOST_ELEMENTS
-) -> Decoder:
+def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:
     """Return the decoder of a channel of ROS messages.
-
-    Parameters
-    ----------
-    definitions : in place of the channel's own
-    most : elements taken of a sequence
 
     Raises
     ------
@@ -387,5 +384,4 @@ def ros_decoder(
         The layout of the channel's type is not known.
     """
     encoding: Literal["cdr", "ros1"] = "cdr" if channel.encoding == "cdr" else "ros1"
-    known = definitions if definitions is not None else definitions_of(channel)
-    return Decoder(compile_layout(known, channel.message_type, wanted, encoding, most))
+    return Decoder(compile_layout(definitions_of(channel), channel.message_type, wanted, encoding))

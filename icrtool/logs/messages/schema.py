@@ -36,8 +36,8 @@ DEEPEST, MOST_FIELDS, LONGEST_FIXED, MOST_NUMBERS = 32, 20_000, 1 << 31, 1 << 16
 
 Real definitions reach a depth of 6 and some hundred fields; a definition that refers to itself has no end.
 """
-MOST_ELEMENTS = 256
-"""Taken of a sequence."""
+MOST_ELEMENTS, MOST_TAKEN = 256, 1024
+"""Taken of a sequence, and of sequences in the elements of a sequence together."""
 
 Step = str | int | None
 """A field's name, an element's place, or None for all elements of a sequence."""
@@ -56,6 +56,7 @@ class Operation(NamedTuple):
     kind : `NUMBERS`, `TEXT` or `LOOP`
     size, number : bytes of a number; how many numbers or elements, or `COUNTED`
     slot : number of the slot that takes it, -1 where it is passed over
+    counter : number of the slot that takes a counted number of elements, -1 where it is passed over
     body : what each element of a loop is made of
     is_constant : nothing in the loop is counted or taken: from the second element on, all have the same size
     """
@@ -64,13 +65,14 @@ class Operation(NamedTuple):
     size: int
     number: int
     slot: int
+    counter: int = -1
     body: tuple[Operation, ...] = ()
     is_constant: bool = False
 
     @property
     def takes(self) -> bool:
         """Whether anything in it is taken."""
-        return self.slot >= 0 or any(operation.takes for operation in self.body)
+        return self.slot >= 0 or self.counter >= 0 or any(operation.takes for operation in self.body)
 
 
 class Slot(NamedTuple):
@@ -88,14 +90,12 @@ class Layout:
     ----------
     slots : by path
     taken : how many slots the program knows; of a field that a definition has twice, the last one counts
-    most : elements taken of a sequence
     """
 
     program: tuple[Operation, ...]
     slots: dict[str, Slot]
     taken: int
     cdr: bool
-    most: int = MOST_ELEMENTS
 
 
 def steps_of(path: str) -> tuple[Step, ...]:
@@ -107,11 +107,10 @@ def steps_of(path: str) -> tuple[Step, ...]:
 class _Compiler:
     """Reads a definition once and writes the program."""
 
-    def __init__(self, definitions: Definitions, wanted: Sequence[str], *, cdr: bool, most: int) -> None:
+    def __init__(self, definitions: Definitions, wanted: Sequence[str], *, cdr: bool) -> None:
         self._definitions = definitions
         self._wanted = frozenset(wanted)
         self._cdr = cdr
-        self._most = most
         self.program: list[Operation] = []
         self.slots: dict[str, Slot] = {}
         self._fields = self._depth = self._loops = self._taken = self._numbers_taken = 0
@@ -157,9 +156,10 @@ class _Compiler:
 
     def _slot(self, path: str, kind: str, count: int = 1) -> int:
         """Return the number of a new slot for a field of up to `count` numbers or texts."""
-        if path.count("[*]") > 1:
-            raise DefinitionError(path, "a sequence in each element of a sequence is not read")
-        self._numbers_taken += count * (self._most if self._loops else 1)
+        if path.count("[*]") > 2:
+            raise DefinitionError(path, "a sequence in each element of a sequence of sequences is not read")
+        nested = path.count("[*]") > 1
+        self._numbers_taken += MOST_TAKEN if nested else count * (MOST_ELEMENTS if self._loops else 1)
         if self._numbers_taken > MOST_NUMBERS:
             raise DefinitionError("message", f"more than {MOST_NUMBERS} numbers of each message would be taken")
         self.slots[path] = Slot(kind, self._taken)
@@ -173,8 +173,8 @@ class _Compiler:
         if count > LONGEST_UNROLLED and is_wanted:
             raise DefinitionError(path, f"an array of {count} numbers is not read")
         if all_of_it in self._wanted:
-            slot = self._slot(all_of_it, kind, self._most if count == COUNTED else count)
-            self.program.append(Operation(NUMBERS, size, count, slot))
+            slot = self._slot(all_of_it, kind, MOST_ELEMENTS if count == COUNTED else count)
+            self.program.append(Operation(NUMBERS, size, count, slot, self._counter(path)))
         elif count == COUNTED:
             self.program.append(Operation(NUMBERS, size, COUNTED, -1))
         elif is_wanted:
@@ -183,9 +183,13 @@ class _Compiler:
         else:
             self._skip(size, count)
 
+    def _counter(self, path: str) -> int:
+        """Return the slot that takes the number of elements of a sequence, -1 where it is not wanted."""
+        return self._slot(f"{path}[#]", "uint32") if f"{path}[#]" in self._wanted else -1
+
     def _loop(self, path: str, element: int, inner: FieldDetail, count: int) -> None:
         """Write a loop over the elements of an array or sequence of strings or messages."""
-        before, self.program = self.program, []
+        before, self.program, counter = self.program, [], self._counter(path.removesuffix("[*]"))
         self._loops += 1
         if element == BASE:
             self._base(path, inner[0])
@@ -195,7 +199,7 @@ class _Compiler:
         body, self.program = tuple(self.program), before
         is_constant = all(step.number != COUNTED and step.slot < 0 for step in body)
         is_constant = is_constant and all(step.is_constant for step in body if step.kind == LOOP)
-        self.program.append(Operation(LOOP, 0, count, -1, body, is_constant))
+        self.program.append(Operation(LOOP, 0, count, -1, counter, body, is_constant))
 
     def _skip(self, size: int, count: int) -> None:
         if not self._cdr:
@@ -210,7 +214,7 @@ class _Compiler:
         """Return what was written, without the steps after the last taken field."""
         while self.program and not self.program[-1].takes:
             self.program.pop()
-        return Layout(tuple(self.program), self.slots, self._taken, self._cdr, self._most)
+        return Layout(tuple(self.program), self.slots, self._taken, self._cdr)
 
 
 def compile_layout(
@@ -218,7 +222,6 @@ def compile_layout(
     message_type: str,
     wanted: Sequence[str],
     encoding: Literal["cdr", "ros1"],
-    most: int = MOST_ELEMENTS,
 ) -> Layout:
     """Compile the layout of a message type.
 
@@ -227,8 +230,8 @@ def compile_layout(
     definitions : of the type and all types it contains
     message_type : ``package/Name``
     wanted : paths such as ``header.stamp.sec``, ``orientation_covariance[0]``, ``position[*]``,
-        ``drivers[*].measured_travel``; those the type does not have are left out of the layout's slots
-    most : elements taken of a sequence
+        ``drivers[*].measured_travel``; those the type does not have are left out of the layout's slots. Of a sequence
+        in each element of a sequence (``a[*].b[*]``) all elements come in a row; ``a[*].b[#]`` are their numbers
 
     Raises
     ------
@@ -236,6 +239,6 @@ def compile_layout(
         The definition of a type in it is missing, or a field has a type that cannot be skipped.
     """
     package, _, name = message_type.partition("/")
-    compiler = _Compiler(definitions, wanted, cdr=encoding == "cdr", most=most)
+    compiler = _Compiler(definitions, wanted, cdr=encoding == "cdr")
     compiler.message(f"{package}/msg/{name}", "")
     return compiler.layout()

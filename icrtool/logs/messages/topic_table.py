@@ -43,9 +43,10 @@ class GrowingColumn:
             self._values = one
         elif one is None or len(held) > 1 or one.shape != held.shape or one.tobytes() != held.tobytes():
             width = max(part.shape[1:], held.shape[1:])
-            if before == 0 or len(held) < self._rows or width > held.shape[1:]:
+            kind = np.result_type(part, held) if before else part.dtype
+            if before == 0 or len(held) < self._rows or width > held.shape[1:] or kind != held.dtype:
                 likely = min(expected, _MOST_EXPECTED // max(*width, 1, 1))
-                self._values = np.empty((*width, max(2 * before, self._rows, likely)), part.dtype).T
+                self._values = np.empty((*width, max(2 * before, self._rows, likely)), kind).T
                 if before:
                     self._put(0, held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:])))
             self._put(before, part)
@@ -193,115 +194,67 @@ class TopicTable:
 
 @dataclass(slots=True)
 class TopicCollector:
-    """Gathers the columns of one topic while blocks go by."""
+    """Gathers the columns of one topic while blocks go by: a ROS 1 bag gives each publisher a channel of its own.
+
+    Attributes
+    ----------
+    channel : the first one; decoders : of each, by its number
+    """
 
     channel: Channel
-    decoder: MessageDecoder
+    decoders: dict[int, MessageDecoder] = field(default_factory=dict)
     _times: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
-    _columns: dict[str, GrowingColumn] = field(default_factory=dict)
+    _numbers: GrowingColumn = field(default_factory=lambda: GrowingColumn(0))
+    _columns: dict[tuple[str, bool], GrowingColumn] = field(default_factory=dict)
     _texts: dict[str, dict[bytes, int]] = field(default_factory=dict)
     _unreadable: int = 0
 
     def feed(self, block: Block, number: int) -> None:
         """Add the messages of a block whose channel is `number`."""
-        for rows, decoded in self.decoder.decode(block, number):
+        for rows, decoded in self.decoders[number].decode(block, number):
             readable = rows[decoded.readable]
             self._unreadable += len(rows) - len(readable)
             if len(readable):
-                self._add(decoded, block.log_time_ns[readable])
+                self._add(decoded, block.log_time_ns[readable], number)
 
-    def _add(self, decoded: MessageColumns, times: Ints) -> None:
+    def _add(self, decoded: MessageColumns, times: Ints, number: int) -> None:
         expected = self.channel.count or 0
         self._times.add(times, expected)
-        for path, slot in self.decoder.slots.items():
-            if slot.kind != "string":
-                values = decoded.numbers(path)
-            else:
-                known = self._texts.setdefault(path, {})
-                values = decoded.text_numbers(path, known)
-            lacking = -1 if slot.kind == "string" else 0
-            self._columns.setdefault(path, GrowingColumn(lacking)).add(values, expected)
+        self._numbers.add(np.full(len(times), number), expected)
+        for path, slot in self.decoders[number].slots.items():
+            is_text = slot.kind == "string"
+            values = decoded.text_numbers(path, self._texts.setdefault(path, {})) if is_text else decoded.numbers(path)
+            self._columns.setdefault((path, is_text), GrowingColumn(-1 if is_text else 0)).add(values, expected)
 
     def table(self) -> TopicTable:
-        """Return what was gathered since the last call, sorted by log time."""
-        times, gathered, unreadable = self._times.taken(), self._columns, self._unreadable
-        self._times, self._columns, self._unreadable = GrowingColumn(0), {}, 0
-        back, order = time_order(times)
+        """Return what was gathered, sorted by log time, and forget it.
+
+        Publishers may have been built from different versions of the type: the columns that all have are kept.
+        """
+        times, numbers = self._times.taken(), self._numbers.taken()
+        # of each publisher by itself: one may be recorded later than another
+        back = max((set_back_of(times[numbers == one]) for one in self.decoders), default=NOT_SET_BACK)
+        order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
-        for path in [*gathered]:
-            if path in self._texts:
-                texts[path] = [LogText(text.decode("utf-8", "replace")) for text in self._texts[path]]
-            values = gathered.pop(path).taken()
+        for path, is_text in [*self._columns]:
+            values = self._columns.pop((path, is_text)).taken()
+            if len(values) < len(times):
+                continue
             columns[path] = values if order is None else values[order]
-        return TopicTable(
-            self.channel.topic,
-            self.channel.message_type,
-            times if order is None else times[order],
-            columns,
-            texts,
-            unreadable,
-            back,
-        )
+            if is_text:
+                texts[path] = [LogText(text.decode("utf-8", "replace")) for text in self._texts[path]]
+        topic, message_type = self.channel.topic, self.channel.message_type
+        times = times if order is None else times[order]
+        return TopicTable(topic, message_type, times, columns, texts, self._unreadable, back)
 
 
-def time_order(times: Ints) -> tuple[SetBack, Ints | None]:
-    """Return how stored log times (n,) go back and what sorting does to the stretches between, and the order (n,).
-
-    The order is None where they do not go back.
-    """
+def set_back_of(times: Ints) -> SetBack:
+    """Return how stored log times (n,) go back, and what sorting does to the stretches between."""
     steps = np.diff(times)
     if not (steps < 0).any():
-        return NOT_SET_BACK, None
-    order = np.argsort(times, kind="stable")
+        return NOT_SET_BACK
     step_ns = int(-steps.min())
     stretch = np.concatenate([[0], np.cumsum(steps < -(NEAR_NS if step_ns > NEAR_NS else OUT_OF_ORDER_NS))])
-    pieces = 1 + np.count_nonzero(np.diff(stretch[order]))
-    return SetBack(step_ns, float(pieces / (stretch[-1] + 1)), int(times[np.argmin(steps)])), order
-
-
-def merge_tables(tables: list[TopicTable]) -> list[TopicTable]:
-    """Join tables of one topic and type: a ROS 1 bag gives each publisher a connection of its own."""
-    groups: dict[tuple[str, str], list[TopicTable]] = {}
-    for table in tables:
-        groups.setdefault((table.topic, table.message_type), []).append(table)
-    return [_merged(group) if len(group) > 1 else group[0] for group in groups.values()]
-
-
-def _merged(group: list[TopicTable]) -> TopicTable:
-    """Join tables of one topic and type, sorted by log time."""
-    unreadable = sum(table.unreadable for table in group)
-    group = [table for table in group if len(table)] or group[:1]
-    times = np.concatenate([table.log_time_ns for table in group])
-    order = np.argsort(times, kind="stable")
-    columns: dict[str, NDArray[Any]] = {}
-    texts: dict[str, list[LogText]] = {}
-    # Publishers may have been built from different versions of the type: the columns that all have are kept.
-    for path in group[0].columns:
-        if any(path not in table.columns or (path in table.texts) != (path in group[0].texts) for table in group):
-            continue
-        parts = [table.columns[path] for table in group]
-        if path in group[0].texts:
-            texts[path] = list(dict.fromkeys(text for table in group for text in table.texts[path]))
-            places = {text: place for place, text in enumerate(texts[path])}
-            renumber = [np.array([*(places[text] for text in table.texts[path]), -1]) for table in group]
-            parts = [numbers[part] for numbers, part in zip(renumber, parts, strict=True)]
-        columns[path] = _joined(parts, -1 if path in texts else 0)[order]
-    set_back = max(table.set_back for table in group)
-    return replace(
-        group[0], log_time_ns=times[order], columns=columns, texts=texts, unreadable=unreadable, set_back=set_back
-    )
-
-
-def _joined(parts: list[NDArray[Any]], lacking: float = 0) -> NDArray[Any]:
-    """Concatenate parts; those with fewer columns are padded with NaN, or with `lacking` where they hold integers."""
-    if parts[0].ndim == 2:
-        width = max(part.shape[1] for part in parts)
-        lacking = np.nan if parts[0].dtype.kind == "f" else lacking
-        parts = [
-            np.pad(part, ((0, 0), (0, width - part.shape[1])), constant_values=lacking)
-            if part.shape[1] < width
-            else part
-            for part in parts
-        ]
-    return np.concatenate(parts)
+    pieces = 1 + np.count_nonzero(np.diff(stretch[np.argsort(times, kind="stable")]))
+    return SetBack(step_ns, float(pieces / (stretch[-1] + 1)), int(times[np.argmin(steps)]))

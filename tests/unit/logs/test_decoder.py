@@ -120,11 +120,12 @@ def plain(values):
 
 @pytest.mark.parametrize("message_type", WANTED)
 @pytest.mark.parametrize("cdr", [True, False], ids=["cdr", "ros1"])
-def test_messages_decoded_together_are_those_decoded_alone(message_type, cdr):
+def test_messages_decoded_together_are_those_decoded_alone(message_type, cdr, monkeypatch):
     """Sound and damaged ones: of one that is alone nothing else is there that could be read."""
+    monkeypatch.setattr(decoder, "MOST_ELEMENTS", 3)
     rng = np.random.default_rng(len(message_type))
     definitions = (STORE if cdr else get_typestore(Stores.ROS1_NOETIC)).fielddefs
-    layout = compile_layout(definitions, message_type, WANTED[message_type], "cdr" if cdr else "ros1", 3)
+    layout = compile_layout(definitions, message_type, WANTED[message_type], "cdr" if cdr else "ros1")
     messages = ros_messages(rng, message_type, cdr)
     assert decoded(layout, *joined(messages))[0] == [*range(len(messages))]
     damaged = [mutated(rng, messages[row % len(messages)]) for row in range(MUTATIONS)]
@@ -169,7 +170,7 @@ def test_decoding_of_an_array_longer_than_all_messages_reads_nothing():
     for count in (10**6, 1 << 61, (1 << 63) - 1):
         for slot in (0, -1):
             numbers = Operation(NUMBERS, 8, count, slot)
-            for operation in (numbers, Operation(LOOP, 0, count, -1, (Operation(NUMBERS, 8, 1, slot),), slot < 0)):
+            for operation in (numbers, Operation(LOOP, 0, count, -1, -1, (Operation(NUMBERS, 8, 1, slot),), slot < 0)):
                 assert decoded(layout_of(operation), *joined([b"\0\1\0\0" + bytes(64)]))[0] == []
 
 
@@ -178,8 +179,8 @@ COUNTS = {
     "taken text": Operation(TEXT, 0, COUNTED, 0),
     "sequence": Operation(NUMBERS, 8, COUNTED, -1),
     "taken sequence": Operation(NUMBERS, 8, COUNTED, 0),
-    "loop": Operation(LOOP, 0, COUNTED, -1, ()),
-    "constant loop": Operation(LOOP, 0, COUNTED, -1, (Operation(NUMBERS, 1, 1, -1),), True),
+    "loop": Operation(LOOP, 0, COUNTED, -1),
+    "constant loop": Operation(LOOP, 0, COUNTED, -1, -1, (Operation(NUMBERS, 1, 1, -1),), True),
 }
 
 
@@ -197,7 +198,7 @@ def test_decoding_of_elements_without_fields_ends(is_constant):
     """A loop over nothing, in a loop over nothing, in a loop over nothing: 10^27 turns if they were taken."""
     body = ()
     for _ in range(3):
-        body = (Operation(LOOP, 0, 10**9, -1, body, is_constant),)
+        body = (Operation(LOOP, 0, 10**9, -1, -1, body, is_constant),)
     assert decoded(Layout(body, {}, 0, False), *joined([bytes(64)]))[0] == []
 
 

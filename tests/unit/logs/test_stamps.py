@@ -7,7 +7,7 @@ import pytest
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.messages.topic_table import TopicTable, time_order
+from icrtool.logs.messages.topic_table import TopicTable, set_back_of
 from icrtool.logs.streams.stamps import NEVER_SET, StampedRows, clock_notes, stamp_rows
 from icrtool.records.text import LogText
 
@@ -15,9 +15,7 @@ TIMES = np.arange(0, 100_000_000_000, 20_000_000)
 
 
 def notes_of(times: Ints) -> list[str]:
-    set_back, order = time_order(times)
-    stamps = times if order is None else times[order]
-    rows = StampedRows(None, stamps, "no header", 0, set_back=set_back)
+    rows = StampedRows(None, np.sort(times), "no header", 0, set_back=set_back_of(times))
     return list(clock_notes([("wheels", rows), ("gnss", rows)], "drive"))
 
 
