@@ -97,7 +97,9 @@ def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
     after = np.median(delay[np.minimum(steps[:, None] + 1 + rows, len(delay) - 1)], axis=1)
     grown = (after - before).astype(np.int64)
     of_stretch = np.diff([np.median(part) for part in np.split(delay, steps + 1)])
-    lasting = (grown > OUT_OF_ORDER_NS) | ((grown < -OUT_OF_ORDER_NS) & (of_stretch < grown / 2))
+    # a few stamps of another clock, as a first one at 0, are replaced by their log times
+    many = np.diff(steps, prepend=-1) > max(1.0, LARGEST_SHARE_ZERO * len(header))
+    lasting = (grown > OUT_OF_ORDER_NS) | ((grown < -OUT_OF_ORDER_NS) & (of_stretch < grown / 2) & many)
     lasting &= (grown > 0) == (jump[steps] < 0)
     if not lasting.any():
         return header, NEVER_SET
