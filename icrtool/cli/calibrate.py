@@ -16,7 +16,6 @@ from icrtool.cli.terminal import show
 
 if TYPE_CHECKING:
     from icrtool.calibration.one_log import LogCalibration
-    from icrtool.calibration.pooled import CalibrationResult
     from icrtool.config import Config
     from icrtool.records.run import Run
 
@@ -71,7 +70,10 @@ def command(
         if sensors is None or not (runs[0].usable or allow_unusable):
             raise
         options.warn([f"no motion model: {err}"], quiet=quiet)
-    texts = _texts(result, sensors, verbose=verbose)
+    from icrtool.output.tables.held_out import calibration_blocks
+    from icrtool.output.text_blocks import printed
+
+    texts: list[str] = [printed(calibration_blocks(result, sensors), verbose=verbose)]
     document = result.calibration.summary() if result is not None else {}
     if sensors is not None:
         document = sensors.summary() | document | {"alignment": sensors.summary()["parameters"]}
@@ -88,18 +90,6 @@ def command(
             if verbose:
                 click.echo()
             show(text)
-
-
-def _texts(result: CalibrationResult | None, sensors: LogCalibration | None, *, verbose: bool) -> list[str]:
-    """Return the answer, with -v all tables."""
-    from icrtool.output.tables.brief import brief_calibration
-    from icrtool.output.tables.calibration import format_calibration
-    from icrtool.output.tables.held_out import format_result
-
-    if not verbose:
-        return [brief_calibration(result, sensors)]
-    texts: list[str] = [format_result(result)] if result is not None else []
-    return [*texts, format_calibration(sensors)] if sensors is not None else texts
 
 
 def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run]:

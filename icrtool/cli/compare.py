@@ -45,7 +45,8 @@ def command(
     from icrtool.calibration.transfer import compare_groups
     from icrtool.output.files.atomic import write_file
     from icrtool.output.files.formats import json_bytes, save_picture
-    from icrtool.output.tables.transfer import brief_transfer, format_transfer, transfer_csv
+    from icrtool.output.tables.transfer import transfer_blocks, transfer_csv
+    from icrtool.output.text_blocks import printed
 
     config = options.load(config_file, robot, sets)
     places = _groups(sources)
@@ -65,7 +66,7 @@ def command(
     if as_json:
         print_json("compare", compared)
     elif not quiet:
-        show(format_transfer(compared) if verbose else brief_transfer(compared))
+        show(printed(transfer_blocks(compared), verbose=verbose))
 
 
 def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:

@@ -90,14 +90,10 @@ def command(
 
 def _print(run: Run, place: str, examine: str, *, verbose: bool) -> None:
     """Print the answer, with -v all that was found; `examine`: command that names what is wrong in the log."""
-    from icrtool.output.tables.brief import brief_run
-    from icrtool.output.tables.run import format_run
+    from icrtool.output.tables.run import next_blocks, run_blocks
+    from icrtool.output.text_blocks import printed
 
-    if verbose:
-        show(format_run(run))
-        click.echo(f"\nwritten to {place}")
-    else:
-        show(brief_run(run, place, examine))
+    show(printed([*run_blocks(run.document), *next_blocks(run.document, place, examine)], verbose=verbose))
 
 
 def check_times(times: tuple[float, ...]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from icrtool.output.text_blocks import Line, Table, Text
+from icrtool.output.text_blocks import Line, Table, Text, narrowed
 
 if TYPE_CHECKING:
     from rich.console import Console, JustifyMethod
@@ -45,7 +45,7 @@ def _print(text: Text, console: Console) -> None:
         elif isinstance(block, str):
             console.print(RichText(str(block)))
         else:
-            table, left_out = _fitting(block, console.width)
+            table, left_out = _fitting(narrowed(block, console.width), console.width)
             console.print(_rich_table(table, RichTable(box=None, pad_edge=False, show_header=bool(table.head))))
             if left_out:
                 why = f"the terminal has {console.width} columns"

@@ -22,8 +22,8 @@ from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, schem
 from icrtool.output.files.own_files import files_in
 from icrtool.output.files.states_file import trials_file
 from icrtool.output.run_directory import is_run_directory
-from icrtool.output.tables.dropout import no_trial, why_no_trial
 from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
+from icrtool.output.text_format import distance_text
 from icrtool.records.dropout import ExampleTrial, ModelResult, error_columns
 from icrtool.records.dropout_document import (
     DROPOUT_SCHEMA,
@@ -42,7 +42,7 @@ from icrtool.records.dropout_document import (
     SummaryRow,
     TrialDocument,
 )
-from icrtool.records.plain_data import rows_of
+from icrtool.records.plain_data import plain, rows_of
 from icrtool.records.run import FigureSet
 
 REPORT_FILE = "report.json"
@@ -125,6 +125,11 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(report)))
 
 
+def shown_document(report: DropoutReport) -> DropoutDocument:
+    """Return what report.json holds as it is read back: null for a number that is not known."""
+    return msgspec.convert(plain(report_document(report)), DropoutDocument)
+
+
 def report_document(report: DropoutReport) -> DropoutDocument:
     """Return what report.json holds, NaN for a number that is not known."""
     run, made = report.run_document, report.calibration
@@ -201,13 +206,38 @@ def _baseline_document(report: DropoutReport) -> BaselineDocument | None:
 
 def _count_documents(report: DropoutReport) -> tuple[CountDocument, ...]:
     """Return how many starts were a trial at each horizon, and why the others were none."""
-    reasons = no_trial(report)
+    counts, reasons = report.counts, no_trial(report)
     return tuple(
         CountDocument(
-            horizon, report.counts.trials[h], {one.key: one.starts[h] for one in reasons}, why_no_trial(report, h)
+            horizon, counts.trials[h], {key: starts[h] for key, (_, starts) in reasons.items()}, why_no_trial(report, h)
         )
         for h, horizon in enumerate(report.horizons_m)
     )
+
+
+def no_trial(report: DropoutReport) -> dict[str, tuple[str, Ints]]:
+    """Return the reasons why starts gave no trial: in words, and how many starts (h,)."""
+    counts, cost = report.counts, report.event_cost
+    driven = distance_text(report.run_document.drive.distance_m)
+    slip = cost.trials if cost is not None else np.zeros_like(counts.short)
+    return {
+        "too_little_way_left": (f"less than that is left of the {driven} driven", counts.short),
+        "across_wheel_gap": ("the path crosses a gap in the wheel data", counts.gap),
+        "ends_in_gnss_outage": ("it ends in a GNSS outage", counts.outage),
+        "from_standstill": ("the robot stands", counts.standing),
+        "crosses_jump": ("the reference jumps on the path", counts.crosses_jump),
+        "across_slip_event": ("the path crosses a slip event", slip),
+    }
+
+
+def why_no_trial(report: DropoutReport, h: int) -> str | None:
+    """Return why a horizon has no trial, None where it has some."""
+    counts, reasons = report.counts, no_trial(report)
+    if not len(counts.trials) or counts.trials[h]:
+        return None
+    if counts.short[h] == report.states:
+        return reasons["too_little_way_left"][0]
+    return ", ".join(f"{why} ({int(starts[h]):,} starts)" for why, starts in reasons.values() if starts[h])
 
 
 def _event_document(report: DropoutReport) -> EventCostDocument | None:

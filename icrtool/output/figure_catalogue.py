@@ -82,7 +82,8 @@ FIGURES = {
         "trajectory.trajectory", with_place=True,
     ),
     "icr_estimates": Entry(
-        "run", "ICR estimates over time", "Good: the lines settle soon and stay within their bands.",
+        "run", "ICR estimates over time",
+        "Good: the lines settle soon and the bands become narrow. A later step: other ground, or a faulty sensor.",
         "icrs.icr_estimates",
     ),
     "icr_clusters": Entry(

@@ -1,4 +1,7 @@
-"""Printed text: sentences and tables; plain here, and by `icrtool.cli.terminal` on a terminal."""
+"""Blocks: what a document states, once; printed here, by `icrtool.cli.terminal` on a terminal, and on a page.
+
+A document (a run, a report, a comparison) is a list of blocks. Whatever lays them out knows nothing of runs or reports.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,35 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple, Self
 
+from icrtool.records.text import shortened
+
 TEXT_WIDTH = 100
 """Characters in a line of plain text."""
 
+BRIEF_WIDTH, BRIEF_LINES = 80, 2
+"""Columns of a terminal that a brief answer fills, and lines of a labelled sentence in it."""
+
+MOST_ITEMS = 4
+"""Sentences of a list in a brief answer."""
+
 LABEL = 10
-"""Width of the labels of `labelled` rows."""
+"""Width of the labels of labelled sentences, beside two blanks."""
+
+NARROWEST, NARROWEST_LAST = 8, 12
+"""Characters that are left of a cell of text in a table that is too wide, and of the lines of a sentence in it."""
 
 Look = Literal["title", "good", "bad", "as is"]
+Grade = Literal["good", "care", "bad", "fact"]
+
+BRIEF, VERBOSE, PAGE = 0, 1, 2
+"""Depth of a section: always shown, with -v and folded on a page, and on a page alone."""
+
+
+class Title(NamedTuple):
+    """What a document is about, and how much it rests on."""
+
+    text: str
+    facts: str
 
 
 class Line(NamedTuple):
@@ -20,6 +45,18 @@ class Line(NamedTuple):
 
     text: str
     look: Look
+
+
+class Cell(NamedTuple):
+    """A cell with a second number beside the first, and further lines; a brief table has the first number alone."""
+
+    text: str
+    aside: str = ""
+    more: tuple[str, ...] = ()
+
+    def lines(self) -> tuple[str, ...]:
+        """Return its lines; numbers beside others stand in a column."""
+        return (f"{self.text} {self.aside:>7}" if self.aside else self.text, *self.more)
 
 
 class Table(NamedTuple):
@@ -30,20 +67,105 @@ class Table(NamedTuple):
     align : ``l`` or ``r`` for each column; the last one holds for the columns after it too
     rows : as many cells in each
     head : names of the columns; empty: none
+    caption : what it shows
+    moments : seconds at which each row begins, which a page shows on its map; empty: none
     """
 
     align: str
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[str | Cell]]
     head: Sequence[str] = ()
+    caption: str = ""
+    moments: Sequence[float] = ()
 
     def sides(self) -> str:
         """Return ``l`` or ``r`` for every column."""
         columns = len(self.head or next(iter(self.rows), ()))
         return self.align.ljust(columns, self.align[-1])[:columns]
 
+    def lines(self, *, brief: bool = False) -> list[list[str]]:
+        """Return the rows as texts, several of a row whose cells have several lines."""
+        found = []
+        for row in self.rows:
+            cells = [
+                ((cell.text,) if brief else cell.lines()) if isinstance(cell, Cell) else (str(cell),) for cell in row
+            ]
+            depth = max(map(len, cells))
+            found += [[cell[line] if line < len(cell) else "" for cell in cells] for line in range(depth)]
+        return found
 
-Block = str | Line | Table
+
+class Facts(NamedTuple):
+    """Labelled sentences; one without a label goes on with what is above it.
+
+    Attributes
+    ----------
+    label : of all of them together: names and numbers then stand in two columns
+    """
+
+    rows: Sequence[tuple[str, str]]
+    label: str = ""
+
+
+class Check(NamedTuple):
+    """Something that was checked, and the finding; `more`: its details. A fact is neither good nor bad."""
+
+    grade: Grade
+    what: str
+    text: str
+    more: tuple[str, ...] = ()
+
+
+class Checks(NamedTuple):
+    """What was checked."""
+
+    rows: Sequence[Check]
+
+
+class Items(NamedTuple):
+    """Sentences as a list."""
+
+    texts: Sequence[str]
+
+
+class Figure(NamedTuple):
+    """Figures of `icrtool.output.figure_catalogue`.
+
+    Attributes
+    ----------
+    names : begin the names of its pictures
+    drawing : template of what a page's scripts draw in place of them; empty: nothing
+    folded : a page shows the titles of its pictures first
+    """
+
+    names: tuple[str, ...]
+    drawing: str = ""
+    folded: bool = True
+
+
+class Section(NamedTuple):
+    """Blocks under a title.
+
+    Attributes
+    ----------
+    lead, text : the answer in a few words, and the sentence that goes on from there
+    label : what stands before them in a brief answer; empty: they do not
+    name : of its place on a page
+    """
+
+    title: str
+    blocks: Sequence[Block]
+    depth: int = BRIEF
+    lead: str = ""
+    text: str = ""
+    label: str = ""
+    grade: Grade = "fact"
+    name: str = ""
+
+
+Block = str | Title | Line | Table | Facts | Checks | Items | Figure | Section
 """A `str` is a sentence; what follows its first line is indented by two more characters."""
+
+Printed = str | Line | Table
 
 
 class Text(str):
@@ -54,14 +176,89 @@ class Text(str):
     blocks : of which it is made
     """
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[Printed, ...]
 
-    def __new__(cls, blocks: Iterable[Block]) -> Self:
+    def __new__(cls, blocks: Iterable[Printed]) -> Self:
         """Return `blocks` as plain text, at most `TEXT_WIDTH` wide where it can be wrapped; no line end."""
         blocks = tuple(blocks)
         self = super().__new__(cls, "\n".join(line.rstrip() for block in blocks for line in _lines(block)))
         self.blocks = blocks
         return self
+
+
+def printed(blocks: Iterable[Block], *, verbose: bool) -> Text:
+    """Return a document as text: the brief answer in lines of `BRIEF_WIDTH`, or all but what is for a page alone."""
+    return Text(_verbose(blocks) if verbose else _brief(blocks))
+
+
+LOOKS: dict[Grade, Look] = {"good": "good", "care": "as is", "bad": "bad", "fact": "as is"}
+MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": ""}
+
+
+def _brief(blocks: Iterable[Block]) -> Iterator[Printed]:
+    for block in blocks:
+        if isinstance(block, Title):
+            title = shortened(block.text, max(BRIEF_WIDTH - len(block.facts) - 3, LABEL + 2))
+            yield Line(f"{title}   {block.facts}", "title")
+        elif isinstance(block, Facts):
+            yield from (Line(_cut(first, text), "as is") for first, text in _fact_lines(block))
+        elif isinstance(block, Checks):
+            checked = [one for one in block.rows if one.grade != "fact"]
+            for number, one in enumerate(checked):
+                first = f"{'' if number else 'checks':{LABEL + 2}}{MARKS[one.grade]:4}{one.what:{LABEL + 2}}"
+                yield Line(_cut(first, one.text, 1 if one.grade == "good" else BRIEF_LINES), "as is")
+        elif isinstance(block, Items):
+            yield from list(block.texts)[:MOST_ITEMS]
+            yield from [f"and {len(block.texts) - MOST_ITEMS} more: -v"] if len(block.texts) > MOST_ITEMS else []
+        elif isinstance(block, Section):
+            if block.depth == BRIEF and block.label:
+                yield Line(_cut(f"{block.label:{LABEL + 2}}", _lead(block), 3), LOOKS[block.grade])
+            yield from _brief(block.blocks) if block.depth == BRIEF else ()
+        elif isinstance(block, Table):
+            yield from [Line(block.caption, "title")] if block.caption else []
+            indent = "   " if block.caption else ""
+            yield block._replace(rows=[(indent + row[0], *row[1:]) for row in block.lines(brief=True)])
+        elif not isinstance(block, Figure):
+            yield block
+
+
+def _verbose(blocks: Iterable[Block]) -> Iterator[Printed]:
+    for block in blocks:
+        if isinstance(block, Title):
+            yield from (Line(block.text, "title"), block.facts)
+        elif isinstance(block, Facts):
+            yield from labelled([(first.rstrip(), text) for first, text in _fact_lines(block)])
+        elif isinstance(block, Checks):
+            for one in block.rows:
+                kept = [(one.what, MARKS[one.grade], one.text), *(("", "", text) for text in one.more)]
+                yield from labelled([(f"{what:{LABEL + 2}}{mark:2}", text) for what, mark, text in kept])
+        elif isinstance(block, Items):
+            yield from list(block.texts)
+        elif isinstance(block, Section):
+            if block.depth <= VERBOSE:
+                yield ""
+                yield from [Line(block.title, "title")] if block.title else []
+                yield from [_lead(block)] if block.label else []
+                yield from _verbose(block.blocks)
+        elif isinstance(block, Table):
+            yield from [Line(block.caption, "as is")] if block.caption else []
+            yield block._replace(rows=block.lines())
+        elif not isinstance(block, Figure):
+            yield block
+
+
+def _lead(section: Section) -> str:
+    return f"{section.lead} {section.text}".strip()
+
+
+def _fact_lines(facts: Facts) -> Iterator[tuple[str, str]]:
+    """Yield what stands before each sentence, and the sentence."""
+    widest = max((len(name) for name, _ in facts.rows), default=0)
+    for number, (name, text) in enumerate(facts.rows):
+        if facts.label:
+            yield f"{'' if number else facts.label:{LABEL + 2}}{name:{widest}}  ", text
+        else:
+            yield f"{name:{LABEL + 2}}", text
 
 
 def labelled(rows: Iterable[tuple[str, str]]) -> list[Table]:
@@ -70,7 +267,7 @@ def labelled(rows: Iterable[tuple[str, str]]) -> list[Table]:
     return [Table("l", padded)] if padded else []
 
 
-def _lines(block: Block) -> Iterable[str]:
+def _lines(block: Printed) -> Iterable[str]:
     if isinstance(block, Table):
         return _table_lines(block)
     if isinstance(block, Line):
@@ -79,7 +276,29 @@ def _lines(block: Block) -> Iterable[str]:
     return _wrap(str(block), "", indent) or [""]
 
 
+def narrowed(table: Table, width: int) -> Table:
+    """Return a table with one line a row, whose widest cells of text are shortened until it fits, where that helps."""
+    sides = table.sides()
+    rows = [list(map(str, table.head)), *table.lines()] if table.head else table.lines()
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    last = len(widths) - 1
+    # a last column of text is wrapped
+    texts = [column for column, side in enumerate(sides[:-1]) if side == "l" and column]
+    widths[last] = min(widths[last], NARROWEST_LAST) if sides[last] == "l" else widths[last]
+    while texts and sum(widths) + 2 * (len(widths) - 1) > width:
+        widest = max(texts, key=lambda column: widths[column])
+        if widths[widest] <= NARROWEST:
+            break
+        widths[widest] -= 1
+    rows = [
+        [shortened(cell, widths[column]) if column in texts else cell for column, cell in enumerate(row)]
+        for row in rows
+    ]  # fmt: skip
+    return table._replace(rows=rows[1:] if table.head else rows)
+
+
 def _table_lines(table: Table) -> Iterator[str]:
+    table = narrowed(table, TEXT_WIDTH)
     rows = [[str(cell) for cell in row] for row in ((table.head, *table.rows) if table.head else table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sides = table.sides()
@@ -99,3 +318,12 @@ def _wrap(text: str, first: str, later: str) -> list[str]:
     return textwrap.wrap(
         text, TEXT_WIDTH, initial_indent=first, subsequent_indent=later, break_long_words=False, break_on_hyphens=False
     )
+
+
+def _cut(first: str, text: str, most: int = BRIEF_LINES) -> str:
+    """Return a text behind `first` in so many lines of a brief answer at most; a path is not broken."""
+    lines = textwrap.wrap(
+        text, BRIEF_WIDTH, initial_indent=first, subsequent_indent=" " * len(first), break_long_words=False,
+        break_on_hyphens=False, max_lines=most, placeholder=" …",
+    )  # fmt: skip
+    return "\n".join(lines) or first.rstrip()

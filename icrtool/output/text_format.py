@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from icrtool.output.text_blocks import Line
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.samples import ROLE_WORDS, Role
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
         ControllerNumbers,
         DriveDocument,
         EventDocument,
-        ExcitationDocument,
         ReferenceJumpDocument,
         RunDocument,
     )
@@ -43,11 +41,6 @@ def run_title(summary: RunDocument) -> str:
     return f"{log}  ({robot})" if robot else str(log)
 
 
-def unusable_lines(summary: RunDocument) -> list[Line]:
-    """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
-    return [] if summary.usable else [Line(f"Do not use: {summary.unusable_because}", "bad")]
-
-
 def position_word(summary: RunDocument) -> str:
     """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
     return "GNSS fixes" if summary.gnss.datum is not None else "position reference"
@@ -61,18 +54,6 @@ def role_word(summary: RunDocument, role: Role) -> str:
 def topics_text(topics: str) -> str:
     """Return the topics of a stream, each once."""
     return " + ".join(dict.fromkeys(topics.split(" + ")))
-
-
-def excitation_text(excitation: ExcitationDocument) -> str:
-    """Return what a drive could show of the ICRs at best, and how it turned; from the key of a run's summary."""
-    if excitation.verdict.all_shown:
-        shown = "enough to show all three ICRs"
-    else:
-        shown = ", ".join(f"{ICR_WORDS[column]} {excitation.verdict[column]}" for column in ICR_COLUMNS)
-        shown += " (weak: found roughly; not shown: cannot be found)"
-    spun = excitation.spun_right_deg + excitation.spun_left_deg
-    turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
-    return f"{shown}; turned {turned}, {spun:,.0f}° of it on the spot"
 
 
 def event_kinds(events: Sequence[EventDocument]) -> str:

@@ -13,7 +13,8 @@ from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.kernels.open_loop.block_sums import difference_half_width
 from icrtool.output.files.atomic import write_file
-from icrtool.output.tables.dropout import format_dropout, shown_horizons
+from icrtool.output.tables.dropout import format_dropout
+from icrtool.output.tables.errors import shown_horizons
 from icrtool.output.text_blocks import Line, Table
 from icrtool.output.text_format import error_text, run_title, xml_text
 from icrtool.records.fleet_document import FleetVerdict, fleet_verdict
@@ -91,11 +92,13 @@ def format_markdown(report: DropoutReport) -> str:
         lines += [word, "", *(f"- {escaped_markdown(line)}" for line in verdicts), ""]
     for block in format_dropout(report).blocks:
         if isinstance(block, Table):
-            rows = [[escaped_markdown(cell.strip()) for cell in row] for row in block.rows]
+            rows = [[escaped_markdown(cell.strip()) for cell in row] for row in block.lines()]
             texts = [column for column, side in enumerate(block.sides()) if side == "l"]
-            lines += ["", *markdown_table(block.head, rows, texts), ""]
+            table = ["", *markdown_table(block.head, rows, texts), ""]
+            lines += table if block.head else [f"- {' '.join(filter(None, row))}" for row in rows]
         elif (text := block.text if isinstance(block, Line) else block) and text not in (title, *verdicts):
-            lines.append(f"- {escaped_markdown(text)}")
+            heading = isinstance(block, Line) and block.look == "title"
+            lines += ["", f"### {escaped_markdown(text)}", ""] if heading else [f"- {escaped_markdown(text)}"]
     if report.baseline is not None:
         lines += _baseline_lines(report, report.baseline)
     return "\n".join(lines) + "\n"

@@ -23,7 +23,7 @@ def packed(column: Floats | Ints | Bytes | Bools, kind: Literal["f32", "f64", "i
 
     Notes
     -----
-    ``f32`` has seven digits: enough for metres within some kilometres of the origin.
+    ``f32`` has seven digits: enough for metres within some kilometres of the origin, and for seconds of a day (8 ms).
     """
     return {"type": kind, "data": b64encode(np.asarray(column).astype(_TYPES[kind]).tobytes()).decode("ascii")}
 

@@ -13,10 +13,11 @@ from icrtool.output.files.formats import schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS
 from icrtool.output.page.pictures import drawn_pictures
 from icrtool.output.page.render import render
+from icrtool.output.tables.transfer import transfer_blocks
+from icrtool.output.text_blocks import Title
 from icrtool.records.calibration_document import GroupComparison, TransferCell
-from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.regular_file import read_regular
-from icrtool.records.text import escaped_texts
+from icrtool.records.text import counted, escaped_texts
 
 SCRIPTS = ("vendor/uPlot.iife.min.js", "vendor/d3.min.js", "columns.js", "charts.js", "comparison.js")
 
@@ -27,13 +28,17 @@ def comparison_page(found: GroupComparison, title: str) -> str:
     """Return the page of a comparison as HTML."""
     from icrtool.output.figures.transfer import transfer
 
-    names, cells = list(found.groups), found.transfer
-    at_choice = {(one.calibrated_on, one.tested_on): one for one in cells if one.horizon_m == CHOICE_HORIZON_M}
-    drawn = drawn_pictures([("transfer", transfer(found))])["transfer"]
+    names = list(found.groups)
+    labels = {name: model.label for name, model in FAMILY.items()}
+    groups = "; ".join(
+        f"{name}: {counted(len(one.logs), 'log')}, model {labels.get(one.model, one.model)}"
+        for name, one in found.groups.items()
+    )
     return render(
-        "comparison.html", SCRIPTS, {"by_group": [_errors(cells, names, name) for name in names]}, title=title,
-        groups=found.groups, pairs=found.pairs, names=names, cells=at_choice, horizon_m=CHOICE_HORIZON_M,
-        drawn=drawn, labels={name: model.label for name, model in FAMILY.items()},
+        SCRIPTS, {"by_group": [_errors(found.transfer, names, name) for name in names]}, title=title,
+        kind="Drive without GNSS: groups of runs compared",
+        blocks=[Title(f"{', '.join(names)} ({title})", groups), *transfer_blocks(found)],
+        names=names, pictures=drawn_pictures([("transfer", transfer(found))]),
     )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ open-loop path that the page integrates ends where the library's does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -26,7 +26,8 @@ from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, co
 from icrtool.motion.recording import Recording, cut_windows, predicted_path
 from icrtool.output.decimate import extremes, places
 from icrtool.output.page.columns import packed, packed_sums
-from icrtool.records.dropout_document import DropoutDocument, FitDocument, ModelDocument
+from icrtool.output.tables.errors import in_order, main_rows
+from icrtool.records.dropout_document import DropoutDocument, FitDocument
 from icrtool.records.run import Run, no_slip_icrs, track_of, width_or_usual_m
 from icrtool.records.tables import Icrs
 
@@ -43,9 +44,6 @@ PATH_CELLS = 4000.0
 
 ERROR_KEYS = {"p95": "p95_m", "p95_low": "p95_low_m", "p95_high": "p95_high_m", "expected": "expected_error_m",
               "expected_low": "expected_low_m", "expected_high": "expected_high_m"}  # fmt: skip
-
-MAIN_ROWS = ("recommended", "controller", "recommended_gyro", "recommended_heading", "no_slip")
-"""Models whose errors are not folded, beside calibrations."""
 
 
 class PageSteps(NamedTuple):
@@ -89,21 +87,6 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "errors": errors_data(report),
         "budgets_m": sorted({one.budget_m for one in report.budgets}),
     }
-
-
-def main_rows(report: DropoutDocument) -> set[str]:
-    """Return the models whose errors are not folded: those of `MAIN_ROWS`; without a whole model, all."""
-    names = {one.name for one in report.models}
-    given = {one.name for one in report.calibrations}
-    return given.union(MAIN_ROWS) & names if MAIN_ROWS[0] in names else names
-
-
-def in_order(models: Sequence[ModelDocument]) -> list[ModelDocument]:
-    """Return models of a report, those of `MAIN_ROWS` first and in its order, after calibrations."""
-    places = {name: place for place, name in enumerate(MAIN_ROWS)}
-    return sorted(
-        models, key=lambda one: -1 if one.name.startswith("calibration") else places.get(one.name, len(places))
-    )
 
 
 def errors_data(report: DropoutDocument) -> dict[str, Any]:
@@ -156,7 +139,7 @@ def _series_data(run: Run, steps: PageSteps) -> dict[str, Any]:
         "std_x": table.std_x_icr_m[steps.rows],
         "heading": np.angle(np.exp(1j * table.heading_rad[steps.rows])),
     }  # fmt: skip
-    return {"step": packed(rows, "i32"), "t": packed(table.t_s[state], "f64")} | {
+    return {"step": packed(rows, "i32"), "t": packed(table.t_s[state], "f32")} | {
         name: packed(column[rows], "f32") for name, column in at.items()
     }
 
@@ -168,7 +151,7 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
         rows = _extreme_rows(run.gnss.difference, chosen)
         found[name] = {
-            "t": packed(run.gnss.t_s[rows], "f64"),
+            "t": packed(run.gnss.t_s[rows], "f32"),
             "north": packed(fixes.north_m[rows] - origin[0], "f32"),
             "east": packed(fixes.east_m[rows] - origin[1], "f32"),
             "difference": packed(run.gnss.difference[rows], "f32"),
@@ -180,7 +163,7 @@ def _headings_data(run: Run) -> dict[str, Any]:
     """Return how far the headings that the filter used were from its own [deg]."""
     rows = _extreme_rows(run.heading.difference, run.heading.used)
     return {
-        "t": packed(run.heading.t_s[rows], "f64"),
+        "t": packed(run.heading.t_s[rows], "f32"),
         "difference_deg": packed(np.degrees(run.heading.difference[rows]), "f32"),
     }
 

@@ -11,8 +11,9 @@ from urllib.parse import quote
 from icrtool.output.page.pictures import pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.run_directory import PAGE_FILE
-from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text
-from icrtool.records.fleet_document import FleetDocument, FleetLog
+from icrtool.output.text_blocks import Block, Cell, Figure, Section, Table, Title
+from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text, signed
+from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
 from icrtool.records.regular_file import is_regular
 
 PLOTS = "plots"
@@ -23,7 +24,7 @@ HORIZON_M = 10.0
 MODELS = MODEL_WORDS
 
 
-class Cell(NamedTuple):
+class Sortable(NamedTuple):
     """One cell of the table: what is shown, and the number it is sorted by (None: nothing to show)."""
 
     text: str
@@ -43,7 +44,7 @@ class Line(NamedTuple):
     log: FleetLog
     link: str
     search: str
-    cells: tuple[Cell, ...]
+    cells: tuple[Sortable, ...]
 
 
 def fleet_page(document: FleetDocument, folder: Path) -> str:
@@ -57,15 +58,47 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
     budgets = _budgets(logs)
     lines = [Line(log, _link(log.run, folder), _search_text(log), tuple(_cells(log, budgets))) for log in logs]
     choices = {key: sorted({getattr(log, key) for log in logs} - {""}) for key in ("status", "robot", "group")}
+    title = folder.absolute().name
+    blocks: list[Block] = [Title(title, _counts_text(document))]
+    if document.calibrations:
+        blocks.append(Section("The robot, from all logs together", [_robots(document.calibrations)], name="robots"))
+    blocks.append(Section("Logs", [Figure((), "fleet")], name="logs"))
+    if reasons := Counter(_reason(log) for log in logs if log.status == "failed").most_common():
+        table = Table("lr", [(reason, f"{count}") for reason, count in reasons], ("reason", "logs"))
+        blocks.append(Section("Why logs failed", [table], name="failed"))
+    if pictures := pictures_in(folder / PLOTS, folder):
+        blocks.append(Section("All logs together", [Figure(tuple(pictures), folded=False)], name="pictures"))
     return render(
-        "fleet.html", ("fleet.js",), None, title=folder.absolute().name, lines=lines, columns=_columns(budgets),
-        counts=document.counts, gates_failed=document.gates_failed, made_with=document.tool_version,
-        choices=choices, named=[key for key in ("robot", "group") if len(choices[key]) > 1],
-        unusable=sum(log.status == "done" and not log.usable for log in logs),
-        horizon_m=HORIZON_M, calibrations=document.calibrations,
-        pictures=list(pictures_in(folder / PLOTS, folder).values()),
-        reasons=Counter(_reason(log) for log in logs if log.status == "failed").most_common(),
+        ("fleet.js",), None, title=title, kind="Drive without GNSS: report of many logs", blocks=blocks, lines=lines,
+        columns=_columns(budgets), choices=choices, pictures=pictures, horizon_m=HORIZON_M,
+        named=[key for key in ("robot", "group") if len(choices[key]) > 1],
     )  # fmt: skip
+
+
+def _counts_text(document: FleetDocument) -> str:
+    """Return how many logs can be used, and how many not."""
+    counts, unusable = document.counts, sum(log.status == "done" and not log.usable for log in document.logs)
+    skipped = f" ({counts.skipped} of them before, skipped this time)" if counts.skipped else ""
+    found = [f"{counts.done - unusable} can be used", f"{unusable} cannot", f"{counts.failed} failed{skipped}"]
+    found += [f"acceptance limits not met: {document.gates_failed}"] if document.gates_failed else []
+    return f"{len(document.logs)} logs: {', '.join(found)}. Made with icrtool {document.tool_version}."
+
+
+def _robots(calibrations: Sequence[FleetCalibration]) -> Table:
+    """Return what each robot's logs teach together."""
+    grouped = any(one.group for one in calibrations)
+    rows: list[list[str | Cell]] = []
+    for one in calibrations:
+        numbers = [Cell(one.reason), Cell("")]
+        if one.multiplier is not None:
+            within = "–" if one.within_m is None else f"{'more than ' if one.within_beyond else ''}{one.within_m:.1f} m"
+            numbers = [Cell(f"{one.multiplier:.3f}", f"± {one.multiplier_std:.3f}"), Cell(within)]
+        icrs = ", ".join(map(signed, one.icrs_m))
+        more = [one.group] if grouped else []
+        rows.append([one.robot or "all logs", *numbers, *more, f"{len(one.logs)}", icrs, ", ".join(one.left_out)])
+    group = ("group",) if grouped else ()
+    head = ("robot", "multiplier", "within 0.5 m (95 %) for", *group, "logs", "ICRs right, left, x [m]", "left out")
+    return Table(f"lrr{'l' * grouped}rrl", rows, head, "Each log was predicted without itself")
 
 
 def _reason(log: FleetLog) -> str:
@@ -92,7 +125,7 @@ def _search_text(log: FleetLog) -> str:
     return " ".join(words).casefold()
 
 
-def _cells(log: FleetLog, budgets: Sequence[str]) -> Iterator[Cell]:
+def _cells(log: FleetLog, budgets: Sequence[str]) -> Iterator[Sortable]:
     icr, errors = log.icr, log.errors
     for name in budgets:
         yield _within(log, name)
@@ -103,22 +136,22 @@ def _cells(log: FleetLog, budgets: Sequence[str]) -> Iterator[Cell]:
         yield _with_std(icr.get(name), icr.get(f"std_{name}"), "+")
     yield _cell(log.distance_m, distance_text)
     yield _cell(log.duration_s, duration_text)
-    yield Cell(log.start_utc.replace("T", " ").removesuffix("Z"), log.start_utc or None)
+    yield Sortable(log.start_utc.replace("T", " ").removesuffix("Z"), log.start_utc or None)
     for count in (log.events, log.warnings, log.gates_failed):
-        yield Cell("" if count is None else f"{count}", count)
+        yield Sortable("" if count is None else f"{count}", count)
 
 
-def _within(log: FleetLog, name: str) -> Cell:
+def _within(log: FleetLog, name: str) -> Sortable:
     """Return a distance within a budget; it may be a lower bound."""
     beyond = name in log.bounds
     return _cell(log.errors.get(name), lambda metres: f"{'> ' if beyond else ''}{metres:.1f} m")
 
 
-def _cell(value: float | None, text: Any) -> Cell:  # noqa: ANN401 - one of the functions of text_format
-    return Cell("", None) if value is None else Cell(text(value), value)
+def _cell(value: float | None, text: Any) -> Sortable:  # noqa: ANN401 - one of the functions of text_format
+    return Sortable("", None) if value is None else Sortable(text(value), value)
 
 
-def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
+def _with_std(value: float | None, std: float | None, sign: str) -> Sortable:
     spread = f" ± {std:.3f}" if std is not None else ""
     return _cell(value, lambda number: f"{number:{sign}.3f}{spread}".replace("-", "−"))
 

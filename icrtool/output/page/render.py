@@ -12,14 +12,14 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from icrtool import __version__
-from icrtool.output import text_format
-from icrtool.output.text_format import error_text
 from icrtool.records.plain_data import plain
-from icrtool.records.text import digits_of, escaped, with_std
+from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
+
+    from icrtool.output.text_blocks import Block
 
 DOCUMENT_ERRORS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """What a page raises for a JSON document that was edited."""
@@ -34,21 +34,30 @@ UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|mm|km|s|min|h|Hz|m/s|%|°|±)(?![\w]))|(?
 RANGE = re.compile(r"(?<=\d)-(?=\d+(\.\d+)?\xa0)")
 """The hyphen of a range of values."""
 
+MINUS = re.compile(r"(?<![\w.)])-(?=\d)")
+"""The sign of a negative number."""
+
 IN_SCRIPT = {ord("<"): "\\u003c", ord(">"): "\\u003e", ord("&"): "\\u0026"}
 """Escapes in JSON, so that no text in it can end the element it stands in."""
 
 
-def render(template: str, scripts: Sequence[str], data: Mapping[str, Any] | None, **content: object) -> str:
-    """Return a page as HTML.
+def render(
+    scripts: Sequence[str], data: Mapping[str, Any] | None, *, title: str, kind: str, blocks: Sequence[Block],
+    **content: object,
+) -> str:  # fmt: skip
+    """Return a page as HTML; text in it is escaped, twice: for a reader, and for HTML.
 
     Parameters
     ----------
-    template : name of a file in ``templates``
     scripts : names of files in ``static``, in the order they are carried out
     data : what the scripts read; None: nothing
-    content : what the template names; text in it is escaped, twice: for a reader, and for HTML
+    kind : what is reported on
+    blocks : what the page states; the first `Title` among them is its heading
+    content : what the templates of drawings name
     """
     from markupsafe import Markup
+
+    from icrtool.output.figure_catalogue import FIGURES
 
     style = "\n".join(_static(name) for name in STYLES)
     code = [BEGIN, *(_static(name) for name in scripts)]
@@ -56,11 +65,12 @@ def render(template: str, scripts: Sequence[str], data: Mapping[str, Any] | None
         f"default-src 'none'; img-src data:; style-src {_source(style)}; "
         f"script-src {' '.join(map(_source, code))}; base-uri 'none'; form-action 'none'"
     )
-    return _environment().get_template(template).render(
+    return _environment().get_template("base.html").render(
         # Ours, not of a log: they stand in the page as they are.
         policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(one) for one in code[1:]],  # noqa: S704
         data=Markup(script_json(data)) if data is not None else None,  # noqa: S704 - escaped for a script element
-        tool_version=__version__, **content,
+        tool_version=__version__, title=title, kind=kind, blocks=blocks, figures=FIGURES,
+        **{"pictures": {}, **content},
     )  # fmt: skip
 
 
@@ -79,18 +89,24 @@ def _environment() -> Environment:
         lstrip_blocks=True, finalize=shown,
     )  # fmt: skip
     environment.filters |= {
-        "metres": lambda value: "–" if value is None else _with_units(error_text(value)),
-        "distance": lambda value: _with_units(text_format.distance_text(value)),
-        "duration": lambda value: _with_units(text_format.duration_text(value)),
-        "signed": text_format.signed,
-        "digits": digits_of,
-        "with_std": lambda *numbers: with_std(*numbers).replace("-", "−"),
         "units": _with_units,
         "breakable": _breakable,
-        "minus": _minus,
-        "turn": _turn,
+        "sentence": lambda text: f"{text[:1].upper()}{text[1:]}",
+        "kind": lambda block: type(block).__name__,
+        "grouped": _grouped,
+        "named": lambda pictures, names: [one for name, one in pictures.items() if name.startswith(names)],
     }
     return environment
+
+
+def _grouped(rows: Sequence[tuple[str, str]]) -> list[tuple[str, list[str]]]:
+    """Return labelled sentences by label; one without a label belongs to that before it."""
+    found: list[tuple[str, list[str]]] = []
+    for name, text in rows:
+        if name or not found:
+            found.append((name, []))
+        found[-1][1].append(text)
+    return found
 
 
 def script_json(data: Mapping[str, Any]) -> str:
@@ -102,7 +118,8 @@ def _with_units(text: str) -> Markup:
     """Return a text whose values stay on one line with their units and standard deviations."""
     from markupsafe import Markup, escape
 
-    return Markup(RANGE.sub("\u2011", UNIT.sub("\xa0", str(escape(escaped(text))))))  # noqa: S704 - escaped
+    printed = MINUS.sub("−", str(escape(escaped(text))))
+    return Markup(RANGE.sub("\u2011", UNIT.sub("\xa0", printed)))  # noqa: S704 - escaped
 
 
 def _breakable(name: str) -> Markup:
@@ -110,17 +127,6 @@ def _breakable(name: str) -> Markup:
     from markupsafe import Markup, escape
 
     return Markup("_<wbr>").join(escape(part) for part in escaped(name).split("_"))
-
-
-def _minus(value: float, digits: int, sign: str = "") -> str:
-    """Return a number as print has it: a minus, not a hyphen, and no sign before zero."""
-    return f"{round(value, digits) + 0.0:{sign}.{digits}f}".replace("-", "−")
-
-
-def _turn(trial: Mapping[str, Any]) -> str:
-    """Return the turn of a trial, as ``96° left``."""
-    degrees = trial["heading_change_deg"]
-    return f"{abs(degrees):.0f}° {'right' if degrees > 0 else 'left'}"
 
 
 def _static(name: str) -> str:

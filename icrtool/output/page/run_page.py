@@ -4,34 +4,39 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import msgspec
-import numpy as np
 
 from icrtool.dropout_analysis.reference import with_smoothed_reference
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import RunError
-from icrtool.motion.models import TERMS
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, report_document
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, read_sums, schema_of
 from icrtool.output.files.own_files import is_page
-from icrtool.output.page.answer import answer_of
-from icrtool.output.page.drive_data import drive_data, in_order, main_rows
+from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
 from icrtool.output.page.render import render
 from icrtool.output.page.without_place import without_place
 from icrtool.output.stored_run import check_sum
-from icrtool.output.tables.dropout import shown_horizons
-from icrtool.output.text_format import duration_text, error_text, position_word, role_word
+from icrtool.output.tables.dropout import answer_sections, model_sections, outage_blocks, verdict_lines, worst_section
+from icrtool.output.tables.errors import errors_section, main_rows
+from icrtool.output.tables.run import (
+    advice_blocks,
+    events_section,
+    log_sections,
+    unusable_lines,
+    warnings_section,
+)
+from icrtool.output.text_blocks import PAGE, Block, Facts, Figure, Section, Title
+from icrtool.output.text_format import driven_text, position_word, run_title
 from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.plain_data import plain
 from icrtool.records.regular_file import read_regular
-from icrtool.records.run import ICR_WORDS, Run, check_type
+from icrtool.records.run import Run, check_type
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import escaped_texts
 
@@ -44,9 +49,6 @@ SCRIPTS = (
     "map.js",
     "run.js",
 )
-
-TWINS = ("trajectory", "icr_estimates", "gnss_difference", "summary")
-"""Pictures that a browser with scripts draws itself; they are for printing, and for readers without scripts."""
 
 
 def write_page(
@@ -92,18 +94,59 @@ def run_page(
         run, document = without_place(run, document)
     summary = run.document
     compared = with_smoothed_reference(run) if document.smoothed else run
+    begun = f"{datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     return render(
-        "run.html", SCRIPTS, drive_data(compared, document, coordinates=coordinates),
-        title=summary.log, summary=summary, report=document, answer=answer_of(summary, document),
-        pictures=pictures, twins=TWINS, icr_words=ICR_WORDS, position_word=position_word(summary),
-        warnings=[one.removeprefix(f"{summary.log}: ") for one in summary.warnings],
-        streams=[(role_word(summary, one.role), one) for one in summary.streams],
-        begun=_utc(int(run.table.stamp_ns[0])),
-        errors=_error_rows(document), worst=_worst_rows(document, summary),
-        config=_config_lines(summary.config.effective()),
-        coordinates=coordinates, samples=len(run.table), worst_label=_worst_label(document),
-        main_rows=main_rows(document), meanings={name: term.meaning for name, term in TERMS.items()},
+        SCRIPTS, drive_data(compared, document, coordinates=coordinates), title=summary.log,
+        kind="Drive without GNSS: report of one log",
+        blocks=[
+            Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {ABOUT}"),
+            *page_blocks(summary, document),
+            Section(
+                "Log and settings", [*log_sections(summary), _provenance(summary, document, coordinates=coordinates)],
+                name="log",
+            ),
+            Section("Words on this page", [Figure((), "words")], name="words"),
+        ],
+        pictures=pictures, position_word=position_word(summary), duration_s=summary.drive.duration_s,
+        folded_models=len(document.models) - len(main_rows(document)),
     )  # fmt: skip
+
+
+ABOUT = (
+    "From this drive icrtool learned how the robot slips when it turns, and then tested how far wheel speeds alone "
+    "keep its position."
+)
+
+
+def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
+    """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
+    drive: list[Block] = [
+        Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive"), *events_section(summary),
+        *outage_blocks(report), Figure(("icr_clusters", "outages")),
+    ]  # fmt: skip
+    return [
+        *unusable_lines(summary), *advice_blocks(summary),
+        Section("Answer", answer_sections(summary, report), name="answer"),
+        Section("The drive", drive, name="drive"),
+        errors_section(report, summary), worst_section(summary, report), *model_sections(report),
+        *([Section("Acceptance limits", verdict_lines(report), name="limits")] if report.gates else []),
+        warnings_section(summary),
+    ]  # fmt: skip
+
+
+def _provenance(summary: RunDocument, report: DropoutDocument, *, coordinates: bool) -> Section:
+    """Return what the page was made from, where, and with what."""
+    facts = [("log", f"{one.path}: {one.bytes:,} bytes, sha256 {one.sha256}") for one in summary.inputs]
+    place, datum = "left out", summary.gnss.datum
+    if coordinates:
+        place = "metric reference, no datum"
+        if datum is not None:
+            place = f"datum {datum[0]:.6f}° {datum[1]:.6f}°, {datum[2]:.1f} m"
+    made = (
+        f"icrtool {summary.tool_version}, {summary.schema}, {report.schema}; {report.starts:,} states; "
+        f"intervals by {report.bootstrap.method}"
+    )
+    return Section("Provenance", [Facts([*facts, ("place", place), ("made with", made)])], PAGE)
 
 
 def read_report(directory: Path) -> DropoutDocument | None:
@@ -154,63 +197,3 @@ def _without_place(run: Run, pictures: Mapping[str, Picture]) -> dict[str, Pictu
     """Return the pictures that do not show coordinates; relative to a datum that is left out they show no place."""
     metric = run.document.gnss.datum is None
     return {name: one for name, one in pictures.items() if not (metric and one.with_place)}
-
-
-def _utc(stamp_ns: int) -> str:
-    return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
-
-
-def _error_rows(report: DropoutDocument) -> dict[str, Any]:
-    """Return the errors by model at the horizons of the table: those nearest to 1, 5, 10 and 20 m."""
-    horizons = [row.horizon_m for row in report.trials]
-    shown = shown_horizons(np.array(horizons))
-    return {
-        "heads": _heads([horizons[h] for h in shown]),
-        "trials": [report.trials[h].trials for h in shown],
-        "why_none": [report.trials[h].why_none for h in shown],
-        "models": [
-            {"name": one.name, "label": one.label, "knows": one.knows, "rows": [one.by_horizon[h] for h in shown]}
-            for one in in_order(report.models)
-        ],
-        "reference": [report.reference_error[h] for h in shown] if report.reference_error else [],
-    }
-
-
-def _worst_rows(report: DropoutDocument, summary: RunDocument) -> list[dict[str, Any]]:
-    """Return the worst trials, each with what happened meanwhile: jumps of the position, outages, slip."""
-    found: list[dict[str, Any]] = []
-    for one in report.worst:
-        speed = one.speed_mean_mps
-        end_s = one.t_s + (one.horizon_m / speed if speed else 0.0)
-        end_ns = one.stamp_ns + round(1e9 * (end_s - one.t_s))
-        sizes = [
-            jump.size_m for jump in summary.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > one.stamp_ns
-        ]
-        real = [out for out in report.outages if out.kind == "real"]
-        lost = [out for out in real if out.begin_s < end_s and out.end_s > one.t_s]
-        slips = [slip.kind for slip in summary.events if slip.begin_s < end_s and slip.end_s > one.t_s]
-        notes = [f"the position steps by {error_text(max(sizes))}"] if sizes else []
-        notes += [f"outage of {duration_text(out.end_s - out.begin_s)}" for out in lost[:1]]
-        notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
-        found.append({**msgspec.structs.asdict(one), "rank": len(found) + 1, "note": ", ".join(notes)})
-    return found
-
-
-def _worst_label(report: DropoutDocument) -> str:
-    """Return the label of the model that the worst trials are of; in earlier versions the momentary ICRs."""
-    name = next((one.model for one in report.worst), "icr")
-    return next((f"the {one.label}" for one in report.models if one.name == name), name)
-
-
-def _heads(horizons_m: Sequence[float]) -> list[str]:
-    return [f"after {metres:g} m" for metres in horizons_m]
-
-
-def _config_lines(config: Mapping[str, Any]) -> Sequence[str]:
-    """Return the configuration a key a line, in the form of a configuration file."""
-    lines = []
-    for section, keys in config.items():
-        lines.append(f"[{section}]")
-        lines += [f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None]
-        lines.append("")
-    return lines

@@ -6,7 +6,7 @@ import math
 import textwrap
 
 from icrtool.calibration.one_log import LogCalibration, Parameter
-from icrtool.output.text_blocks import Block, Line, Table, Text, labelled
+from icrtool.output.text_blocks import VERBOSE, Block, Facts, Line, Section, Table
 
 MEANINGS = "shown: found well enough to set; weak: found roughly; not shown, not separable: this drive cannot find it"
 
@@ -16,26 +16,22 @@ OPTIONS_WIDTH = 76
 DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
 
 
-def format_calibration(calibration: LogCalibration) -> Text:
-    """Return the table of a calibration, no line end."""
+def sensor_blocks(calibration: LogCalibration) -> list[Block]:
+    """Return the settings that one log proposes, and the estimates that they come from."""
     facts = calibration.facts
     right, left = facts.turned_right_deg, facts.turned_left_deg
     speed = f"{facts.speed_mean_mps:.2f} ± {facts.speed_std_mps:.2f} m/s"
+    compared = f"{calibration.windows} windows of driven distance, {calibration.stretches} independent stretches"
     head = [
         ("drive", f"{facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left"),
-        (
-            "compared",
-            f"{calibration.windows} windows of driven distance, {calibration.stretches} independent stretches",
-        ),
+        ("compared", compared),
     ]
     rows = [
         (one.label, value_text(one), one.verdict + (f": {one.note}" if one.note else ""))
         for one in calibration.parameters
     ]
-    blocks: list[Block] = [Line(calibration.name, "title"), "", *labelled(head), ""]
-    return Text(
-        [*blocks, Table("l", rows, ("parameter", "value ± std", "verdict")), MEANINGS, "", *setting_blocks(calibration)]
-    )
+    table = Table("l", rows, ("parameter", "value ± std", "verdict"))
+    return [Section(calibration.name, [Facts(head), table, MEANINGS, ""], VERBOSE), *setting_blocks(calibration)]
 
 
 def value_text(one: Parameter) -> str:

@@ -1,330 +1,313 @@
-"""A dropout report as text: the few lines a field engineer reads first."""
+"""A dropout report as blocks: how far without GNSS, whether to trust it, where it was worst, and all errors."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Literal
 
-import numpy as np
+from msgspec import UNSET
 
+from icrtool.calibration.record import calibration_of
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.kernels.arrays import Floats, Ints
-from icrtool.output.text_blocks import Block, Line, Table, Text
+from icrtool.errors import DataError
+from icrtool.motion.models import TERMS
+from icrtool.output.exports.controllers import format_export
+from icrtool.output.tables.errors import errors_section, model_of
+from icrtool.output.tables.run import advice_blocks, number_blocks, numbers_of, run_checks, unusable_lines
+from icrtool.output.text_blocks import (
+    PAGE,
+    VERBOSE,
+    Block,
+    Check,
+    Checks,
+    Facts,
+    Figure,
+    Line,
+    Section,
+    Table,
+    Text,
+    Title,
+    printed,
+)
 from icrtool.output.text_format import (
-    MODEL_WORDS,
     controller_error_text,
-    controller_text,
     distance_text,
-    driven_text,
     duration_text,
     error_text,
     run_title,
-    unusable_lines,
 )
-from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance, ModelResult, Outage, TurningSplit
-from icrtool.records.text import counted
+from icrtool.records.dropout import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
+from icrtool.records.dropout_document import DropoutDocument, TrialDocument
+from icrtool.records.run import ICR_COLUMNS
+from icrtool.records.run_document import RunDocument
+from icrtool.records.text import counted, shortened
 
-MODEL = 26
-"""Characters of a model's name that are printed."""
+REACH_ROWS = ("controller", "recommended", "recommended_gyro", "recommended_heading", "icr", "no_slip")
+"""Models whose distance is stated first, as far as they are there; the momentary ICRs where nothing is held out."""
 
-LISTED_HORIZONS = 4
-"""More horizons than this without a trial are printed as a range."""
+REACH_LABELS = {"recommended_gyro": "with the gyro", "recommended_heading": "with the heading"}
+
+REACH_NOTES = {"controller": "in any diff_drive_controller"}
+"""What stands beside a distance."""
 
 
-STARTS_TEXT = {"moving": "moving ", "all": ""}
-
-NOTED_STANDING = 0.05
-"""From this share of standing states on, they are mentioned."""
-
-Rows = list[list[str]]
+Row = tuple[str, str, str]
 
 
 def format_dropout(report: DropoutReport) -> Text:
-    """Return the table of a report: errors by model and horizon, budgets, no trials, outages, verdicts; no line end."""
-    reference = "; compared with the smoothed trajectory" if report.smoothed else ""
-    driven = driven_text(report.run_document.drive)
-    starts = f"a trial from each {STARTS_TEXT[report.starts]}state of {report.states:,}"
-    rows = [*_error_rows(report), *_reference_rows(report), *_ratio_rows(report), *_count_rows(report)]
-    head = ("distance without GNSS", "", *_horizon_texts(report))
-    blocks: list[Block] = [
-        *unusable_lines(report.run_document),
-        Line(run_title(report.run_document), "title"),
-        f"{driven}; without GNSS, wheel speeds only, {starts}{reference}",
-        "",
-    ]
-    if sentences := headline(report):
-        blocks += [" ".join(sentences), ""]
-    blocks += [
-        Table("llr", rows, head),
-        "",
-        *_calibration_lines(report),
-        *_fitted_lines(report),
-        *_reference_lines(report),
-    ]
-    blocks += [*_learned_blocks(report), *_count_lines(report), *map(_turning_line, report.by_turning)]
-    blocks += ["", *budget_lines(report.budgets)]
-    if report.comparison is not None:
-        blocks += ["", *report.comparison.notes]
-    elif report.no_comparison:
-        blocks += ["", f"whole model and controller numbers: left out: {report.no_comparison}"]
-    if report.outages:
-        blocks += ["", _outage_table(report.outages, report)]
-    if report.verdicts:
-        blocks += ["", *(Line(one.verdict, "good" if one.passed else "bad") for one in report.verdicts)]
-    return Text(blocks)
+    """Return all that is printed of a report, no line end."""
+    from icrtool.output.dropout_directory import shown_document
+
+    return printed(report_blocks(report.run_document, shown_document(report)), verbose=True)
 
 
-SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
+def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
+    """Return what `icrtool dropout-report` prints.
 
-
-def shown_horizons(horizons_m: Floats) -> list[int]:
-    """Return the places of the horizons (h,) nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
-    if len(horizons_m) <= len(SHOWN_HORIZONS_M):
-        return list(range(len(horizons_m)))
-    nearest = (int(np.argmin(np.abs(horizons_m - metres))) for metres in SHOWN_HORIZONS_M)
-    return sorted(set(nearest))
-
-
-def p95_at(result: ModelResult, report: DropoutReport, distance_m: float) -> float | None:
-    """Return a model's p95 [m] at the horizon nearest to a distance; None beyond the last one, or without trials."""
-    if distance_m > report.horizons_m[-1]:
-        return None
-    value = float(result.summary.p95[int(np.argmin(np.abs(report.horizons_m - distance_m)))])
-    return value if np.isfinite(value) else None
-
-
-def headline(report: DropoutReport) -> list[str]:
-    """Return how far the robot goes without GNSS, and what a controller is given."""
-    reached = {one.model: one for one in reversed(report.budgets)}
-    if (best := reached.get("recommended")) is None:
-        return []
-    interval = f" ({best.interval_text})" if best.interval_text else ""
-    without = f"; no slip: {reached['no_slip'].reach_text}" if "no_slip" in reached else ""
-    found = [
-        f"Without GNSS this robot stays within {best.budget_m:g} m (95 %) for {best.reach_text}{interval}{without}."
-    ]
-    if (calibration := report.calibration) is not None:
-        alone = controller_error_text(calibration.controller)
-        numbers = controller_text(calibration.controller_numbers())
-        found.append(f"Controller: {numbers}{f'; {alone}' if alone else ''}.")
-    return found
-
-
-def _calibration_lines(report: DropoutReport) -> list[str]:
+    Parameters
+    ----------
+    summary : of the run
+    report : what report.json holds; null for a number that is not known
+    """
     return [
-        f"{one.label}: {one.model} from {counted(one.logs, 'log')}, {one.created[:10]}, {one.fitted}"
-        for one in report.calibrations
+        *unusable_lines(summary),
+        Title(run_title(summary), _trials_text(report)),
+        *advice_blocks(summary),
+        *answer_sections(summary, report),
+        *outage_blocks(report),
+        errors_section(report, summary),
+        *model_sections(report),
+        Section("", verdict_lines(report)),
     ]
 
 
-def _fitted_lines(report: DropoutReport) -> list[str]:
-    """Return which rows are of numbers that the fit of the trial itself has seen."""
-    final = report.result("icr_final")
-    return [f"{final.label}: fitted to the whole drive, its trials too"] if final is not None else []
+def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Section]:
+    """Return how far the robot goes, whether to trust it, and where it was worst; of what must not be used, that."""
+    if not (report.usable or report.budgets):
+        unknown = Section("How far without GNSS?", ["Not known: the run is not usable."], VERBOSE)
+        return [unknown, trust_section(summary, report)._replace(depth=VERBOSE)]
+    return [
+        reach_section(summary, report), numbers_section(summary, report), trust_section(summary, report),
+        *worst_cards(summary, report),
+    ]  # fmt: skip
 
 
-def budget_lines(budgets: Sequence[BudgetDistance]) -> list[str]:
-    """Return a sentence a budget: how far each model stays within it."""
-    if not budgets:
-        return ["no trial is as long as the shortest horizon: no budget can be evaluated"]
-    lines = []
-    for budget_m in dict.fromkeys(one.budget_m for one in budgets):
-        first, *others = (one for one in budgets if one.budget_m == budget_m)
-        more = "".join(f"; {one.label}: {one.reach_text}" for one in others)
-        lines.append(f"stays within {budget_m:g} m (95 %) for {first.reach_text} ({first.label}){more}")
-    return lines
+def _trials_text(report: DropoutDocument) -> str:
+    """Return how many trials the numbers rest on, at the horizon nearest to `CHOICE_HORIZON_M` that has any."""
+    row = min(report.trials, key=lambda one: (not one.trials, abs(one.horizon_m - CHOICE_HORIZON_M)))
+    return f"{distance_text(report.run.drive.distance_m)}, {row.trials:,} trials of {row.horizon_m:g} m"
 
 
-def _horizon_texts(report: DropoutReport) -> list[str]:
-    return [f"{report.horizons_m[h]:g} m" for h in shown_horizons(report.horizons_m)]
+def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[list[Row], list[Row]]:
+    """Return label, distance and note of each model within a budget: those of calibrations and `REACH_ROWS`, others.
 
-
-def _error_rows(report: DropoutReport) -> Rows:
-    """Return 95 %, its interval and the expected error of each model, what is recommended first."""
-    shown, rows = shown_horizons(report.horizons_m), []
-    for result in sorted(report.results, key=lambda one: one.name != "recommended"):
-        summary, intervals = result.summary, result.intervals
-        label = result.label if len(result.label) <= MODEL else f"{result.label[: MODEL - 1]}…"
-        spans = (_span_text(float(intervals.p95_low[h]), float(intervals.p95_high[h])) for h in shown)
-        rows += [
-            [label, "95 %", *(_error_text(float(summary.p95[h]), report, h) for h in shown)],
-            ["", "interval", *spans],
-            ["", "expected", *(_error_text(float(summary.expected[h]), report, h) for h in shown)],
-        ]
-    return rows
-
-
-def _ratio_rows(report: DropoutReport) -> Rows:
-    icr, no_slip = report.result("icr"), report.result("no_slip")
-    if icr is None or no_slip is None:
-        return []
+    Parameters
+    ----------
+    events : slip events of the run; the last row is the distance without them, where that is known
+    """
+    by_model = {one.model: one for one in report.budgets if one.budget_m == budget_m}
     rows = []
-    for lead, label, column in (("no slip / ICR", "95 %", "p95"), ("", "expected", "expected")):
-        ours, theirs = getattr(icr.summary, column), getattr(no_slip.summary, column)
-        ratios = (float(theirs[h] / ours[h]) if ours[h] > 0 else math.nan for h in shown_horizons(report.horizons_m))
-        rows.append([lead, label, *(f"{ratio:.1f} x" if math.isfinite(ratio) else "-" for ratio in ratios)])
-    return rows
+    for one in report.calibrations:
+        if found := by_model.pop(one.name, None):
+            label = one.label if one.label.startswith("calibration") else f"calibration {one.label}"
+            rows.append((label, found.short_text, one.fitted))
+    best = by_model.get("recommended") or by_model.get("icr")
+    for name in REACH_ROWS:
+        if name in by_model and not (name == "icr" and best is not by_model["icr"]):
+            found = by_model.pop(name)
+            label, interval = REACH_LABELS.get(name, found.label), found.interval_text
+            note = REACH_NOTES.get(name, interval if name.startswith("recommended") else "")
+            rows.append((label, found.short_text, note or _between_text(found)))
+    if report.run.config.robot.track_width_m is None:
+        rows.append(("no slip", "not known", "needs robot.track_width_m (--robot, --set)"))
+    if events and best is not None and (quiet := best.without_events_text):
+        rows.append((f"without its {counted(events, 'slip event')}", quiet, best.label))
+    return rows, [(one.label, one.short_text, one.interval_text or _between_text(one)) for one in by_model.values()]
 
 
-def _turning_line(split: TurningSplit) -> str:
-    kind = "straight" if split.straight else "turning"
-    errors = ", ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in split.expected_m.items())
-    return f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
+def _between_text(one: BudgetDistance) -> str:
+    low, high = one.between_m
+    return f"between {low:g} and {high:g} m" if high - low > NEAR_HORIZONS_M and not one.beyond else ""
 
 
-def _count_rows(report: DropoutReport) -> Rows:
-    """Return the number of trials, and why other starts are none."""
-    shown = shown_horizons(report.horizons_m)
-    named = [("trials", report.counts.trials)]
-    named += [(one.label, one.starts) for one in no_trial(report) if one.starts[shown].any()]
-    return [[label, "", *(f"{int(column[h]):,}" for h in shown)] for label, column in named]
+def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
+    """Return how far the robot stays within each budget."""
+    blocks: list[Block] = []
+    lead, text = "", ""
+    for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
+        rows, others = reach_rows(report, budget_m, len(summary.events))
+        if not lead:
+            label, lead, note = rows[0]
+            more = f" ({note})" if note else ""
+            text = f"within {budget_m:g} m (95 %), by wheel speeds alone with the {label}{more}"
+        shown = [(shortened(label, 28), distance, note) for label, distance, note in rows]
+        blocks.append(Table("lrl", shown, caption=f"How far within {budget_m:g} m (95 %)?"))
+        if others:
+            blocks.append(Section("Other models", [Table("lrl", others)], VERBOSE))
+    if not blocks:
+        blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
+    if report.ladder.left_out is not UNSET and report.ladder.left_out:
+        blocks.append(Facts([("left out", f"whole model, controller numbers: {report.ladder.left_out}")]))
+    return Section("How far without GNSS?", blocks, lead=lead, text=text)
 
 
-class NoTrial(NamedTuple):
-    """A reason why starts gave no trial: its key in report.json, words in the table, and number of `starts` (h,)."""
-
-    key: str
-    label: str
-    why: str
-    starts: Ints
-
-
-def no_trial(report: DropoutReport) -> tuple[NoTrial, ...]:
-    """Return the reasons why starts gave no trial."""
-    counts, cost = report.counts, report.event_cost
-    driven = distance_text(report.run_document.drive.distance_m)
-    slip = cost.trials if cost is not None else np.zeros_like(counts.short)
-    return (
-        NoTrial("too_little_way_left", "not counted: log ends", f"less than that is left of the {driven} driven",
-                counts.short),
-        NoTrial("across_wheel_gap", "  across a wheel gap", "the path crosses a gap in the wheel data", counts.gap),
-        NoTrial("ends_in_gnss_outage", "  ends in GNSS outage", "it ends in a GNSS outage", counts.outage),
-        NoTrial("from_standstill", "  from standstill", "the robot stands", counts.standing),
-        NoTrial("crosses_jump", "  across a reference jump", "the reference jumps on the path", counts.crosses_jump),
-        NoTrial("across_slip_event", "  across a slip event", "the path crosses a slip event", slip),
-    )  # fmt: skip
-
-
-def _count_lines(report: DropoutReport) -> list[str]:
-    lines = []
-    if report.result("no_slip") is None:
-        lines.append("no slip is left out: robot.track_width_m is not known")
-    if report.standing > NOTED_STANDING * report.states:
-        share = 100 * report.standing / report.states
-        counted = "each standstill is one start" if report.starts == "moving" else "each is a start (--starts all)"
-        lines.append(f"the robot stood at {share:.0f} % of the states: {counted}")
-    return [*lines, *_event_lines(report), *_empty_lines(report)]
-
-
-def _event_lines(report: DropoutReport) -> list[str]:
-    """Return what slip events cost, at the longest horizon with trials on both sides."""
-    cost, icr, events = report.event_cost, report.result("icr"), report.run_document.events
-    if cost is None and events:
-        lasted = duration_text(sum(event.end_s - event.begin_s for event in events))
-        return [f"trials cross {counted(len(events), 'slip event')}, {lasted} in all: --without-events leaves them out"]
-    if cost is None or icr is None:
-        return []
-    if not cost.events:
-        return ["slip events: none in this log; --without-events changes nothing"]
-    left_out, before, after = f"{counted(cost.events, 'slip event')} left out", cost.with_events["icr"], icr.summary
-    both = np.flatnonzero((after.trials > 0) & (before.trials > 0))
-    if not len(both):
-        return [f"{left_out}: no trial remains"]
-    h = int(both[-1])
-    errors = f"{error_text(float(after.p95[h]))} instead of {error_text(float(before.p95[h]))}"
-    what = f"ICR after {report.horizons_m[h]:g} m 95 % {errors}"
-    return [f"{left_out}: {what} ({int(cost.trials[h]):,} trials cross one)"]
-
-
-def why_no_trial(report: DropoutReport, h: int) -> str | None:
-    """Return why a horizon has no trial, None where it has some."""
-    counts = report.counts
-    if not len(counts.trials) or counts.trials[h]:
-        return None
-    reasons = no_trial(report)
-    if counts.short[h] == report.states:
-        return reasons[0].why
-    return ", ".join(f"{one.why} ({int(one.starts[h]):,} starts)" for one in reasons if one.starts[h])
-
-
-def _empty_lines(report: DropoutReport) -> list[str]:
-    """Return a line for each reason why horizons are empty."""
-    horizons: dict[str, list[str]] = {}
-    for h, horizon in enumerate(report.horizons_m):
-        if (why := why_no_trial(report, h)) is not None:
-            horizons.setdefault(why, []).append(f"{horizon:g}")
-    lines = []
-    for why, lengths in horizons.items():
-        span = ", ".join(lengths) if len(lengths) <= LISTED_HORIZONS else f"{lengths[0]} to {lengths[-1]}"
-        lines.append(f"no trial of {span} m: {why}")
-    return lines
-
-
-def _reference_rows(report: DropoutReport) -> Rows:
-    own, shown = report.reference_error, shown_horizons(report.horizons_m)
-    if own is None or not np.isfinite(own.p95).any():
-        return []
-    return [
-        [lead, label, *(_error_text(float(values[h]), report, h) for h in shown)]
-        for lead, label, values in (("reference alone", "95 %", own.p95), ("", "expected", own.expected))
+def trust(summary: RunDocument, report: DropoutDocument) -> tuple[Literal["good", "care", "bad"], str]:
+    """Return whether the numbers of a report can be trusted, and the reasons for care, one sentence."""
+    if not summary.usable:
+        return "bad", f"no: {summary.unusable_because}"
+    if not report.passed:
+        return "bad", "no: an acceptance limit is not met"
+    reasons = [
+        f"{one.what} {one.text}" for one in run_checks(summary) if one.grade == "care" and one.what != "slip events"
     ]
+    if events := summary.events:
+        crossed = "trials across them count" if report.without_events is None else "left out"
+        reasons.append(f"{counted(len(events), 'slip event')}, {crossed}")
+    return ("care", f"yes, with care: {'; '.join(reasons)}") if reasons else ("good", "yes")
 
 
-def _reference_lines(report: DropoutReport) -> list[str]:
-    """Return how much of the momentary ICRs' error can be the reference's own."""
-    own, icr = report.reference_error, report.result("icr")
-    if own is None or icr is None or not np.isfinite(own.p95).any():
-        return []
-    h = int(np.argmin(np.where(np.isfinite(own.p95), np.abs(report.horizons_m - CHOICE_HORIZON_M), np.inf)))
-    whole, part = error_text(float(icr.summary.p95[h])), error_text(float(own.p95[h]))
-    what = f"the {whole} of the momentary ICRs (95 %, {report.horizons_m[h]:g} m)"
-    return [f"up to {part} of {what} can be the error of the position reference"]
+def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
+    """Return whether the numbers can be trusted, and what was checked."""
+    grade, sentence = trust(summary, report)
+    checks = run_checks(summary)
+    if summary.warnings:
+        checks.append(Check("care", "log", f"{counted(len(summary.warnings), 'warning')} about it"))
+    found = Section("", [Checks(sorted(checks, key=lambda one: one.grade != "care"))], VERBOSE)
+    return Section("May I trust it?", [found], lead=sentence, label="Trust?", grade=grade)
 
 
-def _learned_blocks(report: DropoutReport) -> list[Block]:
-    """Return the errors of the momentary ICRs before and after the ICRs were first learned."""
-    split, shown = report.by_learning, shown_horizons(report.horizons_m)
-    if split is None:
-        return []
-    if split.learned_s is None or split.distance_m is None:
-        return ["the ICRs were never learned: their standard deviations hardly fell in this drive"]
-    if not split.before.trials[shown].any():
-        return []
-    when = f"{duration_text(split.learned_s)}, {distance_text(split.distance_m)}"
+def verdict_lines(report: DropoutDocument) -> list[Line]:
+    """Return the verdict on each acceptance limit."""
+    return [Line(one.verdict, "good" if one.passed else "bad") for one in report.gates]
+
+
+def worst_cards(summary: RunDocument, report: DropoutDocument) -> Iterator[Section]:
+    """Yield the worst trial in a sentence, and all of them in a table."""
+    if not report.worst:
+        return
+    one = report.worst[0]
+    note = _meanwhile(one, summary, report)
+    driven = f"{one.horizon_m:g} m from {duration_text(one.t_s)} on"
+    text = f"after {driven}, turning {_turn(one)} at {one.speed_mean_mps:.2f} m/s, with the {_worst_label(report)}"
+    lead = error_text(one.errors_m[one.model])
+    text += f"; meanwhile: {note}" if note else ""
+    yield Section("Where was it worst?", [], lead=lead, text=text, label="Worst")
+
+
+def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
+    """Return the trials with the largest errors."""
+    if not report.worst:
+        return Section("Worst cases", ["No trial was long enough."], VERBOSE, name="worst")
+    first = report.worst[0]
     rows = [
-        [name, *(f"{_bare(part.p95[h])} / {_bare(part.expected[h])}" if part.trials[h] else "-" for h in shown)]
-        for name, part in (("  before", split.before), ("  after", split.after))
-    ]
-    head = f"ICR, momentary, before and after the ICRs were first learned ({when}): 95 % / expected [m]"
-    return [head, Table("lr", rows, ("", *_horizon_texts(report)))]
+        (
+            f"{rank}", duration_text(one.t_s), error_text(one.errors_m[one.model]),
+            error_text(one.errors_m.get("no_slip")), _turn(one), f"{one.speed_mean_mps:.2f} m/s",
+            f"{one.north_m:.1f} m", f"{one.east_m:.1f} m", _meanwhile(one, summary, report),
+        )
+        for rank, one in enumerate(report.worst, start=1)
+    ]  # fmt: skip
+    head = ("", "from", "error", "no slip", "turn", "mean speed", "north", "east", "meanwhile")
+    caption = (
+        f"Trials of {first.horizon_m:g} m with the largest error of the {_worst_label(report)} that do not overlap. "
+        "What they share (a speed, a turn, a place) is where the model fails"
+    )
+    moments = [one.t_s for one in report.worst]
+    blocks: list[Block] = [Table("lrrrrrrrl", rows[:1], head, caption, moments[:1])]
+    if len(rows) > 1:
+        further = Table("lrrrrrrrl", rows[1:], head, "", moments[1:])
+        blocks.append(Section(f"The next {len(rows) - 1}", [further], PAGE))
+    return Section("Worst cases", [*blocks, Figure(("worst",))], PAGE, name="worst")
 
 
-def _outage_table(outages: Sequence[Outage], report: DropoutReport) -> Table:
-    """Return a row an outage, in it p95 of the momentary ICRs over as much distance."""
-    icr, rows = report.result("icr"), []
-    for number, one in enumerate(outages, start=1):
-        usual = p95_at(icr, report, one.distance_m) if icr is not None else None
-        rows.append(
-            (
-                f"{number} {one.kind}", f"{one.begin_s:.1f} s", f"{one.end_s - one.begin_s:.1f} s",
-                f"{one.distance_m:.1f} m", error_text(one.end_error_m), error_text(one.max_error_m),
-                error_text(usual) if usual is not None else "-",
+def _worst_label(report: DropoutDocument) -> str:
+    """Return the label of the model that the worst trials are of; in earlier versions the momentary ICRs."""
+    found = model_of(report, report.worst[0].model)
+    return found.label if found is not None else report.worst[0].model
+
+
+def _turn(trial: TrialDocument) -> str:
+    degrees = trial.heading_change_deg
+    return f"{abs(degrees):.0f}° {'right' if degrees > 0 else 'left'}"
+
+
+def _meanwhile(one: TrialDocument, summary: RunDocument, report: DropoutDocument) -> str:
+    """Return what happened during a trial: jumps of the position, outages, slip."""
+    speed = one.speed_mean_mps
+    end_s = one.t_s + (one.horizon_m / speed if speed else 0.0)
+    end_ns = one.stamp_ns + round(1e9 * (end_s - one.t_s))
+    sizes = [jump.size_m for jump in summary.reference_jumps if jump.begin_ns < end_ns and jump.end_ns > one.stamp_ns]
+    real = [out for out in report.outages if out.kind == "real"]
+    lost = [out for out in real if out.begin_s < end_s and out.end_s > one.t_s]
+    slips = [slip.kind for slip in summary.events if slip.begin_s < end_s and slip.end_s > one.t_s]
+    notes = [f"the position steps by {error_text(max(sizes))}"] if sizes else []
+    notes += [f"outage of {duration_text(out.end_s - out.begin_s)}" for out in lost[:1]]
+    notes += [f"slip event ({kind})" for kind in dict.fromkeys(slips)]
+    return ", ".join(notes)
+
+
+def outage_blocks(report: DropoutDocument) -> Iterator[Block]:
+    """Yield the worst outage of each kind, and all of them in a table, beside p95 of trials over as much distance."""
+    parts = []
+    for kind in ("forced", "real"):
+        if ours := [one for one in report.outages if one.kind == kind]:
+            worst = max(ours, key=lambda one: one.end_error_m or 0.0)
+            parts.append(
+                f"{len(ours)} {kind}, the worst {error_text(worst.end_error_m)} after {worst.distance_m:.1f} m"
             )
-        )  # fmt: skip
-    return Table("lr", rows, ("outage", "from", "length", "distance", "end error", "max error", "95 % of trials"))
+    if not parts:
+        return
+    yield Facts([("Outages", "; ".join(parts))])
+    rows = [
+        (
+            f"{number} {one.kind}", duration_text(one.begin_s), duration_text(one.end_s - one.begin_s),
+            f"{one.distance_m:.1f} m", error_text(one.end_error_m), error_text(one.max_error_m),
+            error_text(p95_at(report, "icr", one.distance_m)),
+        )
+        for number, one in enumerate(report.outages, start=1)
+    ]  # fmt: skip
+    head = ("outage", "from", "length", "distance", "end error", "max error", "95 % of trials")
+    caption = "How far the filter was off when position fixes returned"
+    yield Section("", [Table("lr", rows, head, caption, [one.begin_s for one in report.outages])], VERBOSE)
 
 
-def _error_text(error_m: float, report: DropoutReport, h: int) -> str:
-    percent = 100 * error_m / float(report.horizons_m[h])
-    return f"{error_text(error_m)} {f'{percent:.1f} %' if math.isfinite(percent) else '-':>7}"
+def p95_at(report: DropoutDocument, model: str, distance_m: float) -> float | None:
+    """Return a model's p95 [m] at the horizon nearest to a distance; None beyond the last one, or without trials."""
+    found = model_of(report, model)
+    if found is None or not found.by_horizon or distance_m > found.by_horizon[-1].horizon_m:
+        return None
+    return min(found.by_horizon, key=lambda row: abs(row.horizon_m - distance_m)).p95_m
 
 
-def _span_text(low_m: float, high_m: float) -> str:
-    if not math.isfinite(low_m):
-        return "too short"
-    return f"{error_text(low_m).removesuffix(' m')}-{error_text(high_m)}"
+def model_sections(report: DropoutDocument) -> Iterator[Section]:
+    """Yield the parameters of the recommended motion model, and how the models were compared."""
+    found = report.recommended
+    blocks: list[Block] = []
+    if found is not None:
+        rows = [
+            (name, f"{one.value:+.4f} ± {one.std:.4f}", TERMS[name].meaning if name in TERMS else "", one.verdict)
+            for name, one in found.parameters.items()
+        ]
+        table = Table("lrll", rows, ("term", "value ± σ", "meaning", "by this drive"))
+        blocks.append(Section("Parameters of the motion model", [table, *found.warnings], VERBOSE))
+    blocks += report.ladder.notes if report.ladder.notes is not UNSET else ()
+    if blocks:
+        yield Section("The motion model", blocks, VERBOSE, name="models")
 
 
-def _bare(metres: float) -> str:
-    return error_text(float(metres)).removesuffix(" m")
+def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:
+    """Return what a controller is given, the error with these numbers alone, and its configuration."""
+    width_m = summary.config.robot.track_width_m
+    blocks = number_blocks(summary)
+    if report.recommended is not None and width_m is not None:
+        calibration = calibration_of(report.recommended)
+        icrs = [summary.icr_of_drive(column) for column in ICR_COLUMNS]
+        blocks = numbers_of(calibration.controller_numbers(), width_m, icrs)
+        if alone := controller_error_text(calibration.controller):
+            blocks.append(alone)
+        with suppress(DataError):
+            text = format_export(calibration, "diff_drive_controller")
+            other = "Other controllers: icrtool export --for clearpath RUN"
+            blocks.append(Section("As a diff_drive_controller takes them", [Line(text, "as is"), other], PAGE))
+    return Section("Which numbers into the controller?", blocks, VERBOSE)

@@ -12,7 +12,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.within_budget import within_budget
 from icrtool.motion.models import TERMS
-from icrtool.output.text_blocks import Block, Table, Text
+from icrtool.output.text_blocks import Block, Table, Text, printed
 from icrtool.output.text_format import distance_text, fitted_model_text
 from icrtool.records.calibration_document import ForecastBudget, ForecastColumns, ForecastDocument, ForecastSource
 from icrtool.records.plain_data import known
@@ -99,4 +99,4 @@ def format_forecast(
         blocks.append(f"errors were measured up to {longest:g} m; what is beyond is extrapolated")
     if unknown := "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown):
         blocks.append(f"not found by the calibration, too small or not driven: {unknown}")
-    return Text([*blocks, *calibration.warnings])
+    return printed([*blocks, *calibration.warnings], verbose=True)

@@ -6,11 +6,19 @@ import numpy as np
 
 from icrtool.calibration.controller_numbers import not_shown_sentences
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
+from icrtool.calibration.one_log import LogCalibration
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration
-from icrtool.motion.models import TERMS, FittedModel
-from icrtool.output.text_blocks import Block, Table, Text
-from icrtool.output.text_format import fitted_model_text
+from icrtool.motion.models import ICRS, TERMS, FittedModel
+from icrtool.output.tables.calibration import sensor_blocks
+from icrtool.output.tables.dropout import REACH_LABELS, REACH_NOTES, REACH_ROWS
+from icrtool.output.tables.run import numbers_of
+from icrtool.output.text_blocks import VERBOSE, Block, Facts, Section, Table, Title
+from icrtool.output.text_format import distance_text, fitted_model_text
+from icrtool.records.text import counted
+
+BUDGET_M = 0.5
+"""Error within which a distance counts."""
 
 GEOMETRY = (
     ("y_icr_right_m", "y ICR right", "m"),
@@ -22,17 +30,34 @@ GEOMETRY = (
 )
 
 
-def format_result(result: CalibrationResult) -> Text:
-    """Return the tables of a pooled calibration, no line end."""
-    calibration, fitted = result.calibration, result.calibration.fitted
-    return Text([
-        f"Motion model: {fitted_model_text(fitted)}",
-        "",
-        *_parameter_blocks(calibration),
-        "",
-        *held_out_blocks(result.table),
-        *result.notes,
-    ])  # fmt: skip
+def calibration_blocks(result: CalibrationResult | None, sensors: LogCalibration | None) -> list[Block]:
+    """Return what `icrtool calibrate` prints: numbers, how far on what they were not fitted to, settings of one log."""
+    blocks = _result_blocks(result) if result is not None else []
+    return [*blocks, *sensor_blocks(sensors)] if sensors is not None else blocks
+
+
+def _result_blocks(result: CalibrationResult) -> list[Block]:
+    calibration, table = result.calibration, result.table
+    geometry, covariance = calibration.geometry()
+    icrs = list(zip(geometry[:ICRS], np.sqrt(np.diag(covariance)).tolist(), strict=False))
+    driven = distance_text(sum(log.distance_m for log in calibration.logs))
+    what = "log" if table.folds[0].whole else "block of distance"
+    rows = [
+        (REACH_LABELS.get(row.name, row.label), reached.short_text, REACH_NOTES.get(row.name, ""))
+        for row in sorted(table.scores, key=lambda row: (*REACH_ROWS, row.name).index(row.name))
+        if row.name in REACH_ROWS and (reached := row.within(table.horizons_m, BUDGET_M)) is not None
+    ]
+    unknown = "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown)
+    return [
+        Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
+        *numbers_of(calibration.controller_numbers(), calibration.width_m, icrs),
+        Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?"),
+        Facts([("not found", f"too small, or not driven; taken as usual: {unknown}")] if unknown else []),
+        Section(
+            f"Motion model: {fitted_model_text(calibration.fitted)}",
+            [*_parameter_blocks(calibration), *held_out_blocks(table), *result.notes], VERBOSE,
+        ),
+    ]  # fmt: skip
 
 
 def _parameter_blocks(calibration: Calibration) -> list[Block]:

@@ -12,9 +12,8 @@ from icrtool.config import Config
 from icrtool.errors import IcrToolError
 from icrtool.logs.read_log import Survey
 from icrtool.logs.streams.wheel_pairs import topic_of_side
-from icrtool.output.tables.brief import copied, gravest, labelled_line
-from icrtool.output.tables.run import Row, excitation_row
-from icrtool.output.text_blocks import Block, Text
+from icrtool.output.tables.run import Row, copied, excitation_row, gravest
+from icrtool.output.text_blocks import Block, Facts, Section, Text, printed
 from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
 from icrtool.records.samples import ROLE_WORDS
@@ -69,14 +68,14 @@ def brief_info(
     """
     (_, decision), *missing = verdict_rows(run, problem, names, config)
     good = run is not None and run.usable
-    blocks: list[Block] = [labelled_line("verdict", decision, "good" if good else "bad", most=3)]
     rows = [*_holds_rows(survey, log), *(overview_rows(log, run) if log is not None else [])]
     rows += [excitation_row(run)] if run is not None else []
     rows += _topic_rows(survey, log)
     warnings = run.warnings if run is not None else log.warnings if log is not None else ()
     rows += [("warnings", gravest(warnings, names[0]))] if warnings else []
-    blocks += [labelled_line(label, text) for label, text in (*rows, *missing)]
-    return Text([*blocks, *([copied("next", command)] if command is not None else [])])
+    verdict = Section("", [], lead=decision, label="verdict", grade="good" if good else "bad")
+    last: list[Block] = [copied("next", command)] if command is not None else []
+    return printed([verdict, Facts([*rows, *missing]), *last], verbose=False)
 
 
 def _holds_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:

@@ -1,29 +1,48 @@
-"""A run as text: the few lines a field engineer reads first."""
+"""A run as blocks: may it be used, the numbers, what was checked, and where they come from."""
 
 from __future__ import annotations
 
+import json
+import shlex
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
 from icrtool.alignment.corrections import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
-from icrtool.output.text_blocks import LABEL, TEXT_WIDTH, Block, Line, Table, Text, labelled
+from icrtool.estimation.observability import lacking_turns
+from icrtool.output.text_blocks import (
+    BRIEF_WIDTH,
+    PAGE,
+    VERBOSE,
+    Block,
+    Check,
+    Checks,
+    Facts,
+    Items,
+    Line,
+    Section,
+    Table,
+    Text,
+    Title,
+    printed,
+)
 from icrtool.output.text_format import (
-    controller_text,
-    driven_text,
+    distance_text,
     duration_text,
     error_text,
     event_kinds,
-    excitation_text,
     filter_agreement,
     jump_count,
     position_word,
     role_word,
     run_title,
     topics_text,
-    unusable_lines,
 )
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
-from icrtool.records.run_document import ClassDocument
-from icrtool.records.text import counted
+from icrtool.records.run_document import ControllerNumbers, RunDocument
+from icrtool.records.text import counted, shortened
 
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
 """A delay that receivers have, to show what it does; at lower speeds than this it does little."""
@@ -34,206 +53,349 @@ SLIPPING_MULTIPLIER = 1.1
 SMALLEST_DELAY_S = 0.05
 """A delay below this is not worth a line."""
 
+NOTED_SHARE = 0.05
+"""From this share of rejected fixes on, they are a reason for care."""
 
-SHOWN_WORDS = {"weak": "weak: found roughly", "not shown": "not shown: cannot be found"}
+NOTED_SCALE = 0.002
+"""A correction of wheel speeds below this is not mentioned."""
+
+SMALLEST_OFFSET_DEG = 0.05
+"""A correction of the heading below this is not mentioned."""
+
+NOT_SHOWN_WORDS = {"weak": "weak: found roughly", "not shown": "not shown: cannot be found"}
 """What is printed beside an ICR, by the verdict of `find_excitation`."""
+
+LONGEST_TOPIC = 60
+"""Characters of the topics of a stream in a sentence."""
 
 Row = tuple[str, str]
 """What a line is about, and its sentence."""
 
 
 def format_run(run: Run) -> Text:
-    """Return the table of a run: streams, drive, ICRs, position, heading; at most 100 columns wide, no line end.
+    """Return all that is printed of a run; at most 100 columns wide, no line end.
 
     Warnings are not in it: they belong to stderr.
     """
-    drive = run.document.drive
-    speed = f"{drive.speed_mean_mps:.2f} ± {drive.speed_std_mps:.2f} m/s (mean ± std)"
-    learned = [*_controller_rows(run), *_filter_rows(run), excitation_row(run)]
-    measured = [*_position_rows(run), *_heading_rows(run), *_delay_rows(run), *event_rows(run)]
-    return Text(
-        [
-            *unusable_lines(run.document),
-            Line(run_title(run.document), "title"),
-            "",
-            _stream_table(run),
-            "",
-            *labelled([("drive", f"{driven_text(drive)}, {speed}")]),
-            "",
-            _icr_table(run),
-            *labelled(learned),
-            *_terrain_table(run),
-            "",
-            *labelled(measured),
-        ]
+    return printed(run_blocks(run.document), verbose=True)
+
+
+def run_blocks(summary: RunDocument) -> list[Block]:
+    """Return what `icrtool fit` prints of a run: usable or not, the numbers, why to trust them, where they are from."""
+    excitation = summary.excitation
+    turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
+    driven = f"{distance_text(summary.drive.distance_m)}, {duration_text(summary.drive.duration_s)}"
+    blocks: list[Block] = [*unusable_lines(summary), Title(run_title(summary), f"{driven}, turned {turned}")]
+    head = gravest(summary.warnings, summary.log)
+    if head or summary.usable:
+        line = f"{'USABLE' if summary.usable else '':12}{head}"
+        shown = line if len(line) <= BRIEF_WIDTH else f"{line[: BRIEF_WIDTH - 1].rstrip()}…"
+        blocks.append(Line(shown, "good" if summary.usable else "as is"))
+    if summary.usable:
+        blocks += number_blocks(summary)
+    found = [("corrected", "; ".join(corrections(summary))), ("inputs", "; ".join(_inputs(summary)))]
+    return [
+        *blocks, Checks(run_checks(summary)), Facts([(label, text) for label, text in found if text]),
+        *log_sections(summary),
+    ]  # fmt: skip
+
+
+def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
+    """Return where a run was written, and what to do next; `examine`: command that names what is wrong in its log."""
+    command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
+    return [Section("", [Facts([("written to", place)]), *(advice_blocks(summary) or [copied("next", command)])])]
+
+
+def advice_blocks(summary: RunDocument) -> list[Block]:
+    """Return what to drive next, of a run that is not usable for lack of turns."""
+    drive = "" if summary.usable else to_drive(summary)
+    return [Facts([("next", drive)])] if drive else []
+
+
+def unusable_lines(summary: RunDocument) -> list[Line]:
+    """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
+    return [] if summary.usable else [Line(f"Do not use: {summary.unusable_because}", "bad")]
+
+
+def copied(label: str, command: str) -> Line:
+    """Return a command on one line, however long: it is copied."""
+    return Line(f"{label:12}{command}", "as is")
+
+
+def gravest(warnings: Sequence[str], log: str) -> str:
+    """Return how many warnings there are and the gravest: the first that nothing was done about; none: empty."""
+    plain = [one.removeprefix(f"{log}: ") for one in warnings]
+    first = min(plain, key=lambda one: ("is not given" in one) + 2 * (": corrected" in one), default="")
+    return f"{counted(len(plain), 'warning')} (-v), first: {first}" if len(plain) > 1 else first
+
+
+def number_blocks(summary: RunDocument) -> list[Block]:
+    """Return what a controller is given, and the ICRs that it comes from."""
+    width_m, numbers = summary.config.robot.track_width_m, summary.controller
+    icrs = [summary.icr_of_drive(column) for column in ICR_COLUMNS]
+    if width_m is not None and numbers is not None:
+        return numbers_of(numbers, width_m, icrs)
+    unknown = [ICR_WORDS[name] for name in ICR_COLUMNS[:2] if summary.icr_of_drive(name) is None]
+    why = f"no multiplier: {' and '.join(unknown) or 'the ICRs'} could not be found"
+    if width_m is None:
+        why = "no multiplier and no no-slip model: robot.track_width_m is not known (--robot, --set)"
+    return [Facts([("controller", why), ("ICRs [m]", icrs_text(icrs))])]
+
+
+def numbers_of(numbers: ControllerNumbers, width_m: float, icrs: Sequence[tuple[float, float] | None]) -> list[Block]:
+    """Return the numbers of a controller with one standard deviation each, and the ICRs."""
+    radii = f"{numbers.left_radius:.3f}, {numbers.right_radius:.3f}"
+    std = max(numbers.left_radius_std, numbers.right_radius_std)
+    rows = [
+        ("wheel_separation_multiplier", f"{numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}"),
+        ("left, right wheel radius", f"{radii} ± {std:.3f} of the configured"),
+    ]
+    without = f"(right - left) / {width_m:g} m is the multiplier; without slip: ±{width_m / 2:.3g} m"
+    return [Facts(rows, "controller"), Facts([("ICRs [m]", icrs_text(icrs)), ("", without)])]
+
+
+def icrs_text(icrs: Sequence[tuple[float, float] | None]) -> str:
+    """Return the three ICRs, each with its standard deviation."""
+    rows = zip(ICR_WORDS.values(), icrs, strict=True)
+    return ", ".join(f"{word.removeprefix('y ')} {icr_text(*(found or (None, None)))}" for word, found in rows)
+
+
+def run_checks(summary: RunDocument) -> list[Check]:
+    """Return what was checked of a run, each with its finding and its details."""
+    found = []
+    if agreement := filter_agreement(summary):
+        found.append(Check("good" if agreement.endswith("agrees") else "care", "EKF", agreement))
+    found.append(excitation_check(summary))
+    found += [*_fix_checks(summary), *_heading_checks(summary), *_delay_checks(summary)]
+    if spans := summary.outages_ns:
+        away = duration_text(sum(end - begin for begin, end in spans) / 1e9)
+        lost = len(summary.rtk_losses_ns)
+        cause = (f"{lost} by loss of RTK",) if lost else ()
+        found.append(Check("care", "outages", f"{counted(len(spans), 'outage')}, {away} in all", cause))
+    if events := summary.events:
+        worst = max(events, key=lambda event: (event.end_s - event.begin_s) * event.severity)
+        lasted = duration_text(worst.end_s - worst.begin_s)
+        missed = f"{100 * worst.severity:.0f} % of the wheels' motion missed"
+        most = f"worst: {worst.kind} from {worst.begin_s:.1f} s for {lasted}, {missed}"
+        found.append(Check("care", "slip events", f"{event_kinds(events)}; left out of the fit", (most,)))
+    return found
+
+
+def excitation_check(summary: RunDocument) -> Check:
+    """Return what the drive could show of the ICRs; where one is not shown, what to drive."""
+    excitation, drive = summary.excitation, to_drive(summary)
+    spun = excitation.spun_right_deg + excitation.spun_left_deg
+    turned = f"turned {excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
+    more = (f"{turned}, {spun:,.0f}° of it on the spot",)
+    if excitation.verdict.all_shown:
+        text = f"shown, but {drive}" if drive else "all three ICRs shown: enough turns for each"
+        return Check("care" if drive else "good", "excitation", text, more)
+    weak = [(excitation.verdict[name], ICR_WORDS[name]) for name in ICR_COLUMNS if excitation.verdict[name] != "shown"]
+    words = "; ".join(
+        f"{', '.join(name for one, name in weak if one == verdict)} {verdict}"
+        for verdict in dict.fromkeys(one for one, _ in weak)
     )
+    # what was lacking stands beside the ICRs; what to drive, alone
+    lacks = drive.rpartition(": ")[2]
+    return Check("care", "excitation", f"{words}{f': {lacks}' if lacks else ''}", more)
 
 
 def excitation_row(run: Run) -> Row:
-    """Return what the drive could show of the ICRs; advice is among the warnings."""
-    return "excitation", excitation_text(run.document.excitation)
+    """Return what the drive could show of the ICRs, with its turns; advice is among the warnings."""
+    _, what, text, more = excitation_check(run.document)
+    return what, "; ".join((text, *more))
 
 
-def _stream_table(run: Run) -> Table:
-    head = ("stream".ljust(LABEL), "topic", "type", "rate", "samples", "clock")
-    rows = []
-    for stream in run.document.streams:
-        type_name = stream.message_type.replace("/msg/", "/")
-        hz = stream.rate_hz
-        rate, count = f"{hz:.1f} Hz" if hz is not None else "unknown", f"{stream.count:,}"
-        rows.append(
-            (role_word(run.document, stream.role), topics_text(stream.topic), type_name, rate, count, stream.clock)
-        )
-    widths = [max(len(row[column]) for row in (head, *rows)) for column in range(6)]
-    # Long names are cut: the topic keeps its end, the type its begin.
-    space = TEXT_WIDTH - sum(widths[column] for column in (0, 3, 4, 5)) - 2 * 5
-    topic = min(widths[1], max(space - widths[2], space // 2))
-    kind = min(widths[2], space - topic)
-    return Table("lllrrl", [(row[0], _tail(row[1], topic), _head(row[2], kind), *row[3:]) for row in rows], head)
+def _fix_checks(summary: RunDocument) -> Iterator[Check]:
+    """Yield how many positions were used, how near the filter is to them, and how often they jump."""
+    gnss, word = summary.gnss, position_word(summary)
+    if of := gnss.used + gnss.rejected:
+        reasons = {"gate": gnss.rejected_by_gate, **gnss.rejected_by_reason}
+        why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
+        more = [f"rejected: {why}"] if why else []
+        if (difference := gnss.mean_difference_m) is not None and (largest := gnss.max_difference_m) is not None:
+            raised = summary.filter.process_position_mps != configured_noise(summary.config).position_mps
+            close = "; follows them closely, because the position noise was raised" if raised else ""
+            more.append(f"filter to {word}: mean {error_text(difference)}, max {error_text(largest)}{close}")
+        for name, one in gnss.classes.items() if len(gnss.classes) > 1 else ():
+            done = {"rejected": one.rejected, "down-weighted": one.down_weighted,
+                    "wrongly reported as fixed": one.sold_as_fixed}  # fmt: skip
+            parts = ", ".join(f"{count:,} {what}" for what, count in done.items() if count)
+            more.append(f"{name} {one.fixes:,}{': ' if parts else ''}{parts}")
+        if gnss.recoveries:
+            times = "once" if gnss.recoveries == 1 else f"{gnss.recoveries:,} times"
+            more.append(f"re-acquired after rejection: {times}")
+        good = gnss.rejected < NOTED_SHARE * of
+        what = "fixes" if word == "GNSS fixes" else "positions"
+        yield Check("good" if good else "care", what, f"{gnss.rejected:,} of {of:,} rejected", tuple(more))
+    if jumps := jump_count(summary.reference_jumps):
+        yield Check("care", "reference", jumps)
 
 
-def _icr_table(run: Run) -> Table:
-    """Return the ICRs of the drive, and how those of the filter converged."""
-    icr, verdicts = run.document.icr, run.document.excitation.verdict
-    rows = []
-    for column in ICR_COLUMNS:
-        found = icr_text(*(run.document.icr_of_drive(column) or (None, None)))
-        mean, std, time_s = icr.mean[column], icr.std[column], icr.convergence_s[column]
-        if mean is None:
-            rows.append((ICR_WORDS[column], found, "", "", ""))
-            continue
-        convergence = f"{time_s:.1f} s" if time_s is not None else "none"
-        verdict = SHOWN_WORDS.get(verdicts[column], "")
-        rows.append((ICR_WORDS[column], found, convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
-    head = ("ICR [m]".ljust(LABEL), "value ± σ", "EKF: converged in", "mean ± std after that", "")
-    return Table("l", rows, head)
+def _heading_checks(summary: RunDocument) -> Iterator[Check]:
+    """Yield how far the heading is from the course over ground, and where it comes from."""
+    heading = summary.heading
+    gate = f", {heading.rejected:,} rejected (gate)" if heading.rejected else ""
+    more = [f"{heading.source.replace('_', ' ')}: {heading.parts}"] if heading.parts else []
+    more.append(f"{heading.used:,} of {heading.used + heading.rejected:,} used{gate}")
+    if heading.offset_deg is None:
+        why = "could not be compared with the course over ground: too little straight driving"
+        yield Check("fact", "heading", why, tuple(more))
+        return
+    # Adding zero takes the sign off a rounded -0.0.
+    value = f"{round(heading.offset_deg, 1) + 0.0:+.1f} ± {heading.offset_std_deg:.1f}°"
+    cause = f" ({heading.offset_name})" if heading.offset_name else ""
+    applied = heading.applied_offset_deg
+    more.insert(0, f"corrected by {0.0 - applied:+.1f}°" if applied else "not corrected")
+    yield Check("good", "heading", f"{value} from the course over ground{cause}", tuple(more))
 
 
-def _controller_rows(run: Run) -> list[Row]:
-    """Return what a controller is given; it belongs to the ICRs in the table above."""
-    numbers, width = run.document.controller, run.track_width_m
-    if width is None:
-        return [("controller", "left out, and no-slip odometry too: robot.track_width_m is not known")]
-    if numbers is None:
-        return [("controller", "no multiplier: y right and y left are not shown")] if run.usable else []
-    verdicts = run.document.excitation.verdict
-    shown = all(verdicts[column] == "shown" for column in ("y_icr_right_m", "y_icr_left_m"))
-    note = "" if shown else "; y right and y left are not shown well enough to use it"
-    return [("controller", f"{controller_text(numbers)}; (y right - y left) / b, b = {width:g} m{note}")]
-
-
-def _filter_rows(run: Run) -> list[Row]:
-    """Return where the filter's ICRs ended, as a check of those in the table."""
-    agreement = filter_agreement(run.document)
-    return [("EKF", agreement)] if agreement else []
-
-
-def _terrain_table(run: Run) -> list[Block]:
-    """Return the ICRs between the terrain changes."""
-    rows = []
-    for number, segment in enumerate(run.document.segments, start=1):
-        mean, std = segment.mean, segment.std
-        icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
-        rows.append((f"  {number}", f"{segment.begin_s:.1f} s", *icrs))
-    head = ("segment".ljust(LABEL), "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
-    return ["", Table("lrl", rows, head)] if rows else []
-
-
-def _position_rows(run: Run) -> list[Row]:
-    gnss = run.document.gnss
-    word = position_word(run.document)
-    lines = []
-    if (difference := gnss.mean_difference_m) is not None and (largest := gnss.max_difference_m) is not None:
-        mean, most = error_text(difference), error_text(largest)
-        raised = run.process_position_mps != configured_noise(run.config).position_mps
-        why = "; follows them closely, because the position noise was raised" if raised else ""
-        lines.append(("position", f"filter to {word}: mean {mean}, max {most}{why}"))
-    reasons = {"gate": gnss.rejected_by_gate, **gnss.rejected_by_reason}
-    why = ", ".join(f"{reason} {count:,}" for reason, count in reasons.items() if count)
-    lines.append(
-        (
-            "fixes" if lines else "position",
-            f"{gnss.used:,} used, {gnss.rejected:,} rejected{f' ({why})' if why else ''}",
-        )
-    )
-    lines += _class_rows(gnss.classes, jump_count(run.document.reference_jumps))
-    if gnss.recoveries:
-        times = "once" if gnss.recoveries == 1 else f"{gnss.recoveries:,} times"
-        lines.append(("", f"re-acquired after rejection: {times}"))
-    if outages := len(run.outages_ns):
-        away = duration_text(float((run.outages_ns[:, 1] - run.outages_ns[:, 0]).sum()) / 1e9)
-        lost = len(run.document.rtk_losses_ns)
-        cause = f" ({lost} by loss of RTK)" if lost else ""
-        lines.append(("", f"{counted(outages, 'outage')}{cause}, {away} in all"))
-    return lines
-
-
-def _class_rows(classes: dict[str, ClassDocument], jumps: str) -> list[Row]:
-    """Return what classes the fixes were of, where they were not all of one, and what was done to them."""
-    lines = []
-    for name, one in classes.items() if len(classes) > 1 else ():
-        done = [f"{one.rejected:,} rejected"] if one.rejected else []
-        done += [f"{one.down_weighted:,} down-weighted"] if one.down_weighted else []
-        done += [f"{one.sold_as_fixed:,} wrongly reported as fixed"] if one.sold_as_fixed else []
-        lines.append(("", f"{name} {one.fixes:,}{': ' if done else ''}{', '.join(done)}"))
-    if jumps:
-        lines.append(("", jumps))
-    return lines
-
-
-def _heading_rows(run: Run) -> list[Row]:
-    heading = run.document.heading
-    lines = [f"{heading.source.replace('_', ' ')}: {heading.parts}"] if heading.parts else []
-    if heading.offset_deg is not None:
-        # Adding zero takes the sign off a rounded -0.0.
-        value = f"{round(heading.offset_deg, 1) + 0.0:+.1f} ± {heading.offset_std_deg:.1f} deg"
-        offset = f"{value} from the course over ground"
-        if heading.offset_name:
-            offset += f" ({heading.offset_name})"
-        applied = heading.applied_offset_deg
-        lines.append(f"{offset}; corrected by {0.0 - applied:+.1f} deg" if applied else f"{offset}; not corrected")
-    elif not lines:
-        lines = ["could not be compared with the course over ground: too little straight driving"]
-    used, rejected = heading.used, heading.rejected
-    counts = f"{used:,} used, {rejected:,} rejected{f' (gate {rejected:,})' if rejected else ''}"
-    return [*(("" if number else "heading", line) for number, line in enumerate(lines)), ("headings", counts)]
-
-
-def _delay_rows(run: Run) -> list[Row]:
-    """Return which streams seem to lag or lead the wheels."""
-    if run.document.filter.reference_delay_s or run.document.heading.applied_delay_s:
-        return []
+def _delay_checks(summary: RunDocument) -> Iterator[Check]:
+    """Yield which streams seem to lag or lead the wheels."""
+    if summary.filter.reference_delay_s or summary.heading.applied_delay_s:
+        return
     found = []
-    for word, facts in (("headings", run.document.heading), ("fixes", run.document.gnss)):
+    for word, facts in (("headings", summary.heading), ("fixes", summary.gnss)):
         delay, std = facts.delay_s, facts.delay_std_s
         if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, SIGNIFICANT_SIGMAS * std):
             found.append(f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {abs(delay):.2f} ± {std:.2f} s")
-    multiplier = run.document.icr.separation_multiplier
+    multiplier = summary.icr.separation_multiplier
     slips = multiplier is None or multiplier > SLIPPING_MULTIPLIER
     cause = "slip of the wheels" if slips else f"the robot's response to its wheels, up to {RESPONSE_S:g} s,"
     lines = [*found, f"not corrected: {cause} has the same effect"] if found else []
-    speed = run.document.drive.speed_mean_mps
-    if run.document.gnss.delay_s is None and run.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
+    speed = summary.drive.speed_mean_mps
+    if summary.gnss.delay_s is None and summary.config.frames.reference_delay_s == "auto" and speed > SLOW_MPS:
         shift = error_text(TYPICAL_DELAY_S * speed)
         lines.append(f"of the fixes: not shown by this drive; a lag of {TYPICAL_DELAY_S:g} s would move x by {shift}")
-    return [("" if number else "delays", line) for number, line in enumerate(lines)]
+    if lines:
+        yield Check("fact", "delays", lines[0], tuple(lines[1:]))
 
 
-def event_rows(run: Run) -> list[Row]:
-    """Return how many slip events of each kind there were, and the worst: the one that missed most distance."""
-    events = run.document.events
-    if not events:
+def corrections(summary: RunDocument) -> list[str]:
+    """Return what the alignment corrected, a few words each."""
+    applied = {name: one.applied for name, one in summary.alignment.items()}
+    scale, left, right = (applied.get(name) or 1.0 for name in ("wheel_scale", "left_scale", "right_scale"))
+    found = [f"wheels {100 * scale:.1f} %"] if abs(scale - 1.0) > NOTED_SCALE else []
+    if abs(left - right) > NOTED_SCALE:
+        side, share = ("left", (right - left) / right) if left < right else ("right", (left - right) / left)
+        found.append(f"{side} {100 * share:.1f} % less")
+    if abs(offset := summary.heading.applied_offset_deg) >= SMALLEST_OFFSET_DEG:
+        found.append(f"heading {0.0 - offset:+.1f}°")
+    delays = (("position", summary.filter.reference_delay_s), ("heading", summary.heading.applied_delay_s))
+    found += [f"{word} {'lag' if delay > 0 else 'lead'} {abs(delay):.2f} s" for word, delay in delays if delay]
+    return found
+
+
+def _inputs(summary: RunDocument) -> list[str]:
+    """Return the topics, each once, with what was taken from it."""
+    roles: dict[str, list[str]] = {}
+    for stream in summary.streams:
+        topics = shortened(topics_text(stream.topic), LONGEST_TOPIC)
+        roles.setdefault(topics, []).append("position" if stream.role == "gnss" else stream.role)
+    return [f"{topic} ({', '.join(taken)})" for topic, taken in roles.items()]
+
+
+def to_drive(summary: RunDocument) -> str:
+    """Return what to drive to find the ICRs that a run does not show; empty where turns would not help."""
+    excitation = summary.excitation
+    if excitation.verdict.all_shown:
+        return lacking_turns(*np.radians([excitation.turned_right_deg, excitation.turned_left_deg]).tolist())
+    return next((one for one in excitation.sentences if "drive two full turns" in one), "")
+
+
+def log_sections(summary: RunDocument) -> list[Block]:
+    """Return what was read, and what the filter and the alignment made of it."""
+    speed = f"{summary.drive.speed_mean_mps:.2f} ± {summary.drive.speed_std_mps:.2f} m/s (mean ± std)"
+    tables: list[Block] = [f"The robot drove at {speed}.", _stream_table(summary), _icr_table(summary)]
+    return [
+        Section("Streams, filter", [*tables, *_terrain_table(summary)], VERBOSE),
+        Section("Why these streams, and what was found of them", [_why_facts(summary), *_alignment(summary)], PAGE),
+        Section("Configuration that the run was made with", [Line(_configuration(summary), "as is")], PAGE),
+    ]
+
+
+def _why_facts(summary: RunDocument) -> Facts:
+    return Facts([(role_word(summary, one.role), one.why) for one in summary.streams])
+
+
+def _stream_table(summary: RunDocument) -> Table:
+    rows = []
+    for one in summary.streams:
+        type_name, hz = one.message_type.replace("/msg/", "/"), one.rate_hz
+        rate = f"{hz:.1f} Hz" if hz is not None else "unknown"
+        rows.append(
+            (role_word(summary, one.role), topics_text(one.topic), type_name, rate, f"{one.count:,}", one.clock)
+        )
+    return Table("lllrrl", rows, ("stream", "topic", "type", "rate", "samples", "clock"))
+
+
+def _icr_table(summary: RunDocument) -> Table:
+    """Return the ICRs of the drive, and how those of the filter converged."""
+    icr, verdicts = summary.icr, summary.excitation.verdict
+    rows = []
+    for column in ICR_COLUMNS:
+        found = icr_text(*(summary.icr_of_drive(column) or (None, None)))
+        mean, std, time_s = icr.mean[column], icr.std[column], icr.convergence_s[column]
+        if mean is None:
+            rows.append((ICR_WORDS[column], found, "", "", "", ""))
+            continue
+        convergence = f"{time_s:.1f} s" if time_s is not None else "none"
+        final = icr_text(icr.final[column], icr.final_std[column])
+        verdict = NOT_SHOWN_WORDS.get(verdicts[column], "")
+        rows.append((ICR_WORDS[column], found, final, convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
+    head = ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", "")
+    return Table("l", rows, head)
+
+
+def _terrain_table(summary: RunDocument) -> Iterator[Table]:
+    """Yield the ICRs between the terrain changes."""
+    rows = []
+    for number, segment in enumerate(summary.segments, start=1):
+        mean, std = segment.mean, segment.std
+        icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
+        rows.append((f"  {number}", f"{segment.begin_s:.1f} s", *icrs))
+    if rows:
+        yield Table("lrl", rows, ("segment", "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS)))
+
+
+def _alignment(summary: RunDocument) -> Iterator[Table]:
+    """Yield what the alignment found and corrected."""
+    rows = []
+    for name, one in summary.alignment.items():
+        std = f" ± {one.std:.4f}" if one.std is not None else ""
+        value = "–" if one.value is None else f"{one.value:.4f}{std}"
+        applied = f"{one.applied:.4f}" if one.applied else "–"
+        rows.append((name, value, applied, one.why))
+    if rows:
+        head = ("estimate", "value ± σ", "applied", "why")
+        yield Table("lrrl", rows, head, "Alignment of the streams: what was found and corrected")
+
+
+def _configuration(summary: RunDocument) -> str:
+    """Return the configuration a key a line, in the form of a configuration file."""
+    lines = []
+    for section, keys in summary.config.effective().items():
+        lines += [f"[{section}]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None)]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def warnings_section(summary: RunDocument) -> Section:
+    """Return the warnings of a run, for a page: a command prints them on stderr."""
+    found: list[Block] = [Items([one.removeprefix(f"{summary.log}: ") for one in summary.warnings])]
+    return Section("Warnings", found if summary.warnings else ["None."], PAGE, name="warnings")
+
+
+def events_section(summary: RunDocument) -> list[Section]:
+    """Return the slip events one by one, for a page; without any: no section."""
+    rows = [
+        (one.kind, duration_text(one.begin_s), duration_text(one.end_s - one.begin_s), distance_text(one.distance_m),
+         f"{100 * one.severity:.0f} %")
+        for one in summary.events
+    ]  # fmt: skip
+    if not rows:
         return []
-    worst = max(events, key=lambda event: (event.end_s - event.begin_s) * event.severity)
-    lasted = duration_text(worst.end_s - worst.begin_s)
-    missed = f"{100 * worst.severity:.0f} % of the wheels' motion missed"
-    worst_text = f"worst: {worst.kind} from {worst.begin_s:.1f} s for {lasted}, {missed}"
-    return [("slip", f"{event_kinds(events)}; the ICRs are not learned there"), ("", worst_text)]
-
-
-def _tail(text: str, width: int) -> str:
-    return text if len(text) <= width else "..." + text[len(text) - width + 3 :]
-
-
-def _head(text: str, width: int) -> str:
-    return text if len(text) <= width else text[: width - 3] + "..."
+    head = ("kind", "from", "lasts", "distance", "missing motion")
+    moments = [one.begin_s for one in summary.events]
+    caption = "Slip events: the robot did not move as its wheels did"
+    return [Section("", [Table("lr", rows, head, caption, moments)], PAGE)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from itertools import groupby
 
-from icrtool.output.text_blocks import Block, Table, Text
+from icrtool.output.text_blocks import Block, Table, Text, printed
 from icrtool.records.text import counted
 from icrtool.simulation.study_measures import ICR_NAMES
 from icrtool.simulation.study_records import Level, StudyNumber, StudyRequest, StudyResult
@@ -41,7 +41,7 @@ def format_study(result: StudyResult) -> Text:
         rows = [row for level in result.levels for row in _level_rows(level, shown)]
         blocks += [Table("lr", rows, ("", varies.rpartition(" ")[2], *shown.values()))]
         blocks += [f"{varies}{errors}; median, and below it [5 %, 95 %] of the runs", ""]
-    return Text([*blocks, _findings_table(result)])
+    return printed([*blocks, _findings_table(result)], verbose=True)
 
 
 def _level_rows(level: Level, shown: dict[str, str]) -> list[list[str]]:

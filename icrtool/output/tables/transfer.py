@@ -1,15 +1,13 @@
-"""Compared groups of runs as text and as rows of CSV."""
+"""Compared groups of runs as blocks and as rows of CSV."""
 
 from __future__ import annotations
 
 from icrtool.output.files.formats import csv_bytes
-from icrtool.output.text_blocks import Block, Table, Text
-from icrtool.records.calibration_document import ErrorsAt, GroupComparison, TransferCell
+from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Figure, Items, Section, Table
+from icrtool.output.text_format import distance_text
+from icrtool.records.calibration_document import ComparedPair, ErrorsAt, GroupComparison, TransferCell
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.text import with_interval, with_std
-
-MOST_VERDICTS = 4
-"""Sentences that are printed unless -v is given."""
 
 
 def transfer_csv(found: GroupComparison) -> bytes:
@@ -18,47 +16,48 @@ def transfer_csv(found: GroupComparison) -> bytes:
     return csv_bytes(columns, ([getattr(cell, name) for name in columns] for cell in found.transfer))
 
 
-def format_transfer(found: GroupComparison) -> Text:
-    """Return verdicts, differences and the transfer matrix, no line end."""
-    blocks: list[Block] = []
-    for pair in found.pairs:
-        rows = [
-            (one.quantity, f"{one.first:+.3f}", f"{one.second:+.3f}", with_std(one.difference, one.std, 3))
-            for one in pair.parameters
-        ]
-        table = Table("lr", rows, ("", pair.first, pair.second, "difference ± std"))
-        blocks += [pair.verdict, "", table]
-        for change in pair.errors:
-            if change.p95_m is not None and change.expected_m is not None:
-                route = ", the same route" if change.paired else ""
-                p95 = with_interval(change.p95_m, change.p95_low_m, change.p95_high_m)
-                expected = with_interval(change.expected_m, change.expected_low_m, change.expected_high_m)
-                what = f"error of a fit to other trials after {change.horizon_m:g} m{route}"
-                blocks.append(f"{what}: 95 % {p95}; expected {expected}")
-        blocks.append("")
-    return Text([*blocks, *_matrix_blocks(found)])
-
-
-def brief_transfer(found: GroupComparison) -> Text:
-    """Return the verdicts, a sentence each, and the transfer matrix, no line end."""
-    sentences = [pair.verdict for pair in found.pairs]
-    more = [f"and {len(sentences) - MOST_VERDICTS} more: -v"] if len(sentences) > MOST_VERDICTS else []
-    return Text([*sentences[:MOST_VERDICTS], *more, "", *_matrix_blocks(found)])
-
-
-def _matrix_blocks(found: GroupComparison) -> list[Block]:
-    """Return the errors of each calibration in each group."""
+def transfer_blocks(found: GroupComparison) -> list[Block]:
+    """Return what `icrtool compare` prints: verdicts, the transfer matrix, differences of each pair, the logs."""
     names = list(found.groups)
-    cells = [[found.cell(row, column, CHOICE_HORIZON_M) for column in names] for row in names]
-    matrix = [(row[0].calibrated_on, *(_errors(cell) for cell in row)) for row in cells]
-    return [
-        f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column",
-        Table("lr", matrix, ("", *names)),
+    cells = {(one.calibrated_on, one.tested_on): one for one in found.transfer if one.horizon_m == CHOICE_HORIZON_M}
+    matrix = [(row, *(_errors(cells.get((row, column))) for column in names)) for row in names]
+    caption = f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column"
+    cost: list[Block] = [
+        Figure((), "comparison"),
+        Figure(("transfer",), folded=False),
+        Table("lr", matrix, ("", *names), caption),
         "on the diagonal each trial is predicted by a fit that does not contain it",
+    ]
+    logs = [f"{name}: {one.name}, {distance_text(one.distance_m)}" for name in names for one in found.groups[name].logs]
+    return [
+        Section("Do they differ?", [Items([pair.verdict for pair in found.pairs])]),
+        Section("What a calibration costs elsewhere", cost),
+        *(Section(f"{pair.second} compared with {pair.first}", _pair_tables(pair), VERBOSE) for pair in found.pairs),
+        Section("Logs", [Items(logs)], PAGE),
     ]
 
 
-def _errors(cell: TransferCell) -> str:
-    if cell.p95_m is None or cell.expected_m is None:
+def _pair_tables(pair: ComparedPair) -> list[Table]:
+    """Return how parameters and held-out errors of two groups differ."""
+    rows = [
+        (one.quantity, f"{one.first:+.3f}", f"{one.second:+.3f}", with_std(one.difference, one.std, 3),
+         "yes" if one.significant else "no, may be chance")
+        for one in pair.parameters
+    ]  # fmt: skip
+    head = ("quantity", pair.first, pair.second, "difference ± std", "significant")
+    errors = [
+        (
+            f"{one.horizon_m:g} m", with_interval(one.p95_m, one.p95_low_m, one.p95_high_m),
+            with_interval(one.expected_m, one.expected_low_m, one.expected_high_m),
+        )
+        for one in pair.errors if one.p95_m is not None and one.expected_m is not None
+    ]  # fmt: skip
+    route = ", the same route" if any(one.paired for one in pair.errors) else ""
+    caption = f"Error of a fit to other trials, {pair.second} minus {pair.first}{route}, with its 95 % interval"
+    return [Table("lrrrl", rows, head), Table("lr", errors, ("after", "95 %", "expected"), caption)]
+
+
+def _errors(cell: TransferCell | None) -> str:
+    if cell is None or cell.p95_m is None or cell.expected_m is None:
         return "-"
     return f"{cell.p95_m:.2f} / {cell.expected_m:.2f}"

@@ -17,16 +17,12 @@ from icrtool.dropout_analysis.outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
+from icrtool.output.dropout_directory import shown_document
 from icrtool.output.exports.acceptance import format_markdown, suite_of, write_junit, write_markdown
 from icrtool.output.files.own_files import check_place
-from icrtool.output.tables.dropout import (
-    budget_lines,
-    error_text,
-    format_dropout,
-    p95_at,
-    shown_horizons,
-    why_no_trial,
-)
+from icrtool.output.tables.dropout import format_dropout, p95_at, reach_rows
+from icrtool.output.tables.errors import shown_horizons
+from icrtool.output.text_format import error_text
 from icrtool.records.run import Run
 
 HORIZONS_M = [0.5, 1.0, 5.0, 9.0, 30.0]
@@ -87,7 +83,7 @@ def test_horizons_beyond_the_log_are_printed_with_the_reason(run: Run) -> None:
     text = " ".join(format_dropout(report).split())
     driven = f"{run.summary['drive']['distance_m']:.1f} m"
     assert f"no trial of 500, 700 m: less than that is left of the {driven} driven" in text
-    assert why_no_trial(report, 0) is None
+    assert shown_document(report).trials[0].why_none is None
     assert "no trial of" not in format_dropout(dropout(run, [1.0]))
 
 
@@ -103,9 +99,10 @@ def test_the_reference_and_the_run_up_stand_in_the_table(content: DropoutReport)
 def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutReport) -> None:
     (outage,), icr = content.outages, content.result("icr")
     assert icr is not None
-    usual = p95_at(icr, content, outage.distance_m)
+    document = shown_document(content)
+    usual = p95_at(document, "icr", outage.distance_m)
     assert usual == icr.summary.p95[2]
-    assert p95_at(icr, content, 31.0) is None
+    assert p95_at(document, "icr", 31.0) is None
     line = next(line for line in format_dropout(content).splitlines() if line.startswith("1 real"))
     assert f"{outage.end_error_m:.3f} m" in line
     assert usual > 0
@@ -119,16 +116,18 @@ def test_verdicts_are_lines_of_the_table(content: DropoutReport) -> None:
     assert replace(content, verdicts=content.verdicts[:1]).passed
 
 
-def test_a_budget_is_a_sentence_a_field_engineer_can_act_on() -> None:
-    budgets = [
+def test_a_budget_is_a_table_a_field_engineer_can_act_on(content: DropoutReport) -> None:
+    budgets = (
         BudgetDistance("icr", "ICR, momentary", 0.5, 7.34, beyond=False, between_m=(7.0, 8.0)),
         BudgetDistance("no_slip", "no slip", 0.5, 2.1, beyond=False, between_m=(1.0, 20.0)),
-        BudgetDistance("icr", "ICR, momentary", 9.0, 20.0, beyond=True, between_m=(20.0, 20.0)),
-    ]
-    assert budget_lines(budgets) == [
-        "stays within 0.5 m (95 %) for 7.3 m (ICR, momentary); no slip: 2.1 m (interpolated between 1 and 20 m)",
-        "stays within 9 m (95 %) for more than 20 m (ICR, momentary)",
-    ]
+        BudgetDistance("icr_final", "ICR, final", 0.5, 20.0, beyond=True, between_m=(20.0, 20.0)),
+    )
+    report = msgspec.structs.replace(shown_document(content), budgets=budgets)
+    assert reach_rows(report, 0.5, 0) == (
+        [("ICR, momentary", "7.3 m", ""), ("no slip", "about 2 m", "between 1 and 20 m")],
+        [("ICR, final", "more than 20 m", "")],
+    )
+    assert reach_rows(report, 9.0, 0) == ([], [])
 
 
 def test_a_distance_below_a_metre_between_far_horizons_is_not_zero() -> None:
@@ -141,7 +140,7 @@ def test_a_distance_below_a_metre_between_far_horizons_is_not_zero() -> None:
 def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[..., Run]) -> None:
     parked = make_run(duration_s=20.0, speed_mps=0.008, turn_mps=0.0, troubles=False, track_width_m=None)
     text = format_dropout(content_of(parked, [5.0]))
-    assert "no budget can be evaluated" in text
+    assert "Not known: the run is not usable" in text
     assert "robot.track_width_m is not known" in text
     assert "the robot stood at 100 % of the states" in text
 
@@ -177,11 +176,11 @@ def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutReport, tm
     text = (tmp_path / "m.md").read_text(encoding="utf-8")
     assert text.startswith("## barn")
     assert "limit is not met" in text
-    assert "- stays within 50 m (95 %) for more than" in text
+    assert "How far within 50 m (95 %)?" in text
     assert "Could not be used: runs/x: was edited" in text
-    table = [line for line in text.splitlines() if line.startswith("|")]
-    columns = {line.count("|") for line in table[:8]}
-    assert len(columns) == 1
+    tables = [part for part in text.split("\n\n") if part.startswith("|")]
+    assert len(tables) > 1
+    assert all(len({line.count("|") for line in part.splitlines()}) == 1 for part in tables)
     assert "All acceptance limits are met" in format_markdown(replace(content, verdicts=content.verdicts[:1]))
 
 

@@ -10,7 +10,7 @@ import pytest
 from icrtool.calibration.one_log import DriveFacts, LogCalibration, Setting
 from icrtool.cli.terminal import show
 from icrtool.output.tables.calibration import setting_blocks
-from icrtool.output.text_blocks import TEXT_WIDTH, Line, Table, Text, labelled
+from icrtool.output.text_blocks import TEXT_WIDTH, Line, Table, Text, labelled, printed
 
 TABLE = Table("lr", [("wheels", "50.0 Hz"), ("a [bold]b", "1.25 Hz")], ("stream", "rate"))
 
@@ -33,7 +33,7 @@ def test_sentences_are_wrapped_and_what_is_copied_is_not() -> None:
 def test_settings_to_copy_are_words_that_a_shell_joins_and_a_terminal_holds() -> None:
     settings = [Setting(f"frames.heading_delay_{number}_s", 0.1234567, "") for number in range(5)]
     log = LogCalibration("log", (), tuple(settings), 1, 1, 0.1, DriveFacts(*[0.0] * len(DriveFacts._fields)), ())
-    text = Text(setting_blocks(log))
+    text = printed(setting_blocks(log), verbose=False)
     assert max(map(len, text.splitlines())) <= 80
     script = f"printf '%s\\n' {text.partition(':')[2].strip()}"
     options = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True).stdout.splitlines()

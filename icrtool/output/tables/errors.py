@@ -1,0 +1,261 @@
+"""Errors over distance as blocks: of the models that count, of all others, and what they rest on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from icrtool.kernels.arrays import Floats
+from icrtool.output.text_blocks import VERBOSE, Block, Cell, Figure, Section, Table
+from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text
+from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.dropout_document import DropoutDocument, ErrorRow, ModelDocument
+from icrtool.records.run_document import RunDocument
+from icrtool.records.text import counted, shortened
+
+LONGEST_LABEL = 26
+"""Characters of a model's name that are printed."""
+
+LISTED_HORIZONS = 4
+"""More horizons than this without a trial are printed as a range."""
+
+NOTED_STANDING = 0.05
+"""From this share of standing states on, they are mentioned."""
+
+SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
+
+MAIN_ROWS = ("recommended", "controller", "recommended_gyro", "recommended_heading", "no_slip")
+"""Models whose errors stand first, beside calibrations."""
+
+FILTER_ROWS = ("icr", "no_slip")
+"""The same where there is no whole model."""
+
+NO_TRIAL = {
+    "too_little_way_left": "not counted: log ends", "across_wheel_gap": "  across a wheel gap",
+    "ends_in_gnss_outage": "  ends in GNSS outage", "from_standstill": "  from standstill",
+    "crosses_jump": "  across a reference jump", "across_slip_event": "  across a slip event",
+}  # fmt: skip
+"""Why starts gave no trial, by the keys of report.json."""
+
+
+def shown_horizons(horizons_m: Floats) -> list[int]:
+    """Return the places of the horizons (h,) nearest to 1, 5, 10 and 20 m, each once; of a few horizons, all."""
+    if len(horizons_m) <= len(SHOWN_HORIZONS_M):
+        return list(range(len(horizons_m)))
+    nearest = (int(np.argmin(np.abs(horizons_m - metres))) for metres in SHOWN_HORIZONS_M)
+    return sorted(set(nearest))
+
+
+def _shown(report: DropoutDocument) -> list[int]:
+    return shown_horizons(np.array([row.horizon_m for row in report.trials]))
+
+
+def model_of(report: DropoutDocument, name: str) -> ModelDocument | None:
+    """Return a model of a report; None where it was not computed."""
+    return next((one for one in report.models if one.name == name), None)
+
+
+def main_rows(report: DropoutDocument) -> set[str]:
+    """Return the models whose errors stand first: calibrations and `MAIN_ROWS`; without a whole model, the filter's."""
+    names, given = {one.name for one in report.models}, {one.name for one in report.calibrations}
+    return given.union(MAIN_ROWS if MAIN_ROWS[0] in names else FILTER_ROWS) & names
+
+
+def in_order(models: Sequence[ModelDocument]) -> list[ModelDocument]:
+    """Return models of a report, those of `MAIN_ROWS` first and in its order, after calibrations."""
+    places = {name: place for place, name in enumerate(MAIN_ROWS)}
+    return sorted(
+        models, key=lambda one: -1 if one.name.startswith("calibration") else places.get(one.name, len(places))
+    )
+
+
+def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
+    """Return the errors over distance: what counts first, then all of them, and what they rest on."""
+    heads = [f"{report.trials[h].horizon_m:g} m" for h in _shown(report)]
+    main, models = main_rows(report), in_order(report.models)
+    rows = [_error_row(one.label, one.by_horizon, report) for one in models if one.name in main]
+    others = [_error_row(one.label, one.by_horizon, report) for one in models if one.name not in main]
+    head = ("distance without GNSS", "", *heads)
+    further: list[Block] = []
+    if others:
+        further.append(Section(f"Other models ({len(others)})", [Table("llr", others, head)], VERBOSE))
+    rows.append(["trials", "", *(f"{report.trials[h].trials:,}" for h in _shown(report))])
+    rests = Table("llr", [*_reference_rows(report), *_ratio_rows(report), *_count_rows(report)], head)
+    sentences = [*_fitted_lines(report), *_reference_lines(report), *_count_lines(report, summary)]
+    further.append(
+        Section("What the errors rest on", [rests, *sentences, *_learned_blocks(report), *_turning(report)], VERBOSE)
+    )
+    return Section(
+        "Error over distance without GNSS",
+        [Figure(("summary",), "errors"), Table("llr", rows, head), *further, Figure(("histogram", "examples"))],
+        name="errors",
+    )  # fmt: skip
+
+
+def _error_row(label: str, by_horizon: Sequence[ErrorRow], report: DropoutDocument) -> list[str | Cell]:
+    """Return 95 %, its interval and the expected error of a model."""
+    cells = []
+    for h in _shown(report):
+        row = by_horizon[h]
+        more = (_span_text(row), _with_share(row.expected_error_m, row.horizon_m))
+        cells.append(Cell(error_text(row.p95_m), _share(row.p95_m, row.horizon_m), more))
+    kinds = Cell("95 %", more=("interval", "expected"))
+    return [shortened(label, LONGEST_LABEL), kinds, *cells]
+
+
+def _share(error_m: float | None, horizon_m: float) -> str:
+    return "-" if error_m is None else f"{100 * error_m / horizon_m:.1f} %"
+
+
+def _with_share(error_m: float | None, horizon_m: float) -> str:
+    return f"{error_text(error_m)} {_share(error_m, horizon_m):>7}"
+
+
+def _span_text(row: ErrorRow) -> str:
+    low, high = getattr(row, "p95_low_m", None), getattr(row, "p95_high_m", None)
+    return "too short" if low is None else f"{error_text(low).removesuffix(' m')}-{error_text(high)}"
+
+
+def _reference_rows(report: DropoutDocument) -> Iterator[list[str | Cell]]:
+    """Yield what a perfect model would show."""
+    if any(row.p95_m is not None for row in report.reference_error):
+        cells = [
+            Cell(error_text(row.p95_m), _share(row.p95_m, row.horizon_m),
+                 (_with_share(row.expected_m, row.horizon_m),))
+            for row in (report.reference_error[h] for h in _shown(report))
+        ]  # fmt: skip
+        yield ["reference alone", Cell("95 %", more=("expected",)), *cells]
+
+
+def _ratio_rows(report: DropoutDocument) -> Iterator[list[str | Cell]]:
+    icr, no_slip = model_of(report, "icr"), model_of(report, "no_slip")
+    if icr is None or no_slip is None:
+        return
+    cells = []
+    for h in _shown(report):
+        ours, theirs = icr.by_horizon[h], no_slip.by_horizon[h]
+        p95, expected = (
+            f"{over / under:.1f} x" if over is not None and under else "-"
+            for over, under in (
+                (theirs.p95_m, ours.p95_m), (theirs.expected_error_m, ours.expected_error_m),
+            )
+        )  # fmt: skip
+        cells.append(Cell(p95, more=(expected,)))
+    yield ["no slip / ICR", Cell("95 %", more=("expected",)), *cells]
+
+
+def _count_rows(report: DropoutDocument) -> Iterator[list[str | Cell]]:
+    """Yield why starts gave no trial."""
+    shown = [report.trials[h] for h in _shown(report)]
+    for key, label in NO_TRIAL.items():
+        counts = [row.no_trial.get(key, 0) for row in shown]
+        if any(counts):
+            yield [label, "", *(f"{count:,}" for count in counts)]
+
+
+def _fitted_lines(report: DropoutDocument) -> list[str]:
+    """Return what the numbers of each model were learned from, those of calibrations in detail."""
+    learned: dict[str, list[str]] = {}
+    for one in report.models:
+        learned.setdefault(one.knows, []).append(one.label)
+    lines = [f"learned from {knows}: {'; '.join(labels)}" for knows, labels in learned.items()]
+    return lines + [
+        f"{one.label}: {one.model} from {counted(one.logs, 'log')}, {one.created[:10]}, {one.fitted}"
+        for one in report.calibrations
+    ]
+
+
+def _reference_lines(report: DropoutDocument) -> list[str]:
+    """Return how much of the momentary ICRs' error can be the reference's own."""
+    known, icr = [row for row in report.reference_error if row.p95_m is not None], model_of(report, "icr")
+    if not known or icr is None:
+        return []
+    own = min(known, key=lambda row: abs(row.horizon_m - CHOICE_HORIZON_M))
+    whole = next(row.p95_m for row in icr.by_horizon if row.horizon_m == own.horizon_m)
+    what = f"the {error_text(whole)} of the momentary ICRs (95 %, {own.horizon_m:g} m)"
+    return [f"up to {error_text(own.p95_m)} of {what} can be the error of the position reference"]
+
+
+def _count_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
+    reference = "; compared with the smoothed trajectory" if report.smoothed else ""
+    moving = "moving " if report.starts_counted == "moving" else ""
+    lines = [f"a trial from each {moving}state of {report.starts:,}, by wheel speeds alone{reference}"]
+    if model_of(report, "no_slip") is None:
+        lines.append("no slip is left out: robot.track_width_m is not known")
+    if report.starts_standing > NOTED_STANDING * report.starts:
+        share = 100 * report.starts_standing / report.starts
+        each = "each standstill is one start" if moving else "each is a start (--starts all)"
+        lines.append(f"the robot stood at {share:.0f} % of the states: {each}")
+    if summary.reference_jumps and report.with_jumps:
+        lines.append("trials across jumps of the reference count")
+    return [*lines, *_event_lines(report, summary), *_empty_lines(report)]
+
+
+def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
+    """Return what slip events cost, at the longest horizon with trials on both sides."""
+    cost, icr, events = report.without_events, model_of(report, "icr"), summary.events
+    if cost is None and events:
+        lasted = duration_text(sum(event.end_s - event.begin_s for event in events))
+        return [f"trials cross {counted(len(events), 'slip event')}, {lasted} in all: --without-events leaves them out"]
+    if cost is None or icr is None:
+        return []
+    if not cost.events:
+        return ["slip events: none in this log; --without-events changes nothing"]
+    left_out = f"{counted(cost.events, 'slip event')} left out"
+    both = [
+        (after, before, counts)
+        for after, before, counts in zip(icr.by_horizon, cost.with_events["icr"], report.trials, strict=True)
+        if after.trials and before.trials
+    ]
+    if not both:
+        return [f"{left_out}: no trial remains"]
+    after, before, counts = both[-1]
+    errors = f"{error_text(after.p95_m)} instead of {error_text(before.p95_m)}"
+    crossing = counts.no_trial["across_slip_event"]
+    return [f"{left_out}: ICR after {after.horizon_m:g} m 95 % {errors} ({crossing:,} trials cross one)"]
+
+
+def _empty_lines(report: DropoutDocument) -> list[str]:
+    """Return a line for each reason why horizons are empty."""
+    horizons: dict[str, list[str]] = {}
+    for row in report.trials:
+        if row.why_none is not None:
+            horizons.setdefault(row.why_none, []).append(f"{row.horizon_m:g}")
+    lines = []
+    for why, lengths in horizons.items():
+        span = ", ".join(lengths) if len(lengths) <= LISTED_HORIZONS else f"{lengths[0]} to {lengths[-1]}"
+        lines.append(f"no trial of {span} m: {why}")
+    return lines
+
+
+def _learned_blocks(report: DropoutDocument) -> Iterator[Block]:
+    """Yield the errors of the momentary ICRs before and after the ICRs were first learned."""
+    split, shown = report.by_learning, _shown(report)
+    if split is None:
+        return
+    if split.learned_s is None or split.learned_at_distance_m is None:
+        yield "the ICRs were never learned: their standard deviations hardly fell in this drive"
+        return
+    if not any(split.before[h].trials for h in shown):
+        return
+    rows = [
+        [name, *(f"{_bare(row.p95_m)} / {_bare(row.expected_error_m)}" if row.trials else "-" for row in part)]
+        for name, part in (
+            ("  before", [split.before[h] for h in shown]), ("  after", [split.after[h] for h in shown]),
+        )
+    ]  # fmt: skip
+    when = f"{duration_text(split.learned_s)}, {distance_text(split.learned_at_distance_m)}"
+    caption = f"ICR, momentary, before and after the ICRs were first learned ({when}): 95 % / expected [m]"
+    yield Table("lr", rows, ("", *(f"{report.trials[h].horizon_m:g} m" for h in shown)), caption)
+
+
+def _bare(metres: float | None) -> str:
+    return error_text(metres).removesuffix(" m")
+
+
+def _turning(report: DropoutDocument) -> Iterator[str]:
+    for split in report.by_turning:
+        kind = "straight" if split.straight else "turning"
+        errors = ", ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in split.expected_m.items())
+        yield f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
