@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,10 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems, some_of
+from icrtool.logs.containers.chunked_file import MIXED, NotByRangesError
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.containers.one_recording import Span, check_spans, storage_files, unpacked_name
+from icrtool.logs.containers.remote_file import RemoteFile, read_by_ranges
 from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.split_files import inputs_of
 from icrtool.logs.containers.sqlite_bag import SqliteBag
@@ -43,6 +46,7 @@ class BagDirectory:
     Parameters
     ----------
     files : of a recording that is not a directory
+    distant : MCAP files that are empty there, and are read by ranges where they have an index, by their names
 
     Raises
     ------
@@ -50,8 +54,11 @@ class BagDirectory:
         No storage file in it, none that can be read, or, without metadata.yaml, more than one recording.
     """
 
-    def __init__(self, path: Path, files: Sequence[Path] = ()) -> None:
+    def __init__(
+        self, path: Path, files: Sequence[Path] = (), distant: Mapping[str, RemoteFile] = MappingProxyType({})
+    ) -> None:  # fmt: skip
         self._path = path
+        self._distant = distant
         self.own_problems = Problems(path.name)
         self._scratch: ScratchFolder | None = None
         self._parts: list[Container] = []
@@ -83,8 +90,9 @@ class BagDirectory:
         return inputs_of(self.files, ended)
 
     def transfer(self) -> str:
-        """Return nothing: it is on disk."""
-        return ""
+        """Return how much was read of distant files, and why all of it."""
+        words = read_by_ranges(self._distant.values()) if self._distant else ""
+        return "; ".join(filter(None, [words, MIXED if any(MIXED in part.transfer() for part in self._parts) else ""]))
 
     def share_read(self) -> float:
         """Return the mean over the files, which are read one after the other."""
@@ -167,12 +175,22 @@ class BagDirectory:
     def _open_part(self, file: Path, message_compression: str) -> None:
         try:
             storage = file if unpacked_name(file.name) == file.name else self._unpacked(file)
-            self._parts.append(_part(storage, message_compression))
+            self._parts.append(self._part(storage, message_compression))
             self.files.append(file)
         except LogError as err:
             self.own_problems.add(f"{file.name}: {err.why}; {err.advice}")
         except OSError as err:
             self.own_problems.add(f"{file.name}: cannot be read; {err.strerror}")
+
+    def _part(self, storage: Path, message_compression: str) -> Container:
+        if storage.suffix == ".bag":
+            return Ros1Bag(storage)
+        if (source := self._distant.get(storage.name)) is not None:
+            try:
+                return McapFile(storage, message_compression, source)
+            except NotByRangesError:
+                source.fetch(storage, None)
+        return (McapFile if storage.suffix == ".mcap" else SqliteBag)(storage, message_compression)
 
     def _unpacked(self, file: Path) -> Path:
         """Decompress a storage file to a temporary folder."""
@@ -203,12 +221,6 @@ class BagDirectory:
             own = np.array(sorted(numbers), np.int64)
             self._numbers.append((own, np.array([numbers[number] for number in own.tolist()], np.int64)))
         return list(merged.values())
-
-
-def _part(storage: Path, message_compression: str) -> Container:
-    if storage.suffix == ".bag":
-        return Ros1Bag(storage)
-    return (McapFile if storage.suffix == ".mcap" else SqliteBag)(storage, message_compression)
 
 
 def _metadata(text: str) -> _Metadata:

@@ -42,6 +42,9 @@ JOINED_BYTES = 1 << 22
 """Of the wanted records of chunks that are made one block: each block has a cost of its own."""
 
 
+MIXED = "topics share compressed chunks, which are read whole"
+
+
 class Chunk(NamedTuple):
     """A chunk in a file, and its entry in the index.
 
@@ -304,9 +307,7 @@ class ChunkedFile(ABC):
 
     def transfer(self) -> str:
         """Return how much was read of a distant file, and why all of it."""
-        words = self._source.transfer()
-        mixed = "; topics share compressed chunks, which are read whole" if words and self._mixed else ""
-        return words + mixed
+        return "; ".join(filter(None, [self._source.transfer(), MIXED if self._mixed and self._source.distant else ""]))
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""

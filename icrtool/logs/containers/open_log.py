@@ -44,6 +44,7 @@ class UnpackedLog:
     inputs : what was read, where that is known
     transfer : how it came over a connection
     share : called with the share of the file that was unpacked
+    distant : as in `BagDirectory`
     """
 
     def __init__(
@@ -54,13 +55,14 @@ class UnpackedLog:
         inputs: tuple[InputFile, ...] = (),
         transfer: str = "",
         share: Callable[[float], None] | None = None,
+        distant: Mapping[str, RemoteFile] | None = None,
     ) -> None:
         self._path, self._scratch, self._inputs, self._transfer = path, scratch, inputs, transfer
         problem = ""
         try:
             if _is_packed_file(log):
                 log, problem = unpack(log, scratch.path / "unpacked", share)
-            self._log = _plain_log(log)
+            self._log = _usable(BagDirectory(log, distant=distant) if distant else _container_at(log), log)
         except LogError as err:
             # Its own path is gone when the user reads this.
             raise LogError(path, err.why, "; ".join(filter(None, [problem, err.advice]))) from err
@@ -90,7 +92,7 @@ class UnpackedLog:
 
     def transfer(self) -> str:
         """Return how it came over a connection."""
-        return self._transfer
+        return "; ".join(filter(None, [self._transfer, self._log.transfer()]))
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return first and last log time."""
@@ -212,7 +214,7 @@ def _open(path: Path, share: Callable[[float], None] | None) -> Container:
 def _open_remote(path: UrlPath, share: Callable[[float], None] | None) -> Container:
     """Return the container at an address: read by ranges where it has an index, else fetched to a temporary folder."""
     remote = RemoteFile(path)
-    why = "a folder"
+    why = "SQLite files, or packed"
     if not remote.is_folder:
         start = remote.read_at(0, 512) if remote.has_ranges else b""
         kind = container_of(BytesIO(start))
@@ -229,11 +231,12 @@ def _open_remote(path: UrlPath, share: Callable[[float], None] | None) -> Contai
         log = scratch.path / (path.name or "log")
         if remote.is_folder:
             log.mkdir()
-            inputs = fetch_folder(path, log, share)
+            inputs, distant = fetch_folder(path, log, share)
         else:
-            inputs = (remote.fetch(log, share),)
-        size = sum(one.bytes for one in inputs) / 1e6
-        return UnpackedLog(path, log, scratch, inputs, f"{size:.3g} MB fetched to a temporary folder: {why}")
+            inputs, distant = (remote.fetch(log, share),), {}
+        size = sum(one.bytes for one in inputs if one.sha256 is not None) / 1e6
+        transfer = f"{size:.3g} MB fetched to a temporary folder: {why}" if size else ""
+        return UnpackedLog(path, log, scratch, inputs, transfer, distant=distant)
     except BaseException:
         scratch.close()
         raise

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Event, local
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
@@ -30,6 +30,10 @@ _PIECE_BYTES, PIECES_AHEAD = 1 << 24, 4
 class RemoteFile:
     """A file behind a connection.
 
+    Parameters
+    ----------
+    about : what its store states about it; None: it is asked
+
     Raises
     ------
     LogError
@@ -38,15 +42,15 @@ class RemoteFile:
 
     distant = True
 
-    def __init__(self, path: UrlPath) -> None:
+    def __init__(self, path: UrlPath, about: dict[str, Any] | None = None) -> None:
         self._path = path
         self._files, self._name = filesystem(path)
-        about = asked(path, lambda: self._files.info(self._name))
+        about = _about(path) if about is None else about
         self.is_folder = about.get("type") == "directory"
         self.size = int(about.get("size") or 0)
         self.has_ranges = self._finds_ranges(about)
         self._about = about
-        self._bytes_read = 0
+        self.bytes_read = 0
         self._start: Held | None = None
         self._held = local()
 
@@ -104,7 +108,7 @@ class RemoteFile:
         pieces: list[bytes] = asked(
             self._path, lambda: self._files.cat_ranges([self._name] * len(begins), begins.tolist(), ends.tolist())
         )
-        self._bytes_read += sum(map(len, pieces))
+        self.bytes_read += sum(map(len, pieces))
         part = np.cumsum(far) - 1
         offsets = (at + ranges - begins[part]).T.tolist()
         return b"".join(pieces[one][first:last] for one, (first, last) in zip(part.tolist(), offsets, strict=True))
@@ -116,7 +120,7 @@ class RemoteFile:
         data = asked(self._path, lambda: self._files.cat_file(self._name, start=at, end=end))
         if len(data) != end - at:
             raise LogError(self._path, f"gave {len(data)} bytes for {end - at}", "is it being written?")
-        self._bytes_read += len(data)
+        self.bytes_read += len(data)
         return bytes(data)
 
     def pieces(self) -> Iterator[bytes]:
@@ -166,11 +170,17 @@ class RemoteFile:
 
     def transfer(self) -> str:
         """Return how much was read."""
-        return f"{self._bytes_read / 1e6:.3g} of {self.size / 1e6:.3g} MB read by ranges"
+        return read_by_ranges([self])
 
     def close(self) -> None:
         """Forget what is held."""
         self._held = local()
+
+
+def read_by_ranges(files: Collection[RemoteFile]) -> str:
+    """Return how much was read of some files."""
+    read, size = sum(one.bytes_read for one in files), sum(one.size for one in files)
+    return f"{read / 1e6:.3g} of {size / 1e6:.3g} MB read by ranges"
 
 
 def _version_of(about: dict[str, Any]) -> dict[str, str]:
@@ -188,20 +198,34 @@ def changed_since(path: UrlPath, inputs: Iterable[InputFile]) -> bool:
     ----------
     inputs : the files as they were
     """
-    files, name = filesystem(path)
-    files.invalidate_cache()
-    about = asked(path, lambda: files.info(name))
-    if about.get("type") == "directory":
-        found = asked(path, lambda: files.ls(name, detail=True))
-        now = {str(address_of(files.unstrip_protocol(one["name"]), path)): one for one in found}
-    else:
-        now = {str(path): about}
+    about = _about(path)
+    now = (
+        {str(one): stated for one, stated in _in_folder(path)}
+        if about.get("type") == "directory"
+        else {str(path): about}
+    )
     for one in inputs:
         stated = now.get(one.path, {})
         version = {key: value for key in ("version", "etag") if (value := getattr(one, key)) is not UNSET}
         if stated.get("size") not in {one.bytes, None} or _version_of(stated) != version:
             return True
     return False
+
+
+def _about(path: UrlPath) -> dict[str, Any]:
+    """Return what a store states about a file now, whatever it stated before."""
+    files, name = filesystem(path)
+    files.invalidate_cache(name)
+    about: dict[str, Any] = asked(path, lambda: files.info(name))
+    return about
+
+
+def _in_folder(path: UrlPath) -> list[tuple[UrlPath, dict[str, Any]]]:
+    """Return the addresses of the files in a folder, and what a store states about them now."""
+    files, name = filesystem(path)
+    files.invalidate_cache(name)
+    found: list[dict[str, Any]] = asked(path, lambda: files.ls(name, detail=True))
+    return [(address_of(files.unstrip_protocol(one["name"]), path), one) for one in found]
 
 
 def _has(held: Held | None, at: int, end: int) -> bool:
@@ -251,22 +275,36 @@ def _below(folder: UrlPath) -> list[UrlPath]:
     return sorted((address_of(files.unstrip_protocol(one), folder) for one in found), key=natural_order)
 
 
-def fetch_folder(path: UrlPath, place: Path, share: Callable[[float], None] | None) -> tuple[InputFile, ...]:
-    """Write the storage files and metadata.yaml of a bag directory to a folder on disk.
+class FetchedFolder(NamedTuple):
+    """A bag directory on disk: its storage files as run.json states them, and those that are read by ranges.
+
+    The latter are empty on disk.
+    """
+
+    inputs: tuple[InputFile, ...]
+    distant: dict[str, RemoteFile]
+
+
+def fetch_folder(path: UrlPath, place: Path, share: Callable[[float], None] | None) -> FetchedFolder:
+    """Write the storage files and metadata.yaml of a bag directory to a folder on disk, but MCAP files.
 
     Raises
     ------
     LogError
         They cannot be read.
     """
-    files, name = filesystem(path)
-    names: list[str] = asked(path, lambda: files.ls(name, detail=False))
-    bag = [one for one in names if re.search(r"\.(mcap|db3|bag)\b|metadata\.yaml$", one.rpartition("/")[2])]
+    bag = [one for one in _in_folder(path) if re.search(r"\.(mcap|db3|bag)\b|metadata\.yaml$", one[0].name)]
     if not bag:
         raise LogError(path, "no recording in it", "name a log in it")
-    inputs = []
-    for number, one in enumerate(bag):
+    inputs: list[InputFile] = []
+    distant: dict[str, RemoteFile] = {}
+    for number, (address, about) in enumerate(bag):
         part = (lambda done, before=number: share((before + done) / len(bag))) if share is not None else None
-        remote = RemoteFile(address_of(files.unstrip_protocol(one), path))
-        inputs.append(remote.fetch(place / Path(one).name, part))
-    return tuple(one for one in inputs if not one.path.endswith("metadata.yaml"))
+        remote, file = RemoteFile(address, about), place / address.name
+        if file.suffix == ".mcap" and remote.has_ranges:
+            file.touch()
+            distant[file.name] = remote
+            inputs += remote.inputs(Event())
+        else:
+            inputs.append(remote.fetch(file, part))
+    return FetchedFolder(tuple(one for one in inputs if not one.path.endswith("metadata.yaml")), distant)

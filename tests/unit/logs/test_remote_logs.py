@@ -201,6 +201,35 @@ def test_of_an_object_only_the_bytes_that_are_needed_are_read(fresh, tmp_path):
     fresh.client.delete_object(Bucket="field", Key="large/a.mcap")
 
 
+def test_of_a_bag_directory_of_mcap_files_only_the_bytes_that_are_needed_are_read(fresh, tmp_path):
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    names = [f"drive_{number}.mcap" for number in range(3)]
+    for name in names:
+        drive(folder / name, size=20_000_000, **LAYOUTS["own chunks"])
+    metadata = f"rosbag2_bagfile_information:\n  relative_file_paths: [{', '.join(names)}]\n"
+    (folder / "metadata.yaml").write_text(metadata)
+    size = sum(file.stat().st_size for file in folder.iterdir())
+    for file in folder.iterdir():
+        fresh.client.upload_file(str(file), "field", f"large/drive/{file.name}")
+    before, place = fresh.received, UrlPath("s3://field/large/drive")
+    found, words = small_ones(place)
+    assert found == small_ones(folder)[0]
+    assert fresh.received - before < 0.06 * size
+    assert words.endswith("MB read by ranges")
+    container = open_log(place)
+    inputs = [(one.path, one.sha256) for one in container.inputs(Event())]
+    assert inputs == [(f"{place}/{name}", None) for name in names]
+    container.close()
+
+    cut = (folder / names[1]).read_bytes()[:-5000]
+    (folder / names[1]).write_bytes(cut)
+    fresh.client.put_object(Bucket="field", Key=f"large/drive/{names[1]}", Body=cut)
+    assert small_ones(place)[0] == small_ones(folder)[0]
+    for name in (*names, "metadata.yaml"):
+        fresh.client.delete_object(Bucket="field", Key=f"large/drive/{name}")
+
+
 def test_a_log_without_an_index_is_fetched_and_read_to_its_end(tmp_path):
     (tmp_path / "cut.mcap").write_bytes(MCAP.read_bytes()[:-5000])
     with file_server(tmp_path) as server:
