@@ -9,20 +9,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.calibration.run_recording import known_antenna_m
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
-from icrtool.records.calibration_document import CALIBRATION_SCHEMA
+from icrtool.records.calibration_document import (
+    CALIBRATION_SCHEMA,
+    SensorDocument,
+    SensorDrive,
+    SensorParameter,
+    SensorVerdict,
+)
 from icrtool.records.measurements import RESPONSE_S
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import known
 from icrtool.records.run import Run
 from icrtool.records.samples import InputFile
-
-Verdict = Literal["shown", "weak", "not shown", "not separable", "given"]
 
 
 class _Kind(NamedTuple):
@@ -83,7 +87,7 @@ class Parameter:
     label: str
     value: float
     std: float
-    verdict: Verdict
+    verdict: SensorVerdict
     note: str
 
 
@@ -132,23 +136,23 @@ class LogCalibration:
         """Return a parameter by its key."""
         return next(one for one in self.parameters if one.key == key)
 
-    def summary(self) -> dict[str, Any]:
-        """Return plain data for calibration.json."""
-        facts = self.facts._asdict()
-        return {
-            "schema": CALIBRATION_SCHEMA,
-            "log": self.name,
-            "inputs": plain(self.inputs),
-            "windows": self.windows,
-            "independent_stretches": self.stretches,
-            "window_miss_m": self.residual_m,
-            "drive": {"way_m": facts.pop("distance_m"), **facts},
-            "parameters": {
-                one.key: {"value": one.value, "std": one.std, "verdict": one.verdict, "note": one.note}
-                for one in self.parameters
-            },
-            "settings": {setting.key: setting.value for setting in self.settings},
+    def document(self) -> SensorDocument:
+        """Return what calibration.json holds of the log."""
+        shown = {
+            one.key: SensorParameter(known(one.value), known(one.std), one.verdict, one.note) for one in self.parameters
         }
+        return SensorDocument(
+            schema=CALIBRATION_SCHEMA,
+            log=self.name,
+            inputs=self.inputs,
+            windows=self.windows,
+            independent_stretches=self.stretches,
+            window_miss_m=known(self.residual_m),
+            drive=SensorDrive(*map(known, self.facts)),
+            settings={setting.key: setting.value for setting in self.settings},
+            alignment=shown,
+            parameters=shown,
+        )
 
 
 def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> LogCalibration:
@@ -207,7 +211,7 @@ def _finding(run: Run, name: str) -> tuple[float, float]:
 def _parameter(run: Run, kind: _Kind, facts: DriveFacts) -> Parameter:
     """Return one estimate with a verdict by its standard deviation, and the reason if it is not "shown"."""
     value, std = _finding(run, kind.finding)
-    verdict: Verdict = "not shown"
+    verdict: SensorVerdict = "not shown"
     if std <= kind.useful:
         verdict = "shown"
     elif std <= WEAK * kind.useful:

@@ -23,6 +23,7 @@ from icrtool.records.calibration_document import (
     CALIBRATION_SCHEMA,
     CalibratedRobot,
     CalibrationDocument,
+    CalibrationFile,
     CalibrationLog,
     ControllerDocument,
     ControllerErrors,
@@ -195,13 +196,17 @@ class Calibration:
             f"95 % within {p95:.2f} m after 10 m, held out>"
         )
 
-    def document(self) -> CalibrationDocument:
-        """Return what the calibration file holds."""
+    def document(self, sensors: CalibrationFile | None = None) -> CalibrationDocument:
+        """Return what the calibration file holds; `sensors`: what the only log shows of its sensors."""
         geometry, covariance = self.geometry()
         own = fitted_document(self.fitted, geometry, covariance, self.robot)
         errors = {} if self.controller is None else msgspec.structs.asdict(self.controller)
+        of_log = (
+            {} if sensors is None else {name: getattr(sensors, name) for name in CalibrationFile.__struct_fields__[1:]}
+        )
         return CalibrationDocument(
             schema=CALIBRATION_SCHEMA,
+            **of_log,
             tool_version=self.tool_version,
             created=self.created,
             robot=self.robot,

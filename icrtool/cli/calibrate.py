@@ -17,6 +17,7 @@ from icrtool.cli.terminal import show
 if TYPE_CHECKING:
     from icrtool.calibration.one_log import LogCalibration
     from icrtool.config import Config
+    from icrtool.records.calibration_document import CalibrationFile
     from icrtool.records.run import Run
 
 
@@ -74,10 +75,9 @@ def command(
     from icrtool.output.text_blocks import printed
 
     texts: list[str] = [printed(calibration_blocks(result, sensors), verbose=verbose)]
-    document = result.calibration.summary() if result is not None else {}
-    if sensors is not None:
-        document = sensors.summary() | document | {"alignment": sensors.summary()["parameters"]}
-    if output is not None:
+    document: CalibrationFile | None = sensors.document() if sensors is not None else None
+    document = result.calibration.document(document) if result is not None else document
+    if output is not None and document is not None:
         texts.append(f"written to {write_calibration(document, output)}")
     if plot is not None:
         _draw(sources[0], runs[0], plot)

@@ -23,6 +23,7 @@ from icrtool.dropout_analysis.starts import Starts
 from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.measured_heading import measured_headings
+from icrtool.kernels.open_loop.trials import TrialCounts
 from icrtool.records.dropout import DEFAULT_SEED, CheckedGate, EventCost, Gate, Outage, UsedCalibration
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type
@@ -101,11 +102,15 @@ def dropout_report(
         starts_of_further=None if found is None else found.trials.starts, track=None if found is None else found.track,
     )  # fmt: skip
     give_back_freed()
+    counts, cost = report.counts, None
     if without_events:
-        report = with_event_cost(report, replace(compared, in_gap=whole.in_gap), starts=starts, seed=seed)
-    report = replace(report, comparison=found.table if found is not None else None, calibrations=used)
+        counts, cost = _event_cost(report, replace(compared, in_gap=whole.in_gap), starts=starts, seed=seed)
     return replace(
         report,
+        counts=counts,
+        event_cost=cost,
+        comparison=found.table if found is not None else None,
+        calibrations=used,
         smoothed=reference == "smoothed",
         with_jumps=with_jumps,
         examples=example_trials(compared),
@@ -187,8 +192,8 @@ def leave_out_events(run: Run) -> Run:
     return replace(run, in_gap=run.in_gap | run.slipping)
 
 
-def with_event_cost(report: DropoutReport, run: Run, *, starts: Starts, seed: int) -> DropoutReport:
-    """Return the report of `leave_out_events` with what the slip events cost.
+def _event_cost(report: DropoutReport, run: Run, *, starts: Starts, seed: int) -> tuple[TrialCounts, EventCost]:
+    """Return the counts of the report of `leave_out_events`, and what the slip events cost.
 
     Parameters
     ----------
@@ -202,5 +207,4 @@ def with_event_cost(report: DropoutReport, run: Run, *, starts: Starts, seed: in
         with_events={result.name: result.summary for result in whole.results},
     )
     # starts at a gap, at an outage or at a standstill are counted as without the option
-    counts = whole.counts._replace(trials=report.counts.trials)
-    return replace(report, counts=counts, event_cost=cost)
+    return whole.counts._replace(trials=report.counts.trials), cost

@@ -10,6 +10,7 @@ from msgspec import UNSET, UnsetType
 from icrtool.config import Positive
 from icrtool.records.plain_data import Record
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument
+from icrtool.records.samples import InputFile
 
 CALIBRATION_SCHEMA: Literal["icrtool/calibration/1"] = "icrtool/calibration/1"
 """Version of calibration files."""
@@ -150,14 +151,66 @@ class GyroDocument(Record, frozen=True):
     error_sources: ErrorSources | None = None
 
 
-class CalibrationDocument(Record, frozen=True, kw_only=True):
+SensorVerdict = Literal["shown", "weak", "not shown", "not separable", "given"]
+"""Whether a drive shows a parameter; `not separable`: no drive does; `given`: by the user."""
+
+
+class SensorParameter(Record, frozen=True):
+    """What one log shows of antenna, offsets, delays and scales; null where it is not determined. `note`: why."""
+
+    value: float | None
+    std: float | None
+    verdict: SensorVerdict
+    note: str
+
+
+class SensorDrive(Record, frozen=True):
+    """Distance, turns and speeds of the drive of one log; speeds are those while moving."""
+
+    way_m: float | None
+    turned_right_deg: float | None
+    turned_left_deg: float | None
+    turn_rate_p95_degps: float | None
+    speed_mean_mps: float | None
+    speed_std_mps: float | None
+
+
+class CalibrationFile(Record, frozen=True, kw_only=True):
+    """What every calibration file has, and what it has of one log alone.
+
+    Attributes
+    ----------
+    log, inputs : name and files of the log
+    windows, independent_stretches : windows of driven distance, and how many count as independent
+    window_miss_m : robust standard deviation of their displacements
+    settings : configuration keys that are worth setting
+    alignment : estimates of the sensors
+    """
+
+    schema: Literal["icrtool/calibration/1"]
+    log: str | UnsetType = UNSET
+    inputs: tuple[InputFile, ...] | UnsetType = UNSET
+    windows: int | UnsetType = UNSET
+    independent_stretches: int | UnsetType = UNSET
+    window_miss_m: float | UnsetType | None = UNSET
+    drive: SensorDrive | UnsetType = UNSET
+    settings: dict[str, float] | UnsetType = UNSET
+    alignment: dict[str, SensorParameter] | UnsetType = UNSET
+
+
+class SensorDocument(CalibrationFile, frozen=True, kw_only=True):
+    """A calibration file without a motion model; `parameters` are those of `alignment`."""
+
+    parameters: dict[str, SensorParameter]
+
+
+class CalibrationDocument(CalibrationFile, frozen=True, kw_only=True):
     """A calibration file.
 
     `created`: date and time, UTC, ISO 8601; not in a report's ``recommended``, which is the same whenever it is made.
     `held_out_pooled`, `error_sources`: empty and null in files of earlier versions.
     """
 
-    schema: Literal["icrtool/calibration/1"]
     tool_version: str
     created: str | UnsetType = UNSET
     robot: CalibratedRobot

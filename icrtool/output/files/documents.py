@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.formats import json_bytes, schema_of
-from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationDocument
+from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationFile
 from icrtool.records.fleet_document import FLEET_FILE, FleetDocument, FleetLog
 from icrtool.records.regular_file import check_folders, read_regular
 
@@ -48,10 +47,8 @@ def open_calibration(file: Path | str) -> Calibration:
         raise RunError(path, why, "make one with icrtool calibrate -o") from err
 
 
-def write_calibration(
-    document: CalibrationDocument | Mapping[str, Any], place: Path, inside: Path | None = None
-) -> Path:
-    """Write plain data of a calibration: into `place` where that is a folder, else as `place`.
+def write_calibration(document: CalibrationFile, place: Path, inside: Path | None = None) -> Path:
+    """Write a calibration file: into `place` where that is a folder, else as `place`.
 
     Parameters
     ----------

@@ -99,7 +99,7 @@ def test_a_block_that_is_spoilt_does_not_change_what_it_is_predicted_by() -> Non
 
 
 def test_a_file_comes_back_as_it_was(result: CalibrationResult, tmp_path: Path) -> None:
-    file = write_calibration(result.calibration.summary(), tmp_path)
+    file = write_calibration(result.calibration.document(), tmp_path)
     document = json.loads(file.read_text())
     keys = {"schema", "model", "terms", "parameters", "covariance", "robot", "logs", "held_out", "recommended"}
     assert keys | {"created", "tool_version"} <= set(document)

@@ -61,7 +61,7 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
     report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0])
     request = default_request("rate", Config())
     study = run_study(replace(request, runs=1, values=(50.0,), plan=replace(request.plan, duration_s=5.0)))
-    table = calibration.summary()
+    table = calibration.document()
 
     def named_levels(text: str) -> Iterator[Level]:
         for level in study.levels:
@@ -97,7 +97,7 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
         "run with pictures": lambda place, text: named(text).write(place, states="parquet"),
         "report": dropout,
         "study": lambda place, text: write_study(replace(study, levels=tuple(named_levels(text))), place),
-        "calibration": lambda place, text: write_calibration(table | {"why": text}, place),
+        "calibration": lambda place, text: write_calibration(msgspec.structs.replace(table, created=text), place),
         "picture": lambda place, text: save_picture(
             new_figure(text, "", width_in=3.0, height_in=2.0), place.with_suffix(".png")
         ),
