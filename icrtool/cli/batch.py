@@ -120,7 +120,7 @@ def run_all(
         for row in coming:
             rows.append(row)
             view.row(row)
-    order = {request.row.log: number for number, request in enumerate(requests)}
+    order = {request.known.log: number for number, request in enumerate(requests)}
     return sorted(rows, key=lambda row: order[row.log])
 
 

@@ -18,7 +18,7 @@ from icrtool.config import Config, builtin_robots, load_config
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
-from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
+from icrtool.fleet.one_log import KnownLog, ReportOptions, Request, failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import FoundRecording, as_text, find_recordings, logs_among
 from icrtool.logs.containers.remote_file import RemoteFile
@@ -119,13 +119,13 @@ def finished(request: Request, folder: Path) -> FleetLog | None:
         row = msgspec.json.decode(read_regular(folder / request.row_file, folder), type=FleetLog)
     except (OSError, ValueError):
         return None
-    if row.key != request.row.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
+    if row.key != request.known.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
         return None
     if row.status != "failed":
         needed = ["run.json", "dropout", CHECKSUM_FILE, *([PAGE_FILE] if request.report.page else [])]
-        if not all((folder / request.row.run / name).exists() for name in needed):
+        if not all((folder / request.known.run / name).exists() for name in needed):
             return None
-    return replace(row, this_time="skipped", log=request.row.log, group=request.row.group, tags=request.row.tags)
+    return replace(row, this_time="skipped", log=request.known.log, group=request.known.group, tags=request.known.tags)
 
 
 def run_batch(
@@ -171,7 +171,7 @@ def _all_of(
             if why := lost():
                 yield request, failed(request, why, repeatable=False)
                 continue
-            extra = (partial(watch, request.row.log),) if watch and isinstance(executor, ThreadPoolExecutor) else ()
+            extra = (partial(watch, request.known.log),) if watch and isinstance(executor, ThreadPoolExecutor) else ()
             pending[executor.submit(process_apart, request.encode(), options.timeout_s, *extra)] = request
         waiting = set(pending)
         while waiting:
@@ -206,13 +206,13 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
                 "budgets": report.budgets_m, "ladder": report.ladder, "robot": known.robot,
                 "baseline": baseline, "strict": report.strict, "allow_unusable": report.allow_unusable}  # fmt: skip
     key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
-    row = FleetLog(
-        one.log, f"{RUNS}/{one.name}", "failed", usable=False, robot=known.robot, group=known.group, tags=known.tags,
-        key=key,
+    about_log = KnownLog(
+        log=one.log, run=f"{RUNS}/{one.name}", robot=known.robot or config.robot.name or "", group=known.group,
+        tags=known.tags, key=key,
     )  # fmt: skip
     # Workers of a cluster may have another working directory.
     return Request(
-        path=os.fsencode(one.path.absolute()), row=row, folder=os.fsencode(output.absolute()),
+        path=os.fsencode(one.path.absolute()), known=about_log, folder=os.fsencode(output.absolute()),
         config=config, report=report, overwrite=options.overwrite,
         baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
     )  # fmt: skip

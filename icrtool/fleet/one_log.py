@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from icrtool import __version__
 from icrtool.config import Config
@@ -26,7 +26,7 @@ from icrtool.fleet.recordings import as_text
 from icrtool.logs.containers.channel import truncation
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
-from icrtool.records.plain_data import plain
+from icrtool.records.plain_data import Record, plain
 from icrtool.records.run import ICR_COLUMNS, FigureSet
 from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
@@ -167,6 +167,17 @@ def report_and_write(
     return report
 
 
+class KnownLog(Record, frozen=True, kw_only=True):
+    """What a batch knows of a log before it is processed, as the keys of `FleetLog`."""
+
+    log: str
+    run: str
+    robot: str = ""
+    group: str = ""
+    tags: tuple[str, ...] = ()
+    key: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Request:
     """All that processing a log needs; travels to the process that does it as JSON. Paths are bytes: of any name.
@@ -174,13 +185,12 @@ class Request:
     Attributes
     ----------
     path : of the log
-    row : what is known of it before: names, robot, group, tags, key
     folder : of the batch
     baseline : place of an earlier report or batch to compare with; empty: none
     """
 
     path: bytes
-    row: FleetLog
+    known: KnownLog
     folder: bytes
     config: Config
     report: ReportOptions
@@ -190,7 +200,7 @@ class Request:
     @property
     def row_file(self) -> str:
         """Where the row is written, below the folder, for a batch that continues this one."""
-        name = self.row.run.removeprefix(f"{RUNS}/")
+        name = self.known.run.removeprefix(f"{RUNS}/")
         return f"{ROWS}/{blake2b(os.fsencode(name), digest_size=16).hexdigest()}.json"
 
     def encode(self) -> bytes:
@@ -228,7 +238,7 @@ def process(request: Request, stage: Stage) -> FleetLog:
     except IcrToolError as err:
         # A full disk may not be full the next time, nor a log be written to; the log's own errors come again.
         path = path_of(request.path)
-        reason = err.beside(str(path), str(folder / request.row.run), log_name(path))
+        reason = err.beside(str(path), str(folder / request.known.run), log_name(path))
         row = failed(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
     except OSError as err:
         # The log was removed meanwhile, or its disk fails.
@@ -247,9 +257,9 @@ def failed(request: Request, reason: str, *, details: str = "", repeatable: bool
     inputs: tuple[FleetFile, ...] = ()
     with suppress(OSError):  # a log that was removed meanwhile, or is a device
         inputs = files_of(path_of(request.path)) if repeatable else ()
-    return replace(
-        request.row, status="failed", reason=reason, details=details, repeatable=repeatable, inputs=inputs,
-        robot=_robot(request), tool_version=__version__,
+    return FleetLog(
+        **asdict(request.known), status="failed", reason=reason, usable=False, details=details, repeatable=repeatable,
+        inputs=inputs, tool_version=__version__,
     )  # fmt: skip
 
 
@@ -279,11 +289,11 @@ def _results(request: Request, stage: Stage) -> FleetLog:
     reports: list[DropoutReport] = []
 
     def report(run: Run, partial: Path) -> None:
-        baseline = open_baseline(place).find(request.row.log, run.document.content) if place is not None else None
+        baseline = open_baseline(place).find(request.known.log, run.document.content) if place is not None else None
         reports.append(report_and_write(run, partial, request.report, stage, baseline=baseline))
 
     run = fit_and_write(
-        path_of(request.path), folder / request.row.run, request.config, stage, overwrite=request.overwrite,
+        path_of(request.path), folder / request.known.run, request.config, stage, overwrite=request.overwrite,
         plots=request.report.plots, figures=request.report.figures, inside=folder, then=report,
     )  # fmt: skip
     return _row(request, run.document, int(run.table.stamp_ns[0]), reports[0])
@@ -296,12 +306,11 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         controller = report.calibration.controller_numbers()
     unusable = f"not usable: {summary.unusable_because}" if not summary.usable else ""
     cut = truncation(summary.warnings)
-    return replace(
-        request.row,
+    return FleetLog(
+        **asdict(request.known),
         status="done",
         reason="; ".join(filter(None, [unusable, f"truncated: {cut}" if cut else ""])),
         usable=summary.usable,
-        robot=_robot(request),
         start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary.drive.duration_s,
         distance_m=summary.drive.distance_m,
@@ -314,15 +323,11 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         events=len(summary.events),
         outages=len(report.outages),
         warnings=len(summary.warnings),
-        verdicts=tuple(fleet_verdict(one, request.row.log) for one in report.verdicts),
+        verdicts=tuple(fleet_verdict(one, request.known.log) for one in report.verdicts),
         baseline=_baseline_numbers(report),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
         inputs=files_of(path_of(request.path), summary.inputs),
     )
-
-
-def _robot(request: Request) -> str:
-    return request.row.robot or request.config.robot.name or ""
 
 
 def _errors(report: DropoutReport) -> dict[str, float | None]:

@@ -26,9 +26,10 @@ from icrtool.records.fleet_document import FleetLog
 SCRIPT = """
 import os, signal, sys, time
 from pathlib import Path
-from msgspec.structs import replace
+from msgspec.structs import asdict
 from icrtool.errors import DataError
 from icrtool.fleet import one_log, processes
+from icrtool.records.fleet_document import FleetLog
 
 def results(request, stage):
     stage("reading")
@@ -48,13 +49,13 @@ def results(request, stage):
     if "bad" in path.stem:
         raise DataError(path.name, "no wheels")
     time.sleep(0.3 if "slow" in path.stem else 0)
-    directory = one_log.path_of(request.folder) / request.row.run
+    directory = one_log.path_of(request.folder) / request.known.run
     (directory / "dropout").mkdir(parents=True, exist_ok=True)
     (directory / "run.json").write_text("{}")
     (directory / "B2SUMS").touch()
     if request.report.page:
         (directory / "report.html").touch()
-    return replace(request.row, status="done", usable=True, distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
+    return FleetLog(**asdict(request.known), status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
                    inputs=one_log.files_of(path))
 
 one_log._results = results
@@ -82,7 +83,7 @@ def run(season: Path, jobs: int = 2, **options: object) -> dict[str, FleetLog]:
     requests = plan([season], season.parent / "out", asked)
     with ThreadPoolExecutor(jobs) as executor:
         rows = list(run_batch(requests, executor, asked))
-    assert sorted(row.log for row in rows) == sorted(request.row.log for request in requests), "one row a log"
+    assert sorted(row.log for row in rows) == sorted(request.known.log for request in requests), "one row a log"
     return {Path(row.log).stem: row for row in rows}
 
 
@@ -216,9 +217,9 @@ def test_the_manifest_gives_robot_group_and_tags(season: Path) -> None:
     )
     requests = plan([season / "m.csv"], season.parent / "out", BatchOptions())
     first, second = requests
-    assert (first.row.robot, first.row.group, first.row.tags) == ("husky-a200", "grass", ("wet",))
+    assert (first.known.robot, first.known.group, first.known.tags) == ("husky-a200", "grass", ("wet",))
     assert first.config.robot.name == "husky-a200"
-    assert (second.row.robot, second.config.robot.track_width_m) == ("mule", 0.9)
+    assert (second.known.robot, second.config.robot.track_width_m) == ("mule", 0.9)
     (season / "m.csv").write_text("log,robot\na.mcap,husky-a20\n")
     with pytest.raises(ConfigError, match="husky-a20"):
         plan([season / "m.csv"], season.parent / "out", BatchOptions())
@@ -284,4 +285,6 @@ def test_a_finished_log_of_a_moved_folder_is_found_by_content(season: Path, tmp_
     assert isinstance(request, Request)
     found = finished(request, tmp_path / "out")
     assert found is not None
-    assert finished(replace(request, row=msgspec.structs.replace(request.row, key="other")), tmp_path / "out") is None
+    assert (
+        finished(replace(request, known=msgspec.structs.replace(request.known, key="other")), tmp_path / "out") is None
+    )
