@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import msgspec
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET, UnsetType, field
 
 from icrtool.config import Positive
 from icrtool.records.plain_data import Record
@@ -167,7 +167,7 @@ class SensorParameter(Record, frozen=True):
 class SensorDrive(Record, frozen=True):
     """Distance, turns and speeds of the drive of one log; speeds are those while moving."""
 
-    way_m: float | None
+    distance_m: float | None = field(name="way_m")
     turned_right_deg: float | None
     turned_left_deg: float | None
     turn_rate_p95_degps: float | None

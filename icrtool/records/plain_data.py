@@ -26,7 +26,7 @@ def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
     Of a dataclass the fields that are compared count: the others are no content; nor is what is not set.
     """
     if isinstance(value, msgspec.Struct):
-        value = msgspec.structs.asdict(value)
+        value = dict(zip(value.__struct_encode_fields__, msgspec.structs.astuple(value), strict=True))
     elif is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value) if field.compare}
     if isinstance(value, Mapping):
