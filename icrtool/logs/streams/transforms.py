@@ -26,9 +26,12 @@ LARGEST_TRANSLATION_M = 1e9
 """Beyond it a transform is damaged; UTM coordinates reach 1e7."""
 
 _PREFIX = "transforms[*]."
-_TRANSLATION = tuple(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz")
-_ROTATION = tuple(f"{_PREFIX}transform.rotation.{axis}" for axis in "xyzw")
-FIELDS = (f"{_PREFIX}header.frame_id", f"{_PREFIX}child_frame_id", *_TRANSLATION, *_ROTATION)
+FIELDS = (
+    f"{_PREFIX}header.frame_id", f"{_PREFIX}child_frame_id",
+    *(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz"),
+    *(f"{_PREFIX}transform.rotation.{axis}" for axis in "xyzw"),
+)  # fmt: skip
+"""Of a transform: parent, child, translation, rotation."""
 
 Transforms = dict[str, tuple[str, Floats, Floats]]
 """Child frame to (parent frame, translation (3,) [m], rotation (3, 3)); parent coordinates = R child + t."""
@@ -71,25 +74,15 @@ def _transforms(tables: Sequence[TopicTable]) -> Transforms:
     """Return the transforms of all messages; of several for one child frame, the last."""
     found: Transforms = {}
     for table in tables:
-        if not all(path in table.columns for path in FIELDS):
-            continue
-        parents, parent_names = table.words(FIELDS[0])
-        children, child_names = table.words(FIELDS[1])
-        translation = np.stack([table.floats(path) for path in _TRANSLATION], axis=-1)
-        rotation = np.stack([table.floats(path) for path in _ROTATION], axis=-1)
-        length, size = np.abs(translation).max(axis=-1), np.abs(rotation).max(axis=-1)
-        sound = (length < LARGEST_TRANSLATION_M) & (size > 0.01) & (size < 100.0)  # a unit quaternion, or nearly
-        rows, places = np.nonzero((children >= 0) & sound)
-        last = dict(zip(children[rows, places].tolist(), zip(rows.tolist(), places.tolist(), strict=True), strict=True))
-        for child, at in last.items():
-            parent = _plain(parent_names[parents[at]])
-            found[_plain(child_names[child])] = (parent, translation[at], _matrix(rotation[at]))
+        if all(path in table.columns for path in FIELDS):
+            links = _links(table)
+            found |= {child: (one.parent, one.place[-1], _matrix(one.turn[-1])) for child, one in links.items()}
     return found
 
 
 def _matrix(q: Floats) -> Floats:
-    """Return the rotation matrix of a quaternion x, y, z, w."""
-    x, y, z, w = q / np.linalg.norm(q)
+    """Return the rotation matrix of a unit quaternion x, y, z, w."""
+    x, y, z, w = q
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -127,11 +120,11 @@ _POSE = tuple(f"pose.{name}" for name in ("position.x", "position.y", "position.
 
 
 class _Link(NamedTuple):
-    """A moving frame: its parent, the messages (n,) that hold it, stamps (n, 2), places (n, 3), quaternions (n, 4)."""
+    """A frame in its parent: the messages (n,) and places in them (n,), translations (n, 3), quaternions (n, 4)."""
 
     parent: LogText
     rows: Ints
-    stamps: Ints
+    places: Ints
     place: Floats
     turn: Floats
 
@@ -168,14 +161,14 @@ def transform_pose(table: TopicTable) -> TopicTable:
     base = next((one for last in BASE_FRAMES for one in links if one.rsplit("/", 1)[-1] == last), None)
     if base is None:
         raise DefinitionError(table.topic, f"it moves none of the frames {', '.join(BASE_FRAMES)}")
-    root, rows, stamps, place, turn = links.pop(base)
+    root, rows, places, place, turn = links.pop(base)
     step = np.zeros(len(rows), np.bool_)
     lowest = True
     while root in links:
         above = links.pop(root)
         held = np.searchsorted(above.rows, rows, side="right") - 1
         known = held >= 0
-        rows, stamps, step, held = rows[known], stamps[known], step[known], held[known]
+        rows, places, step, held = rows[known], places[known], step[known], held[known]
         changed = np.diff(above.place, axis=0).any(axis=1) | np.diff(above.turn, axis=0).any(axis=1)
         version = np.append(0, np.cumsum(changed))[held]
         step[1:] |= version[1:] != version[:-1]
@@ -188,8 +181,9 @@ def transform_pose(table: TopicTable) -> TopicTable:
     step |= lowest
     if not step.any():
         raise DefinitionError(table.topic, f"its {root} never moves against the odometry: that is dead reckoning")
-    frame = np.zeros((np.count_nonzero(step), 1), np.int64)
-    values = [*stamps[step].T, *frame.T, *place[step].T, *turn[step].T]
+    stamps = (table.column(path)[rows[step], places[step]] for path in _STAMP)
+    frame = np.zeros(np.count_nonzero(step), np.int64)
+    values = [*stamps, frame, *place[step].T, *turn[step].T]
     columns = dict(zip((*STAMPS[0], FRAME, *_POSE), values, strict=True))
     return replace(
         table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[rows[step]],
@@ -198,22 +192,23 @@ def transform_pose(table: TopicTable) -> TopicTable:
 
 
 def _links(table: TopicTable) -> dict[str, _Link]:
-    """Return the moving frames by name, without their leading slash."""
+    """Return the frames that a topic holds by name, without their leading slash."""
     parents, parent_names = table.words(FIELDS[0])
     children, child_names = table.words(FIELDS[1])
-    stamps = np.stack([table.column(path) for path in _STAMP], axis=-1)
     numbers = np.stack([table.floats(path) for path in FIELDS[2:]], axis=-1)
+    length, size = (np.abs(part).max(axis=-1) for part in (numbers[..., :3], numbers[..., 3:]))
+    sound = (length < LARGEST_TRANSLATION_M) & (size > 0.01) & (size < 100.0)  # a unit quaternion, or nearly
+    all_rows, all_places = np.nonzero((children >= 0) & sound)
+    order = np.argsort(children[all_rows, all_places], kind="stable")
+    ends = np.cumsum(np.bincount(children[all_rows, all_places], minlength=len(child_names)))
     found: dict[str, _Link] = {}
-    for code, name in enumerate(child_names):
-        rows, places = np.nonzero(children == code)
-        pose = numbers[rows, places]
-        size = np.linalg.norm(pose[:, 3:], axis=1)
-        sound = np.isfinite(pose).all(axis=1) & (size > 0.0)
-        rows, places, pose, size = (one[sound] for one in (rows, places, pose, size))
-        if len(rows):
-            parent = LogText(parent_names[parents[rows[-1], places[-1]]].strip("/"))
-            turn = pose[:, 3:] / size[:, None]
-            found[name.strip("/")] = _Link(parent, rows, stamps[rows, places], pose[:, :3], turn)
+    for name, of_child in zip(child_names, np.split(order, ends[:-1]), strict=True):
+        if len(of_child):
+            rows, places = all_rows[of_child], all_places[of_child]
+            pose = numbers[rows, places]
+            parent = LogText(_plain(parent_names[parents[rows[-1], places[-1]]]))
+            turn = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1)[:, None]
+            found[_plain(name)] = _Link(parent, rows, places, pose[:, :3], turn)
     return found
 
 
