@@ -20,7 +20,7 @@ from icrtool.records.text import LogText, escaped
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.errors import IcrToolError
-    from icrtool.logs.read_log import Survey
+    from icrtool.logs.streams.assembly import Survey
     from icrtool.records.run import Run
     from icrtool.records.tables import RobotLog
 
@@ -104,7 +104,8 @@ def _examine(found: Found, config: Config, part: tuple[str | None, str | None], 
         The log cannot be fitted.
     """
     from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
-    from icrtool.logs.read_log import assemble, read_log, survey_log
+    from icrtool.logs.read_log import read_log, survey_log
+    from icrtool.logs.streams.assembly import assemble
     from icrtool.logs.table_file import is_table
 
     start, end = part

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.read_log import Survey
+from icrtool.logs.streams.assembly import Survey
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, WheelMotion
 from icrtool.records.plain_data import plain
 from icrtool.records.samples import ROLE_WORDS, Role, StreamChoice, rate_and_jitter

@@ -28,7 +28,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from icrtool.config import load_config
 from icrtool.errors import IcrToolError
-from icrtool.logs.read_log import assemble, survey_log
+from icrtool.logs.read_log import survey_log
+from icrtool.logs.streams.assembly import assemble
 from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
 
 START_NS = 1_760_000_000_000_000_000
@@ -331,7 +332,7 @@ READ_WITH_LITTLE_MEMORY = """
 import resource, sys
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
-from icrtool.logs.read_log import assemble
+from icrtool.logs.streams.assembly import assemble
 from icrtool.logs.read_log import survey_log
 
 def read(path):

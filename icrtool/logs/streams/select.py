@@ -16,7 +16,6 @@ from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE
 from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, WheelMotion, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
-from icrtool.logs.streams.wheel_speeds import check_joints
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean
 
@@ -332,13 +331,49 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
     return ([*ordered[:MOST_LISTED], f"{more} more"] if more > 0 else ordered) or ["no topic at all"]
 
 
-def common_clock(delays_s: Sequence[float | None]) -> Literal["header", "log"]:
-    """Return the clock for streams that are used together: header stamps or log time.
+_Key = Literal["left_joints", "right_joints"]
+_KEYS: tuple[_Key, _Key] = ("left_joints", "right_joints")
 
-    `delays_s` holds, by stream, log time minus header stamp, None where there are no header stamps. Where some
-    stream has only log times and another's header is far from them, all go by log time.
+
+def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], config: Config) -> None:
+    """Refuse a configured joint that no message of the wheels' topic lists: its side would be the mean of fewer wheels.
+
+    Parameters
+    ----------
+    chosen : the wheels that would be used, None where there are none
+    candidates : all wheels that were found; where `chosen` lists no joints they are looked for here
+
+    Raises
+    ------
+    ConfigError
+        The first such joint, with those that are listed.
     """
-    known = [delay for delay in delays_s if delay is not None]
-    if len(known) == len(delays_s):
-        return "header"
-    return "log" if any(abs(delay) > 0.1 for delay in known) else "header"
+    if not _keys_given(config):
+        return
+    # If the chosen topic lists no joints, none of the others has the configured ones: name the closest one.
+    listing = [motion for motion in candidates if motion.joints]
+    if chosen is not None and chosen.joints:
+        listing = [chosen]
+    closest = min(listing, key=lambda motion: len(_unlisted(motion, config)), default=None)
+    unlisted = _unlisted(closest, config) if closest is not None else []
+    if closest is None or not unlisted:
+        return
+    key, name = unlisted[0]
+    why, advice = f"no message of {closest.topic} lists a joint {name}", f"its joints are {some_of(closest.joints)}"
+    raise ConfigError(f"wheels.{key}", why, advice)
+
+
+def ignored_joints(chosen: WheelMotion, config: Config) -> list[str]:
+    """Return a warning for every configured joint list that is not used, because the messages list no joints."""
+    if chosen.joints:
+        return []
+    why = f"{chosen.topic} ({chosen.message_type}) lists no joints by name"
+    return [f"wheels.{key} is not used: {why}" for key in _keys_given(config)]
+
+
+def _keys_given(config: Config) -> list[_Key]:
+    return [key for key in _KEYS if getattr(config.wheels, key)]
+
+
+def _unlisted(motion: WheelMotion, config: Config) -> list[tuple[_Key, str]]:
+    return [(key, name) for key in _KEYS for name in getattr(config.wheels, key) if name not in motion.joints]

@@ -19,6 +19,9 @@ MOST_PIECES = 10.0
 LARGEST_SHARE_BACKWARDS = 0.01
 LARGEST_SHARE_ZERO = 0.01
 
+FAR_NS = 100_000_000
+"""Header stamps that log time follows by less are used together with log times of other streams."""
+
 AROUND = 25
 """Messages before and after a step of a clock whose median delay to log time shows its size."""
 
@@ -179,6 +182,15 @@ def _set_back_note(streams: Sequence[tuple[Role, StampedRows]], name: str) -> It
 
 def _time_of_day(stamp_ns: int) -> str:
     return f"{np.datetime64(stamp_ns // 1_000_000_000, 's')}Z"
+
+
+def common_clock(streams: Sequence[StampedRows]) -> Literal["header", "log"]:
+    """Return the clock for streams that are used together: header stamps or log time.
+
+    Where some stream has only log times and another's header is far from them, all go by log time.
+    """
+    delays = [rows.delay_ns for rows in streams if rows.header_ns is not None]
+    return "log" if len(delays) < len(streams) and any(abs(delay) > FAR_NS for delay in delays) else "header"
 
 
 def usable_rows(stamps: Ints, usable: Bools) -> Ints | slice:

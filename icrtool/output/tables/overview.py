@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
-from icrtool.logs.read_log import Survey
+from icrtool.logs.streams.assembly import Survey
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.output.tables.run import Row, copied, excitation_row, gravest
 from icrtool.output.text_blocks import Block, Facts, Section, Text, printed

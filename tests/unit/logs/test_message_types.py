@@ -30,7 +30,8 @@ from rosbags.typesys.store import Typestore
 from icrtool.logs.messages.collectors import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.decoded_values import NMEA_SENTENCE
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
-from icrtool.logs.read_log import Survey, survey_log
+from icrtool.logs.read_log import survey_log
+from icrtool.logs.streams.assembly import Survey
 from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
 from icrtool.records.samples import ROLE_WORDS, Role

@@ -12,17 +12,17 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, MissingStreamError
 from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.read_log import Survey, assemble
+from icrtool.logs.streams.assembly import Survey, assemble
 from icrtool.logs.streams.select import (
     Candidates,
     Choice,
     choose_streams,
-    common_clock,
     fields_to_take,
     find_candidates,
+    ignored_joints,
     other_references,
 )
-from icrtool.logs.streams.wheel_speeds import ignored_joints
+from icrtool.logs.streams.stamps import StampedRows, common_clock
 from icrtool.records.text import LogText
 
 COUNT = 50
@@ -442,7 +442,9 @@ def test_an_odometry_is_read_for_all_its_roles_at_once() -> None:
     ],
 )
 def test_streams_that_are_used_together_go_by_one_clock(delays: list[float | None], clock: str) -> None:
-    assert common_clock(delays) == clock
+    times = np.arange(3)
+    rows = [StampedRows(None if d is None else times, times, "", int((d or 0.0) * 1e9)) for d in delays]
+    assert common_clock(rows) == clock
 
 
 def test_a_lidar_pose_is_another_reference_beside_gnss_and_brings_its_heading() -> None:

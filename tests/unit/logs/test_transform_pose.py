@@ -13,7 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from icrtool.config import load_config
-from icrtool.logs.read_log import Survey, survey_log
+from icrtool.logs.read_log import survey_log
+from icrtool.logs.streams.assembly import Survey
 
 START_NS, STEP_NS, COUNT, EVERY = 1_760_000_000_000_000_000, 50_000_000, 60, 5
 STORE = get_typestore(Stores.ROS2_HUMBLE)

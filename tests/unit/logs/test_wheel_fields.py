@@ -13,7 +13,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from icrtool.config import load_config
 from icrtool.errors import ConfigError
-from icrtool.logs.read_log import Survey, assemble, survey_log
+from icrtool.logs.read_log import survey_log
+from icrtool.logs.streams.assembly import Survey, assemble
 from icrtool.logs.streams.sources import WheelMotion
 
 START_NS, STEP_NS, COUNT = 1_760_000_000_000_000_000, 50_000_000, 400

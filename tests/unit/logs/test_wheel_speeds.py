@@ -9,10 +9,10 @@ from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
 from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.assembly import wheel_samples
 from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.sources import WheelMotion, motion_of
 from icrtool.logs.streams.stamps import StampedRows
-from icrtool.logs.streams.wheel_speeds import wheel_samples
 from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog
 
