@@ -7,7 +7,7 @@ import os
 import sys
 from contextlib import suppress
 
-from icrtool.cli.interrupts import INTERRUPTED, end_at_once
+from icrtool.cli.process import INTERRUPTED, end_at_once, standard_streams
 from icrtool.records.process_resources import use_one_arena
 
 __all__ = ["main"]
@@ -34,14 +34,11 @@ def main() -> None:
         import resource
 
         resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
-    with end_at_once():
-        from icrtool.cli.standard_streams import standard_streams
-
-        with standard_streams() as output:
-            status = _run()
-            if output.lost:
-                sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
-                status = status or 1
+    with end_at_once(), standard_streams() as output:
+        status = _run()
+        if output.lost:
+            sys.stderr.write(f"Error: standard output: cannot be written; {output.lost}\n")
+            status = status or 1
     # At its end the interpreter looks for cyclic rubbish among all that was imported: a tenth of a second or two.
     gc.freeze()
     sys.exit(status)
@@ -64,7 +61,7 @@ def _run() -> int:
         except (IcrToolError, OSError) as err:
             if isinstance(err, OSError) and err.filename is None:
                 raise
-            from icrtool.cli.stages import signal_word
+            from icrtool.cli.printing import signal_word
             from icrtool.records.text import LogText
 
             # A path that is too long, or on a disk that fails, where no command knows more about it.

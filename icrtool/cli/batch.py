@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.stages import signal_word
+from icrtool.cli.printing import error, print_json, warn
 from icrtool.records.text import LogText, counted, escaped, shortened
 
 if TYPE_CHECKING:
@@ -43,7 +42,7 @@ LONGEST_STAGE, LEAST_NAME = 28, 12
 @click.option("--redo", is_flag=True, help="Also process logs that are done.")
 @click.option("--overwrite", is_flag=True, help="Also replace runs of other recordings.")
 @options.report
-@json_option
+@options.as_json
 @options.configuration
 @options.verbosity
 def command(
@@ -89,7 +88,7 @@ def command(
     if compared is not None:
         from icrtool.fleet.fleet_files import changes_of
 
-        options.warn([escaped(change) for change in changes_of(rows, missing)], quiet=quiet)
+        warn([escaped(change) for change in changes_of(rows, missing)], quiet=quiet)
     print_results(rows, calibrations, output, written, quiet=quiet, as_json=as_json)
     options.check_compared(one for row in rows for one in row.verdicts)
     missed = any(row.gates_failed for row in rows)
@@ -193,7 +192,7 @@ class View:
         self.close()
         if row.status == "failed":
             if self._reports:
-                click.echo(f"{signal_word('Error:', 'red')} {escaped(row.log)}: {escaped(row.reason)}", err=True)
+                error(f"{escaped(row.log)}: {escaped(row.reason)}")
                 if self._verbose and row.details:
                     click.echo("\n".join(map(escaped, row.details.splitlines())), err=True)
         elif self._prints:

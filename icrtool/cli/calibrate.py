@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,9 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import check_run_config, runs_of, runs_or_logs
-from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.terminal import show
+from icrtool.cli.inputs import check_run_config, runs_of, runs_or_logs
+from icrtool.cli.printing import print_json, show, warn, warn_of
 
 if TYPE_CHECKING:
     from icrtool.calibration.one_log import LogCalibration
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--plot", metavar="FILE", type=options.NEW_PICTURE,
               help="Draw the residuals before and after the calibration: png, svg, pdf. One log.")  # fmt: skip
 @options.allow_unusable
-@json_option
+@options.as_json
 @options.configuration
 @options.verbosity
 def command(
@@ -66,11 +64,11 @@ def command(
     result = None
     try:
         result = calibrate_runs(runs, allow_unusable=allow_unusable)
-        options.warn([str(one) for one in result.left_out], quiet=quiet)
+        warn([str(one) for one in result.left_out], quiet=quiet)
     except IcrToolError as err:
         if sensors is None or not (runs[0].usable or allow_unusable):
             raise
-        options.warn([f"no motion model: {err}"], quiet=quiet)
+        warn([f"no motion model: {err}"], quiet=quiet)
     from icrtool.output.tables.held_out import calibration_blocks
     from icrtool.output.text_blocks import printed
 
@@ -118,14 +116,7 @@ def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> Lo
     """Return what one log shows of antenna, offsets, delays and scales."""
     from icrtool.calibration.one_log import calibrate_log
 
-    if verbose or not sys.stderr.isatty():
-        options.warn(run.warnings, quiet=quiet)
-    if verbose:
-        from icrtool.output.text_format import topics_text
-        from icrtool.records.samples import ROLE_WORDS
-
-        for stream in run.document.streams:
-            click.echo(f"{ROLE_WORDS[stream.role]}: {topics_text(stream.topic)}: {stream.why}", err=True)
+    warn_of(run, quiet=quiet, verbose=verbose)
     return calibrate_log(run, x_icr_m=x_icr)
 
 

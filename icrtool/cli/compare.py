@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import runs_of, runs_or_logs
-from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.terminal import show
+from icrtool.cli.inputs import runs_of, runs_or_logs
+from icrtool.cli.printing import answer
 from icrtool.records.text import LogText
 from icrtool.records.urls import UrlPath, place_of
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @click.option("-o", "--output", metavar="FILE", type=options.NEW_FILE,
               help="Write the comparison as JSON, for icrtool report.")  # fmt: skip
 @click.option("--plot", metavar="FILE", type=options.NEW_PICTURE, help="Draw the comparison: png, svg, pdf.")
-@json_option
+@options.as_json
 @options.configuration
 @options.verbosity
 def command(
@@ -63,10 +63,8 @@ def command(
         from icrtool.output.figures.transfer import transfer as transfer_figure
 
         save_picture(transfer_figure(compared), plot)
-    if as_json:
-        print_json("compare", compared)
-    elif not quiet:
-        show(printed(transfer_blocks(compared), verbose=verbose))
+    text = partial(printed, transfer_blocks(compared), verbose=verbose)
+    answer("compare", compared, text, as_json=as_json, quiet=quiet)
 
 
 def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from icrtool.cli import options
+from icrtool.cli.printing import write_or_print
 
 
 @click.command("config")
@@ -25,4 +26,4 @@ def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], 
     """  # noqa: D301 - click reads the escape
     from icrtool.output.tables.configuration import format_configuration
 
-    options.write_or_print(format_configuration(options.load(config_file, robot, sets)), output)
+    write_or_print(format_configuration(options.load(config_file, robot, sets)), output)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,11 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
-from icrtool.cli.drive_options import numbers
-from icrtool.cli.fit import RUNS, RunPlace, check_run_config, fit_log, logs_of, run_directories
-from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.stages import Stages
-from icrtool.cli.terminal import show
+from icrtool.cli.fit import fit_log
+from icrtool.cli.inputs import RUNS, RunPlace, check_run_config, logs_of, run_directories
+from icrtool.cli.printing import Inputs, Stages, print_json, show, warn
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -56,7 +53,7 @@ class Request:
 
 def distances(text: str) -> tuple[float, ...]:
     """Read the distances [m] of ``--horizons``."""
-    found = numbers(text, "M,M,...")
+    found = options.numbers(text, "M,M,...")
     if min(found) <= 0:
         raise click.BadParameter(f"{text!r} has a distance that is not above zero")
     return found
@@ -84,7 +81,7 @@ def distances(text: str) -> tuple[float, ...]:
 @click.option("--trials", is_flag=True, help="Write every single trial to trials.parquet.")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the random draws.")
 @options.report
-@json_option
+@options.as_json
 @options.configuration
 @options.verbosity
 def command(
@@ -108,6 +105,7 @@ def command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
+    from icrtool.output.dropout_directory import report_document
     from icrtool.output.files.documents import open_calibration
 
     config = options.load(config_file, robot, sets)
@@ -124,20 +122,20 @@ def command(
         trials=trials, overwrite=overwrite, quiet=quiet, prints=not (quiet or as_json), verbose=verbose,
     )  # fmt: skip
     sources, places = plan_sources(sources, output, into, config, quiet=quiet)
-    outcomes = [(str(source), outcome) for source, outcome in report_all(sources, places, request)]
+    inputs = Inputs("source")
+    reports: dict[str, DropoutReport] = {}
+    for number, source in enumerate(sources):
+        if number and request.prints:
+            click.echo()
+        with inputs.each(source) as document:
+            reports[str(source)] = report = _report_one(source, places.get(source), request)
+            document["report"] = report_document(report)
     if as_json:
-        print_json("dropout-report", {"reports": [report_json(source, outcome) for source, outcome in outcomes]})
-    leave(outcomes, junit=junit, markdown=markdown)
-
-
-def report_json(source: str, outcome: Outcome) -> dict[str, Any]:
-    """Return the outcome of a source as plain data: its report, or the reason why there is none."""
-    from icrtool.errors import IcrToolError
-    from icrtool.output.dropout_directory import report_document
-
-    if isinstance(outcome, IcrToolError):
-        return {"source": escaped(source), "status": "failed", "reason": str(outcome)}
-    return {"source": escaped(source), "status": "done", "report": report_document(outcome)}
+        print_json("dropout-report", {"reports": inputs.documents})
+    write_exports({str(source): (inputs.errors | reports)[str(source)] for source in sources}, junit, markdown)
+    verdicts = [one for report in reports.values() for one in report.verdicts]
+    options.check_compared(verdicts)
+    inputs.leave("runs and logs", gate_failed=not all(one.passed for one in verdicts))
 
 
 def plan_sources(
@@ -162,35 +160,14 @@ def plan_sources(
     return sources, {}
 
 
-def report_all(
-    sources: tuple[Path, ...], places: dict[Path, RunPlace], request: Request
-) -> Iterator[tuple[Path, Outcome]]:
-    """Report on each source in turn; one that cannot be used does not stop the others."""
-    from icrtool.errors import IcrToolError
-
-    for number, source in enumerate(sources):
-        if number and request.prints:
-            click.echo()
-        try:
-            yield source, _report_one(source, places.get(source), request)
-        except IcrToolError as err:
-            options.report_error(err, source)
-            yield source, err
-
-
-def leave(outcomes: Sequence[tuple[str, Outcome]], *, junit: Path | None, markdown: Path | None) -> None:
-    """Write the exports, and leave with the status that the outcomes ask for."""
-    from icrtool.errors import IcrToolError
+def write_exports(outcomes: dict[str, Outcome], junit: Path | None, markdown: Path | None) -> None:
+    """Write what machines that watch pull requests read, where it is asked for."""
     from icrtool.output.exports.acceptance import suite_of, write_junit, write_markdown
 
     if junit is not None:
-        write_junit(junit, [suite_of(name, outcome) for name, outcome in outcomes])
+        write_junit(junit, [suite_of(name, outcome) for name, outcome in outcomes.items()])
     if markdown is not None:
-        write_markdown(markdown, outcomes)
-    failed = [name for name, outcome in outcomes if isinstance(outcome, IcrToolError)]
-    verdicts = [one for _, outcome in outcomes if not isinstance(outcome, IcrToolError) for one in outcome.verdicts]
-    options.check_compared(verdicts)
-    options.leave(failed, len(outcomes), "runs and logs", gate_failed=not all(one.passed for one in verdicts))
+        write_markdown(markdown, list(outcomes.items()))
 
 
 def _report_one(source: Path, place: RunPlace | None, request: Request) -> DropoutReport:
@@ -217,7 +194,7 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
         )  # fmt: skip
     report = reports[0]
     if report.baseline is not None:
-        options.warn([f"{run.name}: {change}" for change in report.baseline.changes(run.document)], quiet=request.quiet)
+        warn([f"{run.name}: {change}" for change in report.baseline.changes(run.document)], quiet=request.quiet)
     if request.prints:
         _print(report, directory, request)
     else:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import RUNS
+from icrtool.cli.inputs import RUNS
+from icrtool.cli.printing import warn, write_or_print
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
@@ -69,9 +70,9 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
     if target in CONTROLLERS:
         from icrtool.output.exports.controllers import format_export
 
-        options.write_or_print(f"{format_export(_calibration(source, force=force), cast('Target', target))}\n", output)
+        write_or_print(f"{format_export(_calibration(source, force=force), cast('Target', target))}\n", output)
     else:
-        options.write_or_print(_path_text(_run(source, output), target), output)
+        write_or_print(_path_text(_run(source, output), target), output)
 
 
 def _is_one_file(output: Path) -> bool:
@@ -141,7 +142,7 @@ def _run(source: Path | None, output: Path | None = None) -> Run:
     if output is not None and output.resolve() in (Path(file.path).resolve() for file in run.document.inputs):
         raise OutputError(output, "is the log that the run was made from", "name another file")
     if not run.usable:
-        options.warn([f"{run.name}: its ICRs are not usable: {run.document.unusable_because}"], quiet=False)
+        warn([f"{run.name}: its ICRs are not usable: {run.document.unusable_because}"], quiet=False)
     return run
 
 

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import math
 import shlex
-import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from icrtool.cli import options
-from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.stages import Stages
-from icrtool.cli.terminal import show
+from icrtool.cli.inputs import logs_of, run_directories
+from icrtool.cli.printing import Inputs, Stages, print_json, show, warn_of
 from icrtool.records.text import LogText, escaped
-from icrtool.records.urls import UrlPath
 
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.records.run import FigureSet, Run, WarmStart
-
-RUNS = Path("icrtool-runs")
 
 
 @click.command("fit")
@@ -37,7 +31,7 @@ RUNS = Path("icrtool-runs")
 @click.option("--terrain-change", "changes", metavar="T", type=float, multiple=True,
               help="The ground changes after T seconds: inflate the ICR covariance there; repeatable.")  # fmt: skip
 @click.option("--smooth", is_flag=True, help="Also write the RTS smoother's states (smoothed.csv).")
-@json_option
+@options.as_json
 @options.cut
 @options.configuration
 @options.verbosity
@@ -58,34 +52,31 @@ def command(
       icrtool fit field.mcap --robot husky-a200
       icrtool fit log.bag --set topics.gnss=/rtk/fix -o runs/today
     """  # noqa: D301 - click reads the escape
-    from icrtool.errors import IcrToolError
-
     config = options.load(config_file, robot, sets)
     check_times(changes)
     logs = logs_of(logs, quiet=quiet)
-    directories = run_directories(logs, output, into)
-    documents: list[dict[str, Any]] = []
-    failed: list[Path] = []
-    for log, (directory, inside) in zip(logs, directories, strict=True):
-        try:
+    inputs = Inputs("log")
+    for log, (directory, inside) in zip(logs, run_directories(logs, output, into), strict=True):
+        with inputs.each(log) as document:
             run = fit_log(
                 log, directory, config, inside=inside, quiet=quiet, verbose=verbose, overwrite=overwrite, plots=plots,
                 figures=figures, states=states, span=(start, end), warm_start=warm_start, changes_s=changes,
                 smooth=smooth,
             )  # fmt: skip
-        except IcrToolError as err:
-            failed.append(log)
-            options.report_error(err, log)
-            documents.append({"log": escaped(str(log)), "status": "failed", "reason": str(err)})
-            continue
-        place = escaped(str(directory))
-        documents.append({"log": escaped(str(log)), "status": "done", "directory": place, "run": run.summary})
-        if not (quiet or as_json):
-            again = ["icrtool", "info", escaped(str(log)), "-v", *options.given(config_file, robot, sets, start, end)]
-            _print(run, place, shlex.join(again), verbose=verbose)
+            place = escaped(str(directory))
+            document |= {"directory": place, "run": run.summary}
+            if not (quiet or as_json):
+                again = [
+                    "icrtool",
+                    "info",
+                    escaped(str(log)),
+                    "-v",
+                    *options.given(config_file, robot, sets, start, end),
+                ]
+                _print(run, place, shlex.join(again), verbose=verbose)
     if as_json:
-        print_json("fit", {"logs": documents})
-    options.leave(failed, len(logs), "logs")
+        print_json("fit", {"logs": inputs.documents})
+    inputs.leave("logs")
 
 
 def _print(run: Run, place: str, examine: str, *, verbose: bool) -> None:
@@ -100,53 +91,6 @@ def check_times(times: tuple[float, ...]) -> None:
     """Refuse times [s] of ``--terrain-change`` that are not finite."""
     if not all(math.isfinite(time) for time in times):
         raise click.BadParameter("give finite seconds", param_hint="--terrain-change")
-
-
-def logs_of(places: tuple[Path, ...], *, quiet: bool) -> tuple[Path, ...]:
-    """Return the logs among the arguments of a command, those in folders too, and warn of files that are none."""
-    from icrtool.fleet.recordings import logs_among
-
-    logs, beside = logs_among(places)
-    options.warn([f"{escaped(str(file))}: not a log: left out" for file in beside], quiet=quiet)
-    return tuple(logs)
-
-
-def check_run_config(config: Config, *, free: str = "") -> None:
-    """Refuse settings for a finished run, but those of the section that a report on it is free to change."""
-    from icrtool.errors import ConfigError
-
-    if given := sorted(config.given_sections - {free}):
-        advice = "fit the log again with it, or name the log in place of its run"
-        raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
-
-
-class RunPlace(NamedTuple):
-    """Where the run of a log goes; `inside` is the folder of the runs, below which no link is followed."""
-
-    directory: Path
-    inside: Path | None
-
-
-def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | None) -> list[RunPlace]:
-    """Return where each log's run goes: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` for several or `into`.
-
-    Logs of one name are distinguished by what their paths differ in.
-    """
-    from icrtool.errors import OutputError
-    from icrtool.fleet.recordings import distinct_names
-    from icrtool.output.run_directory import RUN_FILE
-
-    if output is not None and into is not None:
-        raise click.UsageError("-o and --into both state where the runs go: give one of them")
-    if output is not None and len(logs) == 1:
-        return [RunPlace(output, None)]
-    parent = output or into
-    if parent is not None and (parent / RUN_FILE).is_file():
-        raise OutputError(
-            parent, "is a run itself", "fitting that run again would remove the runs in it: name another place"
-        )
-    folder = parent or RUNS
-    return [RunPlace(folder / name, folder) for name in distinct_names(logs)]
 
 
 def _other_robot(source: Path | None, start: WarmStart | None, config: Config) -> tuple[str, ...]:
@@ -188,57 +132,10 @@ def fit_log(
             log, directory, config, stages.begin, warm_start=start, share=stages.share, note=notes.append,
             **options_of_fit,
         )  # fmt: skip
-    # On a terminal the answer names the gravest one.
-    everything = verbose or not sys.stderr.isatty()
-    options.warn((*(run.warnings if everything else ()), *_other_robot(warm_start, start, config), *notes), quiet=quiet)
+    warn_of(run, *_other_robot(warm_start, start, config), *notes, quiet=quiet, verbose=verbose)
     if verbose:
-        from icrtool.output.text_format import jump_lines, topics_text
-        from icrtool.records.samples import ROLE_WORDS
+        from icrtool.output.text_format import jump_lines
 
-        for stream in run.document.streams:
-            click.echo(f"{ROLE_WORDS[stream.role]}: {topics_text(stream.topic)}: {stream.why}", err=True)
         for line in jump_lines(run.document.reference_jumps):
             click.echo(line, err=True)
     return run
-
-
-def runs_or_logs(place: Path) -> list[Path]:
-    """Return the runs in a folder, or else its logs; a run or log is itself."""
-    from icrtool.fleet.recordings import find_recordings
-    from icrtool.fleet.roll_up import is_fleet, runs_of_fleet
-    from icrtool.output.run_directory import RUN_FILE, is_run_directory
-
-    if isinstance(place, UrlPath):
-        return [one.path for one in find_recordings([place])]
-    if is_run_directory(place) or not place.is_dir():
-        return [place]
-    if is_fleet(place):
-        return [run for runs in runs_of_fleet(place).values() for run in runs]
-    runs = sorted(file.parent for file in place.rglob(RUN_FILE) if is_run_directory(file.parent))
-    return runs or [one.path for one in find_recordings([place])]
-
-
-def runs_of(paths: Sequence[Path], config: Config, *, quiet: bool, verbose: bool = False) -> list[Run]:
-    """Read runs, and fit logs without a recommendation; nothing is written."""
-    found = []
-    with options.progress_bar("reading", quiet=quiet) as progress:
-        for path in paths:
-            if verbose:
-                click.echo(str(path), err=True)
-            found.append(_run_of(path, config))
-            if progress is not None:
-                progress(len(found) / len(paths))
-    return found
-
-
-def _run_of(path: Path, config: Config) -> Run:
-    from icrtool.output.run_directory import is_run_directory
-
-    if is_run_directory(path):
-        from icrtool.output.stored_run import open_run
-
-        return open_run(path)
-    from icrtool.estimation.fit import fit
-    from icrtool.logs.read_log import read_log
-
-    return fit(read_log(path, config), config)

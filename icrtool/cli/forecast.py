@@ -10,8 +10,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.export import read_calibration
-from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.terminal import show
+from icrtool.cli.printing import answer
 
 LARGEST_PLAN_BYTES = 50_000_000
 
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 @options.budgets
 @click.option("-o", "--output", metavar="FILE.csv", type=options.NEW_FILE, help="Write a row for each metre.")
 @click.option("--plot", metavar="FILE", type=options.NEW_PICTURE, help="Draw the errors: png, svg, pdf.")
-@json_option
+@options.as_json
 @options.quiet
 def command(
     calibration_file: Path, path: Path, budgets: tuple[float, ...], output: Path | None, plot: Path | None,
@@ -59,10 +58,9 @@ def command(
 
         measured_m = measured_to_m(calibration)
         save_picture(forecast_figure(forecast, path.name, budgets, measured_m, gyro), plot)
-    if as_json:
-        print_json("forecast", forecast_document(forecast, calibration, budgets, gyro))
-    elif not quiet:
-        show(format_forecast(forecast, calibration, budgets, gyro))
+    document = forecast_document(forecast, calibration, budgets, gyro)
+    text = partial(format_forecast, forecast, calibration, budgets, gyro)
+    answer("forecast", document, text, as_json=as_json, quiet=quiet)
 
 
 def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast | None]:

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import logs_of
-from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.stages import Stages
-from icrtool.cli.terminal import show
+from icrtool.cli.inputs import logs_of
+from icrtool.cli.printing import Inputs, Stages, print_json, show, warn
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
@@ -27,7 +25,7 @@ if TYPE_CHECKING:
 
 @click.command("info")
 @options.LOGS
-@json_option
+@options.as_json
 @options.cut
 @options.configuration
 @options.verbosity
@@ -45,30 +43,28 @@ def command(
     from icrtool.errors import IcrToolError
 
     config = options.load(config_file, robot, sets)
-    failed: list[Path] = []
-    documents: list[dict[str, Any]] = []
-    logs = logs_of(logs, quiet=quiet)
-    for log in logs:
-        found = Found(log)
-        given = options.given(config_file, robot, sets, start, end)
-        try:
-            with Stages(LogText(log.name), quiet=quiet, verbose=verbose) as stages:
-                _examine(found, config, (start, end), stages)
-        except IcrToolError as err:
-            found.problem = err
-        if not (quiet or as_json):
-            _print(found, config, given, everything=verbose)
-        # On a terminal the answer names the gravest one.
-        if verbose or as_json or not sys.stderr.isatty():
-            options.warn(found.warnings, quiet=quiet)
-        if found.problem is not None:
-            failed.append(log)
-            options.report_error(found.problem, log)
-        if as_json:
-            documents.append(_document(found, given))
+    given = options.given(config_file, robot, sets, start, end)
+    inputs = Inputs("log")
+    for log in logs_of(logs, quiet=quiet):
+        with inputs.each(log) as document:
+            found = Found(log)
+            try:
+                with Stages(LogText(log.name), quiet=quiet, verbose=verbose) as stages:
+                    _examine(found, config, (start, end), stages)
+            except IcrToolError as err:
+                found.problem = err
+            if as_json:
+                document.update(_document(found, given))
+            elif not quiet:
+                _print(found, config, given, everything=verbose)
+            # On a terminal the answer names the gravest one.
+            if verbose or as_json or not sys.stderr.isatty():
+                warn(found.warnings, quiet=quiet)
+            if found.problem is not None:
+                raise found.problem
     if as_json:
-        print_json("info", {"logs": documents})
-    options.leave(failed, len(logs), "logs")
+        print_json("info", {"logs": inputs.documents})
+    inputs.leave("logs")
 
 
 @dataclass(slots=True)
@@ -149,9 +145,7 @@ def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:
     from icrtool.output.tables.overview import next_command, verdict
 
     return {
-        "log": escaped(str(found.log)),
-        "status": "done" if found.problem is None else "failed",
-        "reason": str(found.problem) if found.problem is not None else None,
+        "reason": None,
         **(survey_document(found.survey) if found.survey is not None else {}),
         "streams": streams_document(found.measured) if found.measured is not None else [],
         "warnings": list(found.warnings),

@@ -1,25 +1,23 @@
-"""Options and messages that several commands share."""
+"""Options that several commands share, and what reads their values."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 
-from icrtool.cli.stages import Stages, signal_word
-from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
+from icrtool.records.text import escaped
 from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from icrtool.config import Config
-    from icrtool.errors import IcrToolError
     from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.dropout import Verdict
     from icrtool.records.fleet_document import FleetVerdict
@@ -122,6 +120,17 @@ def place(command: Command) -> Command:
         click.option("--into", metavar="DIR", type=PLACE, help="Folder of the run directories, also for one log."),
         click.option("--overwrite", is_flag=True, help="Also replace the run of another recording."),
     )  # fmt: skip
+
+
+def numbers(text: str, form: str, count: int | None = None) -> tuple[float, ...]:
+    """Read numbers separated by commas; `form` is what they shall look like."""
+    try:
+        found = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        found = ()
+    if len(found) != (count or len(found)) or not found or not all(map(math.isfinite, found)):
+        raise click.BadParameter(f"{text!r} is not of the form {form}")
+    return found
 
 
 def seed(command: Command) -> Command:
@@ -245,6 +254,12 @@ def cut(command: Command) -> Command:
     )
 
 
+def as_json(command: Command) -> Command:
+    """Add --json, as `as_json`."""
+    text = "Print one JSON document on standard output, and nothing else there."
+    return click.option("--json", "as_json", is_flag=True, help=text)(command)
+
+
 def quiet(command: Command) -> Command:
     """Add -q alone."""
     return click.option("-q", "--quiet", is_flag=True, help="Print no results.")(command)
@@ -273,54 +288,3 @@ def given(
     pairs = [("--config", config_file), ("--robot", robot), *(("--set", one) for one in sets)]
     pairs += [("--from", start), ("--to", end)]
     return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]
-
-
-def write_or_print(text: str, output: Path | None) -> None:
-    """Write a text to its file, or print it where none is named."""
-    if output is None:
-        click.echo(text, nl=False)
-        return
-    from icrtool.output.files.atomic import write_file
-
-    write_file(output, text)
-
-
-def warn(warnings: tuple[str, ...] | list[str], *, quiet: bool) -> None:
-    """Print warnings on standard error."""
-    if not quiet:
-        for warning in warnings:
-            click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
-
-
-def report_error(err: IcrToolError, source: Path | str) -> None:
-    """Print the line about an error, which names the log or run that it occurred in, on standard error."""
-    name = shortened(escaped(str(source)), LONGEST_NAME)
-    named = any(part in str(err) for part in (name, escaped(Path(source).name), escaped(Path(source).stem)))
-    word = signal_word("Error:", "red")
-    click.echo(f"{word} {err}" if named else f"{word} {name}: {err}", err=True)
-
-
-def leave(failed: Sequence[object], of: int, what: str, *, gate_failed: bool = False) -> None:
-    """Exit with the status of a command that had several inputs.
-
-    It is 3 if an acceptance limit was not met, else 1 if an input failed.
-
-    Parameters
-    ----------
-    failed : inputs that could not be used; each was reported when it occurred
-    of : number of inputs
-    """
-    if failed and of > 1:
-        names = [shortened(escaped(str(source)), LONGEST_NAME) for source in failed]
-        word = signal_word("Error:", "red")
-        click.echo(f"{word} {len(failed)} of {of} {what} could not be used: {listed(names)}", err=True)
-    if gate_failed or failed:
-        raise SystemExit(3 if gate_failed else 1)
-
-
-@contextmanager
-def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
-    """Give a function that shows the share done of work of one stage; None where there is no terminal."""
-    with Stages(label, quiet=quiet) as stages:
-        stages.begin("")
-        yield stages.share if stages.on_terminal else None

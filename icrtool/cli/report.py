@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from icrtool.cli import options
-from icrtool.cli.fit import RUNS
+from icrtool.cli.inputs import RUNS
 
 
 @click.command("report")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import click
 
-from icrtool.cli.json_output import json_option, print_json
-from icrtool.cli.terminal import show
+from icrtool.cli import options
+from icrtool.cli.printing import print_json, show
 from icrtool.output.text_blocks import Line, Table, Text
 
 
 @click.command("robots")
-@json_option
+@options.as_json
 def command(as_json: bool) -> None:
     """List the built-in robots for --robot, with their numbers and sources.
 

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from icrtool.cli import options
-from icrtool.cli.drive_options import check_changes, degrees, drive_options, given_fields, numbers
-from icrtool.cli.fit import RUNS
-from icrtool.cli.options import POSITIVE
-from icrtool.cli.simulate import default_icrs, encoder_counts
-from icrtool.cli.terminal import show
+from icrtool.cli.inputs import RUNS
+from icrtool.cli.options import POSITIVE, numbers
+from icrtool.cli.printing import progress_bar, show
+from icrtool.cli.simulate import check_changes, default_icrs, degrees, drive_options, encoder_counts, given_fields
 
 if TYPE_CHECKING:
     from icrtool.config import Config
@@ -89,7 +88,7 @@ def command(
     from icrtool.output.tables.study import format_study
     from icrtool.simulation.studies import run_study
 
-    with options.progress_bar(f"study {name}", quiet=quiet) as progress:
+    with progress_bar(f"study {name}", quiet=quiet) as progress:
         result = run_study(request, progress)
     write_study(result, directory, plots=plots)
     if not quiet:

@@ -1,4 +1,4 @@
-"""Blocks: what a document states, once; printed here, by `icrtool.cli.terminal` on a terminal, and on a page.
+"""Blocks: what a document states, once; printed here, by `icrtool.cli.printing` on a terminal, and on a page.
 
 A document (a run, a report, a comparison) is a list of blocks. Whatever lays them out knows nothing of runs or reports.
 """

@@ -14,7 +14,7 @@ import pytest
 from mcap.writer import Writer
 
 from icrtool.cli.completion import _topics
-from icrtool.cli.stages import Stages, signal_word
+from icrtool.cli.printing import Stages, signal_word
 from icrtool.config import builtin_robots, load_config
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,7 +102,7 @@ def test_on_a_terminal_the_stage_is_rewritten_and_cleared(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.setattr("icrtool.cli.stages.REFRESH_S", 0.0)
+    monkeypatch.setattr("icrtool.cli.printing.REFRESH_S", 0.0)
     with Stages("log") as stages:
         stages.begin("reading")
         stages.share(0.964)

@@ -10,8 +10,7 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from icrtool.cli.drive_options import PATHS
-from icrtool.cli.simulate import WHEEL_MESSAGES, command
+from icrtool.cli.simulate import PATHS, WHEEL_MESSAGES, command
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.logs.read_log import read_log

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from icrtool.cli.batch import line_of, summary_of
 from icrtool.cli.compare import _groups
-from icrtool.cli.fit import runs_or_logs
+from icrtool.cli.inputs import runs_or_logs
 from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, write_fleet
 from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from icrtool.cli.terminal import show
+from icrtool.cli.printing import show
 from icrtool.config import Config, load_config
 from icrtool.errors import DataError, OutputError
 from icrtool.output.figures.study import study_figure

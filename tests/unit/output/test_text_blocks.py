@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from icrtool.calibration.one_log import DriveFacts, LogCalibration, Setting
-from icrtool.cli.terminal import show
+from icrtool.cli.printing import show
 from icrtool.output.tables.calibration import setting_blocks
 from icrtool.output.text_blocks import TEXT_WIDTH, Line, Table, Text, labelled, printed
 

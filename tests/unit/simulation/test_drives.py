@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from icrtool.cli.drive_options import PATHS
+from icrtool.cli.simulate import PATHS
 from icrtool.cli.study import NAMES, command
 from icrtool.errors import ConfigError
 from icrtool.kernels.kinematics import body_velocity

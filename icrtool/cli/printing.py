@@ -1,0 +1,285 @@
+"""What a command prints: results as text or JSON on standard output; stages, warnings and errors on standard error.
+
+Tables are laid out by rich on a terminal, and are plain text elsewhere.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import click
+
+from icrtool.output.text_blocks import Line, Table, Text, narrowed
+from icrtool.records.process_resources import give_back_freed
+from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
+
+if TYPE_CHECKING:
+    import msgspec
+    from rich.console import Console, JustifyMethod
+    from rich.table import Table as RichTable
+
+    from icrtool.errors import IcrToolError
+    from icrtool.records.run import Run
+
+CLEAR = "\r\x1b[K"
+REFRESH_S = 0.1
+"""The share done is rewritten at most this often."""
+
+WIDEST = 120
+"""Columns of a terminal that are used."""
+
+FEWEST_COLUMNS = 3
+"""Columns of a table that stay on the narrowest terminal."""
+
+STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
+
+
+def show(text: str) -> None:
+    """Print a result. ``NO_COLOR`` and ``TERM=dumb`` are respected; nothing in the text is read as markup."""
+    if not isinstance(text, Text) or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
+        click.echo(text)
+        return
+    from rich.console import Console
+
+    console = Console(force_terminal=True, highlight=False, markup=False, emoji=False)
+    console.width = min(console.width, WIDEST)
+    _print(text, console)
+
+
+def _print(text: Text, console: Console) -> None:
+    from rich.table import Table as RichTable
+    from rich.text import Text as RichText
+
+    for block in text.blocks:
+        if isinstance(block, Line):
+            console.print(RichText(block.text, STYLES[block.look]), soft_wrap=block.look == "as is")
+        elif isinstance(block, str):
+            console.print(RichText(str(block)))
+        else:
+            table, left_out = _fitting(narrowed(block, console.width), console.width)
+            console.print(_rich_table(table, RichTable(box=None, pad_edge=False, show_header=bool(table.head))))
+            if left_out:
+                why = f"the terminal has {console.width} columns"
+                console.print(RichText(f"  ({', '.join(left_out)} left out: {why})", "dim"))
+
+
+def _fitting(table: Table, width: int) -> tuple[Table, list[str]]:
+    """Return a table of numbers without the columns that a terminal has no place for, and their names.
+
+    The first and the last one stay; a last column of text is wrapped and needs no more than a few words.
+    """
+    sides, rows = table.sides(), [[str(cell) for cell in row] for row in (table.head, *table.rows) if row]
+    sizes = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
+    if sides[-1] == "l":
+        sizes[-1] = min(sizes[-1], width // 4)
+    kept, left_out = list(range(len(sides))), []
+    while sum(sizes[column] for column in kept) - 2 > width and len(kept) > FEWEST_COLUMNS:
+        out = kept.pop(len(kept) // 2)
+        left_out.append(str(table.head[out]) if table.head else f"column {out + 1}")
+    if not left_out:
+        return table, []
+    chosen = [[row[column] for column in kept] for row in table.rows]
+    head = [table.head[column] for column in kept] if table.head else ()
+    return Table("".join(sides[column] for column in kept), chosen, head), left_out
+
+
+def _rich_table(table: Table, shown: RichTable) -> RichTable:
+    from rich.text import Text as RichText
+
+    sides = table.sides()
+    for number, side in enumerate(sides):
+        head = RichText(str(table.head[number])) if table.head else ""
+        justify: JustifyMethod = "left" if side == "l" else "right"
+        # A sentence, in the last column, is wrapped; a name or a number is not broken.
+        last = number == len(sides) - 1
+        shown.add_column(
+            head, justify=justify, no_wrap=not last or side == "r", header_style="bold", style="" if number else "cyan",
+            overflow="fold" if last else "ellipsis",
+        )  # fmt: skip
+    for row in table.rows:
+        shown.add_row(*(RichText(str(cell)) for cell in row))
+    return shown
+
+
+def print_json(command: str, document: msgspec.Struct | Mapping[str, object]) -> None:
+    """Print the document of a command; its schema is ``icrtool/<command>/1``, whatever `document` states.
+
+    Parameters
+    ----------
+    command : its name on the command line
+    document : a record, or plain data and numpy's; numbers that are not finite become null
+    """
+    from icrtool import __version__
+    from icrtool.output.files.formats import json_bytes
+    from icrtool.records.plain_data import plain
+
+    own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
+    click.echo(json_bytes(own | {key: value for key, value in plain(document).items() if key not in own}), nl=False)
+
+
+def answer(
+    command: str,
+    document: msgspec.Struct | Mapping[str, object],
+    text: Callable[[], str],
+    *,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Print what a command found, as JSON or as text."""
+    if as_json:
+        print_json(command, document)
+    elif not quiet:
+        show(text())
+
+
+def write_or_print(text: str, output: Path | None) -> None:
+    """Write a text to its file, or print it where none is named."""
+    if output is None:
+        click.echo(text, nl=False)
+        return
+    from icrtool.output.files.atomic import write_file
+
+    write_file(output, text)
+
+
+def signal_word(word: str, color: str) -> str:
+    """Return the word that begins a line on standard error, coloured on a terminal; NO_COLOR is respected."""
+    from click import style
+
+    wanted = sys.stderr.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    return style(word, fg=color, bold=True) if wanted else word
+
+
+def warn(warnings: Iterable[str], *, quiet: bool) -> None:
+    """Print warnings on standard error."""
+    if not quiet:
+        for warning in warnings:
+            click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
+
+
+def warn_of(run: Run, *further: str, quiet: bool, verbose: bool) -> None:
+    """Print the warnings of a run and further ones, with -v also why each stream was chosen."""
+    # On a terminal the answer names the gravest one.
+    everything = verbose or not sys.stderr.isatty()
+    warn((*(run.warnings if everything else ()), *further), quiet=quiet)
+    if verbose:
+        from icrtool.output.text_format import topics_text
+        from icrtool.records.samples import ROLE_WORDS
+
+        for stream in run.document.streams:
+            click.echo(f"{ROLE_WORDS[stream.role]}: {topics_text(stream.topic)}: {stream.why}", err=True)
+
+
+def error(text: str) -> None:
+    """Print the line about an error on standard error."""
+    click.echo(f"{signal_word('Error:', 'red')} {text}", err=True)
+
+
+class Inputs:
+    """The inputs of a command: one that cannot be used is reported at once and does not stop the others.
+
+    Attributes
+    ----------
+    documents : what --json prints of each, begun with its place and its status
+    errors : why an input could not be used, by its place
+    """
+
+    def __init__(self, key: str) -> None:
+        self._key = key
+        self.documents: list[dict[str, Any]] = []
+        self.errors: dict[str, IcrToolError] = {}
+
+    @contextmanager
+    def each(self, source: Path) -> Iterator[dict[str, Any]]:
+        """Do the work on one input; give its document."""
+        from icrtool.errors import IcrToolError
+
+        document: dict[str, Any] = {self._key: escaped(str(source)), "status": "done"}
+        self.documents.append(document)
+        try:
+            yield document
+        except IcrToolError as err:
+            document |= {"status": "failed", "reason": str(err)}
+            self.errors[str(source)] = err
+            name = shortened(escaped(str(source)), LONGEST_NAME)
+            named = any(part in str(err) for part in (name, escaped(source.name), escaped(source.stem)))
+            error(str(err) if named else f"{name}: {err}")
+
+    def leave(self, what: str, *, gate_failed: bool = False) -> None:
+        """Exit with status 3 if an acceptance limit was not met, else 1 if an input, a `what`, could not be used."""
+        failed = [shortened(escaped(source), LONGEST_NAME) for source in self.errors]
+        if failed and len(self.documents) > 1:
+            error(f"{len(failed)} of {len(self.documents)} {what} could not be used: {listed(failed)}")
+        if gate_failed or failed:
+            raise SystemExit(3 if gate_failed else 1)
+
+
+class Stages:
+    """The stages of the work on one log; ended, nothing of them stays on a terminal.
+
+    Parameters
+    ----------
+    name : of the log, printed before the stage
+    quiet : print nothing
+    verbose : where standard error is no terminal, print a line for each stage
+    """
+
+    def __init__(self, name: str, *, quiet: bool = False, verbose: bool = False) -> None:
+        self.name = name
+        self.on_terminal = not quiet and sys.stderr.isatty()
+        self.prints_lines = verbose and not quiet and not self.on_terminal
+        self._stage = ""
+        self._shown_s = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+    def begin(self, stage: str) -> None:
+        """Begin a stage: what is being done, for example ``reading``."""
+        give_back_freed()
+        self._stage = stage
+        self._shown_s = time.monotonic()
+        if self.on_terminal:
+            self._write(f"{CLEAR}{self._title()} …")
+        elif self.prints_lines:
+            self._write(f"{self.name}: {stage}\n")
+
+    def share(self, done: float) -> None:
+        """Show which share of the stage is done, 0 to 1; at the end of it, only the stage."""
+        now_s = time.monotonic()
+        if self.on_terminal and now_s - self._shown_s >= REFRESH_S:
+            self._shown_s = now_s
+            percent = f"{100 * min(max(done, 0.0), 1.0):.0f} %" if done < 1.0 else "…"
+            self._write(f"{CLEAR}{self._title()} {percent}")
+
+    def end(self) -> None:
+        """Clear the line; what is printed next begins at its left."""
+        if self.on_terminal:
+            self._write(CLEAR)
+
+    def _title(self) -> str:
+        return f"{self.name}: {self._stage}" if self._stage else self.name
+
+    def _write(self, text: str) -> None:
+        sys.stderr.write(text)
+        sys.stderr.flush()
+
+
+@contextmanager
+def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
+    """Give a function that shows the share done of work of one stage; None where there is no terminal."""
+    with Stages(label, quiet=quiet) as stages:
+        stages.begin("")
+        yield stages.share if stages.on_terminal else None
