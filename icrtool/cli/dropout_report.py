@@ -221,14 +221,13 @@ def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
 
 def _print(report: DropoutReport, directory: Path, request: Request) -> None:
     """Print the answer, with -v all that was found."""
-    from icrtool.output.dropout_directory import shown_document
     from icrtool.output.run_directory import PAGE_FILE
-    from icrtool.output.tables.dropout import report_blocks
+    from icrtool.output.tables.dropout import dropout_blocks
     from icrtool.output.text_blocks import Facts, Section, printed
 
     label, name = ("page", PAGE_FILE) if request.asked.page else ("written to", "dropout")
     place = Section("", [Facts([(label, escaped(str(directory / name)))])])
-    show(printed([*report_blocks(report.run_document, shown_document(report)), place], verbose=request.verbose))
+    show(printed([*dropout_blocks(report), place], verbose=request.verbose))
 
 
 def _read(directory: Path) -> Run:

@@ -120,23 +120,16 @@ def _examine(found: Found, config: Config, part: tuple[str | None, str | None], 
 def _print(found: Found, config: Config, given: Sequence[str], *, everything: bool) -> None:
     """Print whether a log can be fitted, what it holds, and the command to run next; with -v all that was found."""
     from icrtool.logs.describe import describe_log, describe_survey
-    from icrtool.output.tables.overview import brief_info, next_command, overview_rows, verdict_rows
-    from icrtool.output.tables.run import excitation_row
-    from icrtool.output.text_blocks import Line, Text, labelled
+    from icrtool.output.tables.overview import info_blocks, next_command
+    from icrtool.output.text_blocks import printed
 
     command = next_command(escaped(str(found.log)), given, found.run)
-    if not everything:
-        show(brief_info(found.survey, found.measured, found.run, found.problem, found.names, config, command))
-        return
-    if found.survey is not None:
-        click.echo(describe_survey(found.survey, found.measured))
-    elif found.measured is not None:
-        click.echo(describe_log(found.measured))
-    rows = overview_rows(found.measured, found.run) if found.measured is not None else []
-    rows += [excitation_row(found.run)] if found.run is not None else []
-    rows += verdict_rows(found.run, found.problem, found.names, config)
-    last = [Line(f"{'next':<12}{command}", "as is")] if command is not None else []
-    show(Text(["", *labelled(rows), *last]))
+    if everything and found.survey is not None:
+        click.echo(f"{describe_survey(found.survey, found.measured)}\n")
+    elif everything and found.measured is not None:
+        click.echo(f"{describe_log(found.measured)}\n")
+    blocks = info_blocks(found.survey, found.measured, found.run, found.problem, found.names, config, command)
+    show(printed(blocks, verbose=everything))
 
 
 def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:

@@ -188,83 +188,70 @@ class Text(str):
 
 def printed(blocks: Iterable[Block], *, verbose: bool) -> Text:
     """Return a document as text: the brief answer in lines of `BRIEF_WIDTH`, or all but what is for a page alone."""
-    return Text(_verbose(blocks) if verbose else _brief(blocks))
+    return Text(_printed(blocks, verbose))
 
 
 LOOKS: dict[Grade, Look] = {"good": "good", "care": "as is", "bad": "bad", "fact": "as is"}
 MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": ""}
 
 
-def _brief(blocks: Iterable[Block]) -> Iterator[Printed]:
+def _printed(blocks: Iterable[Block], verbose: bool) -> Iterator[Printed]:
     for block in blocks:
-        if isinstance(block, Title):
-            title = shortened(block.text, max(BRIEF_WIDTH - len(block.facts) - 3, LABEL + 2))
-            yield Line(f"{title}   {block.facts}", "title")
-        elif isinstance(block, Facts):
-            yield from (Line(_cut(first, text), "as is") for first, text in _fact_lines(block))
-        elif isinstance(block, Checks):
-            checked = [one for one in block.rows if one.grade != "fact"]
-            for number, one in enumerate(checked):
-                first = f"{'' if number else 'checks':{LABEL + 2}}{MARKS[one.grade]:4}{one.what:{LABEL + 2}}"
-                yield Line(_cut(first, one.text, 1 if one.grade == "good" else BRIEF_LINES), "as is")
-        elif isinstance(block, Items):
-            yield from list(block.texts)[:MOST_ITEMS]
-            yield from [f"and {len(block.texts) - MOST_ITEMS} more: -v"] if len(block.texts) > MOST_ITEMS else []
-        elif isinstance(block, Section):
-            if block.depth == BRIEF and block.label:
-                yield Line(_cut(f"{block.label:{LABEL + 2}}", _lead(block), 3), LOOKS[block.grade])
-            yield from _brief(block.blocks) if block.depth == BRIEF else ()
-        elif isinstance(block, Table):
-            yield from [Line(block.caption, "title")] if block.caption else []
-            indent = "   " if block.caption else ""
-            yield block._replace(rows=[(indent + row[0], *row[1:]) for row in block.lines(brief=True)])
-        elif not isinstance(block, Figure):
+        if isinstance(block, str | Line):
             yield block
-
-
-def _verbose(blocks: Iterable[Block]) -> Iterator[Printed]:
-    for block in blocks:
-        if isinstance(block, Title):
-            yield from (Line(block.text, "title"), block.facts)
-        elif isinstance(block, Facts):
-            yield from labelled([(first.rstrip(), text) for first, text in _fact_lines(block)])
-        elif isinstance(block, Checks):
-            for one in block.rows:
-                kept = [(one.what, MARKS[one.grade], one.text), *(("", "", text) for text in one.more)]
-                yield from labelled([(f"{what:{LABEL + 2}}{mark:2}", text) for what, mark, text in kept])
+        elif isinstance(block, Title):
+            longest = TEXT_WIDTH if verbose else max(BRIEF_WIDTH - len(block.facts) - 3, LABEL + 2)
+            yield Line(f"{shortened(block.text, longest)}   {block.facts}", "title")
+        elif isinstance(block, Facts | Checks):
+            for first, text, most in _fact_lines(block) if isinstance(block, Facts) else _check_lines(block, verbose):
+                yield _sentence(first, text, most, verbose=verbose)
         elif isinstance(block, Items):
-            yield from list(block.texts)
+            most = len(block.texts) if verbose else MOST_ITEMS
+            yield from list(block.texts)[:most]
+            yield from [f"and {len(block.texts) - most} more: -v"] if len(block.texts) > most else []
         elif isinstance(block, Section):
-            if block.depth <= VERBOSE:
-                yield ""
-                yield from [Line(block.title, "title")] if block.title else []
-                yield from [_lead(block)] if block.label else []
-                yield from _verbose(block.blocks)
+            yield from _printed_section(block, verbose) if block.depth <= (VERBOSE if verbose else BRIEF) else ()
         elif isinstance(block, Table):
-            yield from [Line(block.caption, "as is")] if block.caption else []
-            yield block._replace(rows=block.lines())
-        elif not isinstance(block, Figure):
-            yield block
+            yield from [Line(block.caption, "as is" if verbose else "title")] if block.caption else []
+            indent = "   " if block.caption and not verbose else ""
+            yield block._replace(rows=[(indent + row[0], *row[1:]) for row in block.lines(brief=not verbose)])
 
 
-def _lead(section: Section) -> str:
-    return f"{section.lead} {section.text}".strip()
+def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
+    if verbose and (section.blocks or section.label):
+        yield ""
+        yield from [Line(section.title, "title")] if section.title else []
+    if section.label:
+        label, text = f"{section.label:{LABEL + 2}}", f"{section.lead} {section.text}".strip()
+        yield _sentence(label, text, 3, LOOKS[section.grade], verbose=verbose)
+    yield from _printed(section.blocks, verbose)
 
 
-def _fact_lines(facts: Facts) -> Iterator[tuple[str, str]]:
-    """Yield what stands before each sentence, and the sentence."""
+def _check_lines(checks: Checks, verbose: bool) -> Iterator[tuple[str, str, int]]:
+    """Yield what stands before each finding, the finding, and in how many lines of a brief answer."""
+    for number, one in enumerate(one for one in checks.rows if verbose or one.grade != "fact"):
+        first = f"{'' if number else 'checks':{LABEL + 2}}{MARKS[one.grade]:4}{one.what:{LABEL + 3}}"
+        yield first, one.text, 1 if one.grade == "good" else BRIEF_LINES
+        yield from ((" " * len(first), more, BRIEF_LINES) for more in (one.more if verbose else ()))
+
+
+def _sentence(first: str, text: str, most: int, look: Look = "as is", *, verbose: bool) -> Printed:
+    """Return a sentence behind its label, in so many lines of a brief answer at most; no path is broken."""
+    if verbose:
+        return Table("l", [(first[:-2], text)])
+    lines = textwrap.wrap(
+        text, BRIEF_WIDTH, initial_indent=first, subsequent_indent=" " * len(first), break_long_words=False,
+        break_on_hyphens=False, max_lines=most, placeholder=" …",
+    )  # fmt: skip
+    return Line("\n".join(lines) or first.rstrip(), look)
+
+
+def _fact_lines(facts: Facts) -> Iterator[tuple[str, str, int]]:
+    """Yield what stands before each sentence, the sentence, and in how many lines of a brief answer."""
     widest = max((len(name) for name, _ in facts.rows), default=0)
     for number, (name, text) in enumerate(facts.rows):
-        if facts.label:
-            yield f"{'' if number else facts.label:{LABEL + 2}}{name:{widest}}  ", text
-        else:
-            yield f"{name:{LABEL + 2}}", text
-
-
-def labelled(rows: Iterable[tuple[str, str]]) -> list[Table]:
-    """Return rows of a label and a sentence as a table, whose sentences begin in one column; no rows: no table."""
-    padded = [(label.ljust(LABEL), text) for label, text in rows]
-    return [Table("l", padded)] if padded else []
+        of_all = f"{'' if number else facts.label:{LABEL + 2}}{name:{widest}}  "
+        yield of_all if facts.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
 
 
 def _lines(block: Printed) -> Iterable[str]:
@@ -318,12 +305,3 @@ def _wrap(text: str, first: str, later: str) -> list[str]:
     return textwrap.wrap(
         text, TEXT_WIDTH, initial_indent=first, subsequent_indent=later, break_long_words=False, break_on_hyphens=False
     )
-
-
-def _cut(first: str, text: str, most: int = BRIEF_LINES) -> str:
-    """Return a text behind `first` in so many lines of a brief answer at most; a path is not broken."""
-    lines = textwrap.wrap(
-        text, BRIEF_WIDTH, initial_indent=first, subsequent_indent=" " * len(first), break_long_words=False,
-        break_on_hyphens=False, max_lines=most, placeholder=" …",
-    )  # fmt: skip
-    return "\n".join(lines) or first.rstrip()

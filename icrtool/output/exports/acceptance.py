@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
-from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
-from icrtool.kernels.open_loop.block_sums import difference_half_width
 from icrtool.output.files.atomic import write_file
 from icrtool.output.tables.dropout import format_dropout
-from icrtool.output.tables.errors import shown_horizons
 from icrtool.output.text_blocks import Line, Table
-from icrtool.output.text_format import error_text, run_title, xml_text
+from icrtool.output.text_format import run_title, xml_text
 from icrtool.records.fleet_document import FleetVerdict, fleet_verdict
 
 Outcome = DropoutReport | IcrToolError
@@ -96,42 +93,10 @@ def format_markdown(report: DropoutReport) -> str:
             texts = [column for column, side in enumerate(block.sides()) if side == "l"]
             table = ["", *markdown_table(block.head, rows, texts), ""]
             lines += table if block.head else [f"- {' '.join(filter(None, row))}" for row in rows]
-        elif (text := block.text if isinstance(block, Line) else block) and text not in (title, *verdicts):
-            heading = isinstance(block, Line) and block.look == "title"
+        elif (text := block.text if isinstance(block, Line) else block) and text not in verdicts:
+            heading = isinstance(block, Line) and block.look == "title" and not text.startswith(title)
             lines += ["", f"### {escaped_markdown(text)}", ""] if heading else [f"- {escaped_markdown(text)}"]
-    if report.baseline is not None:
-        lines += _baseline_lines(report, report.baseline)
     return "\n".join(lines) + "\n"
-
-
-def _baseline_lines(report: DropoutReport, baseline: BaselineReport) -> list[str]:
-    """Return the table against the baseline: number, difference and its 95 % interval."""
-    shown = shown_horizons(report.horizons_m)
-    changes = [f"- {escaped_markdown(change)}" for change in baseline.changes(report.run_document)]
-    lines = [
-        "",
-        f"Against the baseline ({escaped_markdown(baseline.log)}, icrtool {escaped_markdown(baseline.tool_version)}):",
-        "",
-    ]
-    head = ("difference to the baseline", *(f"{report.horizons_m[h]:g} m" for h in shown))
-    rows = []
-    same = baseline.is_of(report.run_document)
-    for result in report.results:
-        for label, metric, column in (
-            ("95 %", "p95", result.summary.p95),
-            ("expected", "expected", result.summary.expected),
-        ):
-            cells = []
-            for h in shown:
-                row = baseline.rows.get((result.name, float(report.horizons_m[h])))
-                before = row.values_m[metric] if row is not None else math.nan
-                difference = float(column[h]) - before
-                sums = result.block_sums[h] if result.block_sums else None
-                half = difference_half_width(sums, row.sums if row is not None else None, metric, 1.0, paired=same)
-                interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
-                cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
-            rows.append([f"{escaped_markdown(result.label)}, {label}", *cells])
-    return [*lines, *markdown_table(head, rows), *([""] if changes else []), *changes]
 
 
 def _suite(one: Suite, command: str) -> ET.Element:

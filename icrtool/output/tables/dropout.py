@@ -13,7 +13,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.motion.models import TERMS
 from icrtool.output.exports.controllers import format_export
-from icrtool.output.tables.errors import errors_section, model_of
+from icrtool.output.tables.errors import baseline_sections, errors_section, model_of
 from icrtool.output.tables.run import advice_blocks, number_blocks, numbers_of, run_checks, unusable_lines
 from icrtool.output.text_blocks import (
     PAGE,
@@ -57,13 +57,19 @@ Row = tuple[str, str, str]
 
 def format_dropout(report: DropoutReport) -> Text:
     """Return all that is printed of a report, no line end."""
+    return printed(dropout_blocks(report), verbose=True)
+
+
+def dropout_blocks(report: DropoutReport) -> list[Block]:
+    """Return what `icrtool dropout-report` prints, with the differences to a baseline where there is one."""
     from icrtool.output.dropout_directory import shown_document
 
-    return printed(report_blocks(report.run_document, shown_document(report)), verbose=True)
+    *blocks, verdicts = report_blocks(report.run_document, shown_document(report))
+    return [*blocks, *baseline_sections(report), verdicts]
 
 
 def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
-    """Return what `icrtool dropout-report` prints.
+    """Return what is printed of a report as it is stored, the verdicts last.
 
     Parameters
     ----------

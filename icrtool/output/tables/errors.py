@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
-from icrtool.output.text_blocks import VERBOSE, Block, Cell, Figure, Section, Table
+from icrtool.kernels.open_loop.block_sums import difference_half_width
+from icrtool.output.text_blocks import VERBOSE, Block, Cell, Figure, Items, Section, Table
 from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.dropout_document import DropoutDocument, ErrorRow, ModelDocument
@@ -259,3 +262,28 @@ def _turning(report: DropoutDocument) -> Iterator[str]:
         kind = "straight" if split.straight else "turning"
         errors = ", ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in split.expected_m.items())
         yield f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
+
+
+def baseline_sections(report: DropoutReport) -> Iterator[Section]:
+    """Yield the differences of the errors to a baseline with their 95 % intervals, and what else differs from it."""
+    baseline = report.baseline
+    if baseline is None:
+        return
+    shown, same, rows = shown_horizons(report.horizons_m), baseline.is_of(report.run_document), []
+    for result in report.results:
+        for label, metric, column in (
+            ("95 %", "p95", result.summary.p95), ("expected", "expected", result.summary.expected),
+        ):  # fmt: skip
+            cells = []
+            for h in shown:
+                row = baseline.rows.get((result.name, float(report.horizons_m[h])))
+                before, theirs = (row.values_m[metric], row.sums) if row is not None else (math.nan, None)
+                difference = float(column[h]) - before
+                sums = result.block_sums[h] if result.block_sums else None
+                half = difference_half_width(sums, theirs, metric, 1.0, paired=same)
+                interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
+                cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
+            rows.append([f"{result.label}, {label}", *cells])
+    table = Table("lr", rows, ("difference to the baseline", *(f"{report.horizons_m[h]:g} m" for h in shown)))
+    title = f"Against the baseline ({baseline.log}, icrtool {baseline.tool_version})"
+    yield Section(title, [table, Items(baseline.changes(report.run_document))], VERBOSE)

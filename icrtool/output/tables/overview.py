@@ -13,7 +13,7 @@ from icrtool.errors import IcrToolError
 from icrtool.logs.streams.assembly import Survey
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.output.tables.run import Row, copied, excitation_row, gravest
-from icrtool.output.text_blocks import Block, Facts, Section, Text, printed
+from icrtool.output.text_blocks import Block, Facts, Section
 from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
 from icrtool.records.samples import ROLE_WORDS
@@ -41,22 +41,10 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
     return rows + _extent_rows(log)
 
 
-def verdict_rows(run: Run | None, problem: IcrToolError | None, names: Sequence[str], config: Config) -> list[Row]:
-    """Return whether a log can be fitted, and what is missing."""
-    rows = [("verdict", verdict(run, problem, names))]
-    if run is not None and config.robot.track_width_m is None:
-        missing = (
-            "robot.track_width_m (no multiplier, no no-slip odometry): --robot NAME (icrtool robots lists them), or "
-            "--set robot.track_width_m=…"
-        )
-        rows.append(("missing", missing))
-    return rows
-
-
-def brief_info(
+def info_blocks(
     survey: Survey | None, log: RobotLog | None, run: Run | None, problem: IcrToolError | None, names: Sequence[str],
     config: Config, command: str | None,
-) -> Text:  # fmt: skip
+) -> list[Block]:  # fmt: skip
     """Return what `icrtool info` prints: the verdict, what was driven, each topic once, what is missing and next.
 
     Parameters
@@ -66,16 +54,21 @@ def brief_info(
     names : of the log, which stand before the problem where it is printed alone
     command : to run next
     """
-    (_, decision), *missing = verdict_rows(run, problem, names, config)
-    good = run is not None and run.usable
+    decision, good = verdict(run, problem, names), run is not None and run.usable
     rows = [*_holds_rows(survey, log), *(overview_rows(log, run) if log is not None else [])]
     rows += [excitation_row(run)] if run is not None else []
     rows += _topic_rows(survey, log)
     warnings = run.warnings if run is not None else log.warnings if log is not None else ()
     rows += [("warnings", gravest(warnings, names[0]))] if warnings else []
-    verdict = Section("", [], lead=decision, label="verdict", grade="good" if good else "bad")
+    if run is not None and config.robot.track_width_m is None:
+        missing = (
+            "robot.track_width_m (no multiplier, no no-slip odometry): --robot NAME (icrtool robots lists them), or "
+            "--set robot.track_width_m=…"
+        )
+        rows.append(("missing", missing))
+    answer = Section("", [], lead=decision, label="verdict", grade="good" if good else "bad")
     last: list[Block] = [copied("next", command)] if command is not None else []
-    return printed([verdict, Facts([*rows, *missing]), *last], verbose=False)
+    return [answer, Facts(rows), *last]
 
 
 def _holds_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:

@@ -15,11 +15,15 @@ def line_of(text: str, begin: str) -> str:
     return next(line for line in text.splitlines() if line.startswith(begin))
 
 
+def check_of(text: str, what: str) -> str:
+    return next(line for line in text.splitlines() if line[16:].startswith(what))
+
+
 def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
     text = format_run(run)
     icr, drive, geometry = run.summary["icr"], run.summary["drive"], run.summary["geometry"]
-    assert text.splitlines()[0] == "barn  (segway-rmp400)"
     lines = text.splitlines()
+    assert lines[0].startswith("barn  (segway-rmp400)   ")
     assert line_of(text, "wheels").split() == [
         "wheels",
         "/joint_states",
@@ -30,7 +34,7 @@ def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
         "header",
     ]
     assert next(line for line in lines if "/imu" in line and line.startswith("heading")).endswith("log")
-    assert f"{drive['distance_m']:.1f} m, {duration_text(drive['duration_s'])}" in lines[1]
+    assert f"{drive['distance_m']:.1f} m, {duration_text(drive['duration_s'])}" in lines[0]
     assert f"{drive['speed_mean_mps']:.2f} ± {drive['speed_std_mps']:.2f} m/s" in text
     for label, column in (("y right", "y_icr_right_m"), ("y left", "y_icr_left_m"), ("x ", "x_icr_m")):
         line = line_of(text, label)
@@ -40,13 +44,13 @@ def test_the_table_says_what_was_read_and_learned(run: Run) -> None:
         assert (f"{rise:.1f} s" if rise is not None else "none") in line
     multiplier = (geometry["y_icr_right_m"] - geometry["y_icr_left_m"]) / 0.6
     assert f"{multiplier:.3f} ± " in line_of(text, "controller  wheel_separation_multiplier")
-    assert f"right {icr['final']['y_icr_right_m']:+.3f}" in line_of(text, "EKF")
+    assert f"right {icr['final']['y_icr_right_m']:+.3f}" in check_of(text, "EKF")
     used = run.summary["gnss"]["used"]
-    assert line_of(text, "fixes").endswith(f"7 of {used + 7:,} rejected")
+    assert check_of(text, "fixes").endswith(f"7 of {used + 7:,} rejected")
     assert "rejected: gate 4, no fix 3" in text
     assert "1 outage, " in text
     assert "filter to GNSS fixes: mean " in text
-    assert "course over ground" in line_of(text, "heading  ")
+    assert "course over ground" in check_of(text, "heading")
     heading = run.summary["heading"]
     assert heading["used"] > 1000
     assert f"{heading['used']:,} of {heading['used'] + heading['rejected']:,} used" in text
@@ -73,7 +77,7 @@ def test_without_width_the_table_says_what_is_left_out(make_run: Callable[..., R
     assert "robot.track_width_m is not known" in line_of(text, "controller")
     assert "filter to position reference" in text
     assert "outage" not in text
-    assert "0 of " in line_of(text, "positions")
+    assert "0 of " in check_of(text, "positions")
 
 
 def test_turns_to_one_side_that_show_all_icrs_are_noted_with_the_other_side(make_run: Callable[..., Run]) -> None:
@@ -92,7 +96,7 @@ def test_a_parked_robot_has_a_table_too(make_run: Callable[..., Run]) -> None:
     text = format_run(make_run(speed_mps=0.01, duration_s=20.0))
     assert line_of(text, "y right").split() == ["y", "right", "not", "shown"]
     assert text.startswith("Do not use: this drive does not show y right, y left, x: ")
-    assert "too little straight driving" in text
+    assert "too little straight driving" in " ".join(text.split())
 
 
 def test_warnings_are_not_in_the_table(run: Run) -> None:
@@ -126,6 +130,6 @@ def test_fixes_whose_delay_no_change_of_speed_shows_are_said_with_what_a_delay_w
     steady = with_summary(run, gnss={"delay_s": None, "delay_std_s": None})
     speed = run.summary["drive"]["speed_mean_mps"]
     said = f"not shown by this drive; a lag of 0.1 s would move x by {error_text(0.1 * speed)}"
-    assert said in format_run(steady)
+    assert said in " ".join(format_run(steady).split())
     known = with_summary(run, gnss={"delay_s": 0.02, "delay_std_s": 0.01})
-    assert said not in format_run(known)
+    assert said not in " ".join(format_run(known).split())

@@ -10,7 +10,7 @@ import pytest
 from icrtool.calibration.one_log import DriveFacts, LogCalibration, Setting
 from icrtool.cli.printing import show
 from icrtool.output.tables.calibration import setting_blocks
-from icrtool.output.text_blocks import TEXT_WIDTH, Line, Table, Text, labelled, printed
+from icrtool.output.text_blocks import TEXT_WIDTH, Facts, Line, Table, Text, printed
 
 TABLE = Table("lr", [("wheels", "50.0 Hz"), ("a [bold]b", "1.25 Hz")], ("stream", "rate"))
 
@@ -25,7 +25,7 @@ def test_sentences_are_wrapped_and_what_is_copied_is_not() -> None:
     assert len(first) <= TEXT_WIDTH
     assert all(line.startswith("  word") for line in later)
     assert Text([Line(words, "as is")]) == words
-    (first, *later) = Text(labelled([("drive", words), ("", "next")])).splitlines()
+    (first, *later) = printed([Facts([("drive", words), ("", "next")])], verbose=True).splitlines()
     assert first.startswith("drive       word")
     assert [line[:13] for line in later] == [f"{'':12}w"] * (len(later) - 1) + [f"{'':12}n"]
 
@@ -40,7 +40,7 @@ def test_settings_to_copy_are_words_that_a_shell_joins_and_a_terminal_holds() ->
     assert options == [word for one in settings for word in ("--set", f"{one.key}=0.123457")]
 
 
-PAGE = Text([Line("NOT USABLE: x", "bad"), TABLE, *labelled([("drive", " ".join(["word"] * 30))])])
+PAGE = printed([Line("NOT USABLE: x", "bad"), TABLE, Facts([("drive", " ".join(["word"] * 30))])], verbose=True)
 
 
 def test_a_terminal_gets_its_width_and_colours_and_no_markup_of_a_log(
