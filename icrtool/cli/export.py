@@ -28,7 +28,7 @@ ALL_THE_SAME = "--force exports it all the same"
 
 
 @click.command("export")
-@click.argument("source", metavar="[RUN|CAL.json]", required=False, type=options.FILE)
+@click.argument("source", metavar="[RUN|CAL.json]", required=False, type=options.PLACE)
 @click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the result is for.")
 @click.option("-o", "--output", metavar="FILE", type=options.FILE,
               help="File to write; for evo and kitti a directory with a file for each path of the run, "

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
               help="Format of the states; default: csv, parquet for over a million states.")  # fmt: skip
 @options.plots
 @options.figures
-@click.option("--warm-start", metavar="RUN|CAL.json", type=options.FILE,
+@click.option("--warm-start", metavar="RUN|CAL.json", type=options.PLACE,
               help="Start from another run's final ICRs and covariance, or from those of a calibration.")  # fmt: skip
 @click.option("--terrain-change", "changes", metavar="T", type=float, multiple=True,
               help="The ground changes after T seconds: inflate the ICR covariance there; repeatable.")  # fmt: skip

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 @click.command("forecast")
-@click.option("--calibration", "calibration_file", metavar="CAL.json|RUN", required=True, type=options.FILE,
+@click.option("--calibration", "calibration_file", metavar="CAL.json|RUN", required=True, type=options.PLACE,
               help="File that icrtool calibrate -o wrote, or a run, which is calibrated.")  # fmt: skip
-@click.option("--path", "path", metavar="PLAN.csv|RUN", required=True, type=options.FILE,
+@click.option("--path", "path", metavar="PLAN.csv|RUN", required=True, type=options.PLACE,
               help="Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven again.")  # fmt: skip
 @options.budgets
 @click.option("-o", "--output", metavar="FILE.csv", type=options.NEW_FILE, help="Write a row for each metre.")

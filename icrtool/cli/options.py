@@ -51,21 +51,36 @@ LOG = PLACE = _Place()
 LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
 
-FILE = click.Path(path_type=Path)
+class _File(click.Path):
+    """A file or directory on disk."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(
+        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
+    ) -> Path:  # fmt: skip
+        """Return the path; refuse an address."""
+        if isinstance(address := place_of(os.fspath(value)), UrlPath):
+            self.fail(f"{escaped(str(address))}: an address is not taken here; name a place on disk", param, ctx)
+        return cast("Path", super().convert(value, param, ctx))
 
 
-class _NewFile(click.Path):
+FILE = _File()
+
+
+class _NewFile(_File):
     """A file that the command writes: a place that cannot be written is refused before any work is done."""
 
     def __init__(self, *, picture: bool = False) -> None:
-        super().__init__(path_type=Path)
+        super().__init__()
         self._picture = picture
 
     def convert(
         self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
     ) -> Path:  # fmt: skip
         """Return the path."""
-        path: Path = super().convert(value, param, ctx)  # type: ignore[assignment]  # as path_type asks
+        path = super().convert(value, param, ctx)
         if self._picture:
             from icrtool.output.files.formats import check_picture
 

@@ -97,6 +97,8 @@ def test_a_run_at_an_address_is_that_on_disk_and_its_report_is_added_there(store
     np.testing.assert_array_equal(theirs.states.to_numpy(), ours.states.to_numpy())
     for place in ("s3://field/runs/one", "one"):
         assert run(monkeypatch, capfd, "calibrate", place, "-o", f"{place[-3:]}{len(place)}.json", "-q")[0] == 0
+    said = [run(monkeypatch, capfd, "export", "--for", "kml", place)[1] for place in ("s3://field/runs/one", "one")]
+    assert said[0] == said[1]
     first, second = (json.loads(file.read_text())["parameters"] for file in tmp_path.glob("*.json"))
     assert first == second
 
@@ -130,6 +132,20 @@ def test_a_run_that_is_replaced_does_not_count_before_it_is_whole(store, monkeyp
     left = names(store, "runs/one/")
     assert "smoothed.csv" not in left
     assert content(store, "runs/one/notes.txt") == b"of a person"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("report", "PLACE"), ("calibrate", "one", "-o", "PLACE"), ("calibrate", "one", "--plot", "PLACE"),
+     ("fit", "a.mcap", "--config", "PLACE"), ("simulate", "-o", "PLACE")],
+)  # fmt: skip
+def test_where_an_address_is_not_taken_it_is_refused_without_its_secrets(monkeypatch, capfd, tmp_path, arguments):
+    monkeypatch.chdir(tmp_path)
+    place = f"s3://key:{SECRET}@field/one.json"
+    status, said = run(monkeypatch, capfd, *(place if one == "PLACE" else one for one in arguments))
+    assert status == 2
+    assert "s3://field/one.json: an address is not taken here" in said
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
