@@ -303,6 +303,10 @@ def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: b
     return bool(np.abs(np.diff(finite)).sum() < 3.0 * np.ptp(finite) and np.ptp(finite) > 5.0)
 
 
+_LONE_L = re.compile(r"(?<![^\W\d_])[lL]|(?<=[^\W\d_A-Z])L|[lL](?![^\W\d_])")
+"""A letter that begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
+
+
 def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:
     """Return the topic whose name is `left_topic` with left replaced by right; None when there is none."""
     existing = topics if isinstance(topics, AbstractSet | Mapping) else set(topics)
@@ -310,19 +314,8 @@ def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:
         if old in left_topic:
             twin = left_topic.replace(old, new)
             return twin if twin in existing else None
-    for place, letter in enumerate(left_topic):
-        if letter not in "lL" or not _stands_alone(left_topic, place):
-            continue
-        twin = left_topic[:place] + ("r" if letter == "l" else "R") + left_topic[place + 1 :]
+    for found in _LONE_L.finditer(left_topic):
+        twin = f"{left_topic[: found.start()]}{'r' if found[0] == 'l' else 'R'}{left_topic[found.end() :]}"
         if twin in existing:
             return twin
     return None
-
-
-def _stands_alone(name: str, place: int) -> bool:
-    """Return whether a letter begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
-    before = name[place - 1] if place else "/"
-    after = name[place + 1] if place + 1 < len(name) else "/"
-    begins = not before.isalpha() or (before.islower() and name[place].isupper())
-    ends = not after.isalpha()
-    return begins or ends

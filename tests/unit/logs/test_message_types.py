@@ -38,7 +38,7 @@ from icrtool.records.samples import ROLE_WORDS, Role
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 10_000_000
-MESSAGES = 31
+MESSAGES = 16
 TYPES = sorted(name for name in {*PAIR_TYPES}.union(*MESSAGE_TYPES.values()) if "/" in name and name != NMEA_SENTENCE)
 """Of ROS, but sentences, of which more columns are made than the message has fields (test_nmea.py)."""
 CONTAINERS = ("bag", "db3", "db3 big-endian", "db3 without definitions", "mcap cdr", "mcap idl", "mcap ros1")
@@ -410,10 +410,16 @@ def without(store: Typestore, name: str, dropped: str) -> Typestore:
     return changed
 
 
+ROWS = {repr([types.get(name) for types in MESSAGE_TYPES.values()]): name for name in TYPES}
+"""A type for each kind of rows: those of others are read alike."""
+
+
 def top_fields(message_type: str) -> Iterable[str]:
+    """Return the fields of a type; header and stamp of one type alone."""
     if message_type == DYNAMIC_JOINT_STATE:
         return ("header", "joint_names", "interface_values")
-    return dict.fromkeys(re.split(r"[.\[]", path)[0] for path in paths_of(message_type))
+    paths = set(paths_of(message_type)) - ({*HEADER} if message_type != "sensor_msgs/NavSatFix" else set())
+    return sorted({re.split(r"[.\[]", path)[0] for path in paths})
 
 
 def test_a_type_that_lacks_a_field_is_read_without_it_or_refused_in_words(tmp_path: Path) -> None:
@@ -423,7 +429,7 @@ def test_a_type_that_lacks_a_field_is_read_without_it_or_refused_in_words(tmp_pa
     with path.open("wb") as stream:
         writer = McapWriter(stream)
         writer.start()
-        for message_type in TYPES:
+        for message_type in ROWS.values():
             present = [name for name, _ in store.fielddefs[full(message_type)][1]]
             for field in (field for field in top_fields(message_type) if field in present and len(present) > 1):
                 changed = without(store, full(message_type), field)
