@@ -233,7 +233,8 @@ class TopicCollector:
         """
         times, numbers = self._times.taken(), self._numbers.taken()
         # of each publisher by itself: one may be recorded later than another
-        back = max((set_back_of(times[numbers == one]) for one in self.decoders), default=NOT_SET_BACK)
+        stored = [times] if len(self.decoders) == 1 else [times[numbers == one] for one in self.decoders]
+        back = max(map(set_back_of, stored), default=NOT_SET_BACK)
         order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}

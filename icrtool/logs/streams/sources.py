@@ -201,7 +201,7 @@ class Number(NamedTuple):
         values = table.column(*self.names).astype(np.float64) if needed else table.floats(*self.names)
         if math.isfinite(self.largest):
             values = np.where(np.abs(values) < self.largest, values, np.nan)
-        values = values * self.unit
+        values = values if self.unit == 1.0 else values * self.unit
         if self.fine is not None:
             fine = self.fine.of(table)
             values = values + np.where(np.isfinite(fine), fine, 0.0)
