@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from icrtool import figures
     from icrtool.calibration.fit import fit
-    from icrtool.calibration.from_runs import calibrate
+    from icrtool.calibration.pooled import calibrate
     from icrtool.calibration.record import Calibration
     from icrtool.config import Config, load_config
     from icrtool.dropout_analysis.dropout_report import dropout_report
@@ -76,7 +76,7 @@ _HOMES = {
     "RobotLog": "icrtool.records.tables",
     "Run": "icrtool.records.run",
     "WarmStart": "icrtool.records.run",
-    "calibrate": "icrtool.calibration.from_runs",
+    "calibrate": "icrtool.calibration.pooled",
     "dropout": "icrtool.dropout_analysis.trials",
     "dropout_report": "icrtool.dropout_analysis.dropout_report",
     "fit": "icrtool.calibration.fit",

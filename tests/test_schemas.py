@@ -14,7 +14,7 @@ import pytest
 from msgspec.structs import astuple
 
 from icrtool.calibration.forecast import forecast_drive
-from icrtool.calibration.from_runs import calibrate
+from icrtool.calibration.pooled import calibrate
 from icrtool.calibration.run_recording import recording_of
 from icrtool.calibration.transfer import compare_groups
 from icrtool.dropout_analysis.acceptance_limits import parse_gate

@@ -8,8 +8,8 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import fit_models
+from icrtool.calibration.pooled import robot_of
 from icrtool.calibration.record import controller_numbers, fitted_document
 from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config

@@ -13,9 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.calibration.from_runs import robot_of, use_warnings
 from icrtool.calibration.held_out import GYRO, HeldOut, hold_out
-from icrtool.calibration.pooled import calibration_from
+from icrtool.calibration.pooled import calibration_from, robot_of, use_warnings
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import recording_of, scaled_gyro, with_turn_rate
 from icrtool.kernels.arrays import Complexes, Floats

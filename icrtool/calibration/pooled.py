@@ -1,24 +1,30 @@
-"""Calibrate from one run or many: every motion model fitted to all, tested on what it was not fitted to."""
+"""Calibrations of several logs pooled: of runs, and of the recordings that they are."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
+from os import PathLike
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 
 from icrtool import __version__
 from icrtool.calibration.controller_numbers import controller_errors
 from icrtool.calibration.error_growth import cut_error_windows, measure_error_sources
 from icrtool.calibration.held_out import GYRO, HeldOut, errors_without, hold_out
 from icrtool.calibration.record import Calibration
-from icrtool.errors import ConfigError
+from icrtool.calibration.run_recording import turning_recording_of
+from icrtool.errors import ConfigError, DataError
+from icrtool.kernels.arrays import Complexes
 from icrtool.motion.fit import Fold, Prediction, own_constants
 from icrtool.motion.models import MODELS, RECOMMENDED
 from icrtool.motion.recording import ErrorsOf, Recording, cut_windows
 from icrtool.records.calibration_document import CalibratedRobot, CalibrationLog, HeldOutScore, PooledScore
+from icrtool.records.run import MAKE_RUN, Run, check_type
 
 
 class LeftOut(NamedTuple):
@@ -149,3 +155,147 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
     fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
     return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
+
+
+SAME_SHARE, SAME_SPEED = 0.98, 1e-6
+"""A log is a part of another that has so much of its rows, with speeds that differ by no more than this share."""
+
+
+def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Calibration:
+    """Calibrate the motion model of a robot from one run or many, tested on what it was not fitted to.
+
+    Parameters
+    ----------
+    runs : of `icrtool.fit` or `icrtool.open_run`, of one robot; of many, those are left out that are not usable, too
+        short, copies of another, or a part of one
+    allow_unusable : take runs that are not usable, too
+
+    Raises
+    ------
+    ConfigError
+        Runs of different robots or wheel radii, or a track width that is not known.
+    DataError
+        No run is left, or too short a drive.
+    """
+    # A path is refused as what it is, not as a sequence of letters.
+    several = [runs] if isinstance(runs, (Run, str, PathLike)) else runs
+    return calibrate_runs(several, allow_unusable=allow_unusable).calibration
+
+
+def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> CalibrationResult:
+    """Calibrate as `calibrate` does, with the table of the test; one run at a time is held."""
+    taken: list[_Taken] = []
+    left_out: list[LeftOut] = []
+    alone: tuple[str, ...] = ()
+    for run in runs:
+        check_type(run, Run, MAKE_RUN)
+        recording = turning_recording_of(run)
+        robot = robot_of(run, recording.width_m)
+        one = _Taken(recording, _positions(run), robot, use_warnings(run, alone=False))
+        if why := _why_left_out(run, one, taken, allow_unusable=allow_unusable):
+            left_out.append(LeftOut(run.name, why))
+            continue
+        parts = [_is_part(before, one) for before in taken]
+        left_out += [LeftOut(taken[i].recording.name, f"a part of {run.name}") for i in np.flatnonzero(parts)]
+        taken = [*(before for before, is_part in zip(taken, parts, strict=True) if not is_part), one]
+        alone = use_warnings(run)
+    recordings, robots = [one.recording for one in taken], [one.robot for one in taken]
+    if not recordings:
+        if not left_out:
+            raise ConfigError("runs", "no usable one is given", "name at least one run or log")
+        if len(left_out) == 1:
+            raise DataError(*left_out[0], "--allow-unusable takes a run that is not usable")
+        raise DataError("runs", f"none of {len(left_out)} can be used", "; ".join(map(str, left_out)))
+    if len(found := {robot.wheel_radius_m for robot in robots}) > 1:
+        why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
+        raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
+    result = calibrate_recordings(recordings, robots[0])
+    known = alone if len(taken) == 1 else tuple(dict.fromkeys(text for one in taken for text in one.warnings))
+    calibration = replace(result.calibration, warnings=known)
+    return result._replace(calibration=calibration, left_out=tuple(left_out))
+
+
+class _Taken(NamedTuple):
+    """A run that is calibrated.
+
+    Attributes
+    ----------
+    positions : complex (m,), of its fixes, north + i east [m]
+    warnings : of its use beside others
+    """
+
+    recording: Recording
+    positions: Complexes
+    robot: CalibratedRobot
+    warnings: tuple[str, ...]
+
+
+def _positions(run: Run) -> Complexes:
+    found: Complexes = run.sensors.fixes.north_m + 1j * run.sensors.fixes.east_m
+    return found
+
+
+def _is_part(one: _Taken, of: _Taken) -> bool:
+    """Return whether a log, as one that was cut off, holds nothing but a part of a longer one.
+
+    It has the other's stamps, and where both have them the same wheel speeds and positions. At its ends speeds that
+    were made from positions of the wheels may differ.
+    """
+    part, whole = one.recording, of.recording
+    stamps, theirs = (np.rint(1e9 * log.track.t).astype(np.int64) + log.begin_ns for log in (part, whole))
+    if not (len(stamps) < len(theirs) and theirs[0] <= stamps[-1] and stamps[0] <= theirs[-1]):
+        return False
+    _, ours, others = np.intersect1d(stamps, theirs, assume_unique=True, return_indices=True)
+    same = np.isclose(part.track.v_left[ours], whole.track.v_left[others], rtol=SAME_SPEED)
+    same &= np.isclose(part.track.v_right[ours], whole.track.v_right[others], rtol=SAME_SPEED)
+    shared = np.count_nonzero(np.isin(one.positions, of.positions))
+    return bool(same.sum() >= SAME_SHARE * len(stamps) and shared >= SAME_SHARE * len(one.positions))
+
+
+def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unusable: bool) -> str:
+    """Return why a run is not calibrated with those before it; empty where it is."""
+    if not (run.usable or allow_unusable):
+        return f"not usable: {run.document.unusable_because}"
+    recording = one.recording
+    for other in before:
+        if recording.sha256 and other.recording.sha256 == recording.sha256:
+            return f"a copy of {other.recording.name}"
+        if _is_part(one, other):
+            return f"a part of {other.recording.name}"
+    try:
+        cut_windows(recording)
+    except DataError as err:
+        return f"too short: {err.why}"
+    return ""
+
+
+def robot_of(run: Run, width_m: float) -> CalibratedRobot:
+    """Return what a calibration holds of the robot of a run, of track width `width_m`."""
+    robot = run.config.robot
+    return CalibratedRobot(
+        name=robot.name,
+        wheel_radius_m=robot.wheel_radius_m,
+        encoder_counts_per_rev=robot.encoder_counts_per_rev or UNSET,
+        twist_width_m=(run.config.wheels.twist_width_m or UNSET) if _from_twists(run) else UNSET,
+        track_width_m=width_m,
+    )
+
+
+def _from_twists(run: Run) -> bool:
+    """Return whether the wheels were read from the twists of an odometry."""
+    stream = next((one for one in run.document.streams if one.role == "wheels"), None)
+    return stream is not None and "Odometry" in stream.message_type
+
+
+def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
+    """Return what to know of a run before a calibration from it is used; `alone`: it is from no other."""
+    warnings: list[str] = []
+    if alone:
+        warnings += [] if run.usable else [f"not usable: {run.document.unusable_because}"]
+        warnings += run.document.excitation.sentences
+    if _from_twists(run) and run.config.wheels.twist_width_m is None:
+        warnings.append(
+            "the wheels were read from odometry twists, which hold the controller's own multipliers: "
+            "these numbers are right only where b and radius are those the twists were made with"
+        )
+    return tuple(warnings)

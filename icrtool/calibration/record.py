@@ -37,7 +37,7 @@ from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart, call_output
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument
 from icrtool.records.tables import RobotLog
-from icrtool.records.text import counted, escaped_texts
+from icrtool.records.text import counted
 
 
 class Odometry(NamedTuple):
@@ -268,17 +268,6 @@ def _parameters(one: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterD
 
 LARGEST = 1e6
 """Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
-
-
-def read_calibration(stored: Mapping[str, Any]) -> Calibration:
-    """Return the calibration that plain data of a file hold.
-
-    Raises
-    ------
-    ValueError
-        They are not those of a calibration.
-    """
-    return calibration_of(msgspec.convert(escaped_texts(stored), CalibrationDocument))
 
 
 def calibration_of(document: CalibrationDocument) -> Calibration:

@@ -16,8 +16,7 @@ import numpy as np
 from msgspec.structs import astuple
 
 from icrtool import __version__
-from icrtool.calibration.from_runs import calibrate_runs
-from icrtool.calibration.pooled import CalibrationResult, predictor
+from icrtool.calibration.pooled import CalibrationResult, calibrate_runs, predictor
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats

@@ -58,7 +58,7 @@ def command(
     if output is not None:
         calibration_file(output)
     runs = _runs(sources, config, quiet=quiet)
-    from icrtool.calibration.from_runs import calibrate_runs
+    from icrtool.calibration.pooled import calibrate_runs
 
     sensors = _sensors(runs[0], x_icr, quiet=quiet, verbose=verbose) if len(runs) == 1 else None
     result = None
@@ -106,7 +106,7 @@ def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run
 
 def _load_models() -> None:
     """Import what calibrates, and the compiler of its kernels."""
-    from icrtool.calibration.from_runs import calibrate_runs  # noqa: F401
+    from icrtool.calibration.pooled import calibrate_runs  # noqa: F401
     from icrtool.kernels.compiled import load_compiler
 
     load_compiler()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -17,7 +17,7 @@ from icrtool.records.text import LogText, escaped
 if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.dropout_analysis.report import DropoutReport
-    from icrtool.fleet.one_log import ReportOptions
+    from icrtool.fleet.one_log import ReportOptions, TrialOptions
     from icrtool.output.exports.acceptance import Outcome
     from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.run import Run
@@ -36,14 +36,14 @@ class Request:
     ----------
     config : that of the options; logs are fitted with it
     asked, baseline : of `icrtool.cli.options.report`
-    further : further arguments of `icrtool.dropout_report`
+    further : what is asked beside that
     prints : results on standard output
     """
 
     config: Config
     asked: ReportOptions
     baseline: Baseline | None
-    further: dict[str, Any]
+    further: TrialOptions
     trials: bool
     overwrite: bool
     quiet: bool
@@ -105,18 +105,20 @@ def command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
+    from icrtool.fleet.one_log import TrialOptions
     from icrtool.output.dropout_directory import report_document
     from icrtool.output.files.documents import open_calibration
+    from icrtool.records.dropout import DEFAULT_SEED
 
     config = options.load(config_file, robot, sets)
     dropout, given = config.dropout, config.given
-    further = {
-        "horizons_m": horizons or (dropout.horizons_m if "dropout.horizons_m" in given else None),
-        "outage_s": outages or (dropout.forced_outage_s if "dropout.forced_outage_s" in given else None),
-        "calibrations": tuple(open_calibration(file) for file in calibrations), "outage_at_s": outages_at,
-        "starts": starts, "without_events": without_events, "with_jumps": with_jumps,
-        "reference": reference,
-    } | ({"seed": seed} if seed is not None else {})  # fmt: skip
+    further = TrialOptions(
+        horizons_m=horizons or (dropout.horizons_m if "dropout.horizons_m" in given else None),
+        outage_s=outages or (dropout.forced_outage_s if "dropout.forced_outage_s" in given else None),
+        calibrations=tuple(open_calibration(file) for file in calibrations), outage_at_s=outages_at,
+        starts=starts, without_events=without_events, with_jumps=with_jumps, reference=reference,
+        seed=DEFAULT_SEED if seed is None else seed,
+    )  # fmt: skip
     request = Request(
         config=config, asked=asked, baseline=options.baseline_of(baseline, asked.gates), further=further,
         trials=trials, overwrite=overwrite, quiet=quiet, prints=not (quiet or as_json), verbose=verbose,
@@ -189,7 +191,7 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
         # One result: where the report fails, an old run in this place stays, with its report.
         run = fit_log(
             source, directory, request.config, plots=request.asked.plots, figures=request.asked.figures,
-            inside=place.inside, smooth=request.further["reference"] == "smoothed", overwrite=request.overwrite,
+            inside=place.inside, smooth=request.further.reference == "smoothed", overwrite=request.overwrite,
             then=report_into, quiet=request.quiet, verbose=request.verbose,
         )  # fmt: skip
     report = reports[0]
@@ -209,7 +211,7 @@ def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
     from icrtool.dropout_analysis.dropout_report import forced_lengths_s
     from icrtool.fleet.one_log import report_and_write
 
-    if request.further["outage_at_s"] and not forced_lengths_s(run, request.further["outage_s"]):
+    if request.further.outage_at_s and not forced_lengths_s(run, request.further.outage_s):
         raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
     baseline = request.baseline.find(run.name, run.document.content) if request.baseline is not None else None
     with Stages(LogText(run.name), quiet=request.quiet, verbose=request.verbose) as stages:

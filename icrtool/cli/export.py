@@ -165,7 +165,7 @@ def read_calibration(source: Path | None, *, force: bool = False, advice: str = 
         from icrtool.output.files.documents import open_calibration
 
         return source.name, open_calibration(source)
-    from icrtool.calibration.from_runs import calibrate
+    from icrtool.calibration.pooled import calibrate
     from icrtool.errors import DataError
 
     run = open_run(source or newest_run(RUNS))

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from functools import partial
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 from msgspec.structs import asdict, replace
@@ -25,6 +25,7 @@ from icrtool.errors import IcrToolError, LogChangedError, OutputError
 from icrtool.fleet.recordings import as_text
 from icrtool.logs.containers.channel import truncation
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
+from icrtool.records.dropout import DEFAULT_SEED
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.plain_data import Record, plain
 from icrtool.records.run import ICR_COLUMNS, FigureSet
@@ -33,6 +34,7 @@ from icrtool.records.text import escaped
 from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import Calibration
     from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
     from icrtool.dropout_analysis.trials import ErrorSink
     from icrtool.records.dropout import BudgetDistance
@@ -68,6 +70,21 @@ class ReportOptions:
     page: bool = True
     allow_unusable: bool = False
     figures: FigureSet = "default"
+
+
+@dataclass(frozen=True, slots=True)
+class TrialOptions:
+    """What is asked of the report of one log beside `ReportOptions`: arguments of `icrtool.dropout_report`."""
+
+    horizons_m: tuple[float, ...] | None = None
+    outage_s: tuple[float, ...] | None = None
+    outage_at_s: tuple[float, ...] = ()
+    calibrations: tuple[Calibration, ...] = ()
+    starts: Literal["moving", "all"] = "moving"
+    reference: Literal["filter", "smoothed"] = "filter"
+    without_events: bool = False
+    with_jumps: bool = False
+    seed: int = DEFAULT_SEED
 
 
 def fit_and_write(
@@ -130,7 +147,7 @@ def report_and_write(
     begin: Stage,
     *,
     baseline: BaselineReport | None,
-    further: Mapping[str, Any] | None = None,
+    further: TrialOptions | None = None,
     trials: bool = False,
 ) -> DropoutReport:
     """Analyse a run and write its dropout report, and its page, into its directory.
@@ -138,18 +155,20 @@ def report_and_write(
     Parameters
     ----------
     baseline : earlier report of the same log
-    further : arguments of `icrtool.dropout_report`
+    further : what is asked of this report alone
     trials : write every single trial to trials.parquet
     """
     from icrtool.dropout_analysis.dropout_report import dropout_report
     from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, write_report
     from icrtool.output.run_directory import PAGE_FILE
 
+    of_trials = {} if further is None else {field.name: getattr(further, field.name) for field in fields(further)}
+
     def analysed(sink: ErrorSink | None) -> DropoutReport:
         begin("dropout analysis")
         report = dropout_report(
             run, budgets_m=options.budgets_m, gates=options.gates, comparison=options.ladder, baseline=baseline,
-            strict=options.strict, allow_unusable=options.allow_unusable, sink=sink, **(further or {}),
+            strict=options.strict, allow_unusable=options.allow_unusable, sink=sink, **of_trials,
         )  # fmt: skip
         begin("dropout report, pictures" if options.plots else "dropout report")
         return report

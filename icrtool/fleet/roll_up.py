@@ -90,7 +90,7 @@ def is_fleet(directory: Path) -> bool:
 def _pooled(
     one: FleetCalibration, members: Sequence[FleetLog], directory: Path, place: Path, name: str, *, allow_unusable: bool
 ) -> FleetCalibration:
-    from icrtool.calibration.from_runs import calibrate_runs
+    from icrtool.calibration.pooled import calibrate_runs
     from icrtool.output.stored_run import open_run
     from icrtool.output.tables.held_out import held_out_blocks
     from icrtool.output.text_blocks import printed

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from icrtool.errors import OutputError
 from icrtool.logs.containers.split_files import file_sha256, files_of_log
 from icrtool.output.files.atomic import atomic_directory
-from icrtool.output.files.formats import PLOT_FORMATS, csv_bytes, file_b2sum, json_bytes, schema_of, write_sums
+from icrtool.output.files.formats import (
+    PLOT_FORMATS,
+    csv_bytes,
+    file_b2sum,
+    json_bytes,
+    read_document,
+    schema_of,
+    write_sums,
+)
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, write_measurements
 from icrtool.output.files.own_files import check_directory, own_files
 from icrtool.output.files.remote_place import lies_there
 from icrtool.output.files.states_file import StatesFormat, write_states
-from icrtool.records.regular_file import read_regular
+from icrtool.records.plain_data import Record
 from icrtool.records.run import FigureSet, Run
 from icrtool.records.run_document import EVENT_COLUMNS, EventDocument
+from icrtool.records.samples import InputFile
 from icrtool.records.urls import UrlPath
 
 RUN_FILE = "run.json"
@@ -55,11 +62,11 @@ def check_target(
         A file, a directory that is not a run of ours, or the run of another recording is there; or `log` is a run.
     """
     if log is not None and is_run_directory(log):
-        path = next((one.get("path") for one in _inputs_of(log)), "data frames")
+        path = next((one.path for one in _inputs_of(log)), "data frames")
         raise OutputError(log, "is a run, not a log", f"name its log ({path}), or: icrtool dropout-report {log}")
     check_directory(directory, is_run_directory, kind="run directory", inside=inside)
     if log is not None and not overwrite and is_run_directory(directory) and not _is_made_from(directory, log):
-        other = next((one.get("path") for one in _inputs_of(directory)), "data frames")
+        other = next((one.path for one in _inputs_of(directory)), "data frames")
         advice = "name another place, or replace it with --overwrite"
         raise OutputError(directory, f"holds the run of another recording ({other})", advice)
 
@@ -71,10 +78,9 @@ def _is_made_from(directory: Path, log: Path) -> bool:
     if any(os.path.realpath(file) in sources for file in files):
         return True
     if isinstance(log, UrlPath):
-        return [one.get("path") for one in inputs] == [str(log)]
+        return [one.path for one in inputs] == [str(log)]
     return bool(inputs) and all(
-        any(file.stat().st_size == one.get("bytes") and file_sha256(file) == one.get("sha256") for file in files)
-        for one in inputs
+        any(file.stat().st_size == one.bytes and file_sha256(file) == one.sha256 for file in files) for one in inputs
     )
 
 
@@ -150,17 +156,20 @@ def write_run(
 def replaced_log(directory: Path, run: Run) -> str | None:
     """Return the path of the log whose run a new run replaces; None where it has the same content, or none is there."""
     before, now = _inputs_of(directory), run.document.inputs
-    same = [one.get("sha256") or one.get("path") for one in before] == [one.sha256 or one.path for one in now]
-    return str(before[0].get("path")) if before and not same else None
+    same = [one.sha256 or one.path for one in before] == [one.sha256 or one.path for one in now]
+    return str(before[0].path) if before and not same else None
 
 
-def _inputs_of(directory: Path) -> list[dict[str, Any]]:
+class _Inputs(Record, frozen=True):
+    inputs: tuple[InputFile, ...]
+
+
+def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
     """Return the inputs in a run.json that nobody checked yet."""
     try:
-        inputs = json.loads(read_regular(directory / RUN_FILE, directory))["inputs"]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return []
-    return [one for one in inputs if isinstance(one, dict)] if isinstance(inputs, list) else []
+        return read_document(directory / RUN_FILE, _Inputs, directory, escape=False).inputs
+    except (OSError, ValueError, RecursionError):
+        return ()
 
 
 def is_run_directory(directory: Path) -> bool:

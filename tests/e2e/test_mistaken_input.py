@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import icrtool as library
-from icrtool.calibration.from_runs import calibrate_runs
+from icrtool.calibration.pooled import calibrate_runs
 from icrtool.output.files.formats import CHECKSUM_FILE, file_b2sum
 from icrtool.output.run_directory import RUN_FILE
 

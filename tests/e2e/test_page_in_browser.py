@@ -14,8 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from icrtool.calibration.from_runs import calibrate
-from icrtool.calibration.pooled import predictor
+from icrtool.calibration.pooled import calibrate, predictor
 from icrtool.calibration.run_recording import recording_of, turning_recording_of
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport

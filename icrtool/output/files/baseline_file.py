@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-import msgspec
-
 from icrtool.dropout_analysis.report import BaselineReport, baseline_report, known_content
 from icrtool.errors import ConfigError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
 from icrtool.output.files.documents import logs_of_fleet
+from icrtool.output.files.formats import read_document
 from icrtool.records.dropout_document import EarlierReport
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
@@ -109,7 +107,7 @@ def read_report(path: Path, log: str = "", inside: Path | None = None) -> Baseli
         It is not a dropout report.
     """
     try:
-        document = msgspec.convert(json.loads(read_regular(path, inside)), EarlierReport)
+        document = read_document(path, EarlierReport, inside, escape=False)
         if not document.schema.startswith(SCHEMA_FAMILY):
             raise ValueError(document.schema)
         return baseline_report(document, str(path), escaped(log or document.run.log))

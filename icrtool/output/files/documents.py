@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
-
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.atomic import write_file
-from icrtool.output.files.formats import json_bytes, schema_of
-from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationFile
+from icrtool.output.files.formats import json_bytes, read_document, schema_of
+from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationDocument, CalibrationFile
 from icrtool.records.fleet_document import FLEET_FILE, FleetDocument, FleetLog
-from icrtool.records.regular_file import check_folders, read_regular
+from icrtool.records.regular_file import check_folders
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
@@ -35,11 +32,11 @@ def open_calibration(file: Path | str) -> Calibration:
     RunError
         It cannot be read, or is not a calibration.
     """
-    from icrtool.calibration.record import read_calibration
+    from icrtool.calibration.record import calibration_of
 
     path = Path(file)
     try:
-        return replace(read_calibration(json.loads(read_regular(path))), name=path.stem)
+        return replace(calibration_of(read_document(path, CalibrationDocument)), name=path.stem)
     except OSError as err:
         raise RunError(path, "cannot be read", err.strerror or str(err)) from err
     except (ValueError, LookupError, ArithmeticError, RecursionError) as err:
@@ -98,7 +95,7 @@ def read_fleet(directory: Path) -> FleetDocument:
     OSError, ValueError, RecursionError
         It cannot be read, or is not of this version.
     """
-    return msgspec.convert(json.loads(read_regular(directory / FLEET_FILE, directory)), FleetDocument)
+    return read_document(directory / FLEET_FILE, FleetDocument, directory, escape=False)
 
 
 def logs_of_fleet(directory: Path) -> list[FleetLog]:

@@ -11,8 +11,9 @@ import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import msgspec
 import numpy as np
 
 from icrtool.errors import DataError, OutputError, RunError
@@ -21,10 +22,9 @@ from icrtool.output.files.atomic import write_file
 from icrtool.output.files.own_files import check_place
 from icrtool.records.plain_data import plain
 from icrtool.records.regular_file import open_regular, read_regular
-from icrtool.records.text import LogText, table_cell
+from icrtool.records.text import LogText, escaped_texts, table_cell
 
 if TYPE_CHECKING:
-    import msgspec
     from matplotlib.figure import Figure
 
 
@@ -42,7 +42,27 @@ def schema_of(file: Path, inside: Path | None = None) -> str:
     return schema if isinstance(schema, str) else ""
 
 
-def json_bytes(document: msgspec.Struct | Mapping[str, Any]) -> bytes:
+Document = TypeVar("Document", bound=msgspec.Struct)
+
+
+def read_document(file: Path, kind: type[Document], inside: Path | None = None, *, escape: bool = True) -> Document:
+    """Read a JSON file as a record: types and limits are checked, keys that it does not know are ignored.
+
+    Parameters
+    ----------
+    inside : as in `open_regular`
+    escape : texts are printed later, so they are escaped; names of files are not
+
+    Raises
+    ------
+    OSError, ValueError, RecursionError
+        The file cannot be read, or is not as the record has it.
+    """
+    stored = json.loads(read_regular(file, inside))
+    return msgspec.convert(escaped_texts(stored) if escape else stored, kind)
+
+
+def json_bytes(document: msgspec.Struct | Mapping[str, object]) -> bytes:
     """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
     text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
     # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.

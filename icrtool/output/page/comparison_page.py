@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
-
 from icrtool.motion.models import FAMILY
-from icrtool.output.files.formats import schema_of
+from icrtool.output.files.formats import read_document, schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS
 from icrtool.output.page.pictures import drawn_pictures
 from icrtool.output.page.render import render
 from icrtool.output.tables.transfer import transfer_blocks
 from icrtool.output.text_blocks import Title
 from icrtool.records.calibration_document import GroupComparison, TransferCell
-from icrtool.records.regular_file import read_regular
-from icrtool.records.text import counted, escaped_texts
+from icrtool.records.text import counted
 
 SCRIPTS = ("vendor/uPlot.iife.min.js", "vendor/d3.min.js", "columns.js", "charts.js", "comparison.js")
 
@@ -66,7 +62,7 @@ def read_comparison(file: Path, inside: Path | None = None) -> GroupComparison:
     OSError, ValueError, RecursionError
         It cannot be read, or is not of this version.
     """
-    return msgspec.convert(escaped_texts(json.loads(read_regular(file, inside))), GroupComparison)
+    return read_document(file, GroupComparison, inside)
 
 
 def comparison_in(place: Path) -> Path | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -15,7 +14,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import RunError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, report_document
 from icrtool.output.files.atomic import write_file
-from icrtool.output.files.formats import CHECKSUM_FILE, read_sums, schema_of
+from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
 from icrtool.output.files.own_files import is_page
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
@@ -35,10 +34,8 @@ from icrtool.output.text_blocks import PAGE, Block, Facts, Figure, Section, Titl
 from icrtool.output.text_format import driven_text, position_word, run_title
 from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.plain_data import plain
-from icrtool.records.regular_file import read_regular
 from icrtool.records.run import Run, check_type
 from icrtool.records.run_document import RunDocument
-from icrtool.records.text import escaped_texts
 
 SCRIPTS = (
     "vendor/uPlot.iife.min.js",
@@ -166,7 +163,7 @@ def read_report(directory: Path) -> DropoutDocument | None:
     if schema_of(file, directory) != DROPOUT_SCHEMA:
         raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
     try:
-        return msgspec.convert(escaped_texts(json.loads(read_regular(file, directory))), DropoutDocument)
+        return read_document(file, DropoutDocument, directory)
     except (ValueError, RecursionError) as err:
         why = f"is not as this version of icrtool writes it ({err})"
         raise RunError(file, why, "make it again with icrtool dropout-report") from err

@@ -15,18 +15,24 @@ from scipy.optimize import nnls
 from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonnegative, radius
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
 from icrtool.calibration.pooled import calibrate_recordings, predictor
-from icrtool.calibration.record import Calibration, ErrorSources, read_calibration
+from icrtool.calibration.record import Calibration, ErrorSources, calibration_of
 from icrtool.errors import DataError, IcrToolError
 from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
 from icrtool.motion.recording import cut_trials
 from icrtool.output.files.formats import read_numbers
 from icrtool.output.tables.forecast import forecast_csv, reach
+from icrtool.records.calibration_document import CalibrationDocument
 from support.recordings import WIDTH_M, draw_parameters, make_recording, trials_from_all
 
 SIX = FAMILY["six"]
 SEEDS = range(5)
 HORIZONS_M = (5.0, 10.0, 20.0)
 ROUNDING = 1e-6
+
+
+def stored(document: dict[str, object]) -> Calibration:
+    """The calibration of plain data of a file."""
+    return calibration_of(msgspec.convert(document, CalibrationDocument))
 
 
 def calibrated(seed: int) -> Calibration:
@@ -128,8 +134,8 @@ def test_a_budget_is_reached_between_metres(calibration: Calibration) -> None:
 
 def test_the_sources_come_back_from_a_file_and_an_older_file_has_none(calibration: Calibration) -> None:
     document = calibration.summary()
-    assert read_calibration(document).sources == calibration.sources
-    older = read_calibration({key: value for key, value in document.items() if key != "error_sources"})
+    assert stored(document).sources == calibration.sources
+    older = stored({key: value for key, value in document.items() if key != "error_sources"})
     with pytest.raises(DataError, match="calibrate again"):
         forecast_plan(older, np.zeros(2), np.array([0.0, 9.0]))
 
@@ -202,7 +208,7 @@ def test_a_gyro_narrows_the_forecast_and_holds() -> None:
     logs = [make_recording(SIX, parameters, k, 150.0, gyro=True, name=f"log {k}") for k in range(3)]
     found = calibrate_recordings(logs).calibration
     assert found.gyro_sources is not None
-    assert read_calibration(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
+    assert stored(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
     new = make_recording(SIX, parameters, 9, 300.0, gyro=True, name="new")
     trials = cut_trials(new, HORIZONS_M)
     errors = predictor(found, new, with_gyro=True)(trials).position

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.calibration.from_runs import robot_of
 from icrtool.calibration.held_out import hold_out, left_out, plan_folds
-from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings, predictor
+from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings, predictor, robot_of
 from icrtool.calibration.run_recording import recording_of, with_turn_rate
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError

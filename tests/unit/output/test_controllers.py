@@ -11,7 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from icrtool.calibration.controller_numbers import factor_to_old, unfit_reasons
-from icrtool.calibration.from_runs import calibrate
+from icrtool.calibration.pooled import calibrate
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError, DataError
 from icrtool.motion.models import FAMILY, FittedModel, Lever, controller_model, wheel_motion
