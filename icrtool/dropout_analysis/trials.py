@@ -28,7 +28,7 @@ from icrtool.kernels.open_loop.error_statistics import (
 )
 from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
 from icrtool.kernels.open_loop.trials import FrozenIcrs, Intervals, Summary, TrialCounts
-from icrtool.kernels.track import Track
+from icrtool.kernels.track import Track, ends_finder
 from icrtool.motion.recording import MOST_TRIALS, ErrorsOf, Trials
 from icrtool.records.dropout import DEFAULT_SEED, HeadingErrors, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.process_resources import give_back_freed
@@ -306,12 +306,12 @@ def _groups(horizons: int, states: int) -> list[slice]:
 
 def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
     """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
-    states = len(track.distance)
+    states, find = len(track.distance), ends_finder(track)
     ends = np.empty((len(horizons), states), np.int32)
 
     def fill(lo: int) -> TrialCounts:
         hi = min(lo + STARTS_AT_ONCE, states)
-        found = trial_ends(track, horizons, lo, hi)
+        found = find(horizons, np.arange(lo, hi))
         leave_out_standing(found, left_out[lo:hi])
         ends[:, lo:hi] = found.T
         return count_trials(found)

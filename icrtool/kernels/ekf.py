@@ -34,8 +34,8 @@ NORTH, EAST, PSI = (cast(int, np.int64(axis)) for axis in range(3))
 CHANGE, FIX, HEADING, WHEELS = range(4)
 """Kinds of events, in their order at equal stamps: terrain changes, fixes, headings, wheel samples."""
 
-BLOCK_EVENTS = 500_000
-"""Events in one compiled call of `run_ekf`: some 0.1 s, between which Ctrl-C and SIGTERM are acted on."""
+BLOCK_EVENTS = 200_000
+"""Events in one compiled call of `run_ekf`: some 0.03 s, between which Ctrl-C and SIGTERM are acted on."""
 
 
 class Events(NamedTuple):

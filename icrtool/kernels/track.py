@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.equal_steps import ROWS_AT_ONCE, rows_at_steps
 
 Rate = TypeVar("Rate", Floats, Complexes)
 
@@ -195,37 +195,45 @@ def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Cut:
 
 
 def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Ints:
-    """Return the row of the positions at which each distance ends, from some rows (k,) on, ascending.
+    """Return what `ends_finder` finds, from many rows: they are taken some at a time, to bound memory."""
+    find, ends = ends_finder(track), np.empty((len(horizons_m), len(starts)), np.int64)
+    for lo in range(0, len(starts), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        ends[:, some] = find(horizons_m, starts[some]).T
+    return ends.T
 
-    Parameters
-    ----------
-    horizons_m : (h,) distances [m] in any order
 
-    Returns
-    -------
-    int64 (k, h), one horizon contiguous: the first row j with ``distance[j] - distance[start] >= horizon``, or `SHORT`,
-    `GAP`, `OUTAGE`, `JUMP`.
+def ends_finder(track: Track) -> Callable[[Floats, Ints], Ints]:
+    """Return a function that finds the row of the positions at which each distance ends.
+
+    It takes the distances (h,) [m], in any order, and the rows (k,) from which to go, ascending, and returns int64
+    (k, h), one horizon contiguous: the first row j with ``distance[j] - distance[start] >= horizon``, or `SHORT`,
+    `GAP`, `OUTAGE`, `JUMP`. What does not depend on these is computed once.
     """
     distance, rows = np.asarray(track.distance, np.float64), len(track.distance)
-    ends = np.empty((len(horizons_m), len(starts)), np.int64)
-    begin, gap_t = distance[starts], track.gap_t
-    gaps = np.searchsorted(gap_t, track.place_t[starts])
-    for end, horizon in zip(ends, horizons_m, strict=True):
-        # the sum may be rounded up: begin the search a little before it
-        end[:] = np.searchsorted(distance, (begin + horizon) * BEFORE)
-        while True:
-            last, inside = np.minimum(end, rows - 1), end < rows
-            short = np.flatnonzero(inside & (distance[last] - begin < horizon))
-            if not len(short):
-                break
-            end[short] = np.searchsorted(distance, distance[end[short]], side="right")
-        end[inside & track.in_outage[last]] = OUTAGE
-        if len(gap_t):
-            end[inside & (np.searchsorted(gap_t, track.place_t[last]) > gaps)] = GAP
-        end[~inside] = SHORT
-    if track.jump.any():
-        ends[(ends >= 0) & (_before(track.jump, ends) > _before(track.jump, starts))] = JUMP
-    return ends.T
+    gap_t, jumps = track.gap_t, np.flatnonzero(track.jump)
+
+    def find(horizons_m: Floats, starts: Ints) -> Ints:
+        ends = np.empty((len(horizons_m), len(starts)), np.int64)
+        begin, gaps = distance[starts], np.searchsorted(gap_t, track.place_t[starts])
+        for end, horizon in zip(ends, horizons_m, strict=True):
+            # the sum may be rounded up: begin the search a little before it
+            end[:] = np.searchsorted(distance, (begin + horizon) * BEFORE)
+            while True:
+                last, inside = np.minimum(end, rows - 1), end < rows
+                short = np.flatnonzero(inside & (distance[last] - begin < horizon))
+                if not len(short):
+                    break
+                end[short] = np.searchsorted(distance, distance[end[short]], side="right")
+            end[inside & track.in_outage[last]] = OUTAGE
+            if len(gap_t):
+                end[inside & (np.searchsorted(gap_t, track.place_t[last]) > gaps)] = GAP
+            end[~inside] = SHORT
+        if len(jumps):
+            ends[(ends >= 0) & (np.searchsorted(jumps, ends) > np.searchsorted(jumps, starts))] = JUMP
+        return ends.T
+
+    return find
 
 
 def _before(flags: Bools, rows: Ints) -> Ints:
