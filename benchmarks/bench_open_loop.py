@@ -6,12 +6,9 @@ import numpy as np
 from table import Table, seconds_of
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals
-from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
-from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
-from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import FrozenIcrs
-from icrtool.kernels.track import Track
+from icrtool.kernels.error_statistics import block_sums, cut_blocks, error_intervals, error_summary, sort_trials
+from icrtool.kernels.open_loop import open_loop_errors, open_loop_errors_direct
+from icrtool.kernels.track import FrozenIcrs, Track, trial_ends
 
 RATE_HZ = 100
 HORIZONS_M = np.arange(1.0, 21.0)

@@ -15,10 +15,8 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.open_loop.error_statistics import error_summary
-from icrtool.kernels.open_loop.trials import OpenLoopPath, Summary
-from icrtool.kernels.track import Track
-from icrtool.kernels.within_budget import within_budget
+from icrtool.kernels.error_statistics import Summary, error_summary, within_budget
+from icrtool.kernels.track import OpenLoopPath, Track
 from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, FittedModel, controller_model
 from icrtool.motion.recording import (

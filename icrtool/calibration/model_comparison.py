@@ -17,10 +17,8 @@ from icrtool.calibration.held_out import GYRO, HeldOut, hold_out
 from icrtool.calibration.pooled import calibration_from, robot_of, use_warnings
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import recording_of, scaled_gyro, with_turn_rate
-from icrtool.kernels.arrays import Complexes, Floats
-from icrtool.kernels.equal_steps import ROWS_AT_ONCE
-from icrtool.kernels.open_loop.trials import FrozenIcrs, OpenLoopPath
-from icrtool.kernels.track import Track
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
+from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
 from icrtool.motion.models import NO_SLIP, FittedModel
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.dropout import MeasuredHeading

@@ -20,8 +20,15 @@ from icrtool.calibration.pooled import CalibrationResult, calibrate_runs, predic
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.block_sums import BlockSums, block_sums, difference_half_width, error_intervals
-from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
+from icrtool.kernels.error_statistics import (
+    BlockSums,
+    block_sums,
+    cut_blocks,
+    difference_half_width,
+    error_intervals,
+    error_summary,
+    sort_trials,
+)
 from icrtool.kernels.track import Track
 from icrtool.motion.models import RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import Recording, cut_trials
@@ -74,7 +81,7 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> GroupComparison:
     -----
     Parameters of different logs are independent, and their covariances are clustered by distance. Errors and their
     differences have intervals from blocks of the distance of all runs of a group
-    (`icrtool.kernels.open_loop.block_sums`), differences from pairs of blocks where both are of the same trials or the
+    (`icrtool.kernels.error_statistics`), differences from pairs of blocks where both are of the same trials or the
     same route.
     """
     if len(groups) < 2:

@@ -66,8 +66,8 @@ def call_all_kernels() -> None:
     import icrtool
     from icrtool.cli.simulate import needed
     from icrtool.estimation.smooth import smooth
-    from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
-    from icrtool.kernels.open_loop.trials import FrozenIcrs
+    from icrtool.kernels.open_loop import open_loop_errors_direct
+    from icrtool.kernels.track import FrozenIcrs, trial_ends
     from icrtool.logs.writing.log import WriteOptions, write_log
     from icrtool.records.process_resources import unfinished
     from icrtool.records.run import track_of

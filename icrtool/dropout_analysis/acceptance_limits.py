@@ -12,8 +12,7 @@ from msgspec.structs import asdict, astuple
 
 from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.errors import ConfigError
-from icrtool.kernels.open_loop.block_sums import BlockSums, difference_half_width
-from icrtool.kernels.within_budget import within_budget
+from icrtool.kernels.error_statistics import BlockSums, difference_half_width, within_budget
 from icrtool.motion.models import FAMILY
 from icrtool.records.dropout import METRICS, BudgetDistance, CheckedGate, Gate, ModelResult, Verdict
 from icrtool.records.plain_data import known

@@ -11,12 +11,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from icrtool.calibration.model_comparison import ComparedModels, ComparedRow
 from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
 from icrtool.dropout_analysis.trials import Model, models_of
-from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.equal_steps import rows_of_cells
-from icrtool.kernels.open_loop.direct import open_loop_path, trial_ends
-from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import OpenLoopPath
-from icrtool.kernels.track import Track
+from icrtool.kernels.arrays import Floats, Ints, rows_of_cells
+from icrtool.kernels.open_loop import open_loop_errors, open_loop_path
+from icrtool.kernels.track import OpenLoopPath, Track, trial_ends
 from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Trials
 from icrtool.records.dropout import ExampleTrial, TurningSplit

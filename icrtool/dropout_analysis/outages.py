@@ -12,8 +12,8 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.run_filter import set_up_again
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.ekf import run_ekf
-from icrtool.kernels.open_loop.direct import open_loop_path
-from icrtool.kernels.open_loop.trials import OpenLoopPath
+from icrtool.kernels.open_loop import open_loop_path
+from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.dropout import Outage
 from icrtool.records.run import Run, track_of
 

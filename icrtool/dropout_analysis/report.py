@@ -18,8 +18,8 @@ import numpy as np
 from icrtool import __version__
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.open_loop.block_sums import BlockSums
-from icrtool.kernels.open_loop.trials import TrialCounts
+from icrtool.kernels.error_statistics import BlockSums
+from icrtool.kernels.track import TrialCounts
 from icrtool.records.dropout import (
     METRICS,
     BudgetDistance,

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.open_loop.direct import trial_ends
-from icrtool.kernels.track import STANDING, Track
+from icrtool.kernels.track import STANDING, Track, trial_ends
 from icrtool.records.run import ICR_COLUMNS, Run
 
 Starts = Literal["moving", "all"]

@@ -15,20 +15,22 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.open_loop.block_sums import Blocks, block_sums, error_intervals
-from icrtool.kernels.open_loop.direct import count_trials, trial_ends
-from icrtool.kernels.open_loop.error_statistics import (
+from icrtool.kernels.error_statistics import (
+    Blocks,
+    Intervals,
+    Summary,
+    block_sums,
     cut_blocks,
+    error_intervals,
     error_summary,
     histogram_sorted,
     round_bin_width,
     sort_trials,
     summary_of_sorted,
 )
-from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import FrozenIcrs, Intervals, Summary, TrialCounts
-from icrtool.kernels.track import Track, ends_finder
+from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
+from icrtool.kernels.open_loop import open_loop_errors
+from icrtool.kernels.track import FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
 from icrtool.motion.recording import MOST_TRIALS, ErrorsOf, Trials
 from icrtool.records.dropout import DEFAULT_SEED, HeadingErrors, LearnedSplit, ModelResult, ReferenceErrors
 from icrtool.records.process_resources import give_back_freed
@@ -121,7 +123,7 @@ def dropout(
     start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
     where it ends in a real GNSS outage. Of a standstill only the last state starts trials: the others would be copies,
     and a parked robot would set the result. Overlapping trials are not independent: the
-    intervals come from blocks of path of at least four horizons (`icrtool.kernels.open_loop.block_sums`).
+    intervals come from blocks of path of at least four horizons (`icrtool.kernels.error_statistics`).
     """
     check_type(run, Run, MAKE_RUN)
     if len(run.table) < 2:

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.arrays import Floats, Ints, rows_at_steps
 from icrtool.kernels.filter_records import REFERENCE_STEP_S
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
 from icrtool.kernels.track import Track

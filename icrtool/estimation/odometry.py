@@ -11,9 +11,9 @@ from itertools import chain
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.chords import chord_rows
-from icrtool.kernels.open_loop.direct import open_loop_pieces
-from icrtool.kernels.open_loop.trials import OpenLoopPath
+from icrtool.kernels.kinematics import chord_rows
+from icrtool.kernels.open_loop import open_loop_pieces
+from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.run import track_of_states
 from icrtool.records.run_document import DriveDocument
 from icrtool.records.tables import Icrs, States

@@ -18,8 +18,7 @@ from icrtool.estimation.filter_setup import (
     wheel_gap_s,
 )
 from icrtool.estimation.noise_adaptation import run_adaptively
-from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.equal_steps import ROWS_AT_ONCE
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints
 from icrtool.kernels.filter_records import FilterOutput
 from icrtool.records.measurements import SensorData
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart

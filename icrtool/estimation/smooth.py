@@ -8,8 +8,8 @@ import numpy as np
 
 from icrtool.estimation.run_filter import carry_headings, set_up_again
 from icrtool.kernels.arrays import Floats
+from icrtool.kernels.ekf import run_smoother
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.smoother import run_smoother
 from icrtool.records.run import STATE_COLUMNS, Run
 from icrtool.records.tables import States
 

@@ -3,6 +3,16 @@
 The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
 The tests compare this filter with one in matrix form (tests/support/matrix_filter.py), the one to read first.
 `filter_events` is the one event loop: the filter and the smoother's forward pass call it.
+
+Rauch-Tung-Striebel smoother of the ICR EKF: the same events once more, then backwards.
+
+The filter's own steps are run again and every event is kept as a node: what was
+predicted there, what was left after its updates. Backwards, with F of Eqs. 17, 27-29 between node i and the next,
+
+    C = P_i F^T (P-_{i+1})^-1,   xs_i = x_i + C (xs_{i+1} - x-_{i+1}),   Ps_i = P_i + C (Ps_{i+1} - P-_{i+1}) C^T
+
+(Rauch, Tung, Striebel 1965). A long log is taken in chunks from checkpoints of the forward pass: memory does not grow
+with it; the filter runs twice.
 """
 
 from __future__ import annotations
@@ -14,18 +24,22 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.compiled import njit, njit_part
 from icrtool.kernels.filter_records import (
     GATED,
     RECOVERED,
     REFERENCE_STEP_S,
     USED,
+    Events,
     FilterInputs,
     FilterOutput,
     FilterParameters,
+    FilterState,
+    Nodes,
+    Space,
 )
-from icrtool.kernels.kalman import correct, propagate, store
+from icrtool.kernels.kalman import correct, propagate, smooth_passes, store
 from icrtool.kernels.kinematics import step_jacobian, wheel_speed
 
 NORTH, EAST, PSI = (cast(int, np.int64(axis)) for axis in range(3))
@@ -36,76 +50,6 @@ CHANGE, FIX, HEADING, WHEELS = range(4)
 
 BLOCK_EVENTS = 200_000
 """Events in one compiled call of `run_ekf`: some 0.03 s, between which Ctrl-C and SIGTERM are acted on."""
-
-
-class Events(NamedTuple):
-    """Events in order of time: (m,) time [s], kind, and row among those of its kind."""
-
-    t: Floats
-    kind: Ints
-    row: Ints
-
-
-class FilterState(NamedTuple):
-    """All that a run needs to go on from the events before. Changed in place.
-
-    Attributes
-    ----------
-    reached : (2,) time [s], and path length up to there [m]
-    rejected : (2, 4) rows of `rejected_run`, of GNSS and of heading
-    x : (6,); P : (6, 6)
-    """
-
-    reached: Floats
-    rejected: Floats
-    x: Floats
-    P: Floats
-
-    @classmethod
-    def start(cls, t0: float, x0: Floats, P0: Floats) -> FilterState:
-        """Return the state of a run that starts at t0 [s] with state x0 (6,) and covariance P0 (6, 6)."""
-        return cls(np.array([t0, 0.0]), np.zeros((2, 4)), x0.astype(np.float64), P0.astype(np.float64))
-
-    def copy(self) -> FilterState:
-        """Return a state that later events do not change."""
-        return FilterState._make(column.copy() for column in self)
-
-
-class Space(NamedTuple):
-    """Memory of kernels, which allocate none: PH (6,); G (3, 4), as in `step_jacobian`; T (3, 6)."""
-
-    PH: Floats
-    G: Floats
-    T: Floats
-
-    @classmethod
-    def empty(cls) -> Space:
-        """Return new memory."""
-        return cls(np.empty(6), np.empty((3, 4)), np.empty((3, 6)))
-
-
-class Nodes(NamedTuple):
-    """Times of events in order, for the smoother; (m, ...) each.
-
-    Attributes
-    ----------
-    x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 6, 6) likewise
-    G : (m, 3, 4) of `step_jacobian` for the step from the node before; 0 where the pose is not dead-reckoned
-    row : int64 (m,), wheel sample recorded here, -1 where none is
-    """
-
-    x_predicted: Floats
-    P_predicted: Floats
-    x: Floats
-    P: Floats
-    G: Floats
-    row: Ints
-
-    @classmethod
-    def empty(cls, count: int) -> Nodes:
-        """Return so many nodes, to be filled."""
-        x, P, G = (count, 6), (count, 6, 6), (count, 3, 4)
-        return cls(np.empty(x), np.empty(P), np.empty(x), np.empty(P), np.zeros(G), np.empty(count, np.int64))
 
 
 @njit_part
@@ -398,3 +342,46 @@ def run_ekf(
 def compiled_inputs(data: FilterInputs) -> FilterInputs:
     """Return the inputs in the one form that the kernel is compiled for; copies only what is not in it."""
     return FilterInputs._make(np.require(column, requirements=["C", "A", "W"]) for column in data)
+
+
+CHUNK_ROWS = 8192
+"""Wheel samples whose nodes are kept at once: some 30 MB."""
+
+
+class Smoothed(NamedTuple):
+    """Smoothed states: x (k, 6), variance (k, 6), the diagonal of P."""
+
+    x: Floats
+    variance: Floats
+
+
+def run_smoother(
+    data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, chunk_rows: int = CHUNK_ROWS
+) -> Smoothed:
+    """Smooth the run that `icrtool.kernels.ekf.run_ekf` makes of the same arguments.
+
+    Returns
+    -------
+    Smoothed
+        One state per recorded state of the filter; the last one equals the filter's.
+    """
+    first, last = int(np.searchsorted(data.wheel_t, t0)), len(data.wheel_t)
+    chunks, saved = list(pairwise([*range(first, last, chunk_rows), last])), [FilterState.start(t0, x0, P0)]
+    data, forward = compiled_inputs(data), FilterOutput.empty(data, min(chunk_rows, last - first))
+    for begin, end in chunks[:-1]:
+        saved.append(saved[-1].copy())
+        filter_rows(data, begin, end, saved[-1], parameters, forward, begin)
+    out, following = Smoothed(np.empty((last - first, 6)), np.empty((last - first, 6))), Nodes.empty(0)
+    for (begin, end), state in zip(reversed(chunks), reversed(saved), strict=True):
+        nodes = filter_rows(data, begin, end, state, parameters, forward, begin, keep=True)
+        count = len(nodes.row)
+        # the last node is smoothed: the first of the chunk that follows, or that of the end
+        nodes = Nodes._make(np.concatenate(columns) for columns in zip(nodes, following, strict=True))
+        F = np.tile(np.eye(6), (len(nodes.row) - 1, 1, 1))
+        F[:, :3, 2:] += nodes.G[1:]
+        smooth_passes(F, nodes.x_predicted, nodes.P_predicted, nodes.x, nodes.P)
+        recorded = np.flatnonzero(nodes.row[:count] >= 0)
+        out.x[begin - first : end - first] = nodes.x[recorded]
+        out.variance[begin - first : end - first] = np.diagonal(nodes.P, axis1=1, axis2=2)[recorded]
+        following = Nodes._make(column[:1].copy() for column in nodes)
+    return out

@@ -1,4 +1,4 @@
-"""Records of the filter: its constants, inputs and outputs. No kernel is here: who only reads them loads no numba."""
+"""Records of the filter: its constants, inputs, outputs, state. No kernel is here: to read them loads no numba."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, Ints
 
 Codes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -167,3 +167,73 @@ class FilterOutput(NamedTuple):
     def heading_innovation(self) -> Floats:
         """Innovation of each heading (h,) [rad]."""
         return np.asarray(self.headings[2])
+
+
+class Events(NamedTuple):
+    """Events in order of time: (m,) time [s], kind, and row among those of its kind."""
+
+    t: Floats
+    kind: Ints
+    row: Ints
+
+
+class FilterState(NamedTuple):
+    """All that a run needs to go on from the events before. Changed in place.
+
+    Attributes
+    ----------
+    reached : (2,) time [s], and path length up to there [m]
+    rejected : (2, 4) rows of `rejected_run`, of GNSS and of heading
+    x : (6,); P : (6, 6)
+    """
+
+    reached: Floats
+    rejected: Floats
+    x: Floats
+    P: Floats
+
+    @classmethod
+    def start(cls, t0: float, x0: Floats, P0: Floats) -> FilterState:
+        """Return the state of a run that starts at t0 [s] with state x0 (6,) and covariance P0 (6, 6)."""
+        return cls(np.array([t0, 0.0]), np.zeros((2, 4)), x0.astype(np.float64), P0.astype(np.float64))
+
+    def copy(self) -> FilterState:
+        """Return a state that later events do not change."""
+        return FilterState._make(column.copy() for column in self)
+
+
+class Space(NamedTuple):
+    """Memory of kernels, which allocate none: PH (6,); G (3, 4), as in `step_jacobian`; T (3, 6)."""
+
+    PH: Floats
+    G: Floats
+    T: Floats
+
+    @classmethod
+    def empty(cls) -> Space:
+        """Return new memory."""
+        return cls(np.empty(6), np.empty((3, 4)), np.empty((3, 6)))
+
+
+class Nodes(NamedTuple):
+    """Times of events in order, for the smoother; (m, ...) each.
+
+    Attributes
+    ----------
+    x_predicted, x : (m, 6) before and after the updates; P_predicted, P : (m, 6, 6) likewise
+    G : (m, 3, 4) of `step_jacobian` for the step from the node before; 0 where the pose is not dead-reckoned
+    row : int64 (m,), wheel sample recorded here, -1 where none is
+    """
+
+    x_predicted: Floats
+    P_predicted: Floats
+    x: Floats
+    P: Floats
+    G: Floats
+    row: Ints
+
+    @classmethod
+    def empty(cls, count: int) -> Nodes:
+        """Return so many nodes, to be filled."""
+        x, P, G = (count, 6), (count, 6, 6), (count, 3, 4)
+        return cls(np.empty(x), np.empty(P), np.empty(x), np.empty(P), np.zeros(G), np.empty(count, np.int64))

@@ -195,3 +195,25 @@ def model_states(
     moved = dt * (v_x + 1j * v_y) * np.exp(1j * psi[:-1])
     place = np.cumsum(np.vstack([x0[:2], np.column_stack([moved.real, moved.imag]) + steps[:, :2]]), axis=0)
     return np.column_stack([place, psi, icrs])
+
+
+def chord_rows(north: Floats, east: Floats, step_m: float) -> Ints:
+    """Return the first row (c,) and each that is the first at least a step away from the one before it.
+
+    Parameters
+    ----------
+    north, east : (n,) [m], at least one
+    """
+    rows = np.zeros(len(north), np.int64)
+    return rows[: _fill(north, east, step_m, rows)]
+
+
+@njit
+def _fill(north: Floats, east: Floats, step_m: float, rows: Ints) -> int:
+    count = 1
+    for k in range(1, len(north)):
+        a, b = north[k] - north[rows[count - 1]], east[k] - east[rows[count - 1]]
+        if a * a + b * b >= step_m * step_m:
+            rows[count] = k
+            count += 1
+    return count

@@ -1,4 +1,4 @@
-"""Wheels and reference of one drive along time, and windows of driven distance cut from them."""
+"""Wheels and reference of one drive along time; windows of driven distance, and open-loop trials, cut from it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.kernels.equal_steps import ROWS_AT_ONCE, rows_at_steps
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Complexes, Floats, Ints, rows_at_steps
 
 Rate = TypeVar("Rate", Floats, Complexes)
 
@@ -239,3 +238,51 @@ def ends_finder(track: Track) -> Callable[[Floats, Ints], Ints]:
 def _before(flags: Bools, rows: Ints) -> Ints:
     """Return how many of the flags (m,) are set before each row."""
     return np.searchsorted(np.flatnonzero(flags), rows)
+
+
+class FrozenIcrs(NamedTuple):
+    """The ICRs a trial from state k drives with. Each of shape (n,), or (1,) for one triple from every start.
+
+    Attributes
+    ----------
+    y_icr_right, y_icr_left, x_icr : float64 [m], body frame
+    """
+
+    y_icr_right: Floats
+    y_icr_left: Floats
+    x_icr: Floats
+
+    @classmethod
+    def constant(cls, y_icr_right: float, y_icr_left: float, x_icr: float) -> FrozenIcrs:
+        """Return one triple [m] for every start: no-slip is ``(b/2, -b/2, 0)``."""
+        return cls(np.array([y_icr_right]), np.array([y_icr_left]), np.array([x_icr]))
+
+
+class OpenLoopPath(NamedTuple):
+    """An open-loop path from a start state to an end state, both included; float64 (m,) [m, m, rad]."""
+
+    north: Floats
+    east: Floats
+    heading: Floats
+
+
+class TrialCounts(NamedTuple):
+    """How many starts were a trial, and why the others were none; int64 (n_horizons,) each."""
+
+    trials: Ints
+    short: Ints
+    gap: Ints
+    outage: Ints
+    standing: Ints
+    crosses_jump: Ints
+
+
+def trial_ends(track: Track, horizons_m: Floats, lo: int = 0, hi: int | None = None) -> Ints:
+    """Return `ends_from` of all starts in [lo, hi), by default of all states."""
+    return ends_from(track, horizons_m, np.arange(lo, len(track.distance) if hi is None else hi))
+
+
+def count_trials(ends: Ints) -> TrialCounts:
+    """Count trials and the kinds of no trial per horizon in `ends` (n_starts, n_horizons)."""
+    kinds = [(ends == kind).sum(axis=0, dtype=np.int64) for kind in (SHORT, GAP, OUTAGE, STANDING, JUMP)]
+    return TrialCounts(len(ends) - np.sum(kinds, axis=0), *kinds)

@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.equal_steps import ROWS_AT_ONCE
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats, Ints
 from icrtool.kernels.track import Track
 
 VX, VY, OMEGA = 0, 1, 2

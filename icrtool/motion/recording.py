@@ -289,7 +289,7 @@ def predicted_path(
     Parameters
     ----------
     own : constants of the recording
-    steps : the wheel samples joined; default single samples, Euler steps as in `icrtool.kernels.open_loop.direct`
+    steps : the wheel samples joined; default single samples, Euler steps as in `icrtool.kernels.open_loop`
 
     Notes
     -----

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.arrays import Floats, Ints, rows_at_steps
 from icrtool.kernels.robust import huber_weights, mad_std, robust_least_squares
 from icrtool.kernels.track import Track
 

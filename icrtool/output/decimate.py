@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.equal_steps import ROWS_AT_ONCE
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Ints
 
 LINE_POINTS = 2400
 """Points of a drawn line: some three per pixel column of every figure."""

@@ -14,9 +14,8 @@ from icrtool import __version__
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.kernels.arrays import Ints
-from icrtool.kernels.open_loop.block_sums import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
-from icrtool.kernels.open_loop.prefix_sums import TOLERANCE_M
-from icrtool.kernels.open_loop.trials import Summary
+from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS, Summary
+from icrtool.kernels.open_loop import TOLERANCE_M
 from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, schema_of
 from icrtool.output.files.own_files import files_in

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.open_loop.block_sums import BlockSums
-from icrtool.kernels.open_loop.trials import Histogram, Intervals, OpenLoopPath, Summary
+from icrtool.kernels.error_statistics import BlockSums, Histogram, Intervals, Summary
+from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.calibration_document import CalibrationDocument
 from icrtool.records.plain_data import Record
 

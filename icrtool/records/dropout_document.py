@@ -61,7 +61,7 @@ class SummaryRow(ErrorRow, frozen=True):
 
 
 class BlocksDocument(Record, frozen=True):
-    """Sums over blocks of path, as `icrtool.kernels.open_loop.block_sums.BlockSums`, for later comparisons."""
+    """Sums over blocks of path, as `icrtool.kernels.error_statistics.BlockSums`, for later comparisons."""
 
     horizon_m: float
     trials: list[Count]

@@ -19,7 +19,8 @@ from icrtool.calibration.run_recording import recording_of, turning_recording_of
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
-from icrtool.kernels.open_loop.direct import open_loop_path, trial_ends
+from icrtool.kernels.open_loop import open_loop_path
+from icrtool.kernels.track import trial_ends
 from icrtool.motion.fit import own_constants
 from icrtool.motion.models import controller_model
 from icrtool.motion.recording import Trials, cut_windows, predicted_path

@@ -5,11 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from icrtool.kernels.open_loop import prefix_sums as open_loop_fast
-from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
-from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import FrozenIcrs
-from icrtool.kernels.track import Track
+from icrtool.kernels import open_loop
+from icrtool.kernels.open_loop import open_loop_errors, open_loop_errors_direct
+from icrtool.kernels.track import FrozenIcrs, Track, trial_ends
 
 EQUAL_M = 1e-9  # what the fast algorithm promises; moving the world by 1e5 m rounds positions to 1.5e-11 m
 HORIZONS = np.array([0.3, 1.0, 2.5, 6.0])
@@ -73,7 +71,7 @@ def test_fast_equals_direct_integration(drive_and_icrs, block):
     drive, icrs = drive_and_icrs
     ends = trial_ends(drive, HORIZONS)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(open_loop_fast, "BLOCK", block)
+        patch.setattr(open_loop, "BLOCK", block)
         errors = open_loop_errors(drive, icrs, ends)
     assert_equal(errors, open_loop_errors_direct(drive, icrs, ends))
     assert np.array_equal(np.isfinite(errors), ends >= 0)

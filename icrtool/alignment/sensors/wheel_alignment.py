@@ -17,8 +17,7 @@ from icrtool.alignment.log_track import DriveWindows
 from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats
-from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.arrays import Floats, rows_at_steps
 from icrtool.motion.turns import Turns, compare_turns
 from icrtool.records.measurements import WheelFacts
 from icrtool.records.plain_data import known

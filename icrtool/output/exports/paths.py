@@ -16,7 +16,7 @@ import numpy as np
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.open_loop.trials import FrozenIcrs
+from icrtool.kernels.track import FrozenIcrs
 from icrtool.output.decimate import places
 from icrtool.records.run import Run, no_slip_icrs
 from icrtool.records.tables import Icrs, States

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.patches import Circle
 
 from icrtool.calibration.forecast import Forecast
-from icrtool.kernels.within_budget import within_budget
+from icrtool.kernels.error_statistics import within_budget
 from icrtool.output.figures.style import CHANGE, FILTER, HALF_WIDTH, ICR, MEAN, new_figure, styled
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.block_sums import difference_half_width
+from icrtool.kernels.error_statistics import difference_half_width
 from icrtool.output.text_blocks import VERBOSE, Block, Cell, Figure, Items, Section, Table
 from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text
 from icrtool.records.dropout import CHOICE_HORIZON_M

@@ -10,7 +10,7 @@ from icrtool import __version__
 from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.within_budget import within_budget
+from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS
 from icrtool.output.text_blocks import Block, Table, Text, printed
 from icrtool.output.text_format import distance_text, fitted_model_text

@@ -16,7 +16,7 @@ from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
 from icrtool.estimation.measured_heading import measured_headings
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.trials import FrozenIcrs
+from icrtool.kernels.track import FrozenIcrs
 from icrtool.motion.recording import cut_trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.run import Run, track_of

@@ -18,7 +18,7 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import ConfigError
-from icrtool.kernels.within_budget import never_falling, within_budget
+from icrtool.kernels.error_statistics import never_falling, within_budget
 from icrtool.records.run import Run
 from support.documents import with_summary
 

@@ -18,8 +18,14 @@ from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.errors import ConfigError, IcrToolError
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import runs_of_fleet
-from icrtool.kernels.open_loop.block_sums import BlockSums, block_sums, difference_half_width
-from icrtool.kernels.open_loop.error_statistics import cut_blocks, error_summary, sort_trials
+from icrtool.kernels.error_statistics import (
+    BlockSums,
+    block_sums,
+    cut_blocks,
+    difference_half_width,
+    error_summary,
+    sort_trials,
+)
 from icrtool.output.files.baseline_file import open_baseline, read_report
 from icrtool.output.files.formats import json_bytes
 from icrtool.records.dropout_document import EarlierInput

@@ -20,7 +20,7 @@ from icrtool.dropout_analysis import trials
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import ConfigError
-from icrtool.kernels.open_loop.error_statistics import error_summary
+from icrtool.kernels.error_statistics import error_summary
 from icrtool.motion.recording import cut_trials
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.dropout import format_dropout

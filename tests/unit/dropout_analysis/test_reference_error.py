@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.dropout_analysis.trials import Model, dropout
-from icrtool.kernels.open_loop.trials import FrozenIcrs
+from icrtool.kernels.track import FrozenIcrs
 from icrtool.records.run import Run
 from support.barn import ICRS_M, RATE_HZ
 from support.documents import with_summary

@@ -15,8 +15,7 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.open_loop.direct import trial_ends
-from icrtool.kernels.track import JUMP
+from icrtool.kernels.track import JUMP, trial_ends
 from icrtool.motion.recording import cut_trials, cut_windows
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.stored_run import open_run

@@ -9,8 +9,8 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis.trials import dropout, models_of
-from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
-from icrtool.kernels.track import SHORT
+from icrtool.kernels.open_loop import open_loop_errors_direct
+from icrtool.kernels.track import SHORT, trial_ends
 from icrtool.records.run import track_of
 
 LOGS = {

@@ -16,8 +16,8 @@ from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.starts import first_learned
 from icrtool.dropout_analysis.trials import Model, dropout, models_of
 from icrtool.errors import ConfigError, DataError
-from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
-from icrtool.kernels.open_loop.trials import FrozenIcrs
+from icrtool.kernels.open_loop import open_loop_errors_direct
+from icrtool.kernels.track import FrozenIcrs, trial_ends
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 from support.contract import SUMMARY_COLUMNS
 from support.documents import with_summary
@@ -265,7 +265,7 @@ def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
 def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:
     code = (
         "from icrtool.dropout_analysis.trials import load_kernels; load_kernels()\n"
-        "from icrtool.kernels.open_loop import prefix_sums as fast\n"
+        "from icrtool.kernels import open_loop as fast\n"
         "kernels = [fast.sum_moments, fast.fill_errors]\n"
         "print([kernel.__name__ for kernel in kernels if len(kernel.signatures) != 1])"
     )

@@ -11,7 +11,7 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.estimation.fit import fit
-from icrtool.kernels.open_loop.direct import trial_ends
+from icrtool.kernels.track import trial_ends
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.records.measurements import SlipEvent

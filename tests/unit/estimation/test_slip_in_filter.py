@@ -13,9 +13,8 @@ from icrtool.calibration.run_recording import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
 from icrtool.estimation.fit import fit
-from icrtool.kernels.ekf import run_ekf
+from icrtool.kernels.ekf import run_ekf, run_smoother
 from icrtool.kernels.filter_records import GATED, FilterInputs
-from icrtool.kernels.smoother import run_smoother
 from icrtool.motion.recording import cut_windows
 from icrtool.records.measurements import SensorData, SlipEvent
 from icrtool.records.tables import RobotLog

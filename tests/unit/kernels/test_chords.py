@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.kernels.chords import chord_rows
+from icrtool.kernels.kinematics import chord_rows
 
 
 @pytest.mark.parametrize("step", [0.0, 0.1, 0.5, 100.0])

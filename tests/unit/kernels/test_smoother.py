@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from icrtool.kernels import ekf, kalman
-from icrtool.kernels.ekf import FilterState, Nodes, filter_rows, run_ekf, wrap
-from icrtool.kernels.filter_records import REFERENCE_STEP_S, FilterInputs, FilterOutput, FilterParameters
-from icrtool.kernels.smoother import run_smoother
+from icrtool.kernels.ekf import filter_rows, run_ekf, run_smoother, wrap
+from icrtool.kernels.filter_records import (
+    REFERENCE_STEP_S,
+    FilterInputs,
+    FilterOutput,
+    FilterParameters,
+    FilterState,
+    Nodes,
+)
 from support.matrix_filter import state_jacobian
 
 BATCH_TOLERANCE = 1e-7

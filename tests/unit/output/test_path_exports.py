@@ -19,7 +19,8 @@ from numpy.testing import assert_allclose
 from icrtool.dropout_analysis.trials import models_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels
-from icrtool.kernels.open_loop.direct import open_loop_errors_direct, trial_ends
+from icrtool.kernels.open_loop import open_loop_errors_direct
+from icrtool.kernels.track import trial_ends
 from icrtool.output.exports.foxglove import BODIES, ERROR_HORIZON_M, WORLD, write_foxglove
 from icrtool.output.exports.foxglove_layout import foxglove_layout
 from icrtool.output.exports.geojson import format_geojson

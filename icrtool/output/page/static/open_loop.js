@@ -1,5 +1,5 @@
 "use strict";
-// Open-loop paths: what icrtool/kernels/open_loop/direct.py and icrtool/motion/trials.py compute, from the same wheel samples.
+// Open-loop paths: what icrtool/kernels/open_loop.py and icrtool/motion/trials.py compute, from the same wheel samples.
 const icrtoolOpenLoop = (() => {
   const { firstAtLeast } = icrtoolColumns;
   const LEAST_SEPARATION_M = 1e-6;

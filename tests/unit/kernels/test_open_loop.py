@@ -6,17 +6,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from icrtool.kernels.open_loop import direct as open_loop
-from icrtool.kernels.open_loop import prefix_sums as open_loop_fast
-from icrtool.kernels.open_loop.direct import (
-    count_trials,
-    open_loop_errors_direct,
-    open_loop_path,
-    trial_ends,
-)
-from icrtool.kernels.open_loop.prefix_sums import open_loop_errors
-from icrtool.kernels.open_loop.trials import FrozenIcrs
-from icrtool.kernels.track import GAP, OUTAGE, SHORT, Track
+from icrtool.kernels import open_loop
+from icrtool.kernels.open_loop import open_loop_errors, open_loop_errors_direct, open_loop_path
+from icrtool.kernels.track import GAP, OUTAGE, SHORT, FrozenIcrs, Track, count_trials, trial_ends
 
 EQUAL_M = 1e-9  # what the fast algorithm promises against the direct integration
 ROUNDING = 1e-12  # two orders of the same few hundred additions of metres and radians
@@ -182,8 +174,8 @@ def test_fast_equals_direct_over_many_blocks_tiles_and_ranges(monkeypatch, seed)
     ends = trial_ends(drive, HORIZONS)
     direct = open_loop_errors_direct(drive, icrs, ends)
     np.testing.assert_allclose(open_loop_errors(drive, icrs, ends), direct, rtol=0.0, atol=EQUAL_M)
-    monkeypatch.setattr(open_loop_fast, "BLOCK", 100)
-    monkeypatch.setattr(open_loop_fast, "CONSTANT_BLOCK", 300)
+    monkeypatch.setattr(open_loop, "BLOCK", 100)
+    monkeypatch.setattr(open_loop, "CONSTANT_BLOCK", 300)
     np.testing.assert_allclose(open_loop_errors(drive, icrs, ends), direct, rtol=0.0, atol=EQUAL_M)
     fast, slow = open_loop_errors(drive, NO_SLIP, ends), open_loop_errors_direct(drive, NO_SLIP, ends)
     np.testing.assert_allclose(fast, slow, rtol=0.0, atol=EQUAL_M)
@@ -199,8 +191,8 @@ def test_icrs_too_wild_for_moments_are_integrated_directly(monkeypatch):
     wild = FrozenIcrs(icrs.y_icr_right, icrs.y_icr_right - rng.choice([1e-9, 0.05, 3.0], 900), icrs.x_icr)
     ends = trial_ends(drive, HORIZONS)
     rows = []
-    integrate = open_loop_fast.integrate_trials
-    monkeypatch.setattr(open_loop_fast, "integrate_trials", lambda *args: (rows.append(args[4:6]), integrate(*args)))
+    integrate = open_loop.integrate_trials
+    monkeypatch.setattr(open_loop, "integrate_trials", lambda *args: (rows.append(args[4:6]), integrate(*args)))
     fast, direct = open_loop_errors(drive, wild, ends), open_loop_errors_direct(drive, wild, ends)
     assert rows
     assert np.isfinite(fast[ends >= 0]).all()
@@ -280,5 +272,5 @@ class TestKernelsAgainstTheirPythonFunction:
         ends = trial_ends(drive, HORIZONS)
         compiled = open_loop_errors(drive, icrs, ends)
         for name in ("sum_moments", "fill_errors"):
-            monkeypatch.setattr(open_loop_fast, name, getattr(open_loop_fast, name).py_func)
+            monkeypatch.setattr(open_loop, name, getattr(open_loop, name).py_func)
         np.testing.assert_allclose(open_loop_errors(drive, icrs, ends), compiled, rtol=0.0, atol=ROUNDING)

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from scipy.special import stdtrit
 
-from icrtool.kernels.open_loop.block_sums import block_sums, error_intervals, student_factor
-from icrtool.kernels.open_loop.error_statistics import (
+from icrtool.kernels.error_statistics import (
+    block_sums,
     cut_blocks,
+    error_intervals,
     error_summary,
     histogram_sorted,
     round_bin_width,
     sort_trials,
+    student_factor,
     summary_of_sorted,
 )
 

@@ -1,16 +1,56 @@
-"""Sums of trials over blocks of path, and the confidence intervals that follow from them.
+"""Statistics of open-loop errors: percentiles and mean per horizon, their confidence intervals, histograms, budgets.
 
-No compiled kernel is here: a process that only reads or draws these records need not load numba.
+Errors are float64 (n_starts, n_horizons) [m] with NaN where there was no trial, as `icrtool.kernels.open_loop` makes
+them. Trials from neighbouring starts share most of their path and are not independent: intervals come from blocks of
+path, not from trials. No kernel is here: who only reads or draws the records need not load numba.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints, rows_of_cells
+
+
+class Summary(NamedTuple):
+    """Errors of one model, per horizon; (n_horizons,) each, NaN where there was no trial.
+
+    Attributes
+    ----------
+    trials : int64
+    expected, p50, p95, largest : float64 [m]; the expected error is the mean
+    """
+
+    trials: Ints
+    expected: Floats
+    p50: Floats
+    p95: Floats
+    largest: Floats
+
+
+class Intervals(NamedTuple):
+    """Confidence intervals of the expected error and of p95, per horizon; float64 (n_horizons,) [m] each.
+
+    NaN where the path with trials is shorter than `FEWEST_BLOCKS` times two horizons.
+    """
+
+    expected_low: Floats
+    expected_high: Floats
+    p95_low: Floats
+    p95_high: Floats
+
+
+class Histogram(NamedTuple):
+    """Share of trials by error: float64 (n_bins,) each, bins ``[left, right)`` [m] from zero on, percent of all."""
+
+    left: Floats
+    right: Floats
+    percent: Floats
+
 
 SHARES = {"p50": 0.5, "p95": 0.95}
 
@@ -179,7 +219,7 @@ def block_sums(
     Parameters
     ----------
     errors_m : (n,) [m], NaN where there was no trial
-    blocks : of `icrtool.kernels.open_loop.error_statistics.cut_blocks`
+    blocks : of `cut_blocks`
     ordered : errors of the trials in ascending order
     p50_m, p95_m : percentiles of all
 
@@ -215,3 +255,129 @@ def quantile(ordered: Floats, share: float) -> float:
     below = math.floor(rank)
     low, high = ordered[below], ordered[min(below + 1, len(ordered) - 1)]
     return float(low + (high - low) * (rank - below))
+
+
+TAIL = 0.05
+"""Share of trials above the 95th percentile."""
+BLOCK_PARTS = 4
+"""Blocks begin at every quarter of a horizon."""
+BINS = 50
+"""Of a histogram, up to its largest error or less."""
+
+
+def error_summary(errors_m: Floats) -> Summary:
+    """Summarise the trials of every horizon; `errors_m` is (n_starts, n_horizons).
+
+    Notes
+    -----
+    Section 6.4. The paper's expected error weighs a histogram, which is the mean once bins are narrow. Percentiles
+    interpolate linearly between order statistics, as ``numpy.percentile`` does.
+    """
+    # One at a time: a column of a long log is large.
+    columns = [summary_of_sorted([sort_trials(column)]) for column in errors_m.T]
+    return Summary(*(np.concatenate(numbers) for numbers in zip(*columns, strict=True)))
+
+
+def sort_trials(errors_m: Floats) -> Floats:
+    """Return the errors of one horizon's trials in ascending order, without the NaN of those that were none."""
+    ordered = np.sort(errors_m)  # NaN last
+    return ordered[: np.searchsorted(ordered, np.inf, side="right")]
+
+
+def summary_of_sorted(ordered: Sequence[Floats]) -> Summary:
+    """Summarise trials as `error_summary` does; `ordered` has the result of `sort_trials` for each horizon."""
+    table = np.full((4, len(ordered)), np.nan)
+    for h, errors in enumerate(ordered):
+        if len(errors):
+            table[:, h] = errors.mean(), quantile(errors, 0.5), quantile(errors, 1.0 - TAIL), errors[-1]
+    return Summary(np.array([len(errors) for errors in ordered], np.int64), *table)
+
+
+def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
+    """Cut the path of one horizon's trials into blocks of equal length, so many horizons at least.
+
+    Parameters
+    ----------
+    tried : (n,) whether there is a trial from a start
+    path_m : (n,) [m], path length at each start, non-decreasing
+
+    Returns
+    -------
+    None where there are fewer than `FEWEST_BLOCKS`. Path without trials is left out.
+    """
+    if not (count := int(np.count_nonzero(tried))):
+        return None
+    begin, end = int(np.argmax(tried)), len(tried) - int(np.argmax(tried[::-1]))
+    # the usual case is one stretch, and a slice copies nothing
+    rows = slice(begin, end) if end - begin == count else tried
+    path = path_m[rows]
+    first = rows_of_cells(path, lambda part: np.floor((part - path[0]) * (BLOCK_PARTS / horizon_m)))
+    if len(first) < FEWEST_BLOCKS * HORIZONS_A_BLOCK * BLOCK_PARTS:
+        return None
+    count = min(MOST_BLOCKS, len(first) // (BLOCK_PARTS * HORIZONS_A_BLOCK))
+    return Blocks(rows, first[-(-np.arange(count) * len(first) // count)])
+
+
+def round_bin_width(largest_m: float) -> float:
+    """Return the smallest of 1, 2, 5 times a power of ten [m] with which `BINS` bins reach `largest_m`."""
+    if not largest_m > 0.0:
+        return 0.01
+    least = largest_m / BINS
+    power = 10.0 ** math.floor(math.log10(least))
+    return next((factor * power for factor in (1.0, 2.0, 5.0) if factor * power >= least), 10.0 * power)
+
+
+def histogram_sorted(ordered: Floats, bin_width_m: float) -> Histogram:
+    """Count the trials of one horizon in bins of `bin_width_m` from zero to the largest error (Figs. 28-30).
+
+    Parameters
+    ----------
+    ordered : of `sort_trials` [m]
+    bin_width_m : [m], see `round_bin_width`
+    """
+    if not len(ordered):
+        return Histogram(*np.empty((3, 0)))
+    edges = bin_width_m * np.arange(int(ordered[-1] / bin_width_m) + 3, dtype=np.float64)
+    edges = edges[: np.searchsorted(edges, ordered[-1], side="right") + 1]
+    counts = np.diff(np.searchsorted(ordered, edges))
+    return Histogram(edges[:-1], edges[1:], 100.0 * counts / len(ordered))
+
+
+def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool, tuple[float, float]] | None:
+    """Return how far an error (h,) [m] stays within a budget, over the distance (h,) [m] and from 0 m at 0 m on.
+
+    Returns
+    -------
+    The interpolated distance, whether the error is within the budget at the last one, and the distances interpolated
+    between; None without errors.
+
+    Notes
+    -----
+    Errors at few trials may fall with the distance; here they are those that never fall and are nearest to the given
+    ones (isotonic regression, Barlow et al. 1972: the largest over beginnings of the smallest mean over ends).
+    """
+    known = np.isfinite(p95_m)
+    if not known.any():
+        return None
+    distance = np.concatenate([[0.0], horizons_m[known]])
+    p95 = np.concatenate([[0.0], never_falling(p95_m[known])])
+    over = np.flatnonzero(p95 > budget_m)
+    if not len(over):
+        return float(distance[-1]), True, (float(distance[-1]), float(distance[-1]))
+    i = int(over[0])
+    share = (budget_m - p95[i - 1]) / (p95[i] - p95[i - 1])
+    low, high = float(distance[i - 1]), float(distance[i])
+    return low + float(share) * (high - low), False, (low, high)
+
+
+def never_falling(values: Floats) -> Floats:
+    """Return the values (n,) that never fall and are nearest to given ones by least squares."""
+    sums, n = np.concatenate([[0.0], np.cumsum(values)]), len(values)
+    first, last = np.arange(n)[:, None], np.arange(n)
+    length = last - first + 1
+    means = np.where(length > 0, (sums[1:] - sums[:-1, None]) / np.maximum(length, 1), np.inf)
+    # the smallest mean of a stretch from each first value to each last one or further
+    least = np.minimum.accumulate(means[:, ::-1], axis=1)[:, ::-1]
+    least[length <= 0] = -np.inf
+    found: Floats = least.max(axis=0)
+    return found

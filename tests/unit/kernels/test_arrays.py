@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from icrtool.kernels.equal_steps import rows_at_steps
+from icrtool.kernels.arrays import rows_at_steps
 
 
 @pytest.mark.parametrize("seed", range(20))

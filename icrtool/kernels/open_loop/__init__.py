@@ -1,1 +1,0 @@
-"""Open-loop trials and the statistics of their errors."""
