@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from icrtool.errors import ConfigError
-from icrtool.estimation.measured_heading import measured_headings
+from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.motion.models import Lever
 from icrtool.motion.recording import Recording

@@ -65,7 +65,7 @@ def call_all_kernels() -> None:
 
     import icrtool
     from icrtool.cli.simulate import needed
-    from icrtool.estimation.smooth import smooth
+    from icrtool.estimation.run_filter import smooth
     from icrtool.kernels.open_loop import open_loop_errors_direct
     from icrtool.kernels.track import FrozenIcrs, trial_ends
     from icrtool.logs.writing.log import WriteOptions, write_log

@@ -22,7 +22,7 @@ from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.dropout_analysis.starts import Starts
 from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
-from icrtool.estimation.measured_heading import measured_headings
+from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.track import TrialCounts
 from icrtool.records.dropout import DEFAULT_SEED, CheckedGate, EventCost, Gate, Outage, UsedCalibration
 from icrtool.records.process_resources import give_back_freed

@@ -12,8 +12,15 @@ import numpy as np
 from icrtool import __version__
 from icrtool.alignment.sensors.gnss_quality import CLASSES
 from icrtool.config import Config
-from icrtool.estimation.icr_uncertainty import cut_states, final_covariance, multiplier_std
-from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs, withhold_unlearned
+from icrtool.estimation.observability import (
+    Excitation,
+    cut_states,
+    final_covariance,
+    find_excitation,
+    multiplier_std,
+    nominal_icrs,
+    withhold_unlearned,
+)
 from icrtool.estimation.odometry import drive_summary, odometry_end_error
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import (

@@ -14,7 +14,7 @@ from icrtool.calibration.run_recording import recording_of
 from icrtool.config import parse_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
-from icrtool.estimation.measured_heading import measured_headings
+from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import FrozenIcrs
 from icrtool.motion.recording import cut_trials

@@ -10,7 +10,7 @@ import pytest
 
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
-from icrtool.estimation.icr_uncertainty import multiplier_std
+from icrtool.estimation.observability import multiplier_std
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import RobotLog
 from support.drives import ICRS, make_log

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from icrtool.estimation.fit import fit
-from icrtool.estimation.icr_uncertainty import cut_states
-from icrtool.estimation.observability import Excitation, find_excitation, nominal_icrs
+from icrtool.estimation.observability import Excitation, cut_states, find_excitation, nominal_icrs
 from icrtool.records.run import Run, track_of
 from support.exact_drives import CONFIG, simulate
 

@@ -7,7 +7,7 @@ import pytest
 
 from icrtool.config import parse_config
 from icrtool.estimation.fit import fit
-from icrtool.estimation.smooth import smooth
+from icrtool.estimation.run_filter import smooth
 from icrtool.records.run import Run
 from icrtool.records.tables import States
 from support.drives import ICRS, make_log
