@@ -112,7 +112,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     log = RobotLog(
         name, wheels, gnss, heading, datum,
         tuple(
-            _stream(role, one, samples[role].stamp_ns, clock, choice.why[role] + details[role])
+            _stream(role, one, samples[role].stamp_ns, clock, one.why + details[role])
             for role, one in chosen.items()
         ),
         survey.inputs, dict(position.rejected), tuple(warnings), antenna,
@@ -132,7 +132,7 @@ def _other_receivers(
     return tuple(
         OtherReceiver(source.topic, _fixes(source, config, clock, name, datum)[0])
         for source in found.gnss
-        if source is not chosen and source.geodetic is not None and source.usable.any() and not source.problem
+        if source.topic != chosen.topic and source.geodetic is not None and source.usable.any() and not source.problem
     )
 
 

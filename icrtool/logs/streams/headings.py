@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.messages.decoded_values import HDT
 from icrtool.logs.messages.topic_table import FRAME, TopicTable
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
@@ -351,36 +351,30 @@ def find_gyro(
     """
     home = wheels_topic.strip("/").split("/")[0]
     found = []
-    for table, (rate,), sound in _units(tables, GYRO_AXES[2:]):
-        near = table.topic == heading_topic, table.topic.strip("/").split("/")[0] == home, len(rate)
-        found.append((near, table.topic, rate, sound, table))
-    if not found:
-        return None
-    _, topic, rate, sound, table = max(found, key=lambda one: one[:2])
-    stamps = (known.get(topic) or stamp_rows(table)).on(clock)
-    rows = usable_rows(stamps, sound)
-    sign = 1.0 if frame_convention(table)[0] == "ned" else -1.0
-    return GyroSamples(topic, stamps[rows], sign * rate[rows])
+    for table, stamps, (rate,) in _units(tables, GYRO_AXES[2:], clock, known):
+        near = table.topic == heading_topic, table.topic.strip("/").split("/")[0] == home, len(table)
+        found.append((near, table.topic, stamps, rate if frame_convention(table)[0] == "ned" else -rate))
+    return GyroSamples(*max(found, key=lambda one: one[:2])[1:]) if found else None
 
 
 def find_gyros(
     tables: Sequence[TopicTable], clock: Literal["header", "log"], known: Mapping[str, StampedRows] = NOTHING_KNOWN
 ) -> tuple[GyroAxes, ...]:
     """Return the turn rates of every inertial unit, about all three axes; parameters as of `find_gyro`."""
-    found = []
-    for table, axes, sound in _units(tables, GYRO_AXES):
-        stamps = (known.get(table.topic) or stamp_rows(table)).on(clock)
-        rows = usable_rows(stamps, sound)
-        found.append(GyroAxes(table.topic, stamps[rows], np.array([rates[rows] for rates in axes]).T))
-    return tuple(found)
+    units = _units(tables, GYRO_AXES, clock, known)
+    return tuple(GyroAxes(table.topic, stamps, np.array(rates).T) for table, stamps, rates in units)
 
 
-def _units(tables: Sequence[TopicTable], axes: Sequence[str]) -> Iterator[tuple[TopicTable, list[Floats], Bools]]:
-    """Yield the inertial units that measure about some axes, with the rates (n,) about each, and which are sound."""
+def _units(
+    tables: Sequence[TopicTable], axes: Sequence[str], clock: Literal["header", "log"], known: Mapping[str, StampedRows]
+) -> Iterator[tuple[TopicTable, Ints, list[Floats]]]:
+    """Yield the inertial units that measure about some axes, with the stamps (n,) and the sound rates about each."""
     for table in tables:
         if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in axes):
             continue
         rates = [table.floats(axis) for axis in axes]
         sound: Bools = np.logical_and.reduce([np.abs(one) <= FASTEST_RADPS for one in rates])
         if np.count_nonzero(~sound) <= MOST_BAD * len(sound) and any(np.ptp(one[sound]) for one in rates):
-            yield table, rates, sound
+            stamps = (known.get(table.topic) or stamp_rows(table)).on(clock)
+            rows = usable_rows(stamps, sound)
+            yield table, stamps[rows], [one[rows] for one in rates]

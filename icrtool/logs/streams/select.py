@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeVar, cast
+from typing import TypeVar, cast
 
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
@@ -63,12 +63,11 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The source of each role, and the reason for the choice as text; `heading` is None where no topic holds one."""
+    """The source of each role, with the reason for the choice; `heading` is None where no topic holds one."""
 
     wheels: WheelMotion
     gnss: PositionSource
     heading: HeadingSource | None
-    why: dict[Role, str]
 
 
 def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tuple[str, ...]]:
@@ -197,26 +196,18 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
     """
     topics = config.topics
     _check_sides(topics, found, log, channels)
-    wheels = _best(found.wheels, topics.wheels or _pair_name(topics))
+    pair = f"{topics.wheel_left} + {topics.wheel_right}" if topics.wheel_left is not None else None
+    wheels = _chosen(found.wheels, topics.wheels or pair)
     check_joints(wheels, found.wheels, config)
     for role in found.by_role():
         _check_configured(role, found, getattr(topics, role), log, channels)
-    gnss, heading = _best(found.gnss, topics.gnss), _best(found.heading, topics.heading)
+    gnss, heading = _chosen(found.gnss, topics.gnss), _chosen(found.heading, topics.heading)
     if wheels is None or gnss is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
         missing = [role for role, source in by_role.items() if source is None]
         needs = {ROLE_WORDS[role]: NEEDS[role] for role in missing}
         raise MissingStreamError(log, needs, _listing(channels, found.unread | _refused(found, missing)))
-    return Choice(
-        wheels,
-        gnss,
-        heading,
-        {
-            "wheels": _reason(wheels, found.wheels, topics.wheels or _pair_name(topics)),
-            "gnss": _reason(gnss, found.gnss, topics.gnss),
-            "heading": "" if heading is None else _reason(heading, found.heading, topics.heading),
-        },
-    )
+    return Choice(wheels, gnss, heading)
 
 
 def other_references(found: Candidates, choice: Choice, config: Config) -> tuple[Choice, ...]:
@@ -233,18 +224,13 @@ def other_references(found: Candidates, choice: Choice, config: Config) -> tuple
     for source in found.gnss:
         foreign = _namespace(source.topic) in others - {home} or bool(FUSED_WORDS.search(source.topic))
         same_kind = source.metric is None and choice.gnss.metric is None
-        if source is choice.gnss or source.problem or foreign or same_kind:
+        if source.topic == choice.gnss.topic or source.problem or foreign or same_kind:
             continue
         wanted = {source.topic} if source.metric is not None else {one.topic for one in found.heading} - poses
         heading = next((one for one in found.heading if one.topic in wanted and not one.problem), None)
         if heading is not None:
-            why = choice.why | {"gnss": source.why, "heading": heading.why}
-            choices.append(Choice(choice.wheels, source, heading, why))
+            choices.append(Choice(choice.wheels, source, heading))
     return tuple(choices[:MOST_REFERENCES])
-
-
-def _pair_name(topics: TopicsConfig) -> str | None:
-    return f"{topics.wheel_left} + {topics.wheel_right}" if topics.wheel_left is not None else None
 
 
 def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
@@ -296,16 +282,14 @@ def _type_in(log: str, channels: Sequence[Channel], unread: Mapping[str, str], k
     return types[topic]
 
 
-def _best(sources: Sequence[Kind], configured: str | None) -> Kind | None:
-    usable = (source for source in sources if not source.problem or source.topic == configured)
-    return next(usable, None)
-
-
-def _reason(best: Kind, sources: Sequence[Kind], configured: str | None) -> str:
-    if configured is not None:
-        return f"{best.why}; configured"
+def _chosen(sources: Sequence[Kind], configured: str | None) -> Kind | None:
+    """Return the first source that can be used, with the reason for the choice; None without one."""
+    best = next((source for source in sources if not source.problem or source.topic == configured), None)
+    if best is None:
+        return None
     rest = [source.topic for source in sources if source is not best]
-    return f"{best.why}; chosen over {some_of(rest[:3])}" if rest else best.why
+    over = f"; chosen over {some_of(rest[:3])}" if rest else ""
+    return replace(best, why=best.why + (over if configured is None else "; configured"))
 
 
 def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:
@@ -331,8 +315,7 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
     return ([*ordered[:MOST_LISTED], f"{more} more"] if more > 0 else ordered) or ["no topic at all"]
 
 
-_Key = Literal["left_joints", "right_joints"]
-_KEYS: tuple[_Key, _Key] = ("left_joints", "right_joints")
+JOINT_KEYS = ("left_joints", "right_joints")
 
 
 def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], config: Config) -> None:
@@ -348,19 +331,15 @@ def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], 
     ConfigError
         The first such joint, with those that are listed.
     """
-    if not _keys_given(config):
-        return
     # If the chosen topic lists no joints, none of the others has the configured ones: name the closest one.
     listing = [motion for motion in candidates if motion.joints]
     if chosen is not None and chosen.joints:
         listing = [chosen]
     closest = min(listing, key=lambda motion: len(_unlisted(motion, config)), default=None)
-    unlisted = _unlisted(closest, config) if closest is not None else []
-    if closest is None or not unlisted:
-        return
-    key, name = unlisted[0]
-    why, advice = f"no message of {closest.topic} lists a joint {name}", f"its joints are {some_of(closest.joints)}"
-    raise ConfigError(f"wheels.{key}", why, advice)
+    if closest is not None and (unlisted := _unlisted(closest, config)):
+        key, name = unlisted[0]
+        why, advice = f"no message of {closest.topic} lists a joint {name}", f"its joints are {some_of(closest.joints)}"
+        raise ConfigError(f"wheels.{key}", why, advice)
 
 
 def ignored_joints(chosen: WheelMotion, config: Config) -> list[str]:
@@ -368,12 +347,8 @@ def ignored_joints(chosen: WheelMotion, config: Config) -> list[str]:
     if chosen.joints:
         return []
     why = f"{chosen.topic} ({chosen.message_type}) lists no joints by name"
-    return [f"wheels.{key} is not used: {why}" for key in _keys_given(config)]
+    return [f"wheels.{key} is not used: {why}" for key in JOINT_KEYS if getattr(config.wheels, key)]
 
 
-def _keys_given(config: Config) -> list[_Key]:
-    return [key for key in _KEYS if getattr(config.wheels, key)]
-
-
-def _unlisted(motion: WheelMotion, config: Config) -> list[tuple[_Key, str]]:
-    return [(key, name) for key in _KEYS for name in getattr(config.wheels, key) if name not in motion.joints]
+def _unlisted(motion: WheelMotion, config: Config) -> list[tuple[str, str]]:
+    return [(key, name) for key in JOINT_KEYS for name in getattr(config.wheels, key) if name not in motion.joints]

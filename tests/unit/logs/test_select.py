@@ -115,8 +115,8 @@ def topics_of(choice: Choice) -> tuple[str, str, str]:
 def test_each_role_finds_its_topic() -> None:
     choice = choose([joints(), fix(), imu()])
     assert topics_of(choice) == ("/joint_states", "/gps/fix", "/imu/data")
-    assert choice.why["wheels"] == "wheel joints by name: left left_wheel, right right_wheel"
-    assert "±0.02 m" in choice.why["gnss"]
+    assert choice.wheels.why == "wheel joints by name: left left_wheel, right right_wheel"
+    assert "±0.02 m" in choice.gnss.why
 
 
 def test_joints_go_before_odometry_before_commands_and_the_others_are_named() -> None:
@@ -124,10 +124,10 @@ def test_joints_go_before_odometry_before_commands_and_the_others_are_named() ->
     assert choose([twist(), odometry(), joints(), *rest]).wheels.topic == "/joint_states"
     assert choose([twist(), odometry(), *rest]).wheels.topic == "/odom"
     choice = choose([twist(), odometry(), joints(), *rest])
-    assert choice.why["wheels"].endswith("chosen over /odom, /cmd_vel")
+    assert choice.wheels.why.endswith("chosen over /odom, /cmd_vel")
     commanded = choose([twist(), *rest])
     assert commanded.wheels.topic == "/cmd_vel"
-    assert "(commanded)" in commanded.why["wheels"]
+    assert "(commanded)" in commanded.wheels.why
     assert "not measured" in commanded.wheels.note
 
 
@@ -398,7 +398,7 @@ def test_a_configured_pair_may_mix_types_and_namespaces() -> None:
     tables = [joints(), fix(), imu(), side("/port/motor", "Int16"), side("/starboard/drive/feedback", "Float32")]
     choice = choose(tables, "topics.wheel_left=/port/motor", "topics.wheel_right=/starboard/drive/feedback")
     assert choice.wheels.topic == "/port/motor + /starboard/drive/feedback"
-    assert choice.why["wheels"].endswith("; configured")
+    assert choice.wheels.why.endswith("; configured")
     assert (
         len(find(tables, "topics.wheel_left=/port/motor", "topics.wheel_right=/starboard/drive/feedback").wheels) == 1
     )
@@ -407,7 +407,7 @@ def test_a_configured_pair_may_mix_types_and_namespaces() -> None:
 def test_a_configured_topic_is_used_in_spite_of_a_mere_doubt() -> None:
     choice = choose([joints(), odometry("/odom"), imu()], "topics.gnss=/odom")
     assert choice.gnss.topic == "/odom"
-    assert choice.why["gnss"].endswith("; configured")
+    assert choice.gnss.why.endswith("; configured")
 
 
 # What is read at all
