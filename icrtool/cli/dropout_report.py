@@ -131,7 +131,8 @@ def command(
             click.echo()
         with inputs.each(source) as document:
             reports[str(source)] = report = _report_one(source, places.get(source), request)
-            document["report"] = report_document(report)
+            if as_json:
+                document["report"] = report_document(report)
     if as_json:
         print_json("dropout-report", {"reports": inputs.documents})
     write_exports({str(source): (inputs.errors | reports)[str(source)] for source in sources}, junit, markdown)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from icrtool.cli import options
-from icrtool.cli.inputs import RUNS
+from icrtool.cli.inputs import RUNS, read_calibration
 from icrtool.cli.printing import warn, write_or_print
 
 if TYPE_CHECKING:
@@ -155,21 +155,3 @@ def _calibration(source: Path | None, *, force: bool) -> Calibration:
     if (reasons := unfit_reasons(found)) and not force:
         raise DataError(name, f"not fit for use: {reasons[0]}", f"calibrate with other logs; {ALL_THE_SAME}")
     return found
-
-
-def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:
-    """Return a calibration and its name: of a calibration file, or of a run, which is calibrated."""
-    from icrtool.output.stored_run import newest_run, open_run
-
-    if source is not None and source.is_file():
-        from icrtool.output.files.documents import open_calibration
-
-        return source.name, open_calibration(source)
-    from icrtool.calibration.pooled import calibrate
-    from icrtool.errors import DataError
-
-    run = open_run(source or newest_run(RUNS))
-    if not (run.usable or force):
-        why = f"its ICRs are not usable: {run.document.unusable_because}"
-        raise DataError(run.name, why, f"drive again, with turns to both sides{advice}")
-    return run.name, calibrate(run, allow_unusable=force)

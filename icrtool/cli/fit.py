@@ -66,14 +66,8 @@ def command(
             place = escaped(str(directory))
             document |= {"directory": place, "run": run.summary}
             if not (quiet or as_json):
-                again = [
-                    "icrtool",
-                    "info",
-                    escaped(str(log)),
-                    "-v",
-                    *options.given(config_file, robot, sets, start, end),
-                ]
-                _print(run, place, shlex.join(again), verbose=verbose)
+                given = options.given(config_file, robot, sets, start, end)
+                _print(run, place, shlex.join(["icrtool", "info", escaped(str(log)), "-v", *given]), verbose=verbose)
     if as_json:
         print_json("fit", {"logs": inputs.documents})
     inputs.leave("logs")

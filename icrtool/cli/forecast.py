@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options
-from icrtool.cli.export import read_calibration
+from icrtool.cli.inputs import read_calibration
 from icrtool.cli.printing import answer
 
 LARGEST_PLAN_BYTES = 50_000_000

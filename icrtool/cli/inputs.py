@@ -13,6 +13,7 @@ from icrtool.records.text import escaped
 from icrtool.records.urls import UrlPath
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import Calibration
     from icrtool.config import Config
     from icrtool.records.run import Run
 
@@ -106,3 +107,21 @@ def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | No
         )
     folder = parent or RUNS
     return [RunPlace(folder / name, folder) for name in distinct_names(logs)]
+
+
+def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:
+    """Return a calibration and its name: of a calibration file, or of a run, which is calibrated."""
+    from icrtool.output.stored_run import newest_run, open_run
+
+    if source is not None and source.is_file():
+        from icrtool.output.files.documents import open_calibration
+
+        return source.name, open_calibration(source)
+    from icrtool.calibration.pooled import calibrate
+    from icrtool.errors import DataError
+
+    run = open_run(source or newest_run(RUNS))
+    if not (run.usable or force):
+        why = f"its ICRs are not usable: {run.document.unusable_because}"
+        raise DataError(run.name, why, f"drive again, with turns to both sides{advice}")
+    return run.name, calibrate(run, allow_unusable=force)

@@ -29,13 +29,6 @@ from icrtool.simulation.study_records import (
     StudyNumber,
     StudyRequest,
     StudyResult,
-    extreme_medians,
-    mean,
-    median,
-    percent,
-    percent_finite,
-    range_of_means,
-    spread,
 )
 from icrtool.simulation.study_runs import Progress, Scenario, run_scenarios
 
@@ -205,6 +198,26 @@ def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
 
 WINDING = {"path": PathPlan("curved", radius_m=2.0), "duration_s": 200.0}
 NOISES = tuple(round(0.05 * step, 2) for step in range(11))
+ERROR = "error_{icr}_m"
+
+
+def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> Study:
+    """Return the study of an error of the track speeds, on a winding path."""
+    return Study(
+        about=f"ICR error by {word} of the track speeds",
+        figures=figures,
+        varies=f"input {word} [m/s]",
+        varied=sensors_field,
+        request={"runs": 20, "values": NOISES},
+        drive=WINDING,
+        vary=by_preset(lambda base, value: sensing(base, **{sensors_field: value})),
+        measures=(measured.measure_errors,),
+        numbers=(Number("{series}: error of {icr} at {value:g} m/s", ERROR, "spread", "m", paper, largest),),
+        title=f"{{value:g}} m/s of {word} moves y right by {{answer}}",
+        answer=Number("{series}", "error_y_icr_right_m", "median", "m", at=largest),
+    )
+
+
 PATHS = ("circle", "curved", "lawnmower", "spins")
 PATH_TIMES = {"circle": "2.9-12.8 s, driven (Figs. 15, 17)", "": "5-15 s, driven"}
 STARTS = only("proper start", "inverted start")
@@ -212,7 +225,6 @@ START_FATES = {"no guard": "those with y_icr_right > 0 (Fig. 6)", "": "all (Fig.
 CHANGE_TIMES = {"inflated": "0.03-0.17 s (Fig. 9)", "": "100-140 s (Fig. 8)"}
 RADIUS_TIMES = {0.0: "0.1 s (Fig. 10)", 2.0: "1.8 s (Fig. 10)"}
 RTK_ERROR = {0.01: "within 3.8 m for 95 % (RTK, tracked, Fig. 29)"}
-ERROR = "error_{icr}_m"
 
 STUDIES: dict[StudyName, Study] = {
     "convergence": Study(
@@ -221,9 +233,9 @@ STUDIES: dict[StudyName, Study] = {
         request={"presets": ("paper",), "runs": 200, "paths": PATHS},
         vary=by_preset(lambda base, kind: driving(base, kind=kind)),
         measures=(measured.measure_times, measured.measure_errors, trace(end_s=SHOWN_S)),
-        numbers=(Number("{value} ({series}): all three ICRs converged after", "settle_s", spread, "s", PATH_TIMES),),
+        numbers=(Number("{value} ({series}): all three ICRs converged after", "settle_s", "spread", "s", PATH_TIMES),),
         title="Time to settle on a path of kind {value}: {answer}",
-        answer=Number("{series}", "settle_s", median, "s", at=shown_path),
+        answer=Number("{series}", "settle_s", "median", "s", at=shown_path),
     ),
     "initial": Study(
         about="which initial ICRs converge, without and with the sign guard",
@@ -233,11 +245,11 @@ STUDIES: dict[StudyName, Study] = {
         vary=by_start,
         measures=(measured.measure_fate, trace()),
         numbers=(
-            Number("{series}, {value}: converged", "converged", percent, "%", START_FATES, STARTS),
-            Number("{series}, {value}: ends inverted", "inverted", percent, "%", at=STARTS),
+            Number("{series}, {value}: converged", "converged", "percent", "%", START_FATES, STARTS),
+            Number("{series}, {value}: ends inverted", "inverted", "percent", "%", at=STARTS),
         ),
         title="Guarded runs converge: {answer}",
-        answer=Number("{value}", "converged", percent, "%", at=STARTS, series="guard"),
+        answer=Number("{value}", "converged", "percent", "%", at=STARTS, series="guard"),
         summary=lambda found: {fate: float(found[fate].mean()) for fate in FATES},
     ),
     "icr-change": Study(
@@ -249,13 +261,13 @@ STUDIES: dict[StudyName, Study] = {
         vary=by_preset(lambda base, name: replace(base, inflate=name == "inflated"), ("not inflated", "inflated")),
         measures=(measured.measure_changes, trace(), measured.zoom),
         numbers=(
-            Number("{series}, {value}: convergence time (10-90 %)", "change*_rise_*_s", spread, "s", CHANGE_TIMES),
-            Number("{series}, {value}: all three stay within 10 % after", "change*_settle_s", spread, "s"),
-            Number("{series}, {value}: … in so many of the changes", "change*_settle_s", percent_finite, "%"),
-            Number("{series}, {value}: ends inverted", "inverted", percent, "%"),
+            Number("{series}, {value}: convergence time (10-90 %)", "change*_rise_*_s", "spread", "s", CHANGE_TIMES),
+            Number("{series}, {value}: all three stay within 10 % after", "change*_settle_s", "spread", "s"),
+            Number("{series}, {value}: … in so many of the changes", "change*_settle_s", "percent found", "%"),
+            Number("{series}, {value}: ends inverted", "inverted", "percent", "%"),
         ),
         title="Time to follow a change, inflated: {answer}",
-        answer=Number("{series}", "change*_settle_s", median, "s", at=only("inflated")),
+        answer=Number("{series}", "change*_settle_s", "median", "s", at=only("inflated")),
     ),
     "turn-radius": Study(
         about="convergence after a change, by radius of the turn",
@@ -268,46 +280,16 @@ STUDIES: dict[StudyName, Study] = {
         vary=by_preset(on_circle),
         measures=(measured.measure_one_change,),
         numbers=(
-            Number("{series}: radius {value:g} m: an ICR stays within 10 % after, mean", "settle_*_s", mean, "s",
+            Number("{series}: radius {value:g} m: an ICR stays within 10 % after, mean", "settle_*_s", "mean", "s",
                    RADIUS_TIMES, extreme),
-            Number("{series}: radius {value:g} m: all three do", "settle_s", spread, "s", at=extreme),
-            Number("{series}: radius {value:g} m: ends inverted", "inverted", percent, "%", at=extreme),
+            Number("{series}: radius {value:g} m: all three do", "settle_s", "spread", "s", at=extreme),
+            Number("{series}: radius {value:g} m: ends inverted", "inverted", "percent", "%", at=extreme),
         ),
         title="Time to settle at radius {value:g} m: {answer}",
-        answer=Number("{series}", "settle_s", median, "s", at=largest),
+        answer=Number("{series}", "settle_s", "median", "s", at=largest),
     ),
-    "input-noise": Study(
-        about="ICR error by noise of the track speeds",
-        figures="12",
-        varies="input noise [m/s]",
-        varied="input_noise_mps",
-        request={"runs": 20, "values": NOISES},
-        drive=WINDING,
-        vary=by_preset(lambda base, value: sensing(base, input_noise_mps=value)),
-        measures=(measured.measure_errors,),
-        numbers=(
-            Number("{series}: error of {icr} at {value:g} m/s", ERROR, spread, "m", "Fig. 12's axis: -1 to 1 m",
-                   largest),
-        ),
-        title="Noise of {value:g} m/s moves y right by {answer}",
-        answer=Number("{series}", "error_y_icr_right_m", median, "m", at=largest),
-    ),
-    "input-bias": Study(
-        about="ICR error by bias of the track speeds",
-        figures="13",
-        varies="input bias [m/s]",
-        varied="input_bias_mps",
-        request={"runs": 20, "values": NOISES},
-        drive=WINDING,
-        vary=by_preset(lambda base, value: sensing(base, input_bias_mps=value)),
-        measures=(measured.measure_errors,),
-        numbers=(
-            Number("{series}: error of {icr} at {value:g} m/s", ERROR, spread, "m", "Fig. 13's axis: -0.1 to 0.02 m",
-                   largest),
-        ),
-        title="A bias of {value:g} m/s moves y right by {answer}",
-        answer=Number("{series}", "error_y_icr_right_m", median, "m", at=largest),
-    ),
+    "input-noise": by_speed_error("noise", "input_noise_mps", "12", "Fig. 12's axis: -1 to 1 m"),
+    "input-bias": by_speed_error("bias", "input_bias_mps", "13", "Fig. 13's axis: -0.1 to 0.02 m"),
     "input-source": Study(
         about="encoders against commanded speeds",
         figures="11",
@@ -315,9 +297,9 @@ STUDIES: dict[StudyName, Study] = {
         sensors={"input_bias_mps": 0.03},
         vary=by_preset(from_source, ("encoder", "commanded")),
         measures=(measured.measure_errors, trace()),
-        numbers=(Number("{series}: error of {icr}, {value} speeds", ERROR, spread, "m"),),
+        numbers=(Number("{series}: error of {icr}, {value} speeds", ERROR, "spread", "m"),),
         title="Commanded speeds move y right by {answer}",
-        answer=Number("{series}", "error_y_icr_right_m", median, "m", at=only("commanded")),
+        answer=Number("{series}", "error_y_icr_right_m", "median", "m", at=only("commanded")),
     ),
     "gnss": Study(
         about="ICR error and open-loop error by noise of the GNSS",
@@ -329,15 +311,14 @@ STUDIES: dict[StudyName, Study] = {
         vary=by_preset(lambda base, value: sensing(base, gnss_std_m=value)),
         measures=(measured.measure_errors, measured.measure_times, measured.measure_open_loop),
         numbers=(
-            Number("no slip: open loop after 10 m, p95", "blind_no_slip_10m_p95_m",
-                   lambda found: spread(found[:1]), "m"),
-            Number("{series}: GNSS {value:g} m: open loop after 10 m, p95", "blind_icr_10m_p95_m", spread, "m",
+            Number("no slip: open loop after 10 m, p95", "blind_no_slip_10m_p95_m", "first", "m"),
+            Number("{series}: GNSS {value:g} m: open loop after 10 m, p95", "blind_icr_10m_p95_m", "spread", "m",
                    RTK_ERROR, lambda noises: (min(noises), 0.3)),
-            Number("{series}: GNSS {value:g} m: rms error of y_icr_right", "rms_y_icr_right_m", spread, "m",
+            Number("{series}: GNSS {value:g} m: rms error of y_icr_right", "rms_y_icr_right_m", "spread", "m",
                    at=lambda noises: (min(noises), 0.3)),
         ),
         title="GNSS of {value:g} m: 10 m without it cost {answer}",
-        answer=Number("{series}", "blind_icr_10m_p95_m", median, "m", at=largest),
+        answer=Number("{series}", "blind_icr_10m_p95_m", "median", "m", at=largest),
     ),
     "rate": Study(
         about="whether logs of any rate give the same ICRs",
@@ -348,11 +329,11 @@ STUDIES: dict[StudyName, Study] = {
         vary=by_preset(at_rate),
         measures=(measured.measure_errors,),
         numbers=(
-            Number("{series}: {icr} differs between rates by at most", ERROR, range_of_means, "m"),
-            Number("{series}: stated std of {icr}, least and greatest", "std_{icr}_m", extreme_medians, "m"),
+            Number("{series}: {icr} differs between rates by at most", ERROR, "range of means", "m"),
+            Number("{series}: stated std of {icr}, least and greatest", "std_{icr}_m", "extreme medians", "m"),
         ),
         title="Between rates, x_icr differs by {answer}",
-        answer=Number("{series}", "error_x_icr_m", range_of_means, "m"),
+        answer=Number("{series}", "error_x_icr_m", "range of means", "m"),
     ),
     "consistency": Study(
         about="whether the filter's covariance is right: NEES, NIS, coverage",
@@ -361,7 +342,7 @@ STUDIES: dict[StudyName, Study] = {
         measures=(measured.measure_consistency,),
         numbers=consistency_numbers,
         title="Mean NEES, 6 expected: {answer}",
-        answer=Number("{series}", "nees", mean),
+        answer=Number("{series}", "nees", "mean"),
         summary=consistency_of,
     ),
 }  # fmt: skip

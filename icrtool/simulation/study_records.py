@@ -109,6 +109,33 @@ class Level(NamedTuple):
         return {name: statistics(values) for name, values in self.numbers().items()}
 
 
+How = Literal["spread", "median", "mean", "percent", "percent found", "range of means", "extreme medians", "first"]
+
+HOW: dict[How, Callable[[Sequence[Floats]], tuple[float, ...]]] = {
+    "spread": lambda levels: _percentiles(np.concatenate(levels)),
+    "median": lambda levels: (_middle(np.concatenate(levels)),),
+    "mean": lambda levels: (statistics(np.concatenate(levels))["mean"],),
+    "percent": lambda levels: (100 * float(np.concatenate(levels).mean()),),
+    "percent found": lambda levels: (100 * float(np.isfinite(np.concatenate(levels)).mean()),),
+    "range of means": lambda levels: (float(np.ptp([one.mean() for one in levels])),),
+    "extreme medians": lambda levels: (float(min(map(np.median, levels))), float(max(map(np.median, levels)))),
+    "first": lambda levels: _percentiles(levels[0]),
+}
+"""Numbers from the columns (runs,) of levels: 5th percentile, median and 95th percentile of all (``spread``) or of the
+first level; their median, mean or share; between the levels, the range of their means, least and greatest median."""
+
+
+def _percentiles(values: Floats) -> tuple[float, ...]:
+    found = statistics(values)
+    return found["p5"], found["p50"], found["p95"]
+
+
+def _middle(values: Floats) -> float:
+    """Return the median; a run without a number counts as beyond all others, and NaN stands for beyond half."""
+    middle = float(np.median(np.nan_to_num(values, nan=np.inf)))
+    return middle if math.isfinite(middle) else math.nan
+
+
 class Number(NamedTuple):
     """A number that a study reports of its levels.
 
@@ -116,7 +143,7 @@ class Number(NamedTuple):
     ----------
     what : its name, with {series}, {value} and {icr}; the levels of one name are put together
     columns : pattern of the columns it is made of, with {icr}
-    how : its computation, from the columns (runs,) of each level
+    how : its computation, a key of `HOW`
     unit : of the number
     paper : the paper's number as text, or that by value or series; by an empty key for all others
     at : which of the values it is reported of
@@ -125,7 +152,7 @@ class Number(NamedTuple):
 
     what: str
     columns: str
-    how: Callable[[Sequence[Floats]], tuple[float, ...]]
+    how: How
     unit: str = ""
     paper: str | Mapping[Any, str] = ""
     at: Callable[[Sequence[Any]], Sequence[Any]] = tuple
@@ -232,7 +259,7 @@ def reported(numbers: Sequence[Number], levels: Sequence[Level]) -> list[StudyNu
                     columns = np.concatenate([level.found[name] for name in names])
                     pooled.setdefault(what, (number, level, {}))[2][place] = columns
     return [
-        StudyNumber(what, number.how(list(by_level.values())), number.unit, _paper(number.paper, level))
+        StudyNumber(what, HOW[number.how](list(by_level.values())), number.unit, _paper(number.paper, level))
         for what, (number, level, by_level) in pooled.items()
     ]
 
@@ -241,41 +268,3 @@ def _paper(paper: str | Mapping[Any, str], level: Level) -> str:
     if isinstance(paper, str):
         return paper
     return next((paper[key] for key in (level.setting.value, level.setting.series, "") if key in paper), "")
-
-
-def spread(values: Sequence[Floats]) -> tuple[float, ...]:
-    """Return the 5th percentile, the median and the 95th percentile of the columns of several levels."""
-    found = statistics(np.concatenate(values))
-    return found["p5"], found["p50"], found["p95"]
-
-
-def median(values: Sequence[Floats]) -> tuple[float, ...]:
-    """Return the median of the columns; a run without a number counts as beyond all others, NaN is beyond half."""
-    middle = float(np.median(np.nan_to_num(np.concatenate(values), nan=np.inf)))
-    return (middle if math.isfinite(middle) else math.nan,)
-
-
-def mean(values: Sequence[Floats]) -> tuple[float, ...]:
-    """Return the mean of the columns."""
-    return (statistics(np.concatenate(values))["mean"],)
-
-
-def percent(values: Sequence[Floats]) -> tuple[float, ...]:
-    """Return the mean of columns of 0 and 1 as a percentage."""
-    return (100 * float(np.concatenate(values).mean()),)
-
-
-def percent_finite(values: Sequence[Floats]) -> tuple[float, ...]:
-    """Return how many of the values exist."""
-    return percent([np.isfinite(one).astype(np.float64) for one in values])
-
-
-def range_of_means(values: Sequence[Floats]) -> tuple[float, ...]:
-    """Return the largest difference between the means of levels."""
-    return (float(np.ptp([one.mean() for one in values])),)
-
-
-def extreme_medians(values: Sequence[Floats]) -> tuple[float, ...]:
-    """Return the least and the greatest median of a level."""
-    medians = [float(np.median(one)) for one in values]
-    return min(medians), max(medians)

@@ -15,10 +15,10 @@ import pytest
 from icrtool.cli.printing import show
 from icrtool.config import Config, load_config
 from icrtool.errors import DataError, OutputError
-from icrtool.output.figures.study import study_figure
+from icrtool.output.figures.style import new_figure
 from icrtool.output.files.truth_file import log_and_truth, read_speeds, truth_path, write_truth
 from icrtool.output.study_directory import check_study_target, write_study
-from icrtool.output.tables.study import finding_text, format_study, runs_text
+from icrtool.output.tables.study import finding_text, format_study, runs_text, study_subtitle, study_title
 from icrtool.output.text_blocks import Table
 from icrtool.simulation.drives import DrivePlan, Sensors
 from icrtool.simulation.paths import PathPlan
@@ -80,7 +80,7 @@ def test_every_number_of_the_table_is_whole_on_a_terminal_of_80_columns(
 @pytest.mark.parametrize("name", STUDIES)
 def test_the_title_of_a_picture_states_the_answer_with_its_number(name) -> None:
     result = small(name)
-    figure = study_figure(result)
+    figure = new_figure(study_title(result), study_subtitle(result), height_in=2.0)
     title, subtitle = (text.get_text() for text in figure.texts[:2])
     assert [finding_text(one) for one in result.answer if finding_text(one) not in title] == []
     assert subtitle.startswith(f"{name}: ICRs")
