@@ -69,7 +69,7 @@ def command(
         if sensors is None or not (runs[0].usable or allow_unusable):
             raise
         warn([f"no motion model: {err}"], quiet=quiet)
-    from icrtool.output.tables.held_out import calibration_blocks
+    from icrtool.output.tables.calibration import calibration_blocks
     from icrtool.output.text_blocks import printed
 
     texts: list[str] = [printed(calibration_blocks(result, sensors), verbose=verbose)]
@@ -127,7 +127,7 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     from icrtool.alignment.estimator import residuals_by_estimate
     from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
-    from icrtool.output.figures.calibration import residuals_figure
+    from icrtool.output.figures.calibrations import residuals_figure
     from icrtool.output.files.formats import save_picture
     from icrtool.output.stored_run import log_of
 

@@ -60,7 +60,7 @@ def command(
         if file is not None:
             write_file(file, content)
     if plot is not None:
-        from icrtool.output.figures.transfer import transfer as transfer_figure
+        from icrtool.output.figures.calibrations import transfer as transfer_figure
 
         save_picture(transfer_figure(compared), plot)
     text = partial(printed, transfer_blocks(compared), verbose=verbose)

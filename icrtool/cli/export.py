@@ -14,7 +14,7 @@ from icrtool.cli.printing import warn, write_or_print
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
     from icrtool.output.exports.controllers import Target
-    from icrtool.output.exports.trajectories import TrajectoryFormat
+    from icrtool.output.exports.paths import TrajectoryFormat
     from icrtool.records.run import Run
 
 CONTROLLERS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr")
@@ -77,7 +77,7 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
 
 def _is_one_file(output: Path) -> bool:
     """Return whether a place for trajectories is a file: by what is there, else by a suffix that such files have."""
-    from icrtool.output.exports.trajectories import SUFFIXES
+    from icrtool.output.exports.paths import SUFFIXES
 
     return output.is_file() or (output.suffix.lower() in (*SUFFIXES.values(), *TEXT_SUFFIXES) and not output.is_dir())
 
@@ -85,8 +85,7 @@ def _is_one_file(output: Path) -> bool:
 def _path_text(run: Run, target: str) -> str:
     """Return the paths of a run in a text format."""
     if target in TRAJECTORIES:
-        from icrtool.output.exports.paths import paths_of
-        from icrtool.output.exports.trajectories import format_trajectory
+        from icrtool.output.exports.paths import format_trajectory, paths_of
 
         return format_trajectory(paths_of(run)[0], cast("TrajectoryFormat", target))
     if target == "qgis":
@@ -100,8 +99,7 @@ def _path_text(run: Run, target: str) -> str:
 
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
     """Write a file for each path of a run."""
-    from icrtool.output.exports.paths import paths_of
-    from icrtool.output.exports.trajectories import SUFFIXES, format_trajectory, is_trajectory
+    from icrtool.output.exports.paths import SUFFIXES, format_trajectory, is_trajectory, paths_of
 
     directory.mkdir(parents=True, exist_ok=True)
     from icrtool.output.files.atomic import write_file
@@ -117,8 +115,7 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
 
 def _write_foxglove(run: Run, output: Path) -> None:
     """Write the MCAP file, and the layout beside it."""
-    from icrtool.output.exports.foxglove import write_foxglove
-    from icrtool.output.exports.foxglove_layout import foxglove_layout, is_layout
+    from icrtool.output.exports.foxglove import foxglove_layout, is_layout, write_foxglove
     from icrtool.output.files.atomic import atomic_file, write_file
     from icrtool.output.files.formats import json_bytes
     from icrtool.output.files.own_files import check_place

@@ -54,7 +54,7 @@ def command(
     if output is not None:
         write_file(output, forecast_csv(forecast, gyro))
     if plot is not None:
-        from icrtool.output.figures.forecast import forecast_figure
+        from icrtool.output.figures.calibrations import forecast_figure
 
         measured_m = measured_to_m(calibration)
         save_picture(forecast_figure(forecast, path.name, budgets, measured_m, gyro), plot)

@@ -92,7 +92,7 @@ def _pooled(
 ) -> FleetCalibration:
     from icrtool.calibration.pooled import calibrate_runs
     from icrtool.output.stored_run import open_run
-    from icrtool.output.tables.held_out import held_out_blocks
+    from icrtool.output.tables.calibration import held_out_blocks
     from icrtool.output.text_blocks import printed
 
     # A copy of a log would be tested on itself.

@@ -139,7 +139,7 @@ FIGURES = {
     "transfer": Entry(
         "comparison", "The cost of a foreign calibration",
         "Left: the darker, the larger the error. Right: an interval (95 %) that crosses zero may be chance.",
-        "transfer.transfer",
+        "calibrations.transfer",
     ),
 }  # fmt: skip
 """By the name of the file; a name that ends in ``_`` goes on with a distance."""

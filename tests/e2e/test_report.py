@@ -41,7 +41,7 @@ def test_the_page_of_the_newest_run_is_in_its_directory(icrtool: Command, run_di
     assert str(Path("icrtool-runs", "barn", "report.html")) in output
     page = spaced((run_directory / "report.html").read_text(encoding="utf-8"))
     # Neither a dropout report nor pictures were there: both were made for the page, and only for it.
-    assert "within 0.5 m in 95 % of the trials" in page
+    assert "within 0.5 m (95 %), by wheel speeds alone" in page
     assert "data:image/png;base64," in page
     assert not (run_directory / "dropout").exists()
 
@@ -124,5 +124,5 @@ def test_a_fleet_and_a_comparison_have_pages(icrtool: Command, run_place: Path) 
     assert "&lt;b&gt;no heading&lt;/b&gt;" in page
     page = (run_place / "compared.html").read_text(encoding="utf-8")
     assert "they differ" in page
-    assert "0.500 m / 0.500 m" in spaced(page)
+    assert "0.50 / 0.50" in spaced(page)
     assert "<i>" not in page

@@ -11,7 +11,6 @@ from xml.etree import ElementTree as ET
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.files.atomic import write_file
-from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.text_blocks import Line, Table
 from icrtool.output.text_format import run_title, xml_text
 from icrtool.records.fleet_document import FleetVerdict, fleet_verdict
@@ -82,6 +81,9 @@ def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
 
 def format_markdown(report: DropoutReport) -> str:
     """Return one report as Markdown: the verdicts, then the sentences and tables that are printed."""
+    # Not at import: a batch needs the verdicts alone.
+    from icrtool.output.tables.dropout import format_dropout
+
     title, verdicts = run_title(report.run_document), [one.verdict for one in report.verdicts]
     lines = [f"## {escaped_markdown(title)}", ""]
     if verdicts:

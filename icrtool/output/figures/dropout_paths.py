@@ -13,14 +13,6 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
-from icrtool.output.figures.ground import (
-    CELLS,
-    JUMP_LOOK,
-    draw_path,
-    fitted_box_in,
-    look_down,
-    name_directions,
-)
 from icrtool.output.figures.style import (
     FILTER,
     FIX_COLOR,
@@ -34,6 +26,14 @@ from icrtool.output.figures.style import (
     new_figure,
     spot,
     styled,
+)
+from icrtool.output.figures.trajectory import (
+    CELLS,
+    JUMP_LOOK,
+    draw_path,
+    fitted_box_in,
+    look_down,
+    name_directions,
 )
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title
 from icrtool.records.dropout import ExampleTrial, Outage

@@ -8,8 +8,7 @@ from pathlib import Path
 from icrtool.motion.models import FAMILY
 from icrtool.output.files.formats import read_document, schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS
-from icrtool.output.page.pictures import drawn_pictures
-from icrtool.output.page.render import render
+from icrtool.output.page.render import drawn_pictures, render
 from icrtool.output.tables.transfer import transfer_blocks
 from icrtool.output.text_blocks import Title
 from icrtool.records.calibration_document import GroupComparison, TransferCell
@@ -22,7 +21,7 @@ COMPARISON_FAMILY = "icrtool/compare/"
 
 def comparison_page(found: GroupComparison, title: str) -> str:
     """Return the page of a comparison as HTML."""
-    from icrtool.output.figures.transfer import transfer
+    from icrtool.output.figures.calibrations import transfer
 
     names = list(found.groups)
     labels = {name: model.label for name, model in FAMILY.items()}

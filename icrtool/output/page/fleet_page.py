@@ -8,8 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from icrtool.output.page.pictures import pictures_in
-from icrtool.output.page.render import render
+from icrtool.output.page.render import pictures_in, render
 from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.text_blocks import Block, Cell, Figure, Section, Table, Title
 from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text, signed

@@ -1,23 +1,27 @@
-"""Templates to HTML: everything is escaped, scripts and styles stand in the file, and nothing else may be loaded."""
+"""Templates and pictures to HTML: everything is escaped and stands in the file, and nothing else may be loaded."""
 
 from __future__ import annotations
 
 import json
 import re
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from hashlib import sha256
+from hashlib import blake2b, sha256
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from icrtool import __version__
+from icrtool.errors import RunError
 from icrtool.records.plain_data import plain
+from icrtool.records.regular_file import read_regular
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
+    from matplotlib.figure import Figure
 
     from icrtool.output.text_blocks import Block
 
@@ -136,3 +140,80 @@ def _static(name: str) -> str:
 def _source(text: str) -> str:
     """Return a style or script as the content security policy names it."""
     return f"'sha256-{b64encode(sha256(text.encode()).digest()).decode('ascii')}'"
+
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+LARGEST_PICTURE_BYTES = 1 << 24
+"""Ours have less than 1 MB."""
+
+PICTURE = re.compile(r"[a-z_]{1,40}(_\d{1,4}m)?")
+"""The name of a picture of ours, without its suffix."""
+
+
+class Picture(NamedTuple):
+    """One picture of a page.
+
+    Attributes
+    ----------
+    title, caption : one line; what it shows and what to see
+    source : data URL
+    with_place : its axes may be coordinates of a map grid
+    """
+
+    title: str
+    caption: str
+    source: str
+    with_place: bool
+
+
+def drawn_pictures(figures: Iterable[tuple[str, Figure]]) -> dict[str, Picture]:
+    """Return figures as pictures, by name."""
+    from icrtool.output.figures.style import picture_bytes
+
+    return pictures_of((name, picture_bytes(figure, "png")) for name, figure in figures)
+
+
+def pictures_in(directory: Path, inside: Path, sums: Mapping[str, str] | None = None) -> dict[str, Picture]:
+    """Return the PNG pictures of a folder that this module knows, by name; none where the folder is not there.
+
+    Parameters
+    ----------
+    inside : the directory that the user named; below it no link is followed
+    sums : BLAKE2b sums (hex) of files by their path below it, where they are known
+
+    Raises
+    ------
+    RunError
+        One is not a picture that icrtool made: a link, another file, too large, or its sum is another.
+    """
+    from icrtool.output.figure_catalogue import entry_of
+
+    files = (file for file in sorted(directory.glob("*.png")) if PICTURE.fullmatch(file.stem) and entry_of(file.stem))
+    return pictures_of((file.stem, _png(file, inside, sums or {})) for file in files)
+
+
+def _png(file: Path, inside: Path, sums: Mapping[str, str]) -> bytes:
+    name = file.relative_to(inside).as_posix()
+    try:
+        content = read_regular(file, inside, LARGEST_PICTURE_BYTES)
+    except OSError as err:
+        raise RunError(inside, f"{name} cannot be read ({err.strerror})", "remove it") from err
+    if not content.startswith(SIGNATURE):
+        raise RunError(inside, f"{name} is not a PNG picture", "remove it")
+    if sums.get(name, found := blake2b(content).hexdigest()) != found:
+        raise RunError(inside, f"{name} was edited or cut short since the run", "remove it, or fit the log again")
+    return content
+
+
+def pictures_of(found: Iterable[tuple[str, bytes]]) -> dict[str, Picture]:
+    """Return pictures given as name and PNG file."""
+    from icrtool.output.figure_catalogue import entry_of
+
+    pictures = {}
+    for name, content in found:
+        if (known := entry_of(name)) is not None:
+            entry, metres = known
+            source = f"data:image/png;base64,{b64encode(content).decode('ascii')}"
+            pictures[name] = Picture(entry.title.format(metres), entry.caption, source, entry.with_place)
+    return pictures

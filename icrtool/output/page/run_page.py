@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
@@ -17,9 +20,7 @@ from icrtool.output.files.atomic import write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
 from icrtool.output.files.own_files import is_page
 from icrtool.output.page.drive_data import drive_data
-from icrtool.output.page.pictures import Picture, drawn_pictures, pictures_in
-from icrtool.output.page.render import render
-from icrtool.output.page.without_place import without_place
+from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
 from icrtool.output.stored_run import check_sum
 from icrtool.output.tables.dropout import answer_sections, model_sections, outage_blocks, verdict_lines, worst_section
 from icrtool.output.tables.errors import errors_section, main_rows
@@ -32,10 +33,10 @@ from icrtool.output.tables.run import (
 )
 from icrtool.output.text_blocks import PAGE, Block, Facts, Figure, Section, Title
 from icrtool.output.text_format import driven_text, position_word, run_title
-from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
+from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument, TrialDocument
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run, check_type
-from icrtool.records.run_document import RunDocument
+from icrtool.records.run_document import EventDocument, RunDocument
 
 SCRIPTS = (
     "vendor/uPlot.iife.min.js",
@@ -194,3 +195,50 @@ def _without_place(run: Run, pictures: Mapping[str, Picture]) -> dict[str, Pictu
     """Return the pictures that do not show coordinates; relative to a datum that is left out they show no place."""
     metric = run.document.gnss.datum is None
     return {name: one for name, one in pictures.items() if not (metric and one.with_place)}
+
+
+Placed = TypeVar("Placed", EventDocument, TrialDocument)
+
+HIDDEN = "left out"
+"""Stands in place of a number that would show the place."""
+
+
+def without_place(run: Run, report: DropoutDocument) -> tuple[Run, DropoutDocument]:
+    """Return a run and what report.json holds of it, with the first state as origin and without the datum.
+
+    Notes
+    -----
+    Where a position reference is metric its coordinates may be those of a map grid, so the origin moves there too.
+    Magnetic declination and grid convergence narrow the place down, and are left out with their name.
+    """
+    table = run.table
+    north, east = float(table.north_m[0]), float(table.east_m[0])
+
+    changed, document = msgspec.structs.replace, run.document
+
+    def moved(one: Placed) -> Placed:
+        return changed(one, north_m=one.north_m - north, east_m=one.east_m - east)
+
+    cause, datum = document.heading.offset_name, document.gnss.datum
+    shown = changed(
+        document,
+        config=replace(document.config, frames=replace(document.config.frames, datum=None)),
+        warnings=tuple(one.replace(cause, f"its cause is {HIDDEN}") if cause else one for one in document.warnings),
+        gnss=changed(document.gnss, datum=None if datum is None else (math.nan, math.nan, math.nan)),
+        heading=changed(document.heading, offset_name=None, magnetic_declination_deg=None, utm_convergence_deg=None),
+        events=tuple(map(moved, document.events)),
+    )
+    sensors, fixes = run.sensors, run.sensors.fixes
+    at_origin = replace(
+        run,
+        table=replace(table, north_m=table.north_m - north, east_m=table.east_m - east),
+        sensors=replace(
+            sensors,
+            fixes=replace(fixes, north_m=fixes.north_m - north, east_m=fixes.east_m - east),
+            events=tuple(one._replace(north_m=one.north_m - north, east_m=one.east_m - east) for one in sensors.events),
+        ),
+        document=shown,
+    )
+    return at_origin, changed(
+        report, worst=tuple(map(moved, report.worst)), examples=tuple(map(moved, report.examples))
+    )  # fmt: skip

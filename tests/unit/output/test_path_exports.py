@@ -21,12 +21,10 @@ from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import trial_ends
-from icrtool.output.exports.foxglove import BODIES, ERROR_HORIZON_M, WORLD, write_foxglove
-from icrtool.output.exports.foxglove_layout import foxglove_layout
+from icrtool.output.exports.foxglove import BODIES, ERROR_HORIZON_M, WORLD, foxglove_layout, write_foxglove
 from icrtool.output.exports.geojson import format_geojson
 from icrtool.output.exports.kml import GX, KML, format_kml
-from icrtool.output.exports.paths import paths_of
-from icrtool.output.exports.trajectories import format_trajectory
+from icrtool.output.exports.paths import format_trajectory, paths_of
 from icrtool.records.run import Run, track_of
 from support.barn import BAD_FIXES, OUTAGE_S
 from support.documents import with_summary

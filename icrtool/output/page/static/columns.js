@@ -1,5 +1,5 @@
 "use strict";
-// Columns of numbers: base64 of little-endian values (icrtool/output/page/columns.py writes them).
+// Columns of numbers: base64 of little-endian values (icrtool/output/page/drive_data.py writes them).
 const icrtoolColumns = (() => {
   const TYPES = { f32: Float32Array, f64: Float64Array, i32: Int32Array, u8: Uint8Array };
 

@@ -20,8 +20,8 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.output.dropout_directory import report_document, shown_document
-from icrtool.output.page.columns import packed, packed_sums
-from icrtool.output.page.pictures import pictures_of
+from icrtool.output.page.drive_data import packed, packed_sums
+from icrtool.output.page.render import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
 from icrtool.output.tables.dropout import reach_rows, report_blocks
 from icrtool.output.text_blocks import printed
