@@ -14,6 +14,7 @@ from PIL import Image
 
 from icrtool.output.figures.fleet import FleetNumbers, fleet_errors, fleet_icrs
 from icrtool.output.figures.style import drawable, new_figure, picture_bytes, save, style
+from icrtool.records.fleet_document import FleetLog
 
 HOSTILE = ("a$b^{$", "$\\frac{$", "\u6f22\u5b57", "\x1b[2J", "\udc80.mcap", "line\nbreak", "\U0010ffff", "\u202egpj")
 
@@ -37,7 +38,9 @@ def test_an_ordinary_name_is_unchanged() -> None:
 def test_every_robot_of_a_fleet_has_its_name_in_the_key(tmp_path: Path) -> None:
     names = (*HOSTILE, "_hidden", "W" * 300)
     icr = {"y_icr_right_m": 0.4, "y_icr_left_m": -0.4, "std_y_icr_right_m": 0.01, "std_y_icr_left_m": 0.01}
-    points = [{"robot": name, "start_utc": "2025-10-09T08:53:21Z", "icr": icr} for name in names]
+    points = [
+        FleetLog(name, f"runs/{name}", "done", robot=name, start_utc="2025-10-09T08:53:21Z", icr=icr) for name in names
+    ]
     fleet = FleetNumbers("logs", points, {name: {name: 0.1, "b": 0.2} for name in names}, "ICR")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
