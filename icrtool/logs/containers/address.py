@@ -6,6 +6,7 @@ those that the provider's own library finds.
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable
@@ -19,6 +20,8 @@ Result = TypeVar("Result")
 _NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
           "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
 """The library that each kind of address is read with."""
+
+_LOGGERS = ("fsspec", "s3fs", "aiobotocore", "botocore", "gcsfs", "google", "adlfs", "azure", "aiohttp")
 
 _PAUSES_S = (0.5, 2.0)
 """Before a request to a web server is made again; the libraries of object stores do so themselves."""
@@ -55,6 +58,10 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
         raise LogError(
             path, f"{path.scheme}:// is no kind of address that can be read", "try s3, gs, az or https"
         ) from err
+    for name in _LOGGERS:
+        # They log tracebacks of requests, and addresses with their queries; one line reports where they fail.
+        if (logger := logging.getLogger(name)).level == logging.NOTSET:
+            logger.setLevel(logging.CRITICAL + 1)
     found: tuple[Any, str] = asked(path, lambda: url_to_fs(path.url))
     return found
 
