@@ -35,8 +35,8 @@ THREADS, BLOCKS_AHEAD = 2, 3
 READERS, SPANS_AHEAD, BYTES_AHEAD = 8, 16, 1 << 26
 """Of a distant file: threads that read, and pieces and their bytes that are read before they are used."""
 
-SPAN_BYTES = 1 << 24
-"""Of chunks that are read in one piece."""
+FIRST_SPAN_BYTES, SPAN_BYTES = 1 << 22, 1 << 24
+"""Of chunks that are read in one piece: of the first one, for which all that uses them waits, and of each other one."""
 
 JOINED_BYTES = 1 << 22
 """Of the wanted records of chunks that are made one block: each block has a cost of its own."""
@@ -185,11 +185,12 @@ class ChunkedFile(ABC):
         """Yield chunks that follow one another and are read whole, and begin and end of what is read in one piece."""
         group: list[Chunk] = []
         begin = end = 0
+        most = FIRST_SPAN_BYTES
         for chunk in chunks:
             first, last = self._span(chunk, wanted)
-            if group and not (end <= first <= end + NEAR_BYTES and last - begin <= SPAN_BYTES and last > first):
+            if group and not (end <= first <= end + NEAR_BYTES and last - begin <= most and last > first):
                 yield group, begin, end
-                group = []
+                group, most = [], SPAN_BYTES
             begin, end = (begin if group else first), last
             group.append(chunk)
         if group:

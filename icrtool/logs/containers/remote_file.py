@@ -51,7 +51,7 @@ class RemoteFile:
         self.has_ranges = self._finds_ranges(about)
         self._about = about
         self.bytes_read = 0
-        self._start: Held | None = None
+        self._ends: tuple[Held, ...] = ()
         self._held = local()
 
     def _finds_ranges(self, about: dict[str, Any]) -> bool:
@@ -73,13 +73,19 @@ class RemoteFile:
     def read_at(self, at: int, count: int) -> bytes:
         """Return bytes of the file, as many as there are."""
         end = min(at + count, self.size)
-        held = next((one for one in (self._start, self._last) if _has(one, at, end)), None)
+        if not self._ends:
+            self._ends = self._read_ends()
+        held = next((one for one in (*self._ends, self._last) if _has(one, at, end)), None)
         if held is None:
             # What stands at the end of a file is read from its footer backwards.
             first = max(min(at, self.size - _LEAST_BYTES), 0)
             held = self.hold(first, max(end - first, _LEAST_BYTES))
-            self._start = self._start if at else held
         return held.data[at - held.at : end - held.at]
+
+    def _read_ends(self) -> tuple[Held, ...]:
+        """Return start and end of the file, which all that is read by an index begins with, by one request each."""
+        begins = sorted({0, max(self.size - _LEAST_BYTES, 0)})
+        return tuple(map(Held, begins, self._ranges(begins, [begin + _LEAST_BYTES for begin in begins])))
 
     @property
     def _last(self) -> Held | None:
@@ -105,23 +111,30 @@ class RemoteFile:
         """Return what stands in several ranges (2, n) behind a place, one after the other."""
         far = np.append(True, ranges[0, 1:] - ranges[1, :-1] > NEAR_BYTES)
         begins, ends = at + ranges[0, far], at + ranges[1, np.append(far[1:], True)]
-        pieces: list[bytes] = asked(
-            self._path, lambda: self._files.cat_ranges([self._name] * len(begins), begins.tolist(), ends.tolist())
-        )
-        self.bytes_read += sum(map(len, pieces))
+        pieces = self._ranges(begins.tolist(), ends.tolist())
         part = np.cumsum(far) - 1
         offsets = (at + ranges - begins[part]).T.tolist()
         return b"".join(pieces[one][first:last] for one, (first, last) in zip(part.tolist(), offsets, strict=True))
 
     def _range(self, at: int, count: int) -> bytes:
-        end = min(at + count, self.size)
-        if at >= end:
-            return b""
-        data = asked(self._path, lambda: self._files.cat_file(self._name, start=at, end=end))
-        if len(data) != end - at:
-            raise LogError(self._path, f"gave {len(data)} bytes for {end - at}", "is it being written?")
-        self.bytes_read += len(data)
-        return bytes(data)
+        return self._ranges([at], [at + count])[0] if at < self.size and count else b""
+
+    def _ranges(self, begins: list[int], ends: list[int]) -> list[bytes]:
+        """Return bytes of the file, each range by a request of its own, at the same time."""
+        ends = [min(end, self.size) for end in ends]
+
+        def ask() -> list[bytes]:
+            pieces = self._files.cat_ranges([self._name] * len(begins), begins, ends)
+            if (broken := next((one for one in pieces if isinstance(one, BaseException)), None)) is not None:
+                raise broken
+            return list(map(bytes, pieces))
+
+        pieces = asked(self._path, ask)
+        for piece, begin, end in zip(pieces, begins, ends, strict=True):
+            if len(piece) != end - begin:
+                raise LogError(self._path, f"gave {len(piece)} bytes for {end - begin}", "is it being written?")
+        self.bytes_read += sum(map(len, pieces))
+        return pieces
 
     def pieces(self) -> Iterator[bytes]:
         """Yield the content from start to end; the next pieces are read meanwhile."""

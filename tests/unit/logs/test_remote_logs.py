@@ -242,6 +242,22 @@ def test_a_broken_connection_is_made_again(monkeypatch):
         assert messages(UrlPath(f"{server.url}/{MCAP.name}")) == messages(MCAP)
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_connections_that_break_while_chunks_are_read_are_made_again_or_one_error(monkeypatch, tmp_path, layout):
+    monkeypatch.setattr(address, "_PAUSES_S", (0.01, 0.01))
+    drive(tmp_path / "a.mcap", size=8_000_000, **LAYOUTS[layout])
+    with file_server(tmp_path) as server:
+        container = open_log(UrlPath(f"{server.url}/a.mcap"))
+        number = next(one.id for one in container.channels if one.topic == "/small")
+        server.broken = 2
+        found = [text for block in container.blocks(frozenset({number})) for text in texts_of(block, number)]
+        assert found == small_ones(tmp_path / "a.mcap")[0]
+        server.broken = 10_000
+        with pytest.raises(LogError, match="cannot be read"):
+            list(container.blocks(frozenset({number})))
+        container.close()
+
+
 def test_a_connection_that_stays_broken_is_one_line_without_secrets(monkeypatch):
     monkeypatch.setattr(address, "_PAUSES_S", (0.01, 0.01))
     with file_server(SAMPLES, token=TOKEN) as server:
