@@ -155,7 +155,8 @@ class Orientation:
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is
     path : the field of the quaternion
-    covariance : the field of a covariance; size : of its rows; the last one is of yaw
+    variance : the field of the variance of yaw
+    absent : the field that is -1 where messages hold no orientation
     rate : the field of the turn rate of a gyro in the same message
     stuffed : some drivers of GNSS receivers write a compass angle into the quaternion as if it were a yaw
     odometry : preferred where its name is that of an inertial navigation system
@@ -164,29 +165,23 @@ class Orientation:
     what: str
     worth: float
     path: str
-    covariance: str = ""
-    size: int = 6
+    variance: str = ""
+    absent: str = ""
     rate: str = ""
     stuffed: bool = False
     odometry: bool = False
 
     @property
-    def _variances(self) -> tuple[str, str]:
-        return f"{self.covariance}[0]", f"{self.covariance}[{self.size**2 - 1}]"
-
-    @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        variances = self._variances if self.covariance else ()
-        rate = (self.rate,) if self.rate else ()
-        return (*(f"{self.path}.{axis}" for axis in "xyzw"), *variances, *rate)
+        return (*(f"{self.path}.{axis}" for axis in "xyzw"), self.variance, self.absent, self.rate)
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
         """Return the yaw of its orientations."""
         q = np.array([table.column(f"{self.path}.{axis}") for axis in "xyzw"], np.float64).T
         yaw, usable, note = nose_yaw(q, table.floats(self.rate) if self.rate in table.columns else None)
-        first, last = (table.floats(path) for path in self._variances)
-        variance = np.where(last > 0, last, np.nan)
+        variance = table.floats(self.variance)
+        variance = np.where(variance > 0, variance, np.nan)
         unknown = variance >= UNKNOWN_RAD2
         # where all are, the number means nothing
         usable = usable if unknown[usable].all() else usable & ~unknown
@@ -194,7 +189,7 @@ class Orientation:
         if self.stuffed and not _ATTITUDE_WORDS.search(table.topic):
             convention, why = "ned", "compass angle as yaw"
         problem = ""
-        if self.size == 3 and np.all(first == -1.0):
+        if np.all(table.floats(self.absent) == -1.0):
             problem = "holds no orientation (covariance -1, REP-145)"
         elif not usable.any():
             problem = "no valid quaternion"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from icrtool.config import Config
 from icrtool.logs.messages.decoded_values import NMEA_SENTENCE
@@ -28,20 +27,6 @@ from icrtool.logs.streams.wheels import FixedWheels, Joints, Twist, body_twist
 from icrtool.records.samples import OTHER_FIX, RTK_FIX, Role
 
 
-class Row(Protocol):
-    """What a message type carries for a role."""
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """The fields to take of its messages, beside those of a header."""
-        ...
-
-    @property
-    def read(self) -> Callable[[TopicTable, Config], Source]:
-        """Return what was read of a topic; raise `DefinitionError` where it lacks a field that is needed."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class OwnRow:
     """A row that no other kind describes, and the function that reads it."""
@@ -49,6 +34,9 @@ class OwnRow:
     fields: tuple[str, ...]
     read: Callable[[TopicTable, Config], Source]
 
+
+Row = Fix | Pose | Bearing | Orientation | Joints | FixedWheels | Twist | OwnRow
+"""What a message type carries for a role: the fields to take beside those of a header, and how they are read."""
 
 # Wheels: Drive.msg of jackal_msgs and of clearpath_platform_msgs has 0 for left, 1 for right.
 _JOINTS = Joints("wheel joints by name", 100.0, "name[*]", "position[*]", "velocity[*]")
@@ -75,7 +63,8 @@ _SEGWAY_STAMPED = replace(
 
 # Positions: -2 is the default of ROS 2's NavSatStatus; err_horz is a 95 % radius, 2.45 standard deviations.
 _NAVSATFIX = Fix(
-    "GNSS fix", 100.0, covariance="position_covariance", valid=("status.status >= 0 unless -2",),
+    "GNSS fix", 100.0, covariance=("position_covariance[4]", "position_covariance[0]", "position_covariance[1]"),
+    valid=("status.status >= 0 unless -2",),
     solution=Solution("status.status", {GBAS: RTK_FIX}, OTHER_FIX, informative=True),
 )  # fmt: skip
 _GPSFIX = replace(
@@ -103,6 +92,7 @@ _INSPVAX = Fix(
     valid=(f"ins_status.status == {_INS_SOLVED}",), solution=_NUMBER,
 )  # fmt: skip
 _METRIC = Pose("metric pose", 70.0)
+_OF_X_AND_Y = "pose.covariance[7]", "pose.covariance[0]", "pose.covariance[1]"
 _XBOT_INDEPENDENT = ("source != 100",)
 """xbot_msgs/AbsolutePose of source 100 is fused with the wheels."""
 
@@ -195,27 +185,28 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
         ),
         "geometry_msgs/PoseStamped": _METRIC,
         "foxglove.PoseInFrame": _METRIC,
-        "geometry_msgs/PoseWithCovarianceStamped": replace(_METRIC, path="pose.pose", covariance="pose.covariance"),
+        "geometry_msgs/PoseWithCovarianceStamped": replace(_METRIC, path="pose.pose", covariance=_OF_X_AND_Y),
         "xbot_msgs/AbsolutePose": Pose(
-            "GNSS position of OpenMower", 90.0, "pose.pose", "pose.covariance", ("position_accuracy",),
+            "GNSS position of OpenMower", 90.0, "pose.pose", _OF_X_AND_Y, ("position_accuracy",),
             ("flags & 8 == 0",), Solution("flags", XBOT_FLAGS, mask=7), independent=_XBOT_INDEPENDENT,
         ),
         "nav_msgs/Odometry": Pose(
-            "metric position of an odometry message", 60.0, "pose.pose", "pose.covariance", odometry=True
+            "metric position of an odometry message", 60.0, "pose.pose", _OF_X_AND_Y, odometry=True
         ),
     },
     "heading": {
         "sensor_msgs/Imu": Orientation(
-            "orientation of the inertial unit", 100.0, "orientation", "orientation_covariance", 3, "angular_velocity.z"
+            "orientation of the inertial unit", 100.0, "orientation", "orientation_covariance[8]",
+            "orientation_covariance[0]", "angular_velocity.z",
         ),
         "geographic_msgs/GeoPoseStamped": _OF_POSE,
         "geometry_msgs/PoseStamped": _OF_POSE,
         "foxglove.PoseInFrame": _OF_POSE,
         "geometry_msgs/PoseWithCovarianceStamped": replace(
-            _OF_POSE, path="pose.pose.orientation", covariance="pose.covariance"
+            _OF_POSE, path="pose.pose.orientation", variance="pose.covariance[35]"
         ),
         "nav_msgs/Odometry": Orientation(
-            "orientation of an odometry message", 60.0, "pose.pose.orientation", "pose.covariance", odometry=True
+            "orientation of an odometry message", 60.0, "pose.pose.orientation", "pose.covariance[35]", odometry=True
         ),
         "geometry_msgs/QuaternionStamped": Orientation(
             "heading of the GNSS receiver (nmea_navsat_driver)", 80.0, "quaternion", stuffed=True
@@ -260,7 +251,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
 def fields_of(role: Role, message_type: str) -> tuple[str, ...]:
     """Return the fields of a message type that a role is read from, none where it carries nothing for it."""
     row = MESSAGE_TYPES[role].get(message_type)
-    return row.fields if row is not None else ()
+    return tuple(filter(None, row.fields)) if row is not None else ()
 
 
 def read_source(role: Role, table: TopicTable, config: Config) -> Source:

@@ -90,12 +90,8 @@ def _of_word(text: str) -> int:
     return FIXED_FIX if text.endswith(("_INT", "RTKFIXED", "RTK_DIRECT_INS")) else OTHER_FIX
 
 
-def _stated_class(table: TopicTable, solution: Solution | None) -> Bytes | None:
-    return solution.of(table) if solution is not None else None
-
-
-def _fields(solution: Solution | None) -> tuple[str, ...]:
-    return (solution.name,) if solution is not None else ()
+NO_SOLUTION = Solution("", {})
+COVARIANCE_TYPE = "position_covariance_type"
 
 
 def stated_variance(table: TopicTable, covariance: tuple[str, ...], std: tuple[str, ...]) -> Floats:
@@ -118,14 +114,6 @@ def stated_variance(table: TopicTable, covariance: tuple[str, ...], std: tuple[s
         stated = (found[:, 0] > 0) & (found[:, 1] > 0) & (table.floats(COVARIANCE_TYPE) != 0)
         variance[stated] = found[stated]
     return variance
-
-
-COVARIANCE_TYPE = "position_covariance_type"
-
-
-def _places(covariance: str, size: int) -> tuple[str, ...]:
-    """Return the fields of north, east and both in a row-major covariance (size, size) of x east, y north."""
-    return tuple(f"{covariance}[{i}]" for i in (size + 1, 0, 1)) if covariance else ()
 
 
 def _reject(usable: Bools, reasons: Mapping[str, Bools]) -> tuple[Bools, dict[str, int]]:
@@ -160,7 +148,7 @@ class Fix:
     what, worth : what it is called where it is chosen, and how suitable it is as reference
     latitude, longitude : to degrees; height : to m above the ellipsoid
     std : standard deviation [m] to the north and to the east; one for both. These are as `number` reads them
-    covariance : the field of a covariance (3, 3) of east, north, up, which has precedence
+    covariance : the fields of the variances to the north and to the east and of their covariance, which have precedence
     valid : checks that all must pass for a fix
     solution : how it was solved
     """
@@ -171,21 +159,20 @@ class Fix:
     longitude: str = "longitude"
     height: str = "altitude"
     std: tuple[str, ...] = ()
-    covariance: str = ""
+    covariance: tuple[str, ...] = ()
     valid: tuple[str, ...] = ()
-    solution: Solution | None = None
+    solution: Solution = NO_SOLUTION
 
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        covariance = (*_places(self.covariance, 3), COVARIANCE_TYPE) if self.covariance else ()
-        numbers = (self.latitude, self.longitude, self.height, *self.std)
-        return (*fields_in(numbers, self.valid), *covariance, *_fields(self.solution))
+        numbers = fields_in((self.latitude, self.longitude, self.height, *self.std), self.valid)
+        return (*numbers, *self.covariance, COVARIANCE_TYPE if self.covariance else "", self.solution.name)
 
     def read(self, table: TopicTable, _: Config) -> PositionSource:
         """Return its positions; rows without a fix, not finite, far from the others or at 0, 0 are not usable."""
         latitude, longitude = (number(one).of(table, needed=True) for one in (self.latitude, self.longitude))
-        variance = stated_variance(table, _places(self.covariance, 3), self.std)
+        variance = stated_variance(table, self.covariance, self.std)
         no_fix, finite = ~all_valid(table, self.valid), np.isfinite(latitude) & np.isfinite(longitude)
         with np.errstate(invalid="ignore"):
             possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 360.0)
@@ -200,6 +187,10 @@ class Fix:
                 "far from the others": _far_away(places, possible & ~no_fix & finite),
             },
         )
+        height = number(self.height).of(table)
+        plausible = np.abs(height) < HIGHEST_M
+        known = height[plausible & usable]
+        height = np.where(plausible, height, float(np.median(known)) if len(known) else 0.0)
         std = float("nan")
         if np.isfinite(variance[usable, :2]).any():
             std = float(np.sqrt(np.nanmedian(variance[usable, :2])))
@@ -209,19 +200,12 @@ class Fix:
         counts = ", ".join(f"{reason} {count}" for reason, count in rejected.items())
         return PositionSource(
             **of_topic(table),
-            geodetic=np.column_stack([latitude, longitude, _plausible(number(self.height).of(table), usable)]),
+            geodetic=np.column_stack([latitude, longitude, height]),
             variance=variance, usable=usable, rejected=rejected, score=score,
             why=f"{what}, states ±{std:.2g} m" if np.isfinite(std) else f"{what}, states no accuracy",
             problem="" if usable.any() else f"no usable fix ({counts})",
-            stated_class=_stated_class(table, self.solution),
+            stated_class=self.solution.of(table),
         )  # fmt: skip
-
-
-def _plausible(height: Floats, usable: Bools) -> Floats:
-    """Return heights (n,) with the median of the usable ones in place of those that mean "unknown"."""
-    plausible = np.abs(height) < HIGHEST_M
-    known = plausible & usable
-    return np.where(plausible, height, float(np.median(height[known])) if known.any() else 0.0)
 
 
 def _far_away(places_deg: Floats, known: Bools) -> Bools:
@@ -295,9 +279,8 @@ class Pose:
 
     Attributes
     ----------
-    what, worth, std, valid, solution : as of `Fix`
+    what, worth, covariance, std, valid, solution : as of `Fix`
     path : the field of the pose
-    covariance : the field of its covariance (6, 6)
     odometry : its name or frame must show that it is a reference
     independent : where half of the messages or more do not pass, they are fused with the wheels
     """
@@ -305,10 +288,10 @@ class Pose:
     what: str
     worth: float
     path: str = "pose"
-    covariance: str = ""
+    covariance: tuple[str, ...] = ()
     std: tuple[str, ...] = ()
     valid: tuple[str, ...] = ()
-    solution: Solution | None = None
+    solution: Solution = NO_SOLUTION
     odometry: bool = False
     independent: tuple[str, ...] = ()
 
@@ -317,7 +300,7 @@ class Pose:
         """The fields that are read."""
         places = (f"{self.path}.position.{axis}" for axis in "xyz")
         numbers = fields_in(self.std, (*self.valid, *self.independent))
-        return (*places, *_places(self.covariance, 6), *numbers, *_fields(self.solution))
+        return (*places, *self.covariance, *numbers, self.solution.name)
 
     def read(self, table: TopicTable, _: Config) -> PositionSource:
         """Return its positions; those of goals, of dead reckoning and of frames whose z is not up are refused."""
@@ -329,9 +312,9 @@ class Pose:
         places = np.column_stack([x, y, table.floats(f"{self.path}.position.z")])[usable]
         return PositionSource(
             **of_topic(table), metric=np.column_stack([y, x]),
-            variance=stated_variance(table, _places(self.covariance, 6), self.std),
+            variance=stated_variance(table, self.covariance, self.std),
             usable=usable, rejected=rejected, score=self.worth, why=self.what, problem=self._problem(table, places),
-            stated_class=_stated_class(table, self.solution),
+            stated_class=self.solution.of(table),
         )  # fmt: skip
 
     def _problem(self, table: TopicTable, places: Floats) -> str:

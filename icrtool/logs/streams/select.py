@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar, cast
 
@@ -95,26 +95,15 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
     if topics.wheel_left is None:
         wheels = _read_all(tables, "wheels", config, WheelMotion) + wheels
     filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
-
-    def completeness(topic: str) -> float:
-        return sum(COMPLETE for names in filled if _namespace(topic) and _namespace(topic) in names)
-
-    wheels = _ranked(wheels, topics.wheels, completeness)
-    home = _namespace(wheels[0].topic) if wheels else ""
+    complete = {name: COMPLETE * sum(name in names for names in filled) for name in set().union(*filled)}
+    wheels = _ranked(wheels, topics.wheels, complete)
+    kin = {_namespace(wheels[0].topic): SAME_NAMESPACE} if wheels else {}
     others = _other_robots(wheels)
-
-    def kinship(topic: str) -> float:
-        return SAME_NAMESPACE if home and _namespace(topic) == home else 0.0
-
-    gnss = [_independent(source, wheels, topics) for source in gnss]
-    gnss = _ranked(gnss, topics.gnss, kinship, others)
+    gnss = _ranked([_independent(source, wheels, topics) for source in gnss], topics.gnss, kin, others)
     best = gnss[0] if gnss and not gnss[0].problem else None
     metric = best.topic if best is not None and best.metric is not None else ""
-
-    def companionship(topic: str) -> float:
-        return kinship(topic) + (SAME_MESSAGE if topic == metric else 0.0)
-
-    heading = _ranked(heading, topics.heading, companionship, others - ({_namespace(metric)} if metric else set()))
+    others -= {_namespace(metric)} if metric else set()
+    heading = _ranked(heading, topics.heading, kin, others, metric)
     return Candidates(tuple(wheels), tuple(gnss), tuple(heading), unread | _empty_topics(tables))
 
 
@@ -156,15 +145,22 @@ def _independent(source: PositionSource, wheels: Sequence[WheelMotion], topics: 
 def _ranked(
     sources: Sequence[Kind],
     configured: str | None,
-    bonus: Callable[[str], float],
+    bonus: Mapping[str, float],
     others: frozenset[str] = frozenset(),
+    same: str = "",
 ) -> list[Kind]:
-    """Return the sources sorted: usable ones first, this robot's before those of others, then by score and bonus."""
+    """Return the sources sorted: usable ones first, this robot's before those of others, then by score and bonus.
+
+    Parameters
+    ----------
+    bonus, others : by namespace, what is added to a score; those of other robots
+    same : the topic of a metric pose, whose heading is preferred
+    """
 
     def rank(source: Kind) -> tuple[bool, bool, float]:
-        forced = configured is not None and source.topic == configured
-        elsewhere = _namespace(source.topic) in others
-        return (bool(source.problem) and not forced, elsewhere, -(source.score + bonus(source.topic)))
+        home = _namespace(source.topic)
+        worth = source.score + (bonus.get(home, 0.0) if home else 0.0) + (SAME_MESSAGE if source.topic == same else 0.0)
+        return bool(source.problem) and source.topic != configured, home in others, -worth
 
     return sorted(sources, key=rank)
 

@@ -138,7 +138,7 @@ def _fields_of(channel: Channel, searched: set[tuple[str, str]]) -> list[str]:
     if channel.message_type in ARRAY_TYPES:
         return ["data[*]"] if _of_wheels(channel.topic) and not _OTHER_WORDS.search(channel.topic) else []
     words = f"{channel.topic} {channel.message_type} {channel.definition}"
-    if not (_SIDE_WORDS.search(words) and _of_wheels(words)):
+    if _is_known(channel.message_type) or not (_SIDE_WORDS.search(words) and _of_wheels(words)):
         return []
     one = (channel.message_type, channel.definition)
     if sum(len(text) for _, text in searched | {one}) > MOST_SEARCHED:
@@ -151,15 +151,16 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
     """Return whether a field may be a wheel's motion: a driver's messages hold currents and states, too."""
     if message_type in PAIR_TYPES:
         return path == "data"
-    if (
-        any(message_type in types for types in MESSAGE_TYPES.values())
-        or not _of_wheels(f"{topic} {message_type} {path}")
-        or _OTHER_WORDS.search(path)
-    ):
+    if not _of_wheels(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
         return False
     field = path.rpartition(".")[2]
     only_side = bool(_ONLY_SIDE.fullmatch(field) and _SIDE_WORDS.search(field))
     return only_side or any(words.search(path) for words in (_SPEED_WORDS, _PLACE_WORDS))
+
+
+def _is_known(message_type: str) -> bool:
+    """Return whether a type has a row of its own: nothing is looked for by the names of its fields."""
+    return any(message_type in types for types in MESSAGE_TYPES.values())
 
 
 def _of_wheels(name: str) -> bool:
@@ -176,7 +177,7 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelM
         return [pair_motion(sides[0], sides[1], config)] if len(sides) == 2 else []
     found: dict[str, dict[str, Side]] = {}
     for table in tables:
-        for path in table.columns if topics.wheels in (None, table.topic) else ():
+        for path in table.columns if not _is_known(table.message_type) and topics.wheels in (None, table.topic) else ():
             if _may_be_side(table.topic, table.message_type, path):
                 side = Side(table, path)
                 found.setdefault(table.message_type, {})[side.name] = side
