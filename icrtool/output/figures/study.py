@@ -135,7 +135,9 @@ def along(axes: Axes, t: Floats, values: Floats, look: dict[str, Any]) -> None:
     if len(values) > 1:
         axes.fill_between(t, low, high, color=look["color"], alpha=0.18, linewidth=0)
     axes.plot(t, middle, linewidth=1.2, markevery=max(1, len(t) // MARKS), **look)
-    axes.set(xlabel="Time [s]", xlim=(t[0], t[-1]))
+    axes.set_xlabel("Time [s]")
+    if len(t) > 1:
+        axes.set_xlim(t[0], t[-1])
 
 
 def estimates(axes: Axes, _result: StudyResult, levels: Sequence[Level], value: str = "", name: str = "trace") -> None:
@@ -162,7 +164,7 @@ def starts(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
             trace = level.found["trace"][:1]
             along(axes, trace[0, :, 0], trace[..., 1], {"color": "0.35"})
     axes.axhline(right, color=LOOKS[0]["color"], **TRUTH)
-    reach = BEYOND * max(map(abs, result.request.values))
+    reach = BEYOND * max(LEAST_VIEW_M, *map(abs, result.request.values))
     axes.set_ylim(-reach, reach)
     axes.set_title(f"start y left {near:g} m", loc="left")
 

@@ -15,6 +15,7 @@ import pytest
 from icrtool.cli.printing import show
 from icrtool.config import Config, load_config
 from icrtool.errors import DataError, OutputError
+from icrtool.output.figures.study import study_figure
 from icrtool.output.figures.style import new_figure
 from icrtool.output.files.truth_file import log_and_truth, read_speeds, truth_path, write_truth
 from icrtool.output.study_directory import check_study_target, write_study
@@ -85,6 +86,13 @@ def test_the_title_of_a_picture_states_the_answer_with_its_number(name) -> None:
     assert [finding_text(one) for one in result.answer if finding_text(one) not in title] == []
     assert subtitle.startswith(f"{name}: ICRs")
     assert "…" not in title + subtitle
+
+
+@pytest.mark.parametrize(("name", "changes"), [("initial", {"values": (0.0,)}), ("consistency", {})])
+def test_a_study_of_one_value_or_one_time_is_drawn_too(name, changes: dict[str, object]) -> None:
+    request = default_request(name, Config())
+    plan = replace(request.plan, duration_s=4.0)
+    assert study_figure(run_study(replace(request, runs=1, plan=plan, **changes))).axes
 
 
 def test_an_old_study_is_replaced_and_anything_else_is_left_alone(tmp_path: Path) -> None:
