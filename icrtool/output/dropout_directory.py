@@ -124,13 +124,8 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
     (directory / REPORT_FILE).write_bytes(json_bytes(report_document(report)))
 
 
-def shown_document(report: DropoutReport) -> DropoutDocument:
-    """Return what report.json holds as it is read back: null for a number that is not known."""
-    return msgspec.convert(plain(report_document(report)), DropoutDocument)
-
-
 def report_document(report: DropoutReport) -> DropoutDocument:
-    """Return what report.json holds, NaN for a number that is not known."""
+    """Return what report.json holds, equal to what is read back: None for a number that is not known."""
     run, made = report.run_document, report.calibration
     return DropoutDocument(
         schema=DROPOUT_SCHEMA,
@@ -167,7 +162,7 @@ def report_document(report: DropoutReport) -> DropoutDocument:
         gates=report.verdicts,
         passed=report.passed,
         baseline=_baseline_document(report),
-        outages=tuple(OutageDocument(*(getattr(one, name) for name in OUTAGE_KEYS)) for one in report.outages),
+        outages=tuple(OutageDocument(*plain([getattr(one, name) for name in OUTAGE_KEYS])) for one in report.outages),
         worst=tuple(map(_trial_document, report.worst)),
         examples=tuple(map(_trial_document, report.examples)),
     )  # fmt: skip
@@ -185,12 +180,14 @@ WORST_COLUMNS = (
 
 def _model_document(result: ModelResult, report: DropoutReport) -> ModelDocument:
     """Return one model's rows of summary.csv, under its name."""
-    rows = [SummaryRow(**row) for row in rows_of(report.summary_columns()) if row.pop("model") == result.name]
+    rows = [SummaryRow(**row) for row in rows_of(plain(report.summary_columns())) if row.pop("model") == result.name]
     used = next((one for one in report.calibrations if one.name == result.name), None)
     knows = used.fitted if used is not None else KNOWS.get(result.name, "the rest of the drive")
     blocks = [
-        BlocksDocument(horizon, **sums._asdict() | {"errors_m": [float(f"{error:.6g}") for error in sums.errors_m]})
-        for horizon, sums in zip(report.horizons_m, result.block_sums, strict=False)
+        BlocksDocument(
+            horizon, **plain(sums._asdict() | {"errors_m": [float(f"{error:.6g}") for error in sums.errors_m]})
+        )
+        for horizon, sums in zip(report.horizons_m.tolist(), result.block_sums, strict=False)
         if sums is not None
     ]
     return ModelDocument(result.name, result.label, knows, rows, blocks)
@@ -208,9 +205,12 @@ def _count_documents(report: DropoutReport) -> tuple[CountDocument, ...]:
     counts, reasons = report.counts, no_trial(report)
     return tuple(
         CountDocument(
-            horizon, counts.trials[h], {key: starts[h] for key, (_, starts) in reasons.items()}, why_no_trial(report, h)
+            horizon,
+            int(counts.trials[h]),
+            {key: int(starts[h]) for key, (_, starts) in reasons.items()},
+            why_no_trial(report, h),
         )
-        for h, horizon in enumerate(report.horizons_m)
+        for h, horizon in enumerate(report.horizons_m.tolist())
     )
 
 
@@ -252,7 +252,7 @@ def _event_document(report: DropoutReport) -> EventCostDocument | None:
 def _reference_rows(report: DropoutReport) -> tuple[ReferenceRow, ...]:
     """Return the reference's own error at each horizon: what a perfect model would show."""
     own = report.reference_error
-    return () if own is None else tuple(map(ReferenceRow, report.horizons_m, *own))
+    return () if own is None else tuple(map(ReferenceRow, *plain([report.horizons_m, *own])))
 
 
 def _learned_document(report: DropoutReport) -> LearnedDocument | None:
@@ -265,14 +265,14 @@ def _learned_document(report: DropoutReport) -> LearnedDocument | None:
 
 
 def _summary_rows(report: DropoutReport, summary: Summary) -> list[ErrorRow]:
-    return list(map(ErrorRow, report.horizons_m, *error_columns(summary).values()))
+    return list(map(ErrorRow, *plain([report.horizons_m, *error_columns(summary).values()])))
 
 
 def _trial_document(trial: ExampleTrial) -> TrialDocument:
-    return TrialDocument(
+    return TrialDocument(*plain([
         trial.model, trial.stamp_ns, trial.t_s, trial.north_m, trial.east_m, trial.horizon_m,
-        float(np.degrees(trial.heading_change_rad)), trial.speed_mean_mps, dict(trial.errors_m),
-    )  # fmt: skip
+        np.degrees(trial.heading_change_rad), trial.speed_mean_mps, trial.errors_m,
+    ]))  # fmt: skip
 
 
 def _histogram_rows(report: DropoutReport) -> Iterator[tuple[Any, ...]]:

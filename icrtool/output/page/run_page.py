@@ -34,7 +34,6 @@ from icrtool.output.tables.run import (
 from icrtool.output.text_blocks import PAGE, Block, Facts, Figure, Section, Title
 from icrtool.output.text_format import driven_text, position_word, run_title
 from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument, TrialDocument
-from icrtool.records.plain_data import plain
 from icrtool.records.run import Run, check_type
 from icrtool.records.run_document import EventDocument, RunDocument
 
@@ -86,27 +85,26 @@ def run_page(
     report : what report.json holds
     pictures : by name; those that the page is to show where no script draws
     """
-    document = msgspec.convert(plain(report), DropoutDocument)  # null for what is no number
     if not coordinates:
         pictures = _without_place(run, pictures)
-        run, document = without_place(run, document)
+        run, report = without_place(run, report)
     summary = run.document
-    compared = with_smoothed_reference(run) if document.smoothed else run
+    compared = with_smoothed_reference(run) if report.smoothed else run
     begun = f"{datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     return render(
-        SCRIPTS, drive_data(compared, document, coordinates=coordinates), title=summary.log,
+        SCRIPTS, drive_data(compared, report, coordinates=coordinates), title=summary.log,
         kind="Drive without GNSS: report of one log",
         blocks=[
             Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {ABOUT}"),
-            *page_blocks(summary, document),
+            *page_blocks(summary, report),
             Section(
-                "Log and settings", [*log_sections(summary), _provenance(summary, document, coordinates=coordinates)],
+                "Log and settings", [*log_sections(summary), _provenance(summary, report, coordinates=coordinates)],
                 name="log",
             ),
             Section("Words on this page", [Figure((), "words")], name="words"),
         ],
         pictures=pictures, position_word=position_word(summary), duration_s=summary.drive.duration_s,
-        folded_models=len(document.models) - len(main_rows(document)),
+        folded_models=len(report.models) - len(main_rows(report)),
     )  # fmt: skip
 
 

@@ -62,9 +62,9 @@ def format_dropout(report: DropoutReport) -> Text:
 
 def dropout_blocks(report: DropoutReport) -> list[Block]:
     """Return what `icrtool dropout-report` prints, with the differences to a baseline where there is one."""
-    from icrtool.output.dropout_directory import shown_document
+    from icrtool.output.dropout_directory import report_document
 
-    *blocks, verdicts = report_blocks(report.run_document, shown_document(report))
+    *blocks, verdicts = report_blocks(report.run_document, report_document(report))
     return [*blocks, *baseline_sections(report), verdicts]
 
 

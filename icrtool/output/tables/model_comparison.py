@@ -13,7 +13,7 @@ from icrtool.motion.models import FittedModel
 from icrtool.output.text_format import FITTED
 from icrtool.records.dropout import ModelResult, error_columns
 from icrtool.records.dropout_document import FitDocument, LadderDocument, ScoreDocument
-from icrtool.records.plain_data import rows_of
+from icrtool.records.plain_data import plain, rows_of
 
 COMPARISON_COLUMNS = (
     "model", "fitted", "heading", "horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m",
@@ -42,13 +42,13 @@ def comparison_rows(report: DropoutReport, comparison: ModelComparison) -> Itera
 
 
 def comparison_document(report: DropoutReport) -> LadderDocument:
-    """Return what report.json holds, with numbers of numpy; why there is none where it was left out."""
+    """Return what report.json holds; why there is none where it was left out."""
     comparison = report.comparison
     if comparison is None:
         return LadderDocument(left_out=report.no_comparison)
     heading = comparison.heading
     return LadderDocument(
-        horizons_m=list(report.horizons_m),
+        horizons_m=report.horizons_m.tolist(),
         blocks=comparison.blocks,
         starts=comparison.starts,
         heading=heading or None,
@@ -56,7 +56,7 @@ def comparison_document(report: DropoutReport) -> LadderDocument:
         models=[
             ScoreDocument(
                 one.name, one.label, fitted_text(one.name, heading), _heading(one.name, comparison),
-                *(column.tolist() for column in error_columns(one.summary).values()),
+                *plain(list(error_columns(one.summary).values())),
             )
             for one in compared_results(report)
         ],
@@ -68,7 +68,7 @@ def comparison_document(report: DropoutReport) -> LadderDocument:
 def _fit(fit: FittedModel) -> FitDocument:
     """Return the parameters of a fit with one standard deviation."""
     columns = (fit.parameters, np.sqrt(np.diag(fit.covariance)))
-    return FitDocument(*(dict(zip(fit.model.terms, column.tolist(), strict=True)) for column in columns))
+    return FitDocument(*(plain(dict(zip(fit.model.terms, column, strict=True))) for column in columns))
 
 
 def _heading(name: str, comparison: ModelComparison) -> str:

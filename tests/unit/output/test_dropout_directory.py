@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -29,6 +30,7 @@ from icrtool.output.dropout_directory import (
 from icrtool.output.files import disk
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.files.states_file import trials_file
+from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.run import Run
 from support.contract import SUMMARY_COLUMNS
 
@@ -148,8 +150,14 @@ def test_without_track_width_the_no_slip_column_is_empty(make_run: Callable[...,
     assert set(pd.read_csv(tmp_path / "summary.csv").model) == {"icr", "icr_final"}
 
 
-def test_the_document_is_json_without_nan(content: DropoutReport) -> None:
-    json.loads(json_bytes(report_document(content)), parse_constant=pytest.fail)
+def test_the_document_is_json_without_nan_and_is_read_back_equal(
+    content: DropoutReport, make_run: Callable[..., Run]
+) -> None:
+    parked = content_of(make_run(duration_s=20.0), gates=())
+    for report in (content, parked):
+        document = report_document(report)
+        stored = json.loads(json_bytes(document), parse_constant=pytest.fail)
+        assert msgspec.convert(stored, DropoutDocument) == document
 
 
 def test_trials_are_written_group_by_group_with_the_models_as_categories(run: Run, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from icrtool.dropout_analysis.outages import real_outages
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
-from icrtool.output.dropout_directory import shown_document
+from icrtool.output.dropout_directory import report_document
 from icrtool.output.exports.acceptance import format_markdown, suite_of, write_junit, write_markdown
 from icrtool.output.files.own_files import check_place
 from icrtool.output.tables.dropout import format_dropout, p95_at, reach_rows
@@ -83,7 +83,7 @@ def test_horizons_beyond_the_log_are_printed_with_the_reason(run: Run) -> None:
     text = " ".join(format_dropout(report).split())
     driven = f"{run.summary['drive']['distance_m']:.1f} m"
     assert f"no trial of 500, 700 m: less than that is left of the {driven} driven" in text
-    assert shown_document(report).trials[0].why_none is None
+    assert report_document(report).trials[0].why_none is None
     assert "no trial of" not in format_dropout(dropout(run, [1.0]))
 
 
@@ -99,7 +99,7 @@ def test_the_reference_and_the_run_up_stand_in_the_table(content: DropoutReport)
 def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutReport) -> None:
     (outage,), icr = content.outages, content.result("icr")
     assert icr is not None
-    document = shown_document(content)
+    document = report_document(content)
     usual = p95_at(document, "icr", outage.distance_m)
     assert usual == icr.summary.p95[2]
     assert p95_at(document, "icr", 31.0) is None
@@ -122,7 +122,7 @@ def test_a_budget_is_a_table_a_field_engineer_can_act_on(content: DropoutReport)
         BudgetDistance("no_slip", "no slip", 0.5, 2.1, beyond=False, between_m=(1.0, 20.0)),
         BudgetDistance("icr_final", "ICR, final", 0.5, 20.0, beyond=True, between_m=(20.0, 20.0)),
     )
-    report = msgspec.structs.replace(shown_document(content), budgets=budgets)
+    report = msgspec.structs.replace(report_document(content), budgets=budgets)
     assert reach_rows(report, 0.5, 0) == (
         [("ICR, momentary", "7.3 m", ""), ("no slip", "about 2 m", "between 1 and 20 m")],
         [("ICR, final", "more than 20 m", "")],

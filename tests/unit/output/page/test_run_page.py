@@ -19,7 +19,7 @@ import pytest
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
-from icrtool.output.dropout_directory import report_document, shown_document
+from icrtool.output.dropout_directory import report_document
 from icrtool.output.page.drive_data import packed, packed_sums
 from icrtool.output.page.render import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
@@ -94,7 +94,7 @@ def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutRep
     event = EventDocument("skid", 1.0, 2.0, 10**9, 2 * 10**9, 0.0, 0.0, 0.1, 0.5, 1.0)
     document = msgspec.structs.replace(run.document, events=(event, event))
     slipped = replace(report, budgets=budgets, run_document=document)
-    stated = shown_document(slipped)
+    stated = report_document(slipped)
     brief = str(printed(report_blocks(document, stated), verbose=False))
     text = "".join("".join(Elements(run_page(replace(run, document=document), stated, {})).text).split())
     rows, _ = reach_rows(stated, report.budgets[0].budget_m, 2)
@@ -104,7 +104,7 @@ def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutRep
         [word for word in re.split("  +", line.strip()) if word] for line in lines
     ]
     assert all("".join(f"{label}:{distance}".split()) in text for label, distance, _ in rows)
-    assert "without its" not in str(printed(report_blocks(run.document, shown_document(report)), verbose=False))
+    assert "without its" not in str(printed(report_blocks(run.document, report_document(report)), verbose=False))
 
 
 def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> None:
