@@ -295,7 +295,7 @@ def _table_lines(table: Table) -> Iterator[str]:
             for cell, width, side in zip(row, widths, sides, strict=True)
         )
         lead = "".join(f"{cell}  " for cell in first)
-        if sides[-1] == "l" and len(lead) < TEXT_WIDTH // 2:
+        if sides[-1] == "l" and len(lead) <= TEXT_WIDTH - 2 * NARROWEST_LAST:
             yield from _wrap(last.rstrip(), lead, " " * len(lead)) or [lead]
         else:
             yield lead + last

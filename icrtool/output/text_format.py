@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from icrtool.motion.models import FittedModel
     from icrtool.records.calibration_document import ControllerErrors
     from icrtool.records.run_document import (
-        ControllerNumbers,
         DriveDocument,
         EventDocument,
         ReferenceJumpDocument,
@@ -139,22 +138,9 @@ def filter_agreement(summary: RunDocument) -> str:
     return f"ends at {', '.join(ends)}: {'; '.join(apart) or 'agrees'}" if ends else ""
 
 
-def model_text(label: str, name: str, parameters: int) -> str:
-    """Return a recommended model as ``three ICRs (3 parameters, model icr)``."""
-    return f"{label} ({counted(parameters, 'parameter')}, model {name})"
-
-
-def fitted_model_text(fitted: FittedModel) -> str:
-    """Return a fitted model as `model_text` does."""
-    return model_text(fitted.model.label, fitted.model.name, len(fitted.parameters))
-
-
-def controller_text(numbers: ControllerNumbers) -> str:
-    """Return what a controller is given."""
-    return (
-        f"wheel_separation_multiplier {numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}, left/right wheel "
-        f"radius {numbers.left_radius:.3f}/{numbers.right_radius:.3f} of the configured"
-    )
+def model_text(fitted: FittedModel) -> str:
+    """Return a fitted model as ``three ICRs (3 parameters, model icr)``."""
+    return f"{fitted.model.label} ({counted(len(fitted.parameters), 'parameter')}, model {fitted.model.name})"
 
 
 def controller_error_text(errors: ControllerErrors | None) -> str:
@@ -167,9 +153,8 @@ def controller_error_text(errors: ControllerErrors | None) -> str:
     )
 
 
-def turn_text(turn_rad: float) -> str:
+def turn_text(degrees: float) -> str:
     """Return a turn as ``62° right``."""
-    degrees = math.degrees(turn_rad)
     return f"{abs(degrees):.0f}° {'right' if degrees >= 0 else 'left'}"
 
 

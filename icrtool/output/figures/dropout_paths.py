@@ -35,7 +35,7 @@ from icrtool.output.figures.trajectory import (
     look_down,
     name_directions,
 )
-from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title
+from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout import ExampleTrial, Outage
 
 if TYPE_CHECKING:
@@ -89,7 +89,8 @@ def dropout_examples(report: DropoutReport) -> Figure:
     panels = figure.subplots(1, len(examples), squeeze=False)[0]
     for axes, drive in zip(panels, examples, strict=True):
         _draw_drive(axes, report, drive, shape=3.0 / 2.75)
-        facts = f"at {drive.t_s:.0f} s, turns {_turn_text(drive)} at {drive.speed_mean_mps:.2f} m/s"
+        turn = turn_text(math.degrees(drive.heading_change_rad))
+        facts = f"at {drive.t_s:.0f} s, turns {turn} at {drive.speed_mean_mps:.2f} m/s"
         errors = ",  ".join(f"{_word(report, name)} {error_text(error)}" for name, error in drive.errors_m.items())
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
@@ -124,7 +125,8 @@ def dropout_worst(report: DropoutReport) -> Figure:
     for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
         _draw_drive(axes, report, drive, shape=1.0, ticks=0)
         _draw_scale(axes)
-        facts = f"at {duration_text(drive.t_s)}, {_turn_text(drive)}, {drive.speed_mean_mps:.2f} m/s"
+        turn = turn_text(math.degrees(drive.heading_change_rad))
+        facts = f"at {duration_text(drive.t_s)}, {turn}, {drive.speed_mean_mps:.2f} m/s"
         axes.set_title(f"{rank}:  {error_text(drive.errors_m[model])}\n{facts}", **CELL_TITLE)
     for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
@@ -252,11 +254,6 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
             [one.east_m - drive.east_m for one in jumps], [one.north_m - drive.north_m for one in jumps],
             label="step of the reference", **JUMP_LOOK,
         )  # fmt: skip
-
-
-def _turn_text(drive: ExampleTrial) -> str:
-    turn_deg = math.degrees(drive.heading_change_rad)
-    return f"{abs(turn_deg):.0f}° {'right' if turn_deg > 0 else 'left'}"
 
 
 def _outages_text(outages: Sequence[Outage]) -> str:

@@ -7,29 +7,18 @@ import textwrap
 
 import numpy as np
 
-from icrtool.calibration.controller_numbers import not_shown_sentences
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
 from icrtool.calibration.one_log import LogCalibration, Parameter
 from icrtool.calibration.pooled import CalibrationResult
-from icrtool.calibration.record import Calibration
-from icrtool.motion.models import ICRS, TERMS, FittedModel
-from icrtool.output.tables.dropout import REACH_LABELS, REACH_NOTES, REACH_ROWS
+from icrtool.motion.models import ICRS, TERMS
+from icrtool.output.tables.dropout import REACH_ROWS, parameter_table, reach_row
 from icrtool.output.tables.run import numbers_of
 from icrtool.output.text_blocks import VERBOSE, Block, Facts, Line, Section, Table, Title
-from icrtool.output.text_format import distance_text, fitted_model_text
+from icrtool.output.text_format import distance_text, model_text
 from icrtool.records.text import counted
 
 BUDGET_M = 0.5
 """Error within which a distance counts."""
-
-GEOMETRY = (
-    ("y_icr_right_m", "y ICR right", "m"),
-    ("y_icr_left_m", "y ICR left", "m"),
-    ("x_icr_m", "x ICR", "m"),
-    ("multiplier", "multiplier (y right - y left) / b", ""),
-    ("radius_left", "left radius over configured", ""),
-    ("radius_right", "right radius over configured", ""),
-)
 
 
 def calibration_blocks(result: CalibrationResult | None, sensors: LogCalibration | None) -> list[Block]:
@@ -45,7 +34,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
     driven = distance_text(sum(log.distance_m for log in calibration.logs))
     what = "log" if table.folds[0].whole else "block of distance"
     rows = [
-        (REACH_LABELS.get(row.name, row.label), reached.short_text, REACH_NOTES.get(row.name, ""))
+        reach_row(reached)
         for row in sorted(table.scores, key=lambda row: (*REACH_ROWS, row.name).index(row.name))
         if row.name in REACH_ROWS and (reached := row.within(table.horizons_m, BUDGET_M)) is not None
     ]
@@ -56,34 +45,10 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
         Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?"),
         Facts([("not found", f"too small, or not driven; taken as usual: {unknown}")] if unknown else []),
         Section(
-            f"Motion model: {fitted_model_text(calibration.fitted)}",
-            [*_parameter_blocks(calibration), *held_out_blocks(table), *result.notes], VERBOSE,
+            f"Motion model: {model_text(calibration.fitted)}",
+            [parameter_table(calibration.fitted, calibration.gyro), *held_out_blocks(table), *result.notes], VERBOSE,
         ),
     ]  # fmt: skip
-
-
-def _parameter_blocks(calibration: Calibration) -> list[Block]:
-    """Return the parameters with one standard deviation, and what was not shown."""
-    rows = _parameter_rows(calibration.fitted)
-    if calibration.gyro is not None:
-        rows += [("and with gyro", "", ""), *_parameter_rows(calibration.gyro)]
-    geometry, covariance = calibration.geometry()
-    std_of = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)), strict=True))
-    numbers = [
-        (label, f"{getattr(geometry, key):+.4f} ± {std_of[key]:.4f} {unit}".rstrip()) for key, label, unit in GEOMETRY
-    ]
-    return [
-        Table("l", rows, ("parameter", "value ± std", "meaning")),
-        Table("l", numbers),
-        *not_shown_sentences(calibration.fitted),
-    ]
-
-
-def _parameter_rows(fitted: FittedModel) -> list[tuple[str, str, str]]:
-    return [
-        (name, f"{value:+.4f} ± {std:.4f}", TERMS[name].meaning)
-        for name, value, std in zip(fitted.model.terms, fitted.parameters, fitted.std, strict=True)
-    ]
 
 
 def held_out_blocks(table: HeldOut) -> list[Block]:

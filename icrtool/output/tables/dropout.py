@@ -11,7 +11,7 @@ from msgspec import UNSET
 from icrtool.calibration.record import calibration_of
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
-from icrtool.motion.models import TERMS
+from icrtool.motion.models import TERMS, FittedModel
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.errors import baseline_sections, errors_section, model_of
 from icrtool.output.tables.run import advice_blocks, number_blocks, numbers_of, run_checks, unusable_lines
@@ -36,6 +36,7 @@ from icrtool.output.text_format import (
     duration_text,
     error_text,
     run_title,
+    turn_text,
 )
 from icrtool.records.dropout import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
@@ -119,17 +120,23 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
             label = one.label if one.label.startswith("calibration") else f"calibration {one.label}"
             rows.append((label, found.short_text, one.fitted))
     best = by_model.get("recommended") or by_model.get("icr")
-    for name in REACH_ROWS:
-        if name in by_model and not (name == "icr" and best is not by_model["icr"]):
-            found = by_model.pop(name)
-            label, interval = REACH_LABELS.get(name, found.label), found.interval_text
-            note = REACH_NOTES.get(name, interval if name.startswith("recommended") else "")
-            rows.append((label, found.short_text, note or _between_text(found)))
+    first = [name for name in REACH_ROWS if name in by_model and (name != "icr" or best is by_model["icr"])]
+    rows += [reach_row(by_model.pop(name)) for name in first]
     if report.run.config.robot.track_width_m is None:
         rows.append(("no slip", "not known", "needs robot.track_width_m (--robot, --set)"))
     if events and best is not None and (quiet := best.without_events_text):
         rows.append((f"without its {counted(events, 'slip event')}", quiet, best.label))
     return rows, [(one.label, one.short_text, one.interval_text or _between_text(one)) for one in by_model.values()]
+
+
+def reach_row(one: BudgetDistance) -> Row:
+    """Return label, distance and note of a model of `REACH_ROWS`."""
+    note = one.interval_text if one.model.startswith("recommended") else ""
+    return (
+        REACH_LABELS.get(one.model, one.label),
+        one.short_text,
+        REACH_NOTES.get(one.model, note or _between_text(one)),
+    )
 
 
 def _between_text(one: BudgetDistance) -> str:
@@ -143,7 +150,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
     lead, text = "", ""
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows, others = reach_rows(report, budget_m, len(summary.events))
-        if not lead:
+        if rows and not lead:
             label, lead, note = rows[0]
             more = f" ({note})" if note else ""
             text = f"within {budget_m:g} m (95 %), by wheel speeds alone with the {label}{more}"
@@ -195,7 +202,8 @@ def worst_cards(summary: RunDocument, report: DropoutDocument) -> Iterator[Secti
     one = report.worst[0]
     note = _meanwhile(one, summary, report)
     driven = f"{one.horizon_m:g} m from {duration_text(one.t_s)} on"
-    text = f"after {driven}, turning {_turn(one)} at {one.speed_mean_mps:.2f} m/s, with the {_worst_label(report)}"
+    turned = f"turning {turn_text(one.heading_change_deg)} at {one.speed_mean_mps:.2f} m/s"
+    text = f"after {driven}, {turned}, with the {_worst_label(report)}"
     lead = error_text(one.errors_m[one.model])
     text += f"; meanwhile: {note}" if note else ""
     yield Section("Where was it worst?", [], lead=lead, text=text, label="Worst")
@@ -209,7 +217,7 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
     rows = [
         (
             f"{rank}", duration_text(one.t_s), error_text(one.errors_m[one.model]),
-            error_text(one.errors_m.get("no_slip")), _turn(one), f"{one.speed_mean_mps:.2f} m/s",
+            error_text(one.errors_m.get("no_slip")), turn_text(one.heading_change_deg), f"{one.speed_mean_mps:.2f} m/s",
             f"{one.north_m:.1f} m", f"{one.east_m:.1f} m", _meanwhile(one, summary, report),
         )
         for rank, one in enumerate(report.worst, start=1)
@@ -231,11 +239,6 @@ def _worst_label(report: DropoutDocument) -> str:
     """Return the label of the model that the worst trials are of; in earlier versions the momentary ICRs."""
     found = model_of(report, report.worst[0].model)
     return found.label if found is not None else report.worst[0].model
-
-
-def _turn(trial: TrialDocument) -> str:
-    degrees = trial.heading_change_deg
-    return f"{abs(degrees):.0f}° {'right' if degrees > 0 else 'left'}"
 
 
 def _meanwhile(one: TrialDocument, summary: RunDocument, report: DropoutDocument) -> str:
@@ -288,18 +291,24 @@ def p95_at(report: DropoutDocument, model: str, distance_m: float) -> float | No
 
 def model_sections(report: DropoutDocument) -> Iterator[Section]:
     """Yield the parameters of the recommended motion model, and how the models were compared."""
-    found = report.recommended
     blocks: list[Block] = []
-    if found is not None:
-        rows = [
-            (name, f"{one.value:+.4f} ± {one.std:.4f}", TERMS[name].meaning if name in TERMS else "", one.verdict)
-            for name, one in found.parameters.items()
-        ]
-        table = Table("lrll", rows, ("term", "value ± σ", "meaning", "by this drive"))
-        blocks.append(Section("Parameters of the motion model", [table, *found.warnings], VERBOSE))
+    if (found := report.recommended) is not None:
+        parameters: list[Block] = [parameter_table(calibration_of(found).fitted), *found.warnings]
+        blocks.append(Section("Parameters of the motion model", parameters, VERBOSE))
     blocks += report.ladder.notes if report.ladder.notes is not UNSET else ()
     if blocks:
         yield Section("The motion model", blocks, VERBOSE, name="models")
+
+
+def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:
+    """Return the parameters of a model with one standard deviation each, and those of the same one with a gyro."""
+    rows = [
+        (name if one is fitted else f"with gyro: {name}", f"{value:+.4f} ± {std:.4f}",
+         "not shown" if name in one.not_shown else "shown", TERMS[name].meaning)
+        for one in (fitted, gyro) if one is not None
+        for name, value, std in zip(one.model.terms, one.parameters, one.std, strict=True)
+    ]  # fmt: skip
+    return Table("lrll", rows, ("term", "value ± σ", "by this drive", "meaning"))
 
 
 def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:

@@ -13,7 +13,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS
 from icrtool.output.text_blocks import Block, Table, Text, printed
-from icrtool.output.text_format import distance_text, fitted_model_text
+from icrtool.output.text_format import distance_text, model_text
 from icrtool.records.calibration_document import ForecastBudget, ForecastColumns, ForecastDocument, ForecastSource
 from icrtool.records.plain_data import known
 from icrtool.records.text import counted
@@ -77,7 +77,7 @@ def format_forecast(
     """Return the table of a forecast, no line end."""
     total = float(forecast.distance_m[-1])
     fitted, logs = calibration.fitted, counted(len(calibration.logs), "log")
-    model = f"{fitted_model_text(fitted)} from {logs}"
+    model = f"{model_text(fitted)} from {logs}"
     kinds = [("", forecast)] if gyro is None else [("", forecast), (", with gyro", gyro)]
     rows = []
     for metres in sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)}):
