@@ -10,13 +10,11 @@ import numpy as np
 
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.streams.assembly import Survey
-from icrtool.logs.streams.sources import HeadingSource, PositionSource, WheelMotion
+from icrtool.logs.streams.sources import Source
 from icrtool.records.plain_data import plain
-from icrtool.records.samples import ROLE_WORDS, Role, StreamChoice, rate_and_jitter
+from icrtool.records.samples import ROLE_WORDS, StreamChoice, rate_and_jitter
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
-
-Sources = Sequence[WheelMotion | PositionSource | HeadingSource]
 
 GAP_IN_INTERVALS = 5.0
 
@@ -34,12 +32,7 @@ def describe_survey(survey: Survey, measured: RobotLog | None) -> str:
     lines += [f"  {survey.transfer}"] if survey.transfer else []
     lines += _topics(survey)
     chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
-    candidates: tuple[tuple[Role, Sources], ...] = (
-        ("wheels", survey.candidates.wheels),
-        ("gnss", survey.candidates.gnss),
-        ("heading", survey.candidates.heading),
-    )
-    for role, sources in candidates:
+    for role, sources in survey.candidates.by_role().items():
         lines.append(f"\n{ROLE_WORDS[role]} (key topics.{role}; * chosen):")
         lines += _candidates(sources, chosen[role].topic if role in chosen else None)
         if role in chosen:
@@ -101,7 +94,7 @@ def _gaps(stamps: Ints) -> str:
     return f", {counted(int(np.count_nonzero(long)), 'gap')} up to {float(interval.max()):.1f} s"
 
 
-def _candidates(sources: Sources, chosen: str | None) -> list[str]:
+def _candidates(sources: Sequence[Source], chosen: str | None) -> list[str]:
     if not sources:
         return ["  no candidate"]
     lines = []

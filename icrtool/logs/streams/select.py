@@ -14,7 +14,7 @@ from icrtool.logs.messages.collectors import READ_ENCODINGS
 from icrtool.logs.messages.topic_table import HEADER, TopicTable
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE
 from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
-from icrtool.logs.streams.sources import HeadingSource, PositionSource, WheelMotion, of_topic
+from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelMotion, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean
@@ -56,7 +56,7 @@ class Candidates:
     heading: tuple[HeadingSource, ...]
     unread: dict[str, str] = field(default_factory=dict)
 
-    def by_role(self) -> dict[Role, Sequence[WheelMotion | PositionSource | HeadingSource]]:
+    def by_role(self) -> dict[Role, Sequence[Source]]:
         """Return the sources of each role."""
         return {"wheels": self.wheels, "gnss": self.gnss, "heading": self.heading}
 
