@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from icrtool.config import Config
-from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import read_source
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
+from support.tables import table_of
 
 WORD, NUMBER = "novatel_gps_msgs/NovatelPosition", "novatel_oem7_msgs/BESTPOS"
 
@@ -20,7 +21,7 @@ def stated(message_type: str, path: str, values: Any, texts: list[str] | None = 
     count = len(values)
     names = {name: np.full(count, 48.0) for name in ("latitude", "longitude", "lat", "lon")}
     columns = {**names, path: np.asarray(values)}
-    table = TopicTable("/t", message_type, np.arange(count), columns, {path: texts} if texts is not None else {}, 0)
+    table = replace(table_of(message_type, columns), texts={path: texts} if texts is not None else {})
     found = read_source("gnss", table, Config()).stated_class
     return None if found is None else found.tolist()
 

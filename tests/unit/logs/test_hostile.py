@@ -37,6 +37,7 @@ from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.stamps import stamp_rows
 from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
 from icrtool.records.text import LogText
+from support.tables import block_of, channel_of, collected
 
 SEPARATOR = "=" * 80 + "\n"
 START_NS = 1_760_000_000_000_000_000
@@ -506,18 +507,8 @@ def dynamic_joints(stamp_ns: int, names: list[str], interfaces: list[str]) -> by
     return message.done()
 
 
-def block_of(messages: list[tuple[int, bytes]]) -> Block:
-    sizes = np.array([len(data) for _, data in messages])
-    times, end = np.array([stamp for stamp, _ in messages]), np.cumsum(sizes)
-    data = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
-    return Block(data, np.zeros(len(messages), np.int64), times, end - sizes, end)
-
-
-def collected(kind: str, definition: str, wanted: tuple[str, ...], *blocks: list[tuple[int, bytes]]) -> TopicTable:
-    collector = collector_for(Channel(0, LogText("/t"), LogText(kind), LogText("cdr"), definition), wanted)
-    for messages in blocks:
-        collector.feed(block_of(messages), 0)
-    return collector.table()
+def columns_of(kind: str, definition: str, wanted: tuple[str, ...], *blocks: list[tuple[int, bytes]]) -> TopicTable:
+    return collected(channel_of(kind, definition=definition), wanted, *blocks)
 
 
 DYNAMIC = "control_msgs/DynamicJointState"
@@ -527,16 +518,16 @@ def test_a_clock_of_dynamic_joint_states_that_is_set_back_is_seen_within_and_bet
     stamps = START_NS + 10**9 * np.array([0, 1, 2, 3, -3600, -3599, -3598, -3597])
     messages = [(int(stamp), dynamic_joints(int(stamp), WHEELS, ["velocity"])) for stamp in stamps]
     for blocks in ([messages], [messages[:4], messages[4:]], [messages[:2], messages[2:6], messages[6:]]):
-        table = collected(DYNAMIC, DYNAMIC_JOINTS, (), *blocks)
+        table = columns_of(DYNAMIC, DYNAMIC_JOINTS, (), *blocks)
         assert table.set_back.step_ns == 3603 * 10**9
         assert (np.diff(table.log_time_ns) > 0).all()
-    assert collected(DYNAMIC, DYNAMIC_JOINTS, (), messages[:4]).set_back.step_ns == 0
+    assert columns_of(DYNAMIC, DYNAMIC_JOINTS, (), messages[:4]).set_back.step_ns == 0
 
 
 def test_another_number_of_joints_in_each_message_costs_no_time() -> None:
     messages = [(START_NS + i, dynamic_joints(START_NS, [f"j{k}" for k in range(i)], ["velocity"])) for i in range(100)]
     begin = time.process_time()
-    table = collected(DYNAMIC, DYNAMIC_JOINTS, (), messages)
+    table = columns_of(DYNAMIC, DYNAMIC_JOINTS, (), messages)
     assert len(table) + table.unreadable == 100
     assert time.process_time() - begin < LONGEST_S
 
@@ -546,7 +537,7 @@ JOINT_FIELDS = ("header.stamp.sec", "header.stamp.nanosec", "name[*]", "position
 
 def test_topics_of_many_joints_take_memory_for_their_messages_only() -> None:
     wide = joints(START_NS, [f"j{k}" for k in range(256)], [1.0] * 256)
-    collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, [(START_NS, wide)])
+    columns_of("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, [(START_NS, wide)])
     tracemalloc.start()
     channel = Channel(0, LogText("/t"), LogText("sensor_msgs/JointState"), LogText("cdr"), JOINTS)
     kept = [collector_for(channel, JOINT_FIELDS) for _ in range(20)]
@@ -562,7 +553,7 @@ def test_a_message_of_more_wheels_than_a_robot_has_is_not_of_wheels(side: int, p
 
     names = [f"{one}_wheel_{k}" for k in range(side) for one in ("left", "right")]
     rows = [(START_NS + i, joints(START_NS + i, names, [0.1 * i] * len(names))) for i in range(3)]
-    table = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, rows)
+    table = columns_of("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, rows)
     motion = read_source("wheels", table, Config())
     assert problem in motion.problem
     assert bool(motion.problem) == bool(problem)
@@ -570,7 +561,7 @@ def test_a_message_of_more_wheels_than_a_robot_has_is_not_of_wheels(side: int, p
 
 def test_of_ever_new_names_the_first_thousands_are_told_apart() -> None:
     many = [(START_NS + i, joints(START_NS + i, [f"w{i:03}_{k:03}" for k in range(200)], [])) for i in range(400)]
-    numbers, names = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, many).words("name[*]")
+    numbers, names = columns_of("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, many).words("name[*]")
     assert len(set(names)) == len(names) == MOST_TEXTS + 1
     assert [names[number] for number in numbers[:400, 0]] == [f"w{i:03}_000" for i in range(400)]
     assert numbers.shape == (400, 200)
@@ -582,7 +573,7 @@ def test_joints_at_infinity_are_left_out() -> None:
 
     rows = [(START_NS + i * 10**8, [0.1 * i, 0.1 * i if i % 4 else np.inf * (-1) ** i]) for i in range(100)]
     messages = [(stamp, joints(stamp, WHEELS, positions)) for stamp, positions in rows]
-    table = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, messages)
+    table = columns_of("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, messages)
     config = load_config(sets=["robot.track_width_m=0.5", "robot.wheel_radius_m=0.1"])
     motion = read_source("wheels", table, Config())
     samples, warnings = wheel_samples(motion, motion.stamps.on("log"), config, "x")
@@ -595,7 +586,7 @@ def test_stamps_that_are_no_whole_numbers_are_none(kind: str) -> None:
     definition = JOINTS.replace("builtin_interfaces/Time", "x/T") + f"\n{SEPARATOR}MSG: x/T\n{kind} sec\n{kind} nanosec"
     stamp = Cdr().add("dd", np.nan, np.inf) if kind == "float64" else Cdr().text("1").text("2")
     message = stamp.text("base").texts(WHEELS).numbers([1.0, 2.0]).numbers([]).numbers([]).done()
-    table = collected("sensor_msgs/JointState", definition, JOINT_FIELDS, [(START_NS, message)] * 3)
+    table = columns_of("sensor_msgs/JointState", definition, JOINT_FIELDS, [(START_NS, message)] * 3)
     assert stamp_rows(table).header_ns is None
     assert table.column("position[*]").tolist() == [[1.0, 2.0]] * 3
 
@@ -607,7 +598,7 @@ def test_a_signalling_nan_warns_nobody() -> None:
     stamp, data = messages[7]
     at = data.index(struct.pack("<d", rows[7][1]))
     messages[7] = stamp, data[:at] + b"\1\0\0\0\0\0\xf0\x7f" + data[at + 8 :]
-    positions = collected("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, messages).column("position[*]")
+    positions = columns_of("sensor_msgs/JointState", JOINTS, JOINT_FIELDS, messages).column("position[*]")
     assert np.isnan(positions[7, 1])
     with np.errstate(invalid="raise"):
         assert np.isnan(positions * 2.0)[7, 1]

@@ -14,27 +14,12 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.sources import HeadingSource, PositionSource
 from icrtool.logs.streams.stamps import increasing, stamp_rows
+from support.tables import START_NS, STEP_NS, table_of
 
-START_NS, STEP_NS = 1_760_000_000_000_000_000, 50_000_000
 ROUNDING_DEG = 1e-12
 """A degree near 180 is rounded at 3e-14; a few operations follow."""
 
 ROUNDING_RAD = 1e-12
-
-
-def table_of(
-    message_type: str, columns: dict[str, Any], topic: str = "/topic", texts: dict[str, list[str]] | None = None
-) -> TopicTable:
-    """Return a table; a text column is given as texts."""
-    arrays, found = {}, {}
-    for path, values in columns.items():
-        if isinstance(values, list) and isinstance(values[0], str):
-            found[path] = list(dict.fromkeys(values))
-            arrays[path] = np.array([found[path].index(value) for value in values])
-        else:
-            arrays[path] = np.asarray(values)
-    length = len(next(iter(arrays.values())))
-    return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, found, 0)
 
 
 def position(message_type: str, topic: str = "/topic", **columns: Any) -> PositionSource:

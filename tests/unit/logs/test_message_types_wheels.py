@@ -20,6 +20,7 @@ from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.sources import WheelMotion
 from icrtool.logs.streams.wheel_pairs import Side, pair_motion
+from support.tables import table_of
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 20_000_000
 CONFIG = load_config()
@@ -72,9 +73,7 @@ def write_bag(path: Path, publishers: Sequence[tuple[str, list[Any]]], name: str
 
 
 def column_table(message_type: str, topic: str = "/topic", **columns: Any) -> TopicTable:
-    arrays = {path.replace("__", "."): np.asarray(values) for path, values in columns.items()}
-    length = len(next(iter(arrays.values())))
-    return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, {}, 0)
+    return table_of(message_type, {path.replace("__", "."): values for path, values in columns.items()}, topic)
 
 
 def read(table: TopicTable, config: Any = CONFIG) -> WheelMotion:
@@ -262,7 +261,7 @@ def test_the_second_message_of_a_cycle_belongs_to_the_first() -> None:
 def drivers(package: str) -> TopicTable:
     travel, velocity = np.array([[1.0, 2.0], [3.0, 5.0]]), np.array([[0.1, 0.2], [0.3, 0.5]])
     columns = {"drivers[*].measured_travel": travel, "drivers[*].measured_velocity": velocity}
-    return TopicTable("/feedback", f"{package}/Feedback", START_NS + np.arange(2), columns, {}, 0)
+    return table_of(f"{package}/Feedback", columns)
 
 
 @pytest.mark.parametrize("package", ["jackal_msgs", "clearpath_platform_msgs"])
@@ -277,7 +276,7 @@ def test_driver_0_is_left_and_driver_1_is_right(package: str) -> None:
 
 def test_four_wheels_of_a_leo_are_front_and_rear_left_then_right() -> None:
     columns = {"position[*]": np.array([[1.0, 3.0, 5.0, 9.0]] * 2), "velocity[*]": np.array([[1.0, 2.0, 3.0, 4.0]] * 2)}
-    motion = read(TopicTable("/wheels", "leo_msgs/WheelStates", START_NS + np.arange(2), columns, {}, 0))
+    motion = read(table_of("leo_msgs/WheelStates", columns))
     assert motion.position is not None
     assert motion.position is not None
     assert (motion.position[0][0], motion.position[1][0]) == (2.0, 7.0)
@@ -290,7 +289,7 @@ def test_a_segway_tells_metres() -> None:
         for what in ("velocity", "displacement")
     }
     for name in ("segway_rmp/SegwayStatusStamped", "segway_rmp_ros2/SegwayStatusStamped", "segway_interfaces/Stamped"):
-        motion = read(TopicTable("/status", name, START_NS + np.arange(2), columns, {}, 0))
+        motion = read(table_of(name, columns))
         assert motion.unit == "m"
         assert motion.position is not None
         assert motion.position[1].tolist() == [3.0, 6.0]
@@ -326,7 +325,7 @@ def test_motor_drivers_are_told_apart_by_their_joint(message_type: str, names: s
 
 def twist_table(message_type: str, topic: str, prefix: str, x: Any, y: Any, turn: Any) -> TopicTable:
     columns = {f"{prefix}linear.x": np.array(x), f"{prefix}linear.y": np.array(y), f"{prefix}angular.z": np.array(turn)}
-    return TopicTable(topic, message_type, START_NS + np.arange(len(x)), columns, {}, 0)
+    return table_of(message_type, columns, topic)
 
 
 @pytest.mark.parametrize(

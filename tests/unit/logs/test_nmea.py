@@ -13,13 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from icrtool.config import Config
-from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.collectors import collector_for
 from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC, parse_sentence
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import read_source
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
-from icrtool.records.text import LogText
+from support.tables import channel_of, collected
 
 ROUNDING_DEG = 1e-12
 STEP_NS = 100_000_000
@@ -46,16 +44,10 @@ def gga(quality: int, utc: str = "101500.00", north: str = "4806.000") -> bytes:
 
 def table_of(texts: list[bytes]) -> TopicTable:
     """Return the messages of a topic, as ROS 2 serializes them."""
-    messages = []
-    for text in texts:
-        head = b"\0\1\0\0" + struct.pack("<iII", 0, 0, 1) + b"\0\0\0\0"
-        messages.append(head + struct.pack("<I", len(text) + 1) + text + b"\0")
-    end = np.cumsum([len(message) for message in messages])
-    zeros, stamps = np.zeros(len(texts), np.int64), STEP_NS * np.arange(1, len(texts) + 1)
-    data = np.frombuffer(b"".join(messages), np.uint8)
-    collector = collector_for(Channel(0, LogText("/nmea"), LogText(NMEA_SENTENCE), LogText("cdr")), ("sentence",))
-    collector.feed(Block(data, zeros, stamps, np.append(0, end[:-1]), end), 0)
-    return collector.table()
+    head = b"\0\1\0\0" + struct.pack("<iII", 0, 0, 1) + b"\0\0\0\0"
+    messages = (head + struct.pack("<I", len(text) + 1) + text + b"\0" for text in texts)
+    stamps = (STEP_NS * (1 + i) for i in range(len(texts)))
+    return collected(channel_of(NMEA_SENTENCE), ("sentence",), list(zip(stamps, messages, strict=True)))
 
 
 @PATIENT

@@ -18,13 +18,14 @@ from hypothesis import strategies as st
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from icrtool.errors import DefinitionError
-from icrtool.logs.containers.channel import Block, Channel
+from icrtool.logs.containers.channel import Channel
 from icrtool.logs.messages.collectors import collector_for
 from icrtool.logs.messages.decoded_values import LONGEST_MESSAGE_BYTES
 from icrtool.logs.messages.definitions import number_fields
 from icrtool.logs.messages.protobuf import LONGEST_DESCRIPTORS
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.records.text import LogText
+from support.tables import collected
 
 LONGEST_S = 2.0
 PATIENT = settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
@@ -78,11 +79,7 @@ def json_channel(definition: str = "") -> Channel:
 
 
 def table_of(channel: Channel, messages: list[bytes], *wanted: str) -> TopicTable:
-    collector = collector_for(channel, wanted)
-    ends, zeros = np.cumsum([len(message) for message in messages]), np.zeros(len(messages), np.int64)
-    data = np.frombuffer(b"".join(messages), np.uint8)
-    collector.feed(Block(data, zeros, np.arange(len(messages)), np.append(0, ends[:-1]), ends), 0)
-    return collector.table()
+    return collected(channel, wanted, list(enumerate(messages)))
 
 
 def draw(name: str, rng: np.random.Generator) -> Any:
