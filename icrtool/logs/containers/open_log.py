@@ -5,11 +5,12 @@ from __future__ import annotations
 import stat
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from threading import Event
-from typing import BinaryIO
+from types import MappingProxyType
+from typing import BinaryIO, NamedTuple
 
 from icrtool.errors import LogChangedError, LogError
 from icrtool.logs.containers.bag_directory import BagDirectory
@@ -34,35 +35,41 @@ KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file, also
 Plain = BagDirectory | McapFile | Ros1Bag | SqliteBag
 
 
+class Brought(NamedTuple):
+    """A log that lies on disk now, perhaps packed.
+
+    Attributes
+    ----------
+    inputs : what was read for it; none of one that was there before
+    transfer : how it came over a connection
+    distant : as in `BagDirectory`
+    """
+
+    log: Path
+    inputs: tuple[InputFile, ...] = ()
+    transfer: str = ""
+    distant: Mapping[str, RemoteFile] = MappingProxyType({})
+
+
 class UnpackedLog:
     """A log that lies in a temporary folder, which is removed when it is closed.
 
     Parameters
     ----------
     path : what the user named
-    log : file on disk, unpacked first where it is packed
-    inputs : what was read, where that is known
-    transfer : how it came over a connection
+    brought : unpacked first where it is packed
     share : called with the share of the file that was unpacked
-    distant : as in `BagDirectory`
     """
 
     def __init__(
-        self,
-        path: Path,
-        log: Path,
-        scratch: ScratchFolder,
-        inputs: tuple[InputFile, ...] = (),
-        transfer: str = "",
-        share: Callable[[float], None] | None = None,
-        distant: Mapping[str, RemoteFile] | None = None,
-    ) -> None:
-        self._path, self._scratch, self._inputs, self._transfer = path, scratch, inputs, transfer
-        problem = ""
+        self, path: Path, brought: Brought, scratch: ScratchFolder, share: Callable[[float], None] | None = None
+    ) -> None:  # fmt: skip
+        self._path, self._scratch, self._brought = path, scratch, brought
+        log, problem = brought.log, ""
         try:
             if _is_packed_file(log):
                 log, problem = unpack(log, scratch.path / "unpacked", share)
-            self._log = _usable(BagDirectory(log, distant=distant) if distant else _container_at(log), log)
+            self._log = _plain_log(log, brought.distant)
         except LogError as err:
             # Its own path is gone when the user reads this.
             raise LogError(path, err.why, "; ".join(filter(None, [problem, err.advice]))) from err
@@ -88,11 +95,11 @@ class UnpackedLog:
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:
         """Return the file that the user named, with its SHA-256."""
-        return self._inputs or inputs_of([self._path], ended)
+        return self._brought.inputs or inputs_of([self._path], ended)
 
     def transfer(self) -> str:
         """Return how it came over a connection."""
-        return "; ".join(filter(None, [self._transfer, self._log.transfer()]))
+        return "; ".join(filter(None, [self._brought.transfer, self._log.transfer()]))
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return first and last log time."""
@@ -176,70 +183,76 @@ def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
     OSError
         It cannot be read.
     """
-    file, scratch = path, ScratchFolder()
+    scratch = ScratchFolder()
     try:
-        if isinstance(path, UrlPath):
-            file = scratch.path / (path.name or "file")
-            read = RemoteFile(path).fetch(file, None)
-        else:
-            (read,) = inputs_of([path], Event())
+        file, inputs, *_ = _brought(path, scratch.path, RemoteFile(path) if isinstance(path, UrlPath) else None)
         if _is_packed_file(file):
             file, problem = unpack(file, scratch.path / "unpacked")
             if problem:
                 raise LogError(path, "does not decompress", problem)
-        yield file, read
+        yield file, (inputs or inputs_of([path], Event()))[0]
     finally:
         scratch.close()
 
 
 def _open(path: Path, share: Callable[[float], None] | None) -> Container:
-    if isinstance(path, UrlPath):
-        return _open_remote(path, share)
-    if path != STANDARD_INPUT and not _is_packed_file(path):
+    remote, why = RemoteFile(path) if isinstance(path, UrlPath) else None, ""
+    if remote is not None:
+        opened = _by_ranges(path, remote)
+        if not isinstance(opened, str):
+            return opened
+        why = opened
+    elif path != STANDARD_INPUT and not _is_packed_file(path):
         return _plain_log(path)
     scratch = ScratchFolder()
     try:
-        if path != STANDARD_INPUT:
-            return UnpackedLog(path, path, scratch, share=share)
+        return UnpackedLog(path, _brought(path, scratch.path, remote, why, share), scratch, share)
+    except BaseException:
+        scratch.close()
+        raise
+
+
+def _by_ranges(path: Path, remote: RemoteFile) -> Plain | str:
+    """Return the container of a file at an address, where it has an index; else why it has to be fetched."""
+    if remote.is_folder:
+        return "SQLite files, or packed"
+    if not remote.has_ranges:
+        return "its server gives no parts of a file"
+    start = remote.read_at(0, 512)
+    kind = container_of(BytesIO(start))
+    if kind is None:
+        if is_packed(start):
+            return "it is packed"
+        raise LogError(path, "not a log", f"a log is {KINDS}")
+    if kind is SqliteBag:
+        return "an SQLite file"
+    try:
+        return _usable(McapFile(path, source=remote) if kind is McapFile else Ros1Bag(path, remote), path)
+    except NotByRangesError:
+        return "it has no index"
+
+
+def _brought(
+    path: Path, folder: Path, remote: RemoteFile | None, why: str = "", share: Callable[[float], None] | None = None
+) -> Brought:
+    """Return a log that was fetched or saved to a folder where it is not on disk; `why` it is fetched."""
+    if remote is None and path != STANDARD_INPUT:
+        return Brought(path)
+    if remote is None:
         if sys.stdin.isatty():
             raise LogError(path, "standard input is a terminal", "pipe a log into it, or name one")
-        log = scratch.path / "stdin"
+        log = folder / "stdin"
         digest = save(sys.stdin.buffer, log)
-        return UnpackedLog(path, log, scratch, (InputFile(str(path), log.stat().st_size, digest),))
-    except BaseException:
-        scratch.close()
-        raise
-
-
-def _open_remote(path: UrlPath, share: Callable[[float], None] | None) -> Container:
-    """Return the container at an address: read by ranges where it has an index, else fetched to a temporary folder."""
-    remote = RemoteFile(path)
-    why = "SQLite files, or packed"
-    if not remote.is_folder:
-        start = remote.read_at(0, 512) if remote.has_ranges else b""
-        kind = container_of(BytesIO(start))
-        if kind in {McapFile, Ros1Bag}:
-            with suppress(NotByRangesError):
-                opened = McapFile(path, source=remote) if kind is McapFile else Ros1Bag(path, remote)
-                return _usable(opened, path)
-        elif remote.has_ranges and kind is None and not is_packed(start):
-            raise LogError(path, "not a log", f"a log is {KINDS}")
-        why = "it has no index" if kind in {McapFile, Ros1Bag} else "an SQLite file" if kind else "it is packed"
-        why = why if remote.has_ranges else "its server gives no parts of a file"
-    scratch = ScratchFolder()
-    try:
-        log = scratch.path / (path.name or "log")
-        if remote.is_folder:
-            log.mkdir()
-            inputs, distant = fetch_folder(path, log, share)
-        else:
-            inputs, distant = (remote.fetch(log, share),), {}
-        size = sum(one.bytes for one in inputs if one.sha256 is not None) / 1e6
-        transfer = f"{size:.3g} MB fetched to a temporary folder: {why}" if size else ""
-        return UnpackedLog(path, log, scratch, inputs, transfer, distant=distant)
-    except BaseException:
-        scratch.close()
-        raise
+        return Brought(log, (InputFile(str(path), log.stat().st_size, digest),))
+    log = folder / (path.name or "log")
+    if remote.is_folder:
+        log.mkdir()
+        inputs, distant = fetch_folder(remote.path, log, share)
+    else:
+        inputs, distant = (remote.fetch(log, share),), {}
+    size = sum(one.bytes for one in inputs if one.sha256 is not None) / 1e6
+    transfer = f"{size:.3g} MB fetched to a temporary folder: {why}" if size else ""
+    return Brought(log, inputs, transfer, distant)
 
 
 def _is_packed_file(path: Path) -> bool:
@@ -250,9 +263,9 @@ def _is_packed_file(path: Path) -> bool:
         return is_packed(stream.read(512))
 
 
-def _plain_log(path: Path) -> Plain:
-    """Return the container of a log that is not packed."""
-    return _usable(_container_at(path), path)
+def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType({})) -> Plain:
+    """Return the container of a log that is not packed; `distant` as in `BagDirectory`."""
+    return _usable(BagDirectory(path, distant=distant) if distant else _container_at(path), path)
 
 
 def _usable(container: Plain, path: Path) -> Plain:

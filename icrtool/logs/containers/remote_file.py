@@ -43,7 +43,7 @@ class RemoteFile:
     distant = True
 
     def __init__(self, path: UrlPath, about: dict[str, Any] | None = None) -> None:
-        self._path = path
+        self.path = path
         self._files, self._name = filesystem(path)
         about = _about(path) if about is None else about
         self.is_folder = about.get("type") == "directory"
@@ -58,9 +58,9 @@ class RemoteFile:
         """Return whether the server gives parts of the file."""
         if self.is_folder or not self.size or about.get("partial") is False:
             return False
-        if not self._path.scheme.startswith("http"):
+        if not self.path.scheme.startswith("http"):
             return True
-        return asked(self._path, self._gives_last_byte)
+        return asked(self.path, self._gives_last_byte)
 
     def _gives_last_byte(self) -> bool:
         try:
@@ -129,18 +129,18 @@ class RemoteFile:
                 raise broken
             return list(map(bytes, pieces))
 
-        pieces = asked(self._path, ask)
+        pieces = asked(self.path, ask)
         for piece, begin, end in zip(pieces, begins, ends, strict=True):
             if len(piece) != end - begin:
-                raise LogError(self._path, f"gave {len(piece)} bytes for {end - begin}", "is it being written?")
+                raise LogError(self.path, f"gave {len(piece)} bytes for {end - begin}", "is it being written?")
         self.bytes_read += sum(map(len, pieces))
         return pieces
 
     def pieces(self) -> Iterator[bytes]:
         """Yield the content from start to end; the next pieces are read meanwhile."""
         if not self.has_ranges:
-            with asked(self._path, lambda: self._files.open(self._name, block_size=0)) as stream:
-                while piece := asked(self._path, lambda: stream.read(_PIECE_BYTES), again=False):
+            with asked(self.path, lambda: self._files.open(self._name, block_size=0)) as stream:
+                while piece := asked(self.path, lambda: stream.read(_PIECE_BYTES), again=False):
                     yield piece
             return
         with ThreadPoolExecutor(PIECES_AHEAD) as pool:
@@ -170,7 +170,7 @@ class RemoteFile:
                 written += len(piece)
                 if share is not None:
                     share(min(written / max(self.size, 1), 1.0))
-        return InputFile(str(self._path), written, digest.hexdigest(), **self.version)
+        return InputFile(str(self.path), written, digest.hexdigest(), **self.version)
 
     @property
     def version(self) -> dict[str, str]:
@@ -179,7 +179,7 @@ class RemoteFile:
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:  # noqa: ARG002 - nothing is read for it
         """Return the file without a SHA-256: not all of it is read."""
-        return (InputFile(str(self._path), self.size, None, **self.version),)
+        return (InputFile(str(self.path), self.size, None, **self.version),)
 
     def transfer(self) -> str:
         """Return how much was read."""
