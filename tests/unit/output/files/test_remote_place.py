@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -218,3 +222,20 @@ def test_names_in_a_bucket_lead_to_no_place_outside_the_temporary_folder(store, 
     with pytest.raises(OutputError, match="cannot be written"), on_disk(UrlPath("s3://field/one")):
         pass
     assert not list(tmp_path.rglob("escaped.json"))
+
+
+def test_ctrl_c_while_a_run_is_uploaded_leaves_nothing_that_counts_and_no_temporary_file(store, tmp_path):
+    command = ("fit", str(MCAP), *ROBOT, "-o", "s3://field/runs/one", "--plots", "none")
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", "icrtool", *command], cwd=tmp_path, stderr=subprocess.PIPE,
+        env={**os.environ, "TMPDIR": str(tmp_path / "temporary")},
+    )  # fmt: skip
+    begun = store.sent
+    while store.sent < begun + 1_000_000:
+        assert process.poll() is None
+        time.sleep(0.005)
+    with store.lock:  # nothing passes
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+    process.stderr.close()
+    assert "B2SUMS" not in names(store, "runs/one/")
