@@ -127,6 +127,9 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
 def report_document(report: DropoutReport) -> DropoutDocument:
     """Return what report.json holds, equal to what is read back: None for a number that is not known."""
     run, made = report.run_document, report.calibration
+    by_model: dict[str, list[SummaryRow]] = {result.name: [] for result in report.results}
+    for row in rows_of(plain(report.summary_columns())):
+        by_model[row.pop("model")].append(SummaryRow(**row))
     return DropoutDocument(
         schema=DROPOUT_SCHEMA,
         tool_version=__version__,
@@ -149,7 +152,7 @@ def report_document(report: DropoutReport) -> DropoutDocument:
             level=LEVEL,
             seed=report.seed,
         ),
-        models=tuple(_model_document(result, report) for result in report.results),
+        models=tuple(_model_document(result, by_model[result.name], report) for result in report.results),
         trials=_count_documents(report),
         reference_error=_reference_rows(report),
         by_learning=_learned_document(report),
@@ -178,9 +181,8 @@ WORST_COLUMNS = (
 )  # fmt: skip
 
 
-def _model_document(result: ModelResult, report: DropoutReport) -> ModelDocument:
-    """Return one model's rows of summary.csv, under its name."""
-    rows = [SummaryRow(**row) for row in rows_of(plain(report.summary_columns())) if row.pop("model") == result.name]
+def _model_document(result: ModelResult, rows: list[SummaryRow], report: DropoutReport) -> ModelDocument:
+    """Return one model's `rows` of summary.csv, under its name."""
     used = next((one for one in report.calibrations if one.name == result.name), None)
     knows = used.fitted if used is not None else KNOWS.get(result.name, "the rest of the drive")
     blocks = [
