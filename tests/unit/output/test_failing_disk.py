@@ -21,7 +21,6 @@ import pytest
 
 import icrtool
 from icrtool.calibration.record import Calibration
-from icrtool.config import Config
 from icrtool.errors import OutputError
 from icrtool.fleet.fleet_files import write_fleet
 from icrtool.output.exports.foxglove import write_foxglove
@@ -33,9 +32,9 @@ from icrtool.output.files.truth_file import log_and_truth
 from icrtool.output.study_directory import write_study
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.run import Run
-from icrtool.simulation.studies import default_request, run_study
 from icrtool.simulation.study_records import Level
 from support.documents import with_summary
+from support.studies import small_study
 
 Writer = Callable[[Path, str], object]
 """Writes something to a place; the text is in its content."""
@@ -59,8 +58,7 @@ def calibration(run: Run) -> Calibration:
 @pytest.fixture(scope="module")
 def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
     report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0])
-    request = default_request("rate", Config())
-    study = run_study(replace(request, runs=1, values=(50.0,), plan=replace(request.plan, duration_s=5.0)))
+    study = small_study("rate")
     table = calibration.document()
 
     def named_levels(text: str) -> Iterator[Level]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ import pandas as pd
 import pytest
 
 from icrtool.cli.printing import show
-from icrtool.config import Config, load_config
 from icrtool.errors import DataError, OutputError
 from icrtool.output.figures.study import study_figure
 from icrtool.output.figures.style import new_figure
@@ -24,25 +22,16 @@ from icrtool.output.text_blocks import Table
 from icrtool.simulation.drives import DrivePlan, Sensors
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.record import simulate
-from icrtool.simulation.studies import STUDIES, default_request, run_study
-from icrtool.simulation.study_records import StudyNumber, StudyResult
+from icrtool.simulation.studies import STUDIES, run_study
+from icrtool.simulation.study_records import StudyNumber
+from support.studies import small_request, small_study
 
 PNG = b"\x89PNG"
 
 
-@cache
-def small(name, robot: str | None = None) -> StudyResult:
-    request = default_request(name, load_config(robot=robot) if robot else Config())
-    settings = (1.0, -1.0) if name == "initial" else request.values[:2]  # noqa: PD011 - the values of a study, no pandas
-    plan = replace(request.plan, duration_s={"turn-radius": 25.0, "gnss": 40.0}.get(name, 12.0))
-    if name == "icr-change":
-        plan = replace(plan, changes=((4.0, (0.7, -0.6, 0.0)), (8.0, (0.5, -0.7, 0.1))))
-    return run_study(replace(request, runs=2, values=settings, paths=request.paths[:2], plan=plan))
-
-
 @pytest.mark.parametrize("name", STUDIES)
 def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> None:
-    result = small(name)
+    result = small_study(name)
     write_study(result, tmp_path / "study")
     assert sorted(path.name for path in (tmp_path / "study").glob("[!.]*")) == sorted(
         ["study.json", f"{name}.csv", f"{name}.png"]
@@ -63,7 +52,7 @@ def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> N
 def test_every_number_of_the_table_is_whole_on_a_terminal_of_80_columns(
     name, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = format_study(small(name))
+    text = format_study(small_study(name))
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("NO_COLOR", "1")
@@ -80,7 +69,7 @@ def test_every_number_of_the_table_is_whole_on_a_terminal_of_80_columns(
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_the_title_of_a_picture_states_the_answer_with_its_number(name) -> None:
-    result = small(name)
+    result = small_study(name)
     figure = new_figure(study_title(result), study_subtitle(result), height_in=2.0)
     title, subtitle = (text.get_text() for text in figure.texts[:2])
     assert [finding_text(one) for one in result.answer if finding_text(one) not in title] == []
@@ -90,13 +79,11 @@ def test_the_title_of_a_picture_states_the_answer_with_its_number(name) -> None:
 
 @pytest.mark.parametrize(("name", "changes"), [("initial", {"values": (0.0,)}), ("consistency", {})])
 def test_a_study_of_one_value_or_one_time_is_drawn_too(name, changes: dict[str, object]) -> None:
-    request = default_request(name, Config())
-    plan = replace(request.plan, duration_s=4.0)
-    assert study_figure(run_study(replace(request, runs=1, plan=plan, **changes))).axes
+    assert study_figure(run_study(small_request(name, 1, 4.0, **changes))).axes
 
 
 def test_an_old_study_is_replaced_and_anything_else_is_left_alone(tmp_path: Path) -> None:
-    result = small("rate")
+    result = small_study("rate")
     write_study(result, tmp_path / "study", plots=())
     before = (tmp_path / "study").stat().st_ino
     write_study(result, tmp_path / "study", plots=())
@@ -118,19 +105,19 @@ def test_a_study_that_cannot_be_drawn_leaves_nothing_behind(tmp_path: Path, monk
 
     monkeypatch.setattr(figure_study, "study_figure", fail)
     with pytest.raises(OutputError, match="No space left"):
-        write_study(small("rate"), tmp_path / "deep" / "study")
+        write_study(small_study("rate"), tmp_path / "deep" / "study")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_table_names_the_robot_settings_and_the_paper(tmp_path: Path) -> None:
-    text = format_study(small("turn-radius"))
+    text = format_study(small_study("turn-radius"))
     assert "turn-radius (Fig. 10): convergence after a change" in text
     assert "2 runs of 25 s each, seed 0; circle at 0.4 m/s, ICRs +0.500, -0.750, -0.250 m" in text
     assert "0.1 s (Fig. 10)" in text
 
 
 def test_one_run_is_singular() -> None:
-    request = small("rate").request
+    request = small_study("rate").request
     assert runs_text(replace(request, runs=1)).startswith("1 run of")
 
 
@@ -229,7 +216,6 @@ def test_a_place_that_does_not_exist_is_said_in_one_line(tmp_path: Path) -> None
 
 
 def test_a_path_may_be_named_in_any_study(tmp_path: Path) -> None:
-    request = default_request("rate", Config())
-    plan = replace(request.plan, path=PathPlan("spins"), duration_s=6.0)
-    result = run_study(replace(request, runs=1, values=(50.0,), plan=plan))
+    request = small_request("rate", 1, 6.0, values=(50.0,))
+    result = run_study(replace(request, plan=replace(request.plan, path=PathPlan("spins"))))
     assert "spins at 0.4 m/s" in format_study(result)

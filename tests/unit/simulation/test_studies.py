@@ -15,15 +15,9 @@ from icrtool.simulation import study_runs
 from icrtool.simulation.paths import PathPlan
 from icrtool.simulation.studies import STUDIES, default_request, run_study
 from icrtool.simulation.study_measures import chi2_band, convergence_time, errors_over_std, settling_time, statistics
-from icrtool.simulation.study_records import StudyRequest, StudyResult
-
-
-def request(name: Any, runs: int, duration_s: float | None = None, **changes: Any) -> StudyRequest:
-    base = default_request(name, Config())
-    plan = base.plan if duration_s is None else replace(base.plan, duration_s=duration_s)
-    if name == "icr-change" and duration_s is not None:
-        plan = replace(plan, changes=((duration_s / 2, (0.7, -0.6, 0.0)),))
-    return replace(base, runs=runs, plan=plan, **changes)
+from icrtool.simulation.study_records import StudyResult
+from support.studies import SMALL, small_study
+from support.studies import small_request as request
 
 
 def level(result: StudyResult, **wanted: Any) -> dict[str, Any]:
@@ -34,24 +28,9 @@ def median(result: StudyResult, metric: str, **wanted: Any) -> float:
     return level(result, **wanted)["metrics"][metric]["p50"]
 
 
-SMALL: dict[str, dict[str, Any]] = {
-    "convergence": {"duration_s": 10.0, "paths": ("circle", "spins")},
-    "initial": {"duration_s": 5.0, "values": (1.0, -1.0)},
-    "icr-change": {"duration_s": 20.0},
-    "turn-radius": {"duration_s": 25.0, "values": (0.0, 2.0)},
-    "input-noise": {"duration_s": 10.0, "values": (0.0, 0.1)},
-    "input-bias": {"duration_s": 10.0, "values": (0.0, 0.1)},
-    "input-source": {"duration_s": 10.0},
-    "gnss": {"duration_s": 30.0, "values": (0.01, 0.3)},
-    "rate": {"duration_s": 10.0, "values": (20.0, 100.0)},
-    "consistency": {"duration_s": 15.0},
-}
-
-
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_study_runs_small_and_says_the_same_again(name) -> None:
-    asked = request(name, 2, **SMALL[name])
-    result, again = run_study(asked), run_study(asked)
+    result, again = small_study(name), run_study(request(name, 2, **SMALL[name]))
     rows = {len(values) for values in result.columns.values()}
     assert len(rows) == 1
     assert rows != {0}
