@@ -303,7 +303,7 @@ def model_sections(report: DropoutDocument) -> Iterator[Section]:
 def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:
     """Return the parameters of a model with one standard deviation each, and those of the same one with a gyro."""
     rows = [
-        (name if one is fitted else f"with gyro: {name}", f"{value:+.4f} ± {std:.4f}",
+        (name if one is fitted else f"with gyro: {name}", f"{round(value, 4) + 0.0:+.4f} ± {std:.4f}",
          "not shown" if name in one.not_shown else "shown", TERMS[name].meaning)
         for one in (fitted, gyro) if one is not None
         for name, value, std in zip(one.model.terms, one.parameters, one.std, strict=True)

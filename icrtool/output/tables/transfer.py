@@ -40,8 +40,8 @@ def transfer_blocks(found: GroupComparison) -> list[Block]:
 def _pair_tables(pair: ComparedPair) -> list[Table]:
     """Return how parameters and held-out errors of two groups differ."""
     rows = [
-        (one.quantity, f"{one.first:+.3f}", f"{one.second:+.3f}", with_std(one.difference, one.std, 3),
-         "yes" if one.significant else "no, may be chance")
+        (one.quantity, *(f"{round(value, 3) + 0.0:+.3f}" for value in (one.first, one.second)),
+         with_std(one.difference, one.std, 3), "yes" if one.significant else "no, may be chance")
         for one in pair.parameters
     ]  # fmt: skip
     head = ("quantity", pair.first, pair.second, "difference ± std", "significant")
