@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from table import Table, seconds_of
+from table import Table, cpu_seconds_of
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import block_sums, cut_blocks, error_intervals, error_summary, sort_trials
@@ -49,8 +49,8 @@ def open_loop_rows(table: Table, hours: float, repeats: int) -> None:
     ends = trial_ends(drive, HORIZONS_M)
     by_direct = "by direct integration, compiled"
     for name, model in (("momentary ICRs", icrs), ("no slip", NO_SLIP)):
-        [direct] = seconds_of(lambda model=model: open_loop_errors_direct(drive, model, ends), 1, warm_up=False)
-        fast = seconds_of(lambda model=model: open_loop_errors(drive, model, ends), repeats)
+        [direct] = cpu_seconds_of(lambda model=model: open_loop_errors_direct(drive, model, ends), 1, warm_up=False)
+        fast = cpu_seconds_of(lambda model=model: open_loop_errors(drive, model, ends), repeats)
         table.add(f"open loop, {name}, {len(HORIZONS_M)} horizons", fast, direct, by_direct, goal="100 times")
         apart_m = np.nanmax(np.abs(open_loop_errors(drive, model, ends) - open_loop_errors_direct(drive, model, ends)))
         if not apart_m < LARGEST_DIFFERENCE_M:
@@ -71,4 +71,4 @@ def open_loop_rows(table: Table, hours: float, repeats: int) -> None:
         "intervals of a model": intervals,
     }
     for name, job in jobs.items():
-        table.add(name, seconds_of(job, repeats), direct, f"for its errors {by_direct}")
+        table.add(name, cpu_seconds_of(job, repeats), direct, f"for its errors {by_direct}")

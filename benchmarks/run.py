@@ -24,7 +24,7 @@ import batch
 import numpy as np
 from bench_open_loop import open_loop_rows
 from make_log import add_images, make_logs
-from table import HEAD, Table, seconds_of
+from table import HEAD, Table, cpu_seconds_of, seconds_of
 
 ROBOT = ("--robot", "segway-rmp400")
 BY_ANYREADER = "to read it with AnyReader"
@@ -151,8 +151,8 @@ def filter_speed(bench: Bench) -> None:
         return setup, (len(setup.data.wheel_t) + len(setup.data.gnss_t) + len(setup.data.heading_t)) / 1e6
 
     (whole, events), (minute, few) = prepare(bench.extent.log_s), prepare(60.0)
-    ours = [seconds / events for seconds in seconds_of(lambda: run_ekf(*whole), bench.extent.repeats)]
-    [plain] = seconds_of(lambda: run_ekf_plain(*minute), 1, warm_up=False)
+    ours = [seconds / events for seconds in cpu_seconds_of(lambda: run_ekf(*whole), bench.extent.repeats)]
+    [plain] = cpu_seconds_of(lambda: run_ekf_plain(*minute), 1, warm_up=False)
     bench.table.add("filter, an event", ours, plain / few, "in matrices", unit="us", goal="0.2 us")
 
 

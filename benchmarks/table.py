@@ -6,6 +6,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,13 +67,19 @@ class Table:
         path.write_text(json.dumps({"schema": SCHEMA, "log_s": self.log_s, "rows": rows}, indent=1) + "\n")
 
 
-def seconds_of(call: Callable[[], object], repeats: int, *, warm_up: bool = True) -> list[float]:
-    """Return the wall seconds of some calls, after one to warm up."""
+def seconds_of(
+    call: Callable[[], object], repeats: int, *, warm_up: bool = True, clock: Callable[[], float] = time.perf_counter
+) -> list[float]:
+    """Return the wall seconds of some calls, or those of another clock, after one to warm up."""
     if warm_up:
         call()
     seconds = []
     for _ in range(repeats):
-        begin = time.perf_counter()
+        begin = clock()
         call()
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(clock() - begin)
     return seconds
+
+
+cpu_seconds_of = partial(seconds_of, clock=time.process_time)
+"""CPU seconds of some calls: for kernels of one thread, which another process on the machine does not lengthen."""
