@@ -50,7 +50,7 @@ class Bearing:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The fields that are read."""
+        """The fields that are read; an empty one is none."""
         return fields_in((self.angle, self.std, self.variance), (*self.valid, *self.independent))
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
@@ -173,7 +173,7 @@ class Orientation:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The fields that are read."""
+        """The fields that are read; an empty one is none."""
         return (*(f"{self.path}.{axis}" for axis in "xyzw"), self.variance, self.absent, self.rate)
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:

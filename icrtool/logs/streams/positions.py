@@ -165,7 +165,7 @@ class Fix:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The fields that are read."""
+        """The fields that are read; an empty one is none."""
         numbers = fields_in((self.latitude, self.longitude, self.height, *self.std), self.valid)
         return (*numbers, *self.covariance, COVARIANCE_TYPE if self.covariance else "", self.solution.name)
 
@@ -297,7 +297,7 @@ class Pose:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The fields that are read."""
+        """The fields that are read; an empty one is none."""
         places = (f"{self.path}.position.{axis}" for axis in "xyz")
         numbers = fields_in(self.std, (*self.valid, *self.independent))
         return (*places, *self.covariance, *numbers, self.solution.name)
