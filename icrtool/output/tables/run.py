@@ -171,7 +171,7 @@ def run_checks(summary: RunDocument) -> list[Check]:
         away = duration_text(sum(end - begin for begin, end in spans) / 1e9)
         lost = len(summary.rtk_losses_ns)
         cause = (f"{lost} by loss of RTK",) if lost else ()
-        found.append(Check("care", "outages", f"{counted(len(spans), 'outage')}, {away} in all", cause))
+        found.append(Check("care", "outages", f"{len(spans)}, {away} in all", cause))
     if events := summary.events:
         worst = max(events, key=lambda event: (event.end_s - event.begin_s) * event.severity)
         lasted = duration_text(worst.end_s - worst.begin_s)
