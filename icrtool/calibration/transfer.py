@@ -50,9 +50,6 @@ from icrtool.records.text import with_interval, with_std
 
 HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
 
-SAME_ROUTE_M = 1.0
-"""Two drives took the same route where they are nowhere further apart at the same distance."""
-
 TWO_SIDED = 1.96
 """Standard deviations in a 95 % interval."""
 
