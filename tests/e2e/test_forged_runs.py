@@ -110,6 +110,17 @@ def test_a_directory_that_is_a_link_is_refused(icrtool: Command, place: Path, ho
     assert name in errors
 
 
+@pytest.mark.parametrize("target", ["not-there", "folder/not-there", "secret.txt"])
+def test_a_link_in_the_place_of_a_directory_is_refused_whatever_it_leads_to(
+    icrtool: Command, place: Path, home: Home, target: str
+) -> None:
+    remove(place / "dropout")
+    (place / "dropout").symlink_to(home.folder / target)
+    status, errors = use(icrtool, place, home, ("dropout-report", "RUN", "--plots", "none", "--no-ladder"))
+    assert status == 1
+    assert "dropout is a link" in errors
+
+
 @pytest.mark.parametrize("target", ["secret.txt", "folder/trajectory.png"])
 def test_a_picture_that_is_a_link_is_not_shown(icrtool: Command, place: Path, home: Home, target: str) -> None:
     for name in ("plots/trajectory.png", "dropout/plots/summary.png"):

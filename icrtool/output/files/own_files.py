@@ -122,7 +122,7 @@ def check_directory(directory: Path, ours: IsOurs, *, kind: str, inside: Path | 
     why, advice = "", "it is left alone; name another place"
     with reported(directory):
         if inside is not None:
-            check_folders(directory, inside)
+            check_folders(directory / OWN_FILES, inside)  # a link in its own place is none to be replaced
         place = real_place(directory)
         restore(place, ours)
         if outer := next((parent for parent in place.parents if ours(parent)), None):
