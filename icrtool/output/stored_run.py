@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, RunError
 from icrtool.logs.containers.split_files import numbered_file, split_path
-from icrtool.output.files.formats import CHECKSUM_FILE, file_b2sum, read_sums
+from icrtool.output.files.formats import CHECKSUM_FILE, file_b2sum, parse_json, read_sums
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of
 from icrtool.output.files.remote_place import fetched
 from icrtool.output.files.states_file import StatesFileError, StatesFormat, read_states
@@ -146,7 +145,7 @@ def _read_document(directory: Path) -> dict[str, Any]:
         why = "not a run directory" if directory.is_dir() else "no such run directory"
         raise RunError(directory, why, f"it holds no readable {RUN_FILE}; icrtool fit makes one") from err
     try:
-        document = json.loads(raw)
+        document = parse_json(raw)
     except (ValueError, RecursionError) as err:
         raise RunError(directory, f"{RUN_FILE} is not JSON", FIT_AGAIN) from err
     schema = document.get("schema") if isinstance(document, dict) else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -143,6 +144,20 @@ def test_what_a_page_shows_is_as_it_was_written(icrtool: Command, place: Path, h
     if name.startswith("dropout"):
         assert use(icrtool, place, home, ("dropout-report", "RUN", "--plots", "none", "--no-ladder"))[0] == 0
         assert use(icrtool, place, home, ("report", "RUN"))[0] == 0
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
+@pytest.mark.parametrize("command", [("compare", "RUN", "other=OWN"), ("calibrate", "RUN", "-o", "season.json")])
+def test_a_number_that_is_not_finite_is_refused(
+    icrtool: Command, place: Path, home: Home, number: str, command: tuple[str, ...]
+) -> None:
+    text = (place / "run.json").read_text()
+    scale = re.search(r'"applied_right_scale": ([^,]+),', text)
+    assert scale is not None
+    (place / "run.json").write_text(text.replace(scale[0], f'"applied_right_scale": {number},'))
+    status, errors = use(icrtool, place, home, command)
+    assert status == 1
+    assert "run.json" in errors
 
 
 @pytest.mark.parametrize(

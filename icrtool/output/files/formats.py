@@ -42,6 +42,24 @@ def schema_of(file: Path, inside: Path | None = None) -> str:
     return schema if isinstance(schema, str) else ""
 
 
+def parse_json(raw: bytes) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return the content of a JSON file of ours.
+
+    Raises
+    ------
+    ValueError, RecursionError
+        It is no JSON, or holds a number that is not finite: icrtool writes none, `json_bytes`.
+    """
+    return json.loads(raw, parse_constant=_finite, parse_float=_finite)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no number")
+    return value
+
+
 Document = TypeVar("Document", bound=msgspec.Struct)
 
 
@@ -58,7 +76,7 @@ def read_document(file: Path, kind: type[Document], inside: Path | None = None, 
     OSError, ValueError, RecursionError
         The file cannot be read, or is not as the record has it.
     """
-    stored = json.loads(read_regular(file, inside))
+    stored = parse_json(read_regular(file, inside))
     return msgspec.convert(escaped_texts(stored) if escape else stored, kind)
 
 
