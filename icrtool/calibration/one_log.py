@@ -168,7 +168,7 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> LogCalibration:
         The drive is too short for an estimate.
     """
     wheels, drive = run.document.wheels, run.document.drive
-    if SEPARATION.finding not in run.document.alignment:
+    if not {kind.finding for kind in KINDS} <= run.document.alignment.keys():
         why = f"{drive.distance_m:.0f} m of driven distance are too few windows, or an older version made the run"
         raise DataError(run.name, why, "drive longer, or fit the log again")
     facts = _drive_facts(run)

@@ -160,6 +160,13 @@ def test_a_number_that_is_not_finite_is_refused(
     assert "run.json" in errors
 
 
+def test_a_run_without_one_of_the_findings_shows_no_sensors(icrtool: Command, place: Path, home: Home) -> None:
+    text = (place / "run.json").read_text()
+    assert '"heading_offset_deg": {' in text
+    (place / "run.json").write_text(text.replace('"heading_offset_deg": {', '"another": {'))
+    assert use(icrtool, place, home, ("calibrate", "RUN", "-o", "season.json"))[0] in (0, 1)
+
+
 @pytest.mark.parametrize(
     "name", ["run.json", "B2SUMS", "states.csv", "measurements.npz", "dropout/report.json", "plots/trajectory.png"]
 )
