@@ -97,13 +97,13 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
     filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
     complete = {name: COMPLETE * sum(name in names for names in filled) for name in set().union(*filled)}
     wheels = _ranked(wheels, topics.wheels, complete)
-    kin = {_namespace(wheels[0].topic): SAME_NAMESPACE} if wheels else {}
+    near = {_namespace(wheels[0].topic): SAME_NAMESPACE} if wheels else {}
     others = _other_robots(wheels)
-    gnss = _ranked([_independent(source, wheels, topics) for source in gnss], topics.gnss, kin, others)
+    gnss = _ranked([_independent(source, wheels, topics) for source in gnss], topics.gnss, near, others)
     best = gnss[0] if gnss and not gnss[0].problem else None
     metric = best.topic if best is not None and best.metric is not None else ""
     others -= {_namespace(metric)} if metric else set()
-    heading = _ranked(heading, topics.heading, kin, others, metric)
+    heading = _ranked(heading, topics.heading, near, others, metric)
     return Candidates(tuple(wheels), tuple(gnss), tuple(heading), unread | _empty_topics(tables))
 
 

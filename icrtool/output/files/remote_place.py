@@ -166,11 +166,10 @@ class _Store:
         last = [name for name in COUNTS if name in now]
         self._remove([name for name in COUNTS if name in before])
         self._remove([name for name in gone if name not in COUNTS])
-        # What a broken upload leaves is known as icrtool's by this list.
-        for names in ([name for name in changed if name == OWN_FILES],
-                      [name for name in changed if name not in {OWN_FILES, *last}]):  # fmt: skip
+        # What a broken upload leaves is known as icrtool's by the first of these.
+        others = [name for name in changed if name not in {OWN_FILES, *last}]
+        for names in ([name for name in changed if name == OWN_FILES], others, last):
             self._each(lambda name: self._files.put_file(str(folder / name), self._of(name)), names)
-        self._each(lambda name: self._files.put_file(str(folder / name), self._of(name)), last)
 
     def _names(self, parts: Collection[str] | None) -> list[str]:
         """Return the files below the address."""
@@ -241,7 +240,7 @@ def _named(place: UrlPath, folder: Path) -> Iterator[None]:
 
 
 def _is_below(name: str) -> bool:
-    """Return whether a name, of whoever wrote it, is that of a file below a folder."""
+    """Return whether a name, which a stranger may have written, is that of a file below a folder."""
     path = PurePosixPath(name)
     return bool(name) and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
 
