@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from threading import RLock
 from typing import TYPE_CHECKING
 
 import click
@@ -178,14 +179,21 @@ class View:
         self._counts: Counter[str] = Counter()
         self._processed = 0
         self._stages: dict[str, str] = {}
+        # Stages come from threads of the logs: none may write between the removal of the line and a result.
+        self._lock = RLock()
 
     def stage(self, log: str, stage: str) -> None:
         """Show the stage of a log."""
-        self._stages[log] = stage
-        self._show()
+        with self._lock:
+            self._stages[log] = stage
+            self._show()
 
     def row(self, row: FleetLog) -> None:
         """Show the result of a log."""
+        with self._lock:
+            self._add(row)
+
+    def _add(self, row: FleetLog) -> None:
         self._stages.pop(row.log, None)
         self._counts[row.status] += 1
         self._processed += row.this_time == "processed"
