@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
+from typing import Literal
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from icrtool.kernels.kinematics import chord_rows
 from icrtool.kernels.open_loop import open_loop_pieces
 from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.dropout import MeasuredHeading
-from icrtool.records.run import Run, track_of_states
+from icrtool.records.run import Run, no_slip_icrs, track_of_states
 from icrtool.records.run_document import DriveDocument
 from icrtool.records.tables import Icrs, States
 
@@ -41,6 +42,15 @@ class OdometryPath:
     east_m: Floats
     heading_rad: Floats
     end_error_m: float
+
+
+OdometryName = Literal["icr", "no_slip"]
+
+
+def odometry_icrs(run: Run) -> dict[OdometryName, Icrs]:
+    """Return the constant ICRs of a run's odometries: its final ones, and where b is known those of no slip."""
+    icrs: dict[OdometryName, Icrs] = {"icr": run.table.icrs_at(-1)}
+    return icrs if run.track_width_m is None else icrs | {"no_slip": no_slip_icrs(run.track_width_m)}
 
 
 def drive_wheels(table: States, in_gap: Bools, icrs: Icrs) -> OdometryPath:

@@ -199,8 +199,9 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
             for h, end in enumerate(ends[start].tolist()):
                 path = open_loop_path(drive, *icrs, start, end)
                 error = np.hypot(path.north[-1] - drive.north[end], path.east[-1] - drive.east[end])
-                # Micrometres of rounding in each column, seven digits in the first heading.
-                assert errors[name][h] == pytest.approx(error, abs=1e-4), (name, start, h)
+                # Micrometres of rounding in each column, seven digits in the first heading; the heading of an odometry
+                # turns within a gap, so that its 16 bits are 2e-5 rad: 0.2 mm over 20 m.
+                assert errors[name][h] == pytest.approx(error, abs=1e-4 if name == "icr" else 3e-4), (name, start, h)
         for name, of_model in along.items():
             assert errors[name] == pytest.approx(of_model[number].tolist(), abs=1e-4), (name, start)
 
@@ -245,13 +246,13 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     names = {"calibration": False, "calibration_gyro": True}
     assert {one.name: one.with_gyro for one in report.calibrations} == names
     # Read back from JSON, as `icrtool report` does; so many paths that each has one point of three.
-    monkeypatch.setattr(drive_data, "MOST_STEPS", 10_000)
+    monkeypatch.setattr(drive_data, "PATH_POINTS", 15_000)
     document = msgspec.convert(json.loads(json_bytes(report_document(report))), DropoutDocument)
     file = tmp_path / "calibrations.html"
     file.write_text(run_page(run, document, {}), encoding="utf-8")
     page = chrome.page()
     page.open(file)
-    assert set(page.evaluate("icrtoolPage.data.models.filter((one) => one.path).map((one) => one.path.every)")) == {2}
+    assert set(page.evaluate("Object.values(icrtoolPage.data.paths).map((one) => one.every)")) == {2}
     table, recording = report.comparison, turning_recording_of(run)
     assert table is not None
     drawn = set(page.evaluate("icrtoolPage.data.models.map((one) => one.name)"))

@@ -15,11 +15,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import drive_wheels
+from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.track import FrozenIcrs
 from icrtool.output.decimate import places
-from icrtool.records.run import Run, no_slip_icrs
+from icrtool.records.run import Run
 from icrtool.records.tables import Icrs, States
 
 PathName = Literal["filter", "smoothed", "icr", "no_slip"]
@@ -85,15 +85,12 @@ class Globe(NamedTuple):
 
 def paths_of(run: Run) -> tuple[ExportPath, ...]:
     """Return the paths of a run: filter, smoother where it has one, ICR odometry, no slip where b is known."""
-    table, width = run.table, run.track_width_m
+    table = run.table
     momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
     paths = [_of_states("filter", table, momentary)]
     if run.smoothed is not None:
         paths.append(_of_states("smoothed", run.smoothed, momentary))
-    paths.append(_of_odometry("icr", run, table.icrs_at(-1)))
-    if width is not None:
-        paths.append(_of_odometry("no_slip", run, no_slip_icrs(width)))
-    return tuple(paths)
+    return *paths, *(_of_odometry(name, run, icrs) for name, icrs in odometry_icrs(run).items())
 
 
 def globe_of(run: Run) -> Globe | None:

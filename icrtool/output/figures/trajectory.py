@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrtool.alignment.sensors.gnss_quality import CLASSES, REFERENCE
-from icrtool.estimation.odometry import OdometryPath, drive_wheels
+from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
 from icrtool.output.figures.style import (
@@ -26,7 +26,7 @@ from icrtool.output.figures.style import (
     styled,
 )
 from icrtool.output.text_format import distance_text, driven_text, error_text, position_word, run_title
-from icrtool.records.run import Run, no_slip_icrs
+from icrtool.records.run import Run
 from icrtool.records.run_document import OdometryDocument
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
@@ -69,14 +69,15 @@ SLIP_LOOK: dict[str, Any] = {
 REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": BAD_FIX_COLOR}
 """Markers by class: shape and luminance distinguish them."""
 
+ODOMETRIES = {"icr": (ICR, "ICR odometry", 3), "no_slip": (NO_SLIP, "no-slip odometry", 2)}
+"""Pen, label and order of the paths that wheel speeds alone lead along."""
+
 
 @styled
 def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
     table = run.table
-    paths = [(table.icrs_at(-1), ICR, "ICR odometry", 3)]
-    if (b := run.track_width_m) is not None:
-        paths.append((no_slip_icrs(b), NO_SLIP, "no-slip odometry", 2))
+    paths = [(icrs, *ODOMETRIES[name]) for name, icrs in odometry_icrs(run).items()]
     # Each path is driven twice, here for its corners only: both at once would be in memory beside the picture.
     corners = [_corners(drive_wheels(table, run.in_gap, icrs)) for icrs, *_ in paths]
     lowest, highest = _extent(_corners(table), *corners)

@@ -1,7 +1,8 @@
-"""The numbers that the script of a run's page draws: the drive, decimated, and the wheels, from which paths are driven.
+"""The numbers that the script of a run's page draws: the drive, decimated, and the path of each model through it.
 
-Time series keep the least and the greatest value of each interval. The wheels are not thinned up to `MOST_STEPS`: an
-open-loop path that the page integrates ends where the library's does.
+Time series keep the least and the greatest value of each interval. A path of constant parameters is turned to where an
+open-loop trial starts. ICRs that differ by start have no such path: the page drives the wheels, not thinned up to
+`MOST_STEPS`, with those of the start, and ends where the library does.
 """
 
 from __future__ import annotations
@@ -11,36 +12,37 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
-from typing import Any, Literal, NamedTuple
+from itertools import chain
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
+from numpy.typing import NDArray
 
 from icrtool.calibration.pooled import calibrated
 from icrtool.calibration.record import calibration_of
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import drive_wheels
-from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints
+from icrtool.estimation.odometry import drive_wheels, odometry_icrs
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.motion.fit import own_constants
 from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
 from icrtool.motion.recording import Recording, cut_windows, predicted_path
-from icrtool.output.decimate import extremes, places
+from icrtool.output.decimate import extremes
 from icrtool.output.tables.errors import in_order, main_rows
 from icrtool.records.dropout_document import DropoutDocument, FitDocument
-from icrtool.records.run import Run, no_slip_icrs, track_of, width_or_usual_m
-from icrtool.records.tables import Icrs
+from icrtool.records.run import Run, track_of, width_or_usual_m
 
 MOST_STEPS = 150_000
-"""Wheel samples of a page, of more, equally many are joined to one; and points of all calibrated paths together."""
+"""Wheel samples of a page; of more, equally many are joined to one."""
+
+PATH_POINTS = 200_000
+"""Points of the paths of all models together; of more, equally many are left out between two."""
 
 SERIES_POINTS = 16_000
 """Rows of the time series: some ten per pixel column, so that a stretch of a tenth still has its extremes."""
 
 FIX_POINTS = 8_000
-
-PATH_CELLS = 4000.0
-"""An odometry path has a point in each cell of this fraction of the drive's extent."""
 
 ERROR_KEYS = {"p95": "p95_m", "p95_low": "p95_low_m", "p95_high": "p95_high_m", "expected": "expected_error_m",
               "expected_low": "expected_low_m", "expected_high": "expected_high_m"}  # fmt: skip
@@ -79,8 +81,8 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "series": _series_data(run, steps),
         "fixes": _fixes_data(run, origin),
         "headings": _headings_data(run),
-        "odometry": _odometry_data(run, origin),
-        "models": _models(run, report, steps),
+        "half_width_m": None if run.track_width_m is None else run.track_width_m / 2,
+        **_models_data(run, report, steps, origin),
         "events": _events_data(run, origin),
         "outages": [{"kind": one.kind, "begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
         "changes_s": list(run.changes_s),
@@ -111,14 +113,12 @@ def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict
         "left": track.cumulate(track.v_left)[rows],
         "right": track.cumulate(track.v_right)[rows],
         "distance": track.distance[rows],
-        "north": track.north[rows],
-        "east": track.east[rows],
+        "north": track.north[rows] - origin[0],
+        "east": track.east[rows] - origin[1],
     }
     gaps = np.searchsorted(rows, np.flatnonzero(track.held[:-1] == 0.0), side="right") - 1
     return {
         "joined": steps.joined,
-        "first_north": float(track.north[0]) - origin[0],
-        "first_east": float(track.east[0]) - origin[1],
         "gaps": np.unique(gaps).tolist(),
         "without_reference": _spans(track.in_outage[rows]),
     } | {name: packed_sums(column) for name, column in columns.items()}
@@ -126,21 +126,18 @@ def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict
 
 def _series_data(run: Run, steps: PageSteps) -> dict[str, Any]:
     """Return the states that the time series show; each is a step too."""
-    table = run.table
-    columns = {
-        "v_left": table.v_left_mps, "v_right": table.v_right_mps,
-        "y_right": table.y_icr_right_m, "y_left": table.y_icr_left_m, "x": table.x_icr_m,
-    }  # fmt: skip
-    at = {name: column[steps.rows] for name, column in columns.items()}
-    rows = extremes(*at.values(), points=SERIES_POINTS)
+    table, icrs = run.table, {"y_right": "y_icr_right_m", "y_left": "y_icr_left_m", "x": "x_icr_m"}
+    values = {name: getattr(table, column)[steps.rows] for name, column in icrs.items()}
+    spreads = {f"std_{name}": getattr(table, f"std_{column}") for name, column in icrs.items()}
+    speeds = {"v_left": table.v_left_mps, "v_right": table.v_right_mps}
+    rows = extremes(*(one[steps.rows] for one in speeds.values()), *values.values(), points=SERIES_POINTS)
     state = steps.rows[rows]
-    at |= {
-        "std_y_right": table.std_y_icr_right_m[steps.rows], "std_y_left": table.std_y_icr_left_m[steps.rows],
-        "std_x": table.std_x_icr_m[steps.rows],
-        "heading": np.angle(np.exp(1j * table.heading_rad[steps.rows])),
-    }  # fmt: skip
-    return {"step": packed(rows, "i32"), "t": packed(table.t_s[state], "f32")} | {
-        name: packed(column[rows], "f32") for name, column in at.items()
+    return {
+        "step": packed_sums(rows, unit=1),
+        "t": packed_sums(table.t_s[state]),
+        "heading": packed(np.angle(np.exp(1j * table.heading_rad[state]))),
+        **{name: packed(column[rows]) for name, column in values.items()},
+        **{name: packed_levels(column[state]) for name, column in (speeds | spreads).items()},
     }
 
 
@@ -151,10 +148,10 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
         rows = _extreme_rows(run.gnss.difference, chosen)
         found[name] = {
-            "t": packed(run.gnss.t_s[rows], "f32"),
-            "north": packed(fixes.north_m[rows] - origin[0], "f32"),
-            "east": packed(fixes.east_m[rows] - origin[1], "f32"),
-            "difference": packed(run.gnss.difference[rows], "f32"),
+            "t": packed(run.gnss.t_s[rows]),
+            "north": packed(fixes.north_m[rows] - origin[0]),
+            "east": packed(fixes.east_m[rows] - origin[1]),
+            "difference": packed(run.gnss.difference[rows]),
         }
     return found
 
@@ -163,8 +160,8 @@ def _headings_data(run: Run) -> dict[str, Any]:
     """Return how far the headings that the filter used were from its own [deg]."""
     rows = _extreme_rows(run.heading.difference, run.heading.used)
     return {
-        "t": packed(run.heading.t_s[rows], "f32"),
-        "difference_deg": packed(np.degrees(run.heading.difference[rows]), "f32"),
+        "t": packed(run.heading.t_s[rows]),
+        "difference_deg": packed(np.degrees(run.heading.difference[rows])),
     }
 
 
@@ -174,57 +171,47 @@ def _extreme_rows(difference: Floats, chosen: Bools) -> Ints:
     return rows[extremes(difference[rows], points=FIX_POINTS)]
 
 
-def _odometry_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
-    table, b = run.table, run.track_width_m
-    extent = max(float(np.ptp(table.north_m)), float(np.ptp(table.east_m)), 1.0)
-
-    def path(icrs: Icrs) -> dict[str, Any]:
-        one = drive_wheels(table, run.in_gap, icrs)
-        rows = places(one.north_m, one.east_m, extent / PATH_CELLS)
-        north, east = one.north_m[rows] - origin[0], one.east_m[rows] - origin[1]
-        return {"north": packed(north, "f32"), "east": packed(east, "f32"), "t": packed(table.t_s[rows], "f32")}
-
-    return {"icr": path(table.icrs_at(-1)), "no_slip": None if b is None else path(no_slip_icrs(b))}
+Paths = Iterator[tuple[str, tuple[Floats, Complexes]]]
+"""Name of a model; heading [rad] and place [m] of the robot along its path, at the steps of the page alone."""
 
 
-class ModelPath(NamedTuple):
-    """The path of a model through the whole drive, at the steps of the page alone: a drive has many states and models.
-
-    Attributes
-    ----------
-    heading, place : [rad], forward + j right [m], of the robot at the steps
-    """
-
-    name: str
-    label: str
-    heading: Floats
-    place: Complexes
-
-
-def _models(run: Run, report: DropoutDocument, steps: PageSteps) -> list[dict[str, Any]]:
-    """Return how each model of the report moves: by ICRs, or along a path that is turned to where a trial starts."""
+def _models_data(run: Run, report: DropoutDocument, steps: PageSteps, origin: tuple[float, float]) -> dict[str, Any]:
+    """Return the models of the report, and where each of constant parameters leads from the begin of the drive."""
     labels = {one.name: one.label for one in report.models}
-    b = run.track_width_m
-    icrs = {"icr": None, "no_slip": None if b is None else no_slip_icrs(b), "icr_final": run.table.icrs_at(-1)}
-    models: list[dict[str, Any]] = [
-        {"name": name, "label": labels[name], "icrs": icrs[name]} for name in icrs if name in labels
-    ]
-    recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(b)))
-    paths = [*_held_out(recording, report, labels, steps.rows), *_calibrated(recording, report, steps.rows)]
+    recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(run.track_width_m)))
+    paths = dict(
+        chain(
+            _odometry(run, steps.rows, origin),
+            _held_out(recording, report, steps.rows),
+            _calibrated(recording, report, steps.rows),
+        )
+    )
     count = len(steps.rows)
-    every = max(-(-len(paths) * count // MOST_STEPS), 1)
+    every = max(-(-len(paths) * count // PATH_POINTS), 1)
     rows = np.unique(np.append(np.arange(0, count, every), count - 1))
-    for one in paths:
-        columns = {"forward": one.place.real, "right": one.place.imag, "turn": one.heading}
-        path: dict[str, Any] = {"every": every, "first_turn": float(one.heading[0])}
-        path |= {name: packed_sums(column[rows]) for name, column in columns.items()}
-        models.append({"name": one.name, "label": one.label, "path": path})
-    return sorted(models, key=lambda one: one["name"] != RECOMMENDED)
+    packed_paths = {
+        name: {
+            "every": every,
+            "heading": packed_sums(heading[rows]),
+            "north": packed_sums(place.real[rows]),
+            "east": packed_sums(place.imag[rows]),
+        }
+        for name, (heading, place) in paths.items()
+    }
+    names = [name for name in (RECOMMENDED, "icr", "no_slip", *paths) if name in paths or name == "icr"]
+    models = [{"name": name, "label": labels[name]} for name in dict.fromkeys(names) if name in labels]
+    return {"models": models, "paths": packed_paths}
 
 
-def _held_out(
-    recording_of: Callable[[str], Recording], report: DropoutDocument, labels: Mapping[str, str], rows: Ints
-) -> Iterator[ModelPath]:
+def _odometry(run: Run, rows: Ints, origin: tuple[float, float]) -> Paths:
+    """Yield the odometries of the run, which the figure of the trajectory draws too."""
+    for name, icrs in odometry_icrs(run).items():
+        path = drive_wheels(run.table, run.in_gap, icrs)
+        model = "icr_final" if name == "icr" else name
+        yield model, (path.heading_rad[rows], path.north_m[rows] + 1j * path.east_m[rows] - complex(*origin))
+
+
+def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Paths:
     """Yield the path of each held-out model of the report, here as fitted to the whole drive."""
     ladder = report.ladder
     if ladder.fits is UNSET:
@@ -242,7 +229,7 @@ def _held_out(
             with suppress(DataError):
                 own = own_constants(windows(), fit, recording.width_m)
                 fitted = controller_model(fit, recording.lever, recording.width_m) if model == CONTROLLER else fit
-                yield ModelPath(name, labels[name], *predicted_path(recording, fitted, own)(recording.track.t[rows]))
+                yield name, predicted_path(recording, fitted, own)(recording.track.t[rows])
 
 
 def _fitted(name: str, fits: Mapping[str, FitDocument]) -> FittedModel:
@@ -252,7 +239,7 @@ def _fitted(name: str, fits: Mapping[str, FitDocument]) -> FittedModel:
     return FittedModel(model, np.array([value[term] for term in model.terms]), np.zeros((k, k)))
 
 
-def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Iterator[ModelPath]:
+def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Paths:
     """Yield the path of each calibration that was given; with the gyro too where there is one."""
     recording = recording_of("gyro") if report.calibrations else None
     for one in report.calibrations:
@@ -260,7 +247,7 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
         if recording is not None and document and not (turned and recording.track.gyro is None):
             with suppress(DataError):
                 model = calibrated(calibration_of(document), recording, with_gyro=turned)
-                yield ModelPath(one.name, one.label, *predicted_path(recording, *model)(recording.track.t[rows]))
+                yield one.name, predicted_path(recording, *model)(recording.track.t[rows])
 
 
 def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:
@@ -277,8 +264,6 @@ def _spans(flags: Bools) -> list[list[int]]:
     return [[int(first), int(end) - 1] for first, end in edges.reshape(-1, 2)]
 
 
-_TYPES = {"f32": "<f4", "f64": "<f8", "i32": "<i4", "u8": "u1"}
-
 LARGEST_STEP = 32_000
 """Units of the largest step: what 16 bits hold, with a margin for rounding."""
 
@@ -286,18 +271,24 @@ SMALLEST_UNIT = 1e-7
 """Metres or radians: finer steps mean nothing."""
 
 
-def packed(column: Floats | Ints | Bytes | Bools, kind: Literal["f32", "f64", "i32", "u8"]) -> dict[str, Any]:
+def packed(column: Floats) -> dict[str, Any]:
     """Return a column (n,) for a page.
 
     Notes
     -----
     ``f32`` has seven digits: enough for metres within some kilometres of the origin, and for seconds of a day (8 ms).
     """
-    return {"type": kind, "data": b64encode(np.asarray(column).astype(_TYPES[kind]).tobytes()).decode("ascii")}
+    return {"type": "f32", "data": _base64(column, "<f4")}
 
 
-def packed_sums(column: Floats) -> dict[str, Any]:
-    """Return a running sum (n,) for a page, as steps of 16 bits each; the page gets it from zero on.
+def packed_levels(column: Floats) -> dict[str, Any]:
+    """Return a column (n,) without NaN for a page, in 16 bits each: in steps of the greatest value / `LARGEST_STEP`."""
+    unit = max(float(np.abs(column).max(initial=0.0)) / LARGEST_STEP, SMALLEST_UNIT)
+    return {"type": "levels", "unit": unit, "data": _base64(np.rint(column / unit), "<i2")}
+
+
+def packed_sums(column: Floats | Ints, unit: float | None = None) -> dict[str, Any]:
+    """Return a running sum (n,) for a page: where it begins, and its steps of 16 bits each, in multiples of `unit`.
 
     Notes
     -----
@@ -305,6 +296,10 @@ def packed_sums(column: Floats) -> dict[str, Any]:
     where a step is 0.1 m at most.
     """
     sums = column - column[0]
-    unit = max(float(np.abs(np.diff(sums)).max(initial=0.0)) / LARGEST_STEP, SMALLEST_UNIT)
-    steps = np.diff(np.rint(sums / unit)).astype("<i2")
-    return {"type": "sums", "unit": unit, "data": b64encode(steps.tobytes()).decode("ascii")}
+    unit = unit or max(float(np.abs(np.diff(sums)).max(initial=0.0)) / LARGEST_STEP, SMALLEST_UNIT)
+    steps = np.diff(np.rint(sums / unit))
+    return {"type": "sums", "first": float(column[0]), "unit": unit, "data": _base64(steps, "<i2")}
+
+
+def _base64(column: NDArray[Any], kind: str) -> str:
+    return b64encode(column.astype(kind).tobytes()).decode("ascii")

@@ -202,8 +202,8 @@ const icrtoolCharts = (() => {
       series.push(edge, line(one), { ...edge });
       bands.push({ series: [first, first + 2], fill: faint(one.color, 0.22) });
     }
-    const half = data.models.find((model) => model.name === "no_slip")?.icrs?.[0];
-    if (half !== undefined) {
+    const half = data.half_width_m;
+    if (half !== null) {
       for (const side of [half, -half]) {
         columns.push(new Float32Array(s.t.length).fill(side));
         series.push(line({ label: "half the track width", color: "reference", dash: "dotted", width: 1 }));

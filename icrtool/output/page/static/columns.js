@@ -1,22 +1,23 @@
 "use strict";
 // Columns of numbers: base64 of little-endian values (icrtool/output/page/drive_data.py writes them).
 const icrtoolColumns = (() => {
-  const TYPES = { f32: Float32Array, f64: Float64Array, i32: Int32Array, u8: Uint8Array };
-
   function bytesOf(text) {
     const raw = atob(text), bytes = new Uint8Array(raw.length);
     for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
     return bytes.buffer;
   }
 
-  /** Return the numbers of a column as a typed array; of a running sum, from zero on. */
+  /** Return the numbers of a column as a typed array. */
   function decode(column) {
-    if (column.type !== "sums") return new TYPES[column.type](bytesOf(column.data));
-    const steps = new Int16Array(bytesOf(column.data)), sums = new Float64Array(steps.length + 1);
+    if (column.type === "f32") return new Float32Array(bytesOf(column.data));
+    const steps = new Int16Array(bytesOf(column.data));
+    if (column.type === "levels") return Float64Array.from(steps, (step) => step * column.unit);
+    // A running sum has one number more than steps.
+    const sums = new Float64Array(steps.length + 1).fill(column.first);
     let units = 0;
     for (let i = 0; i < steps.length; i++) {
       units += steps[i];
-      sums[i + 1] = units * column.unit;
+      sums[i + 1] += units * column.unit;
     }
     return sums;
   }

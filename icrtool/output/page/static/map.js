@@ -10,7 +10,7 @@ const icrtoolMap = (() => {
     const { color, lookOf, toggle } = icrtoolCharts, d3 = window.d3;
     const element = document.getElementById("map"), s = data.series, steps = data.steps;
     const origin = data.origin || [0, 0];
-    const north = steps.north.map((value) => value + steps.first_north), east = steps.east.map((value) => value + steps.first_east);
+    const { north, east } = steps, odometry = Object.fromEntries(["icr_final", "no_slip"].filter((name) => data.paths[name]).map((name) => [name, data.paths[name]]));
     const rowNorth = Float64Array.from(s.step, (step) => north[step]), rowEast = Float64Array.from(s.step, (step) => east[step]);
     const tree = d3.quadtree(d3.range(s.step.length), (row) => rowEast[row], (row) => rowNorth[row]);
     // At first: what answers a question. The rest is a click away.
@@ -31,7 +31,7 @@ const icrtoolMap = (() => {
     add("fixes", { stroke: color("fix"), "stroke-width": 3.5 });
     add("rejected", { stroke: color("rejected"), "stroke-width": 1.3 });
     add("no_slip", { stroke: color("no-slip"), "stroke-width": 1.5, "stroke-dasharray": "8 3 2 3" });
-    add("icr", { stroke: color("icr"), "stroke-width": 1.5, "stroke-dasharray": "7 4" });
+    add("icr_final", { stroke: color("icr"), "stroke-width": 1.5, "stroke-dasharray": "7 4" });
     add("filter", { stroke: color("filter"), "stroke-width": 1.3 });
     add("outages", { stroke: color("filter"), "stroke-width": 6, opacity: 0.35 });
     add("events", { stroke: color("slip"), "stroke-width": 5, opacity: 0.7 });
@@ -122,15 +122,12 @@ const icrtoolMap = (() => {
       const from = Number.isFinite(span[0]) ? s.step[Math.min(firstAtLeast(s.t, span[0]), s.t.length - 1)] : 0;
       const to = Number.isFinite(span[1]) ? s.step[Math.min(firstAtLeast(s.t, span[1]), s.t.length - 1)] : north.length - 1;
       layers.filter.attr("d", line(north, east, x, y, from, to));
-      for (const name of ["icr", "no_slip"]) {
-        const path = data.odometry[name];
-        layers[name].attr("d", path ? line(path.north, path.east, x, y) : "");
-      }
+      for (const [name, path] of Object.entries(odometry)) layers[name].attr("d", line(path.north, path.east, x, y));
       layers.outages.attr("d", during(data.outages, x, y));
       layers.events.attr("d", during(data.events, x, y));
       for (const [name, layer] of Object.entries(layers)) layer.attr("display", hidden.has(name) ? "none" : null);
       // While open-loop paths are shown, the odometry of the whole drive steps back.
-      for (const name of ["icr", "no_slip"]) layers[name].attr("opacity", loop ? 0.3 : null);
+      for (const name of Object.keys(odometry)) layers[name].attr("opacity", loop ? 0.3 : null);
       drawMarks(x, y);
       drawLoop(x, y);
       place();
@@ -219,8 +216,8 @@ const icrtoolMap = (() => {
       const entries = [
         { name: "filter", label: "filter", color: "filter" }, { name: "fixes", label: "fixes used", color: "fix", marker: "dot" },
         ...(data.fixes.rejected.t.length ? [{ name: "rejected", label: "fixes rejected", color: "rejected", marker: "cross" }] : []),
-        { name: "icr", label: "ICR odometry (final ICRs, from the start)", color: "icr", dash: "dashed" },
-        ...(data.odometry.no_slip ? [{ name: "no_slip", label: "no-slip odometry", color: "no-slip", dash: "dashdot" }] : []),
+        { name: "icr_final", label: "ICR odometry (final ICRs, from the start)", color: "icr", dash: "dashed" },
+        ...(odometry.no_slip ? [{ name: "no_slip", label: "no-slip odometry", color: "no-slip", dash: "dashdot" }] : []),
         ...(data.events.length ? [{ name: "events", label: "slip events", color: "slip", width: 5 }] : []),
         ...(data.outages.length ? [{ name: "outages", label: "outages", color: "final", width: 5 }] : []),
       ];

@@ -1,5 +1,5 @@
 "use strict";
-// Open-loop paths: what icrtool/kernels/open_loop.py and icrtool/motion/trials.py compute, from the same wheel samples.
+// Open-loop paths: those that the library computed, turned to the start; of momentary ICRs from the same wheel samples.
 const icrtoolOpenLoop = (() => {
   const { firstAtLeast } = icrtoolColumns;
   const LEAST_SEPARATION_M = 1e-6;
@@ -22,29 +22,20 @@ const icrtoolOpenLoop = (() => {
     return { north, east };
   }
 
-  /**
-   * Return the path of a model with constant parameters: its path through the whole drive, turned into place.
-   * Of a model that moves by ICRs along a measured turn the path is that of the mean of its tracks.
-   */
-  function alongPath(path, icrs, start, end, last, heading) {
+  /** Return the path of a model with constant parameters: its path through the whole drive, turned into place. */
+  function alongPath(path, start, end, last, heading) {
     // The path has one of `every` steps, and the last one.
     const at = (values, i) => {
       const k = Math.min(Math.floor(i / path.every), values.length - 2), from = k * path.every;
       return values[k] + ((i - from) / (Math.min(from + path.every, last) - from)) * (values[k + 1] - values[k]);
     };
-    const turned = heading - at(path.turn, start) - path.first_turn, c = Math.cos(turned), s = Math.sin(turned);
-    const middle = icrs ? (icrs[0] + icrs[1]) / 2 : 0, x = icrs ? icrs[2] : 0;
-    const placeAt = (i) => {
-      const psi = at(path.turn, i) + path.first_turn;
-      return [at(path.forward, i) - x * Math.cos(psi) + middle * Math.sin(psi),
-        at(path.right, i) - x * Math.sin(psi) - middle * Math.cos(psi)];
-    };
-    const [forward0, right0] = placeAt(start);
+    const turned = heading - at(path.heading, start), c = Math.cos(turned), s = Math.sin(turned);
+    const north0 = at(path.north, start), east0 = at(path.east, start);
     const north = new Float64Array(end - start + 1), east = new Float64Array(end - start + 1);
     for (let i = start; i <= end; i++) {
-      const [ahead, aside] = placeAt(i), forward = ahead - forward0, right = aside - right0;
-      north[i - start] = forward * c - right * s;
-      east[i - start] = forward * s + right * c;
+      const ahead = at(path.north, i) - north0, aside = at(path.east, i) - east0;
+      north[i - start] = ahead * c - aside * s;
+      east[i - start] = ahead * s + aside * c;
     }
     return { north, east };
   }
@@ -65,8 +56,9 @@ const icrtoolOpenLoop = (() => {
     if (longest === null || longest > last) why = last === gap ? "a gap in the wheel data" : "the end of the log";
     const hasReference = (step) => !steps.without_reference.some(([from, to]) => from <= step && step <= to);
     const models = data.models.map((model) => {
-      const icrs = model.icrs === null ? [series.y_right[row], series.y_left[row], series.x[row]] : model.icrs;
-      const path = model.path ? alongPath(model.path, icrs, start, end, final, heading) : byIcrs(steps, icrs, start, end, heading);
+      const known = data.paths[model.name];
+      const path = known ? alongPath(known, start, end, final, heading)
+        : byIcrs(steps, [series.y_right[row], series.y_left[row], series.x[row]], start, end, heading);
       const errors = ends.map((step) => {
         if (step === null || step > end || !hasReference(step)) return null;
         const k = step - start;

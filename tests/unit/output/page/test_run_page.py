@@ -20,7 +20,7 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.output.dropout_directory import report_document
-from icrtool.output.page.drive_data import packed, packed_sums
+from icrtool.output.page.drive_data import packed, packed_levels, packed_sums
 from icrtool.output.page.render import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
 from icrtool.output.tables.dropout import reach_rows, report_blocks
@@ -69,8 +69,12 @@ def data_of(page: str) -> dict[str, Any]:
 def numbers(column: dict[str, Any]) -> np.ndarray:
     raw = base64.b64decode(column["data"])
     if column["type"] == "sums":
-        return np.concatenate([[0.0], np.cumsum(np.frombuffer(raw, "<i2").astype(int)) * column["unit"]])
-    return np.frombuffer(raw, {"f32": "<f4", "f64": "<f8", "i32": "<i4", "u8": "u1"}[column["type"]])
+        steps = np.frombuffer(raw, "<i2").astype(int)
+        return column["first"] + np.concatenate([[0.0], np.cumsum(steps) * column["unit"]])
+    if column["type"] == "levels":
+        return np.frombuffer(raw, "<i2") * column["unit"]
+    assert column["type"] == "f32"
+    return np.frombuffer(raw, "<f4")
 
 
 @pytest.fixture(scope="module")
@@ -137,10 +141,12 @@ def test_a_run_with_too_few_turns_states_what_to_drive(run: Run, report: Dropout
 
 def test_the_numbers_of_the_drawings_are_those_of_the_run(page: str, run: Run) -> None:
     data, table = data_of(page), run.table
-    step = numbers(data["series"]["step"])
-    np.testing.assert_allclose(numbers(data["series"]["t"]), table.t_s[step])
+    step = numbers(data["series"]["step"]).astype(int)
+    # 16 bits: a 32,000th of the longest step between two moments, and of the greatest speed.
+    np.testing.assert_allclose(numbers(data["series"]["t"]), table.t_s[step], atol=1e-4)
+    np.testing.assert_allclose(numbers(data["series"]["v_left"]), table.v_left_mps[step], atol=1e-4)
     np.testing.assert_allclose(numbers(data["series"]["y_right"]), table.y_icr_right_m[step], rtol=1e-6)
-    north = numbers(data["steps"]["north"]) + data["steps"]["first_north"] + data["origin"][0]
+    north = numbers(data["steps"]["north"]) + data["origin"][0]
     np.testing.assert_allclose(north, table.north_m, atol=1e-5)
     held = np.where(run.in_gap[:-1], 0.0, np.diff(table.t_s))
     driven = np.concatenate([[0.0], np.cumsum(held * table.v_left_mps[:-1])])
@@ -153,7 +159,7 @@ def test_a_report_on_the_smoothed_trajectory_is_drawn_along_it() -> None:
     assert smoothed.smoothed is not None
     found = dropout_report(smoothed, reference="smoothed", comparison=False)
     data = data_of(run_page(smoothed, report_document(found), {}))
-    north = numbers(data["steps"]["north"]) + data["steps"]["first_north"] + data["origin"][0]
+    north = numbers(data["steps"]["north"]) + data["origin"][0]
     np.testing.assert_allclose(north, smoothed.smoothed.north_m, atol=1e-5)
 
 
@@ -162,14 +168,16 @@ def test_running_sums_do_not_gather_errors() -> None:
     column = np.cumsum(rng.normal(0.02, 0.01, 200_000))
     found = numbers(packed_sums(column))
     unit = packed_sums(column)["unit"]
-    assert np.abs(found - (column - column[0])).max() <= 0.5001 * unit
+    assert np.abs(found - column).max() <= 0.5001 * unit
     assert unit < 3e-6
 
 
 def test_columns_survive_their_packing() -> None:
     column = np.random.default_rng(16).normal(size=100)
-    np.testing.assert_array_equal(numbers(packed(column, "f64")), column)
-    np.testing.assert_array_equal(numbers(packed(np.arange(5), "i32")), np.arange(5))
+    np.testing.assert_allclose(numbers(packed(column)), column, rtol=1e-7)
+    # Half of a 32,000th of the greatest.
+    np.testing.assert_allclose(numbers(packed_levels(column)), column, atol=0.51 / 32_000 * np.abs(column).max())
+    np.testing.assert_array_equal(numbers(packed_sums(np.array([3, 4, 9]), unit=1)), [3, 4, 9])
 
 
 def test_the_page_may_load_nothing_and_run_only_its_own_scripts(page: str) -> None:
@@ -231,7 +239,8 @@ def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutRe
         assert trace in shown, trace
         assert trace not in hidden, trace
     assert data_of(hidden)["origin"] is None
-    assert max(map(abs, (data_of(hidden)["steps"]["first_north"], data_of(hidden)["steps"]["first_east"]))) < 1.0
+    steps = data_of(hidden)["steps"]
+    assert max(abs(steps[axis]["first"]) for axis in ("north", "east")) < 1.0
 
 
 def test_a_picture_whose_axes_show_a_map_grid_is_left_out_without_coordinates(run: Run, report: DropoutReport) -> None:
