@@ -13,16 +13,15 @@ from icrtool.alignment.conventions import apply_convention, decide_conventions
 from icrtool.alignment.corrections import AlignedStreams, align_streams
 from icrtool.alignment.estimator import Geometry, estimate_alignment
 from icrtool.alignment.log_track import check_streams, cut_windows, track_of_log
-from icrtool.alignment.sensors.gnss_quality import grade_fixes
-from icrtool.alignment.sensors.sensor_noise import heading_variance, position_variance, reference_noise, without_frozen
+from icrtool.alignment.sensors.gnss_quality import fixes_of, grade_fixes
+from icrtool.alignment.sensors.sensor_noise import heading_variance, reference_noise, without_frozen
 from icrtool.alignment.sensors.wheel_alignment import bridged
 from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
 from icrtool.alignment.slip.slip_events import find_disagreements
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
-from icrtool.records.measurements import Finding, Fixes, IcrStart, Measurements, SensorData
+from icrtool.records.measurements import Finding, IcrStart, Measurements, SensorData
 from icrtool.records.run import width_or_usual_m
-from icrtool.records.samples import PositionFixes
 from icrtool.records.tables import RobotLog
 
 
@@ -45,81 +44,67 @@ def align(log: RobotLog, config: Config) -> Measurements:
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
     log = with_wheel_speeds(log, config)
-    if config.filter.preset == "field":
-        log = without_frozen(log)
-    found = _align_once(log, config)
     if config.filter.preset == "paper":
         # it takes its wheels as they are
-        return found
-    found = _with_events(log, config, found)
+        return _align_once(log, config)
+    log, width = without_frozen(log), width_or_usual_m(config.robot.track_width_m)
+    found = _align_once(log, config)
+    seen = find_disagreements(found.sensors, width)
+    if seen.events:
+        # aligned again without them, where there is enough besides
+        with suppress(DataError):
+            spans = tuple((event.begin_ns, event.end_ns) for event in seen.events)
+            found = _align_once(replace(log, slipping_ns=spans), config)
+            seen = find_disagreements(found.sensors, width)
     filled, note = bridged(found.sensors.wheels, config.filter.wheel_gap_s)
     notes = (f"{log.name}: {note}",) if note else ()
-    return replace(found, sensors=replace(found.sensors, wheels=filled), warnings=(*found.warnings, *notes))
+    sensors = replace(found.sensors, wheels=filled, events=seen.events, jumps=seen.jumps)
+    return replace(found, sensors=sensors, warnings=(*found.warnings, *notes))
 
 
 def _align_once(log: RobotLog, config: Config) -> Measurements:
     found = align_streams(log, config)
-    heading = found.heading
+    heading, derived = found.heading.facts, found.derived
     fix_steps, heading_steps = found.steps()
-    quality = grade_fixes(found.log, config, fix_steps)
-    noise = reference_noise(found.log, config.filter, fix_steps, heading_steps)
-    sensors = sensors_as_sent(quality.log, config, noise)
+    position_std_m, heading_std_rad = reference_noise(found.log, config.filter, fix_steps, heading_steps)
+    quality = grade_fixes(found.log, config, fix_steps, position_std_m)
+    check_streams(found.log)
+    headings = found.log.heading
+    if derived is None:
+        noise = heading_variance(headings, config.filter, math.radians(heading.applied_std_deg), heading_std_rad)
+        corrected = headings.heading_rad - math.radians(heading.applied_offset_deg)
+        headings = replace(headings, heading_rad=corrected, var_rad2=noise)
+    sensors = SensorData(
+        name=log.name,
+        wheels=found.log.wheels,
+        fixes=quality.fixes,
+        headings=headings,
+        gyro=found.log.gyro,
+        heading_from_position=found.log.heading_is_of_position,
+        heading_correlation_s=max(config.filter.heading_correlation_s, found.heading.correlation_s),
+        antenna_m=(antenna_m := _antenna_m(log, config)),
+        losses_ns=quality.losses_ns,
+        icr_start=start_icrs(found.geometry, antenna_m, config),
+        heading_is_estimated=derived is not None,
+        heading_is_measured=math.isfinite(heading_std_rad),
+        turn_wander_rad=math.inf if found.fit is None else found.fit.turn_wander_rad,
+        attitude=None if derived is None else derived.attitude,
+    )
     return Measurements(
-        sensors=replace(
-            sensors,
-            fixes=replace(
-                sensors.fixes,
-                fix_class=quality.fix_class,
-                misreported=quality.misreported,
-                down_weighted=quality.down_weighted,
-            ),
-            headings=replace(
-                sensors.headings,
-                heading_rad=sensors.headings.heading_rad - heading.remaining_offset_rad,
-                var_rad2=quality.log.heading.var_rad2
-                if heading.is_estimated
-                else heading_variance(quality.log.heading, config.filter, heading.applied_std_rad, noise[1]),
-            ),
-            heading_correlation_s=max(config.filter.heading_correlation_s, heading.applied_correlation_s),
-            heading_is_estimated=heading.is_estimated,
-            heading_is_measured=math.isfinite(noise[1]),
-            turn_wander_rad=math.inf if found.fit is None else found.fit.turn_wander_rad,
-            attitude=None if found.derived is None else found.derived.attitude,
-            losses_ns=quality.losses_ns,
-            icr_start=start_icrs(found.geometry, sensors.antenna_m, config),
-        ),
-        findings=alignment_findings(found, sensors.antenna_m),
-        wheels=found.wheels.facts(found.fit),
-        heading=heading.facts(),
+        sensors=sensors,
+        findings=alignment_findings(found, antenna_m),
+        wheels=found.wheels.facts,
+        heading=heading,
         streams=found.log.streams,
         fix_statistics=quality.statistics,
         clock_std_s=found.delays.clock_std_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
-        warnings=(*quality.log.warnings, *found.warnings, *quality.warnings),
+        warnings=(*found.log.warnings, *found.warnings, *quality.warnings),
     )
 
 
-def _with_events(log: RobotLog, config: Config, found: Measurements) -> Measurements:
-    """Return the streams with the slip events and jumps found in them; where there are events, aligned again without.
-
-    A log with too little besides them keeps its first alignment.
-    """
-    width = width_or_usual_m(config.robot.track_width_m)
-    seen = find_disagreements(found.sensors, width)
-    if seen.events:
-        spans = tuple((event.begin_ns, event.end_ns) for event in seen.events)
-        with suppress(DataError):
-            found = _align_once(replace(log, slipping_ns=spans), config)
-            seen = find_disagreements(found.sensors, width)
-    return replace(found, sensors=replace(found.sensors, events=seen.events, jumps=seen.jumps))
-
-
-def sensors_as_sent(log: RobotLog, config: Config, measured: tuple[float, float] = (math.nan, math.nan)) -> SensorData:
+def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
     """Return the streams of a log without any correction, each sample with its noise: for logs known to be right.
-
-    Parameters
-    ----------
-    measured : noise of positions [m] and headings [rad], of `reference_noise`; NaN: as stated or configured
 
     Raises
     ------
@@ -130,28 +115,13 @@ def sensors_as_sent(log: RobotLog, config: Config, measured: tuple[float, float]
     return SensorData(
         name=log.name,
         wheels=log.wheels,
-        fixes=_fixes(log.gnss, config, measured[0]),
-        headings=replace(log.heading, var_rad2=heading_variance(log.heading, config.filter, measured_rad=measured[1])),
+        fixes=fixes_of(log.gnss, config.filter),
+        headings=replace(log.heading, var_rad2=heading_variance(log.heading, config.filter)),
         gyro=log.gyro,
         heading_from_position=log.heading_is_of_position,
         heading_correlation_s=config.filter.heading_correlation_s,
         antenna_m=_antenna_m(log, config),
         losses_ns=np.empty((0, 2), np.int64),
-    )
-
-
-def _fixes(gnss: PositionFixes, config: Config, measured_m: float) -> Fixes:
-    variance = position_variance(gnss, config.filter, measured_m)
-    none = np.zeros(len(gnss.stamp_ns), np.bool_)
-    return Fixes(
-        stamp_ns=gnss.stamp_ns,
-        north_m=gnss.north_m,
-        east_m=gnss.east_m,
-        var_north_m2=np.ascontiguousarray(variance[:, 0]),
-        var_east_m2=np.ascontiguousarray(variance[:, 1]),
-        fix_class=np.zeros(len(gnss.stamp_ns), np.uint8),
-        misreported=none,
-        down_weighted=none,
     )
 
 
@@ -184,13 +154,11 @@ def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) ->
     ----------
     antenna_m : the antenna from the body origin, forward and right; the ICRs refer to the origin
     """
-    wheels, heading, delays = found.wheels, found.heading, found.delays
-    degrees = math.degrees
+    wheels, heading, delays = found.wheels.facts, found.heading.facts, found.delays
+    offset = None if heading.offset_deg is None else -heading.offset_deg
     return {
         "wheel_scale": _finding(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
-        "heading_offset_deg": _finding(
-            -degrees(heading.offset_rad), degrees(heading.offset_std_rad), -degrees(heading.applied_offset_rad)
-        ),
+        "heading_offset_deg": _finding(offset, heading.offset_std_deg, -heading.applied_offset_deg),
         "heading_delay_s": _finding(*delays.heading, delays.applied_heading_s),
         "position_delay_s": _finding(*delays.gnss, delays.applied_gnss_s),
         "position_delay_against_heading_s": _finding(
@@ -223,16 +191,17 @@ def _robot_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> di
     }
 
 
-def _finding(value: float, std: float, applied: float, nothing: float = 0.0) -> Finding:
-    """Return one estimate; `nothing` is the correction that changes nothing."""
-    known = math.isfinite(value) and math.isfinite(std)
+def _finding(value: float | None, std: float | None, applied: float, nothing: float = 0.0) -> Finding:
+    """Return one estimate, None or no finite number where it is not known; `nothing` is the correction that is none."""
+    if value is None or std is None or not math.isfinite(value + std):
+        value = std = None
     if applied != nothing:
         why = "corrected"
-    elif known:
+    elif value is not None:
         why = "not corrected: too small, too uncertain, or not separable from wheel slip"
     else:
         why = "not corrected: this drive does not show it"
-    return Finding(value if known else None, std if known else None, applied, why)
+    return Finding(value, std, applied, why)
 
 
 def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: Config) -> IcrStart | None:

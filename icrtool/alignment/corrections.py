@@ -28,7 +28,6 @@ from icrtool.alignment.heading.heading_alignment import (
     FEWEST_WINDOWS,
     OPPOSITE_SENSE,
     HeadingAlignment,
-    align_estimated_heading,
     align_heading,
     compare_with_course,
     refuse_stuck,
@@ -39,7 +38,6 @@ from icrtool.alignment.heading.heading_choice import (
     as_turn_rate,
     derive_heading,
     fuse_heading,
-    stated_source,
     without_heading,
 )
 from icrtool.alignment.log_track import DriveWindows, check_streams, track_of_log, windows_of_log
@@ -267,7 +265,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     free, convention = config.frames.heading_offset_deg == "auto" and corrects, decision.convention
     fit = estimate_alignment(windows, width)
     if derived is not None:
-        heading = align_estimated_heading(log, derived, None)
+        heading = align_heading(log, config, None, derived)
     else:
         if free:
             refuse_stuck(log)
@@ -280,14 +278,12 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
             if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
                 return align_streams(bare, config)
             refuse_unexplained(log, course)
-        heading = align_heading(log, config, fit, course, stated_source(log), convention)
-        if free and config.frames.heading == "auto":
-            derived = fuse_heading(log, windows.track)
+        derived = fuse_heading(log, windows.track) if free and config.frames.heading == "auto" else None
+        heading = align_heading(log, config, (fit, course, convention), derived)
         if derived is not None:
             log = derived.apply(log)
             windows = windows_of_log(log, width, derived.smoothed)
             fit = estimate_alignment(windows, width)
-            heading = align_estimated_heading(log, derived, heading)
     configured = configured_scales(config)
     if convention.swapped and corrects:
         configured = configured[::-1]

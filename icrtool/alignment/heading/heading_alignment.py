@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from icrtool.alignment.conventions import Convention
 from icrtool.alignment.estimator import AlignmentFit
-from icrtool.alignment.heading.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
+from icrtool.alignment.heading.heading_choice import NOISY_SCATTER_RAD, DerivedHeading, stated_source
 from icrtool.alignment.log_track import STARTS_A_WINDOW, DriveWindows
 from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
@@ -31,8 +30,7 @@ UTM_LATITUDES_DEG = (-80.0, 84.0)
 TURNS = {0.0: "", 90.0: "a quarter turn clockwise", -90.0: "a quarter turn counter-clockwise", 180.0: "half a turn"}
 
 
-@dataclass(frozen=True, slots=True)
-class OffsetName:
+class OffsetName(NamedTuple):
     """What an offset may come from.
 
     Attributes
@@ -173,6 +171,9 @@ class CourseAngles(NamedTuple):
         return len(self.angle) >= FEWEST_WINDOWS and max(self.agreement, self.mirrored_agreement) >= EXPLAINED
 
 
+NO_COURSE = CourseAngles(np.empty(0), np.empty(0), np.empty(0, np.bool_), 0, 0.0)
+
+
 def compare_with_course(windows: DriveWindows) -> CourseAngles:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
     track, (begin, end) = windows.track, (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
@@ -192,145 +193,111 @@ def compare_with_course(windows: DriveWindows) -> CourseAngles:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class HeadingAlignment:
+class HeadingAlignment(NamedTuple):
     """What is known of the heading, and what is done with it.
 
     Attributes
     ----------
-    source : what the heading is made of; parts : in words, with its standard deviation, empty for a stated heading
-    windows : stretches of distance compared
-    offset_rad, offset_std_rad : heading minus course over ground at no curvature; NaN when there was nothing to compare
-    scatter_rad : robust standard deviation of the differences
-    agreement, mirrored_agreement : mean resultant length of heading minus course over ground, in either sense
-    applied_mirror : the heading is turned over; applied_offset_rad : what is subtracted from it, after that
-    name : what a significant offset may come from
-    applied_std_rad, applied_correlation_s : the least noise, and how long it is correlated, that the filter uses
-    std_rad : median standard deviation of an estimated heading, as the filter is given it; NaN for a stated one
+    facts : as in run.json
+    correlation_s : how long the noise of a stated heading is correlated, where it was raised
     """
 
-    source: str
-    parts: str = ""
-    windows: int = 0
-    offset_rad: float = math.nan
-    offset_std_rad: float = math.nan
-    scatter_rad: float = math.nan
-    agreement: float = math.nan
-    mirrored_agreement: float = math.nan
-    applied_mirror: bool = False
-    applied_offset_rad: float = 0.0
-    applied_std_rad: float = 0.0
-    applied_correlation_s: float = 0.0
-    std_rad: float = math.nan
-    name: OffsetName = NO_NAME
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def is_estimated(self) -> bool:
-        """Whether the log's heading is an estimate, which holds every correction."""
-        return math.isfinite(self.std_rad)
-
-    @property
-    def remaining_offset_rad(self) -> float:
-        """Offset of the log's heading that is still to be corrected."""
-        return 0.0 if self.is_estimated else self.applied_offset_rad
-
-    def facts(self) -> HeadingFacts:
-        """Return what run.json holds, angles in degrees."""
-        return HeadingFacts(
-            source=self.source,
-            parts=self.parts or None,
-            windows=self.windows,
-            applied_mirror=self.applied_mirror,
-            offset_deg=known(math.degrees(self.offset_rad)),
-            offset_std_deg=known(math.degrees(self.offset_std_rad)),
-            scatter_deg=known(math.degrees(self.scatter_rad)),
-            applied_offset_deg=math.degrees(self.applied_offset_rad),
-            applied_std_deg=math.degrees(self.applied_std_rad),
-            std_deg=known(math.degrees(self.std_rad)),
-            offset_name=self.name.text or None,
-            magnetic_declination_deg=self.name.declination_deg,
-            utm_convergence_deg=self.name.convergence_deg,
-            agreement=known(self.agreement),
-            mirrored_agreement=known(self.mirrored_agreement),
-        )
+    facts: HeadingFacts
+    correlation_s: float
+    warnings: tuple[str, ...]
 
 
 def align_heading(
-    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseAngles, source: str, convention: Convention
+    log: RobotLog, config: Config, stated: tuple[AlignmentFit | None, CourseAngles, Convention] | None,
+    derived: DerivedHeading | None,
 ) -> HeadingAlignment:  # fmt: skip
-    """Return offset and noise of a stated heading, and what is applied.
+    """Return offset and noise of the heading, and what is applied.
 
     Parameters
     ----------
-    fit : of this heading; None where the drive is too short
-    source : kind of sensor
-    convention : that the streams were found to have
+    stated : of the heading that a sensor states: its estimate, None where the drive is too short; its course over
+        ground; the convention that the streams were found to have. None without such a heading
+    derived : the heading where it was estimated, which holds every correction
     """
-    mirrored = convention.heading < 0
-    given, corrects = config.frames.heading_offset_deg, config.filter.preset == "field"
-    fixed = -math.radians(given) if given != "auto" and corrects else 0.0
-    nothing = HeadingAlignment(
-        source, windows=len(course.angle), agreement=course.agreement, mirrored_agreement=course.mirrored_agreement,
-        applied_mirror=mirrored and corrects, applied_offset_rad=fixed,
-    )  # fmt: skip
-    if fit is None:
-        return nothing
-    pose_mirrored = mirrored and convention.position < 0 and fit.windows.track.same_clock
-    turn, std = fit.estimate("offset")
-    offset = math.remainder(-turn, 2 * math.pi)
-    scatter = fit.across_scatter
-    text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
-    significant = _significant(offset - fixed, std)
-    applied, notes = fixed, []
-    if mirrored and not corrects:
-        notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
-    elif mirrored and pose_mirrored:
-        applied = offset if given == "auto" else fixed
-        notes.append("the heading of the same poses is mirrored likewise: corrected; frames.heading sets it")
-    elif mirrored:
-        applied = offset if given == "auto" else fixed
-        notes.append(
-            f"{OPPOSITE_SENSE}: its yaw is of the other convention (ENU/NED), "
-            f"offset {text}: applied; frames.heading sets it"
-        )
-    elif significant and given == "auto" and corrects:
-        applied = offset
-        notes.append(_offset_note(text, applied))
-    elif significant:
-        notes.append(f"heading is {text} off the course over ground; {-math.degrees(fixed):+.1f}° is applied")
-    noisy = corrects and scatter > NOISY_SCATTER_RAD and course.is_explained
+    corrects, offset, std, scatter, correlation_s = config.filter.preset == "field", math.nan, math.nan, math.nan, 0.0
+    applied, mirrored, course, name, notes = 0.0, False, NO_COURSE, NO_NAME, list[str]()
+    if stated is not None:
+        fit, course, convention = stated
+        mirrored = convention.heading < 0
+        if config.frames.heading_offset_deg != "auto" and corrects:
+            applied = -math.radians(config.frames.heading_offset_deg)
+        if fit is not None:
+            turn, std = fit.estimate("offset")
+            offset, scatter = math.remainder(-turn, 2 * math.pi), fit.across_scatter
+            applied, name, notes = _correction(log, config, fit, convention, (offset, std), applied)
+    noisy = derived is None and corrects and scatter > NOISY_SCATTER_RAD and course.is_explained
     if noisy:
+        correlation_s = course.duration_s
         notes.append(
             f"the heading scatters by {math.degrees(scatter):.0f}° about the course over ground: "
             "its noise is raised to that"
         )
-    return replace(
-        nothing, offset_rad=offset, offset_std_rad=std, scatter_rad=scatter, applied_offset_rad=applied,
-        applied_std_rad=scatter if noisy else 0.0, applied_correlation_s=course.duration_s if noisy else 0.0,
-        name=name, warnings=tuple(f"{log.name}: {note}" for note in notes),
-    )  # fmt: skip
+    if derived is not None and derived.attitude_offset is not None:
+        offset, std = derived.attitude_offset
+        applied = offset
+        text, name = _offset_in_words(log, offset, std, mirrored=mirrored)
+        notes = [note for note in notes if OPPOSITE_SENSE in note]
+        if not notes and _significant(offset, std):
+            notes = [_offset_note(text, offset)]
+    elif derived is not None:
+        notes = [f"the heading is estimated: {derived.why}"]
+    facts = HeadingFacts(
+        source=stated_source(log) if derived is None else derived.source,
+        parts=None if derived is None else derived.why,
+        windows=len(course.angle),
+        applied_mirror=mirrored and corrects,
+        offset_deg=known(math.degrees(offset)),
+        offset_std_deg=known(math.degrees(std)),
+        scatter_deg=known(math.degrees(scatter)),
+        applied_offset_deg=math.degrees(applied),
+        applied_std_deg=math.degrees(scatter) if noisy else 0.0,
+        std_deg=None if derived is None else known(math.degrees(derived.estimate.median_causal_std)),
+        offset_name=name.text or None,
+        magnetic_declination_deg=name.declination_deg,
+        utm_convergence_deg=name.convergence_deg,
+        agreement=known(course.agreement),
+        mirrored_agreement=known(course.mirrored_agreement),
+    )
+    return HeadingAlignment(facts, correlation_s, tuple(f"{log.name}: {note}" for note in notes))
 
 
-def align_estimated_heading(
-    log: RobotLog, derived: DerivedHeading, stated: HeadingAlignment | None
-) -> HeadingAlignment:
-    """Return what is known of an estimated heading, and of the stated one that it was made of (None: without one)."""
-    std = derived.estimate.median_causal_std
-    estimated = f"{log.name}: the heading is estimated: {derived.why}"
-    own = HeadingAlignment(derived.source, derived.why, std_rad=std, warnings=(estimated,))
-    if stated is None or derived.attitude_offset is None:
-        return own
-    offset, offset_std = derived.attitude_offset
-    text, name = _offset_in_words(log, offset, offset_std, mirrored=stated.applied_mirror)
-    notes = [note for note in stated.warnings if OPPOSITE_SENSE in note]
-    if not notes and _significant(offset, offset_std):
-        notes = [f"{log.name}: {_offset_note(text, offset)}"]
-    return replace(
-        stated, source=own.source, parts=own.parts, offset_rad=offset, offset_std_rad=offset_std,
-        applied_offset_rad=offset, applied_std_rad=0.0, applied_correlation_s=0.0, std_rad=std,
-        name=name, warnings=tuple(notes),
-    )  # fmt: skip
+def _correction(
+    log: RobotLog, config: Config, fit: AlignmentFit, convention: Convention, found: tuple[float, float], fixed: float
+) -> tuple[float, OffsetName, list[str]]:
+    """Return what is subtracted from a stated heading [rad], what its offset comes from, and what to report.
+
+    Parameters
+    ----------
+    found : offset and its standard deviation [rad]; fixed : what is subtracted by the configuration
+    """
+    offset, std = found
+    mirrored, corrects = convention.heading < 0, config.filter.preset == "field"
+    pose_mirrored = mirrored and convention.position < 0 and fit.windows.track.same_clock
+    text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
+    significant = _significant(offset - fixed, std)
+    applies = config.frames.heading_offset_deg == "auto" and corrects
+    applied = offset if applies and (mirrored or significant) else fixed
+    if mirrored and not corrects:
+        note = f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned"
+    elif pose_mirrored:
+        note = "the heading of the same poses is mirrored likewise: corrected; frames.heading sets it"
+    elif mirrored:
+        note = (
+            f"{OPPOSITE_SENSE}: its yaw is of the other convention (ENU/NED), "
+            f"offset {text}: applied; frames.heading sets it"
+        )
+    elif significant and applies:
+        note = _offset_note(text, applied)
+    elif significant:
+        note = f"heading is {text} off the course over ground; {-math.degrees(fixed):+.1f}° is applied"
+    else:
+        return applied, name, []
+    return applied, name, [note]
 
 
 def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool) -> tuple[str, OffsetName]:

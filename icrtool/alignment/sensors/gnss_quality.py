@@ -8,8 +8,9 @@ are found by their noise beside a jump, or between a jump and its return.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,11 +18,12 @@ from icrtool.alignment.sensors.sensor_noise import (
     FEWEST_STEPS,
     LARGEST_SANE_GNSS_STD_M,
     FixSteps,
+    position_variance,
     unstated_position_std_m,
 )
-from icrtool.config import Config
+from icrtool.config import Config, FilterConfig
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
-from icrtool.records.measurements import FixStatistics
+from icrtool.records.measurements import Fixes, FixStatistics
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, PositionFixes
 from icrtool.records.tables import RobotLog
 
@@ -48,39 +50,50 @@ NOISIER = 1.5
 """White noise from step to step that is this many times what the messages state is used instead."""
 
 SHORTEST_LOSS_S = 2.0
-NO_SPANS: Ints = np.empty((0, 2), np.int64)
 
 
-@dataclass(frozen=True, slots=True)
-class GnssQuality:
+class GnssQuality(NamedTuple):
     """Classes of the fixes of a log, and their noise.
 
     Attributes
     ----------
-    log : with the variances that the fixes deserve; the given one in preset ``paper``
-    fix_class : uint8 (m,), keys of `CLASSES`
-    misreported : bool (m,), reported as fixed and are not
-    down_weighted : bool (m,), given a larger variance for their class
+    fixes : with their classes, and the variances that they deserve
     statistics : of the classes
     losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
     """
 
-    log: RobotLog
-    fix_class: Bytes
-    misreported: Bools
-    down_weighted: Bools
+    fixes: Fixes
     statistics: FixStatistics
     losses_ns: Ints
     warnings: tuple[str, ...]
 
 
-def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
+def fixes_of(gnss: PositionFixes, settings: FilterConfig, measured_m: float = math.nan) -> Fixes:
+    """Return positions as the filter uses them, all of one class; `measured_m` as in `position_variance`."""
+    variance, none = position_variance(gnss, settings, measured_m), np.zeros(len(gnss.stamp_ns), np.bool_)
+    return Fixes(
+        stamp_ns=gnss.stamp_ns,
+        north_m=gnss.north_m,
+        east_m=gnss.east_m,
+        var_north_m2=np.ascontiguousarray(variance[:, 0]),
+        var_east_m2=np.ascontiguousarray(variance[:, 1]),
+        fix_class=np.zeros(len(none), np.uint8),
+        misreported=none,
+        down_weighted=none,
+    )
+
+
+def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: float = math.nan) -> GnssQuality:
     """Return the classes of the fixes, and the noise of each.
 
     The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
     fixes move against the wheels: a stretch that is noisier than the rest, or lies between two jumps that take each
     other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
     number of samples that err alike. Preset ``paper`` takes every fix as it is.
+
+    Parameters
+    ----------
+    measured_m : as in `position_variance`
     """
     gnss, changes = log.gnss, config.filter.preset != "paper"
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
@@ -96,17 +109,20 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps) -> GnssQuality:
     variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
     if raised or down.any():
         gnss = replace(gnss, var_north_m2=variance[:, 0].copy(), var_east_m2=variance[:, 1].copy())
-    quality = GnssQuality(
-        log=replace(log, gnss=gnss),
-        fix_class=kinds,
-        misreported=misreported,
-        down_weighted=down,
-        statistics=FixStatistics(_class_std(gnss, kinds), white),
-        losses_ns=_losses(gnss.stamp_ns, fixed) if norm else NO_SPANS,
-        warnings=(),
+    fixes = replace(
+        fixes_of(gnss, config.filter, measured_m), fix_class=kinds, misreported=misreported, down_weighted=down
     )
-    notes = _notes(quality, stated, raised, changes=changes)
-    return replace(quality, warnings=tuple(f"{log.name}: {note}" for note in notes))
+    given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+    notes = [
+        *_notes_of_classes(fixes, stated, given, changes=changes),
+        *_notes_of_noise(fixes, stated, {name: white[name] for name in raised}),
+    ]
+    return GnssQuality(
+        fixes,
+        FixStatistics(_class_std(given, kinds), white),
+        _losses(gnss.stamp_ns, fixed) if norm else np.empty((0, 2), np.int64),
+        tuple(f"{log.name}: {note}" for note in notes),
+    )
 
 
 def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
@@ -167,8 +183,6 @@ def _losses(stamps: Ints, fixed: Bools) -> Ints:
     Others before the first and after the last fixed one make a span with the log's end.
     """
     rows = np.flatnonzero(fixed)
-    if not len(rows):
-        return NO_SPANS
     edge = np.concatenate([[-1], rows, [len(stamps)]])
     times = stamps[np.clip(edge, 0, len(stamps) - 1)]
     lost = (np.diff(edge) > 1) & (np.diff(times) > SHORTEST_LOSS_S * 1e9)
@@ -177,34 +191,37 @@ def _losses(stamps: Ints, fixed: Bools) -> Ints:
     return np.column_stack([times[:-1][lost], ends[lost]])
 
 
-def _notes(quality: GnssQuality, stated: Floats, raised: list[str], *, changes: bool) -> list[str]:
-    """Return sentences on what the fixes do not state, and on what was done to their noise."""
-    notes, misreported, rows = [], quality.misreported, quality.fix_class
+def _notes_of_classes(fixes: Fixes, stated: Floats, given: Floats, *, changes: bool) -> list[str]:
+    """Return sentences on fixes that are not fixed; `stated`, `given` (m,): deviations before and after [m]."""
+    notes, misreported = [], fixes.misreported
     if misreported.any():
         notes.append(
             f"{_counted(misreported)} state {_accuracy(stated[misreported], 'that they are fixed')} "
             f"but scatter or jump like RTK float{': taken as float' if changes else ''}"
         )
-    down = quality.down_weighted & ~misreported
+    down = fixes.down_weighted & ~misreported
     if down.any():
-        gnss = quality.log.gnss
-        given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2)[down] / 2)
-        notes.append(
-            f"{_counted(down)} are not RTK fixed, as most of this log are: they are used with ±{np.median(given):.2g} m"
-        )
+        used = np.median(given[down])
+        notes.append(f"{_counted(down)} are not RTK fixed, as most of this log are: they are used with ±{used:.2g} m")
+    return notes
+
+
+def _notes_of_noise(fixes: Fixes, stated: Floats, raised: dict[str, float]) -> list[str]:
+    """Return sentences on the classes whose noise was raised to what they scatter by [m]."""
+    notes = []
     for code, name in CLASSES.items():
-        if name in raised and not quality.down_weighted[rows == code].all():
+        rows = fixes.fix_class == code
+        if name in raised and not fixes.down_weighted[rows].all():
             kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
             notes.append(
-                f"the {kind} state {_accuracy(stated[rows == code], 'no accuracy')} and scatter by "
-                f"{quality.statistics.step_std_m[name]:.2g} m: the scatter is used"
+                f"the {kind} state {_accuracy(stated[rows], 'no accuracy')} and scatter by {raised[name]:.2g} m: "
+                "the scatter is used"
             )
     return notes
 
 
-def _class_std(gnss: PositionFixes, kinds: Bytes) -> dict[str, float]:
-    """Return the median standard deviation of the fixes of each class [m], by its name; NaN for no such fixes."""
-    std = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
+def _class_std(std: Floats, kinds: Bytes) -> dict[str, float]:
+    """Return the median of the standard deviations (m,) of the fixes of each class [m], by its name; NaN for none."""
     given = {name: std[(kinds == code) & np.isfinite(std)] for code, name in CLASSES.items()}
     return {name: float(np.median(one)) if len(one) else math.nan for name, one in given.items()}
 

@@ -8,7 +8,8 @@ to an absolute heading stays near it, however long it drives.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,48 +56,18 @@ FUSED_CORRELATION = 0.9995
 """A turn rate of the wheels that follows the gyro this closely was made of it."""
 
 
-@dataclass(frozen=True, slots=True)
-class WheelAlignment:
-    """What is known of the wheels, and what was done with it.
+class WheelAlignment(NamedTuple):
+    """What is known of the wheels, and what is done with them.
 
     Attributes
     ----------
-    scale, scale_std : distance by the position reference per distance by the wheels; NaN where not shown
-    applied : what the speeds of the left and of the right side were multiplied with
-    configured : what they were multiplied with before, by the configuration
-    held_share : share of samples, while moving, that repeat the one before
-    filtered : how they show that a filter made them, `icrtool.alignment.sensors.wheel_alignment`; empty for none
+    facts : as in run.json
+    applied : what the speeds of the left and of the right side are multiplied with, beside the configured scales
     """
 
-    scale: float
-    scale_std: float
+    facts: WheelFacts
     applied: tuple[float, float]
-    configured: tuple[float, float]
-    held_share: float
-    filtered: str
     warnings: tuple[str, ...]
-
-    @property
-    def applied_scale(self) -> float:
-        """Mean of what both sides were multiplied with."""
-        return (self.applied[0] + self.applied[1]) / 2
-
-    def facts(self, fit: AlignmentFit | None) -> WheelFacts:
-        """Return what run.json holds; `fit` is that of the windows, None where the drive is too short."""
-        count = len(fit.windows.begin) if fit is not None else 0
-        groups = () if fit is None else (fit.windows.group, fit.windows.turn_group)
-        return WheelFacts(
-            scale=known(self.scale),
-            scale_std=known(self.scale_std),
-            applied_scale=self.applied_scale,
-            applied_left_scale=self.applied[0] * self.configured[0],
-            applied_right_scale=self.applied[1] * self.configured[1],
-            held_share=known(self.held_share),
-            filtered=self.filtered or None,
-            windows=count,
-            stretches=len(np.union1d(*groups)) if groups else 0,
-            residual_m=None if fit is None else known(math.hypot(*fit.fit.scale[[0, count]].tolist())),
-        )
 
 
 def configured_scales(config: Config) -> tuple[float, float]:
@@ -226,13 +197,27 @@ def align_wheels(
     """
     filtered = "" if fit is None or not sound else find_filtering(fit)
     applied, of_scale = ((1.0, 1.0), []) if filtered else _find_scales(fit, config, sound=sound)
-    a, a_std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
     share = _held_share(log.wheels)
     notes = [*notes, *of_scale, *_held_note(log.wheels, share), *_fused_note(log)]
-    return WheelAlignment(
-        a, a_std, applied, (abs(configured[0]), abs(configured[1])), share, filtered,
-        tuple(f"{log.name}: {note}" for note in notes),
-    )  # fmt: skip
+    scale, std, windows, stretches, residual_m = math.nan, math.nan, 0, 0, math.nan
+    if fit is not None:
+        scale, std = fit.estimate("scale")
+        windows = len(fit.windows.begin)
+        stretches = len(np.union1d(fit.windows.group, fit.windows.turn_group))
+        residual_m = math.hypot(*fit.fit.scale[[0, windows]].tolist())
+    facts = WheelFacts(
+        scale=known(scale),
+        scale_std=known(std),
+        applied_scale=(applied[0] + applied[1]) / 2,
+        applied_left_scale=applied[0] * abs(configured[0]),
+        applied_right_scale=applied[1] * abs(configured[1]),
+        held_share=known(share),
+        filtered=filtered or None,
+        windows=windows,
+        stretches=stretches,
+        residual_m=known(residual_m),
+    )
+    return WheelAlignment(facts, applied, tuple(f"{log.name}: {note}" for note in notes))
 
 
 def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[str]]:

@@ -88,8 +88,8 @@ def test_the_other_convention_is_told_from_an_offset_by_the_turns_between_rows()
     log = rows_to_and_fro()
     assert align_streams(log, load_config()).heading.warnings == ()
     other = align_streams(told(log, math.pi / 2 - log.heading.heading_rad), load_config()).heading
-    assert other.agreement > 0.8
-    assert other.applied_mirror
+    assert other.facts.agreement > 0.8
+    assert other.facts.applied_mirror
     assert "other convention" in other.warnings[0]
     paper = align_streams(
         other_log := told(log, -log.heading.heading_rad), load_config(sets=["filter.preset=paper"])
@@ -167,7 +167,7 @@ def test_a_heading_in_whole_degrees_on_straight_rows_is_not_stuck(left_scale: fl
     wheels = replace(log.wheels, left=left_scale * log.wheels.left)
     check = align_streams(replace(log, wheels=wheels), load_config(sets=[WIDTH])).heading
     assert check.warnings == ()
-    assert check.agreement > 0.99
+    assert check.facts.agreement > 0.99
 
 
 def test_a_heading_stuck_from_the_first_turn_on_is_refused_on_straight_rows() -> None:

@@ -225,7 +225,7 @@ def test_noise_alone_does_not_overrule_a_message_that_says_fixed() -> None:
     misreported = {
         told: grade_fixes(
             confess(noisy, np.zeros(len(t), np.bool_), told), CONFIG, align_streams(noisy, CONFIG).steps()[0]
-        ).misreported
+        ).fixes.misreported
         for told in ("flags", "not")
     }
     assert not misreported["flags"].any()
@@ -250,7 +250,7 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
     quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).steps()[0])
     (warning,) = quality.warnings
     assert warning.startswith(f"made: {words}")
-    assert np.sqrt(quality.log.gnss.var_north_m2) == pytest.approx(real_m, rel=0.1)
+    assert np.sqrt(quality.fixes.var_north_m2) == pytest.approx(real_m, rel=0.1)
 
 
 def test_what_is_done_to_float_fixes_is_said_by_number_and_noise() -> None:
@@ -270,7 +270,7 @@ def test_fixes_that_only_say_that_they_are_fixed_are_misreported_without_a_numbe
     unknown, told = np.full(count, np.nan), np.full(count, FIXED_FIX, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, stated_class=told))
     quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).steps()[0])
-    assert quality.misreported.any()
+    assert quality.fixes.misreported.any()
     assert "RTK float" in quality.warnings[0]
     assert not any("nan" in warning for warning in quality.warnings)
 
