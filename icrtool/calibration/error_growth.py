@@ -4,7 +4,8 @@ The position error of a drive without GNSS has two parts. The parameters have a 
 follows from their derivatives. What the model leaves out is described by a few sources of error with a variance each:
 the heading at the start, a turn rate off by a constant, turns off by a share, a turn rate that wanders, a speed off by
 a share, a speed that wanders. Their variances are fitted to the squared errors of held-out windows of several lengths,
-and the quantiles are scaled so that they hold there.
+and the quantiles are scaled so that they hold there. A controller expresses a part of the model alone: its errors are
+measured in the same windows.
 """
 
 from __future__ import annotations
@@ -22,10 +23,19 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import OMEGA, displacements, path_at
-from icrtool.motion.models import FittedModel, model_columns, wheel_motion
-from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, Windows, cut_windows, totals_of
-from icrtool.records.calibration_document import ErrorSources
+from icrtool.motion.models import CONTROLLER, RECOMMENDED, FittedModel, model_columns, wheel_motion
+from icrtool.motion.recording import (
+    NO_CONSTANTS,
+    LogConstants,
+    Recording,
+    Windows,
+    cut_windows,
+    predicted_path,
+    totals_of,
+)
+from icrtool.records.calibration_document import ControllerErrors, ErrorSources
 from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.plain_data import known
 
 TWIST_OVER_M = 1.0
 """Errors of velocities are those of their means over windows of this length."""
@@ -286,3 +296,71 @@ def nonnegative(matrix: Floats, y: Floats) -> Floats:
     cost[(x < 0.0).any(axis=1)] = np.inf
     found: Floats = x[np.argmin(cost)] / size
     return found
+
+
+SMALLEST_VARIANCE = 1e-6
+FEWEST_TESTED = 10
+"""A controller is given errors from so many windows at least."""
+
+
+def measure_controller_errors(cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut) -> ControllerErrors | None:
+    """Return the errors of what a controller can express, fitted without each fold, in that fold.
+
+    Parameters
+    ----------
+    cut : of `cut_error_windows`
+
+    Returns
+    -------
+    None where too few windows were left out.
+    """
+    far, near = (_window_errors(cut, length, table) for length in (CHOICE_HORIZON_M, TWIST_OVER_M))
+    if min(len(far), len(near)) < FEWEST_TESTED or CHOICE_HORIZON_M not in table.horizons_m:
+        return None
+    h = table.horizons_m.index(CHOICE_HORIZON_M)
+    return ControllerErrors(
+        pose_variance=_variances(far[:, :3]),
+        twist_variance=_variances(near[:, :3] / near[:, 3:4]),
+        turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
+        way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
+        p95_m=known(float(table.score(CONTROLLER).together.p95[h])),
+        full_p95_m=known(float(table.score(RECOMMENDED).together.p95[h])),
+    )
+
+
+def _window_errors(cut: Sequence[tuple[int, Recording, Windows]], length_m: float, table: HeldOut) -> Floats:
+    """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
+    rows = [np.empty((0, 6))]
+    for i, recording, windows in cut:
+        these = np.flatnonzero(windows.length_m == length_m)
+        for fold, some in left_out(table.folds, i, windows.start_m[these], windows.end_m[these]):
+            if (found := table.without(CONTROLLER, fold)) is not None:
+                rows.append(_fold_errors(recording, windows, these[some], *found))
+    return np.concatenate(rows)
+
+
+def _fold_errors(
+    recording: Recording, windows: Windows, some: Ints, fitted: FittedModel, own: LogConstants
+) -> Floats:  # fmt: skip
+    """Return the errors of some windows (m,) by a model that was not fitted to them."""
+    s, e = windows.start[some], windows.end[some]
+    begin, finish = windows.knot_t[s], windows.knot_t[e]
+    path = predicted_path(recording, fitted, own, windows.steps.around(begin.min(), finish.max()))
+    (theta, turned), (place, moved) = (np.split(one, 2) for one in path(np.append(begin, finish)))
+    error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
+    turn = windows.turned[some]
+    columns = error.real, error.imag, turned - theta - turn, finish - begin, turn, windows.length_m[some]
+    return np.column_stack(columns)
+
+
+def _variances(errors: Floats) -> tuple[float, float, float]:
+    """Return mean squares (3,), never zero."""
+    along, across, heading = (max(float(value), SMALLEST_VARIANCE) for value in (errors**2).mean(axis=0))
+    return along, across, heading
+
+
+def _shares(miss: Floats, first: Floats, second: Floats) -> tuple[float, float]:
+    """Return a, b >= 0 with miss^2 about a first^2 + b second^2, by least squares."""
+    columns = np.column_stack([first**2, second**2])
+    both = np.maximum(nonnegative(columns.T @ columns, columns.T @ miss**2), SMALLEST_VARIANCE)
+    return float(both[0]), float(both[1])

@@ -172,9 +172,9 @@ def _errors(
     calibration: Calibration, steps: Track, begin_s: Floats, end_s: Floats, *, with_gyro: bool
 ) -> tuple[Spread, Floats, Floats]:
     """Return moments, expected and 95 % error of windows from and to times (w,)."""
-    fitted, sources = calibration.fitted, calibration.sources
-    if with_gyro and calibration.gyro is not None:
-        fitted, sources = calibration.gyro, calibration.gyro_sources
+    fitted, sources = calibration.fitted, calibration.error_sources
+    if with_gyro and calibration.gyro is not None and (turned := calibration.fitted_with_gyro) is not None:
+        fitted, sources = turned, calibration.gyro.error_sources
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")

@@ -7,7 +7,7 @@ the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -118,7 +118,7 @@ def _calibration(run: Run, found: HeldOut) -> Calibration | None:
     """Return the calibration of a run from the table that compares its models; an attitude is no gyro."""
     if run.track_width_m is None:
         return None
-    return replace(calibration_from(found, robot_of(run, found.recordings[0].width_m)), warnings=use_warnings(run))
+    return calibration_from(found, robot_of(run, found.recordings[0].width_m), use_warnings(run))
 
 
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:

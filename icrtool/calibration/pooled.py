@@ -4,27 +4,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from datetime import UTC, datetime
 from os import PathLike
 from typing import NamedTuple
 
 import numpy as np
 from msgspec import UNSET
+from msgspec.structs import asdict
 
 from icrtool import __version__
-from icrtool.calibration.controller_numbers import controller_errors
-from icrtool.calibration.error_growth import cut_error_windows, measure_error_sources
+from icrtool.calibration.error_growth import cut_error_windows, measure_controller_errors, measure_error_sources
 from icrtool.calibration.held_out import GYRO, HeldOut, errors_without, hold_out
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.record import Calibration, fitted_document, parameter_documents
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Complexes
 from icrtool.motion.fit import Fold, Prediction, own_constants
-from icrtool.motion.models import MODELS, RECOMMENDED
-from icrtool.motion.recording import ErrorsOf, Recording, cut_windows
-from icrtool.records.calibration_document import CalibratedRobot, CalibrationLog, HeldOutScore, PooledScore
+from icrtool.motion.models import FIVE, MODELS, RECOMMENDED
+from icrtool.motion.recording import ErrorsOf, Recording, Windows, cut_windows
+from icrtool.records.calibration_document import (
+    CALIBRATION_SCHEMA,
+    CalibratedRobot,
+    CalibrationLog,
+    ControllerDocument,
+    FittedDocument,
+    GyroDocument,
+    HeldOutScore,
+    PooledScore,
+)
 from icrtool.records.run import MAKE_RUN, Run, check_type
+from icrtool.records.run_document import RecommendedDocument
 
 
 class LeftOut(NamedTuple):
@@ -46,13 +55,16 @@ class CalibrationResult(NamedTuple):
     left_out: tuple[LeftOut, ...] = ()
 
 
-def calibrate_recordings(recordings: Sequence[Recording], robot: CalibratedRobot | None = None) -> CalibrationResult:
+def calibrate_recordings(
+    recordings: Sequence[Recording], robot: CalibratedRobot | None = None, warnings: tuple[str, ...] = ()
+) -> CalibrationResult:
     """Fit the motion models to all recordings, and test each on what it was not fitted to.
 
     Parameters
     ----------
     recordings : one or many, of one robot
     robot : as its calibration holds it; default: of no name
+    warnings : what to know before use
 
     Raises
     ------
@@ -69,10 +81,12 @@ def calibrate_recordings(recordings: Sequence[Recording], robot: CalibratedRobot
     if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
         raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
     table = hold_out(recordings)
-    return CalibrationResult(calibration_from(table, robot), table, _notes(recordings))
+    return CalibrationResult(calibration_from(table, robot, warnings), table, _notes(recordings))
 
 
-def calibration_from(table: HeldOut, robot: CalibratedRobot | None = None) -> Calibration:
+def calibration_from(
+    table: HeldOut, robot: CalibratedRobot | None = None, warnings: tuple[str, ...] = ()
+) -> Calibration:
     """Return the calibration of the recordings that a held-out table is of."""
     recordings, best = table.recordings, table.fits[RECOMMENDED]
     constants = [best.constants(i) for i in range(len(recordings))]
@@ -83,22 +97,33 @@ def calibration_from(table: HeldOut, robot: CalibratedRobot | None = None) -> Ca
         )
         for one, own in zip(recordings, constants, strict=True)
     )  # fmt: skip
-    cut = cut_error_windows(recordings)
+    robot = robot if robot is not None else CalibratedRobot(track_width_m=recordings[0].width_m)
+    geometry, covariance = table.fits[FIVE].fitted.geometry(robot.track_width_m)
+    found, cut = fitted_document(best.fitted, geometry, covariance, robot), cut_error_windows(recordings)
+    errors = measure_controller_errors(cut, table)
     return Calibration(
-        robot=robot if robot is not None else CalibratedRobot(track_width_m=recordings[0].width_m),
-        fitted=best.fitted,
-        others={name: table.fits[name].fitted for name in MODELS},
-        gyro=table.fits[f"{RECOMMENDED}{GYRO}"].fitted if table.has_gyro else None,
+        schema=CALIBRATION_SCHEMA,
+        tool_version=__version__,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        robot=robot,
+        recommended=found.model,
+        **{name: getattr(found, name) for name in RecommendedDocument.__struct_fields__[1:-1]},
+        controller=ControllerDocument(**asdict(found.controller), **({} if errors is None else asdict(errors))),
+        gyro=_gyro(cut, table) if table.has_gyro else None,
+        models={name: FittedDocument(*parameter_documents(table.fits[name].fitted)) for name in MODELS},
         logs=logs,
         held_out=tuple(_scores(table)),
-        pooled=tuple(_pooled(table)),
-        controller=controller_errors(cut, table),
-        sources=measure_error_sources(cut, table, RECOMMENDED),
-        gyro_sources=measure_error_sources(cut, table, f"{RECOMMENDED}{GYRO}") if table.has_gyro else None,
-        warnings=(),
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        tool_version=__version__,
+        held_out_pooled=tuple(_pooled(table)),
+        error_sources=measure_error_sources(cut, table, RECOMMENDED),
+        warnings=warnings,
     )
+
+
+def _gyro(cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut) -> GyroDocument:
+    """Return the recommended model with a gyro, and its sources of error."""
+    name = f"{RECOMMENDED}{GYRO}"
+    fitted = table.fits[name].fitted
+    return GyroDocument(fitted.model.name, *parameter_documents(fitted), measure_error_sources(cut, table, name))
 
 
 def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
@@ -153,7 +178,8 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
         raise ConfigError("robot.track_width_m", why, "use a calibration of this robot")
     if with_gyro and (calibration.gyro is None or recording.track.gyro is None):
         raise ConfigError("gyro", "not in the calibration, or not in the log", "use the wheels alone")
-    fitted = calibration.gyro if with_gyro and calibration.gyro is not None else calibration.fitted
+    turned = calibration.fitted_with_gyro if with_gyro else None
+    fitted = calibration.fitted if turned is None else turned
     return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
 
 
@@ -209,10 +235,8 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
     if len(found := {robot.wheel_radius_m for robot in robots}) > 1:
         why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
-    result = calibrate_recordings(recordings, robots[0])
     known = alone if len(taken) == 1 else tuple(dict.fromkeys(text for one in taken for text in one.warnings))
-    calibration = replace(result.calibration, warnings=known)
-    return result._replace(calibration=calibration, left_out=tuple(left_out))
+    return calibrate_recordings(recordings, robots[0], known)._replace(left_out=tuple(left_out))
 
 
 class _Taken(NamedTuple):

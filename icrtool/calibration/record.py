@@ -6,33 +6,37 @@ the configured wheel radius.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
 from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.motion.models import FIVE, FittedModel, TrackGeometry, find_model, wheel_motion
+from icrtool.motion.models import (
+    FIVE,
+    NO_SLIP,
+    RECOMMENDED,
+    TERMS,
+    FittedModel,
+    TrackGeometry,
+    find_model,
+    wheel_motion,
+)
 from icrtool.records.calibration_document import (
-    CALIBRATION_SCHEMA,
     CalibratedRobot,
     CalibrationDocument,
-    CalibrationFile,
-    CalibrationLog,
-    ControllerDocument,
     ControllerErrors,
-    ErrorSources,
     FittedDocument,
     GyroDocument,
     HeldOutScore,
     PooledScore,
 )
+from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart, call_output
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument
@@ -49,57 +53,71 @@ class Odometry(NamedTuple):
     heading_rad: Floats
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class Calibration:
+class Calibration(CalibrationDocument, frozen=True, kw_only=True):
     """Constant parameters of a robot's motion model, their covariance, and the error that they give.
+
+    Its fields are the keys of a calibration file.
 
     Attributes
     ----------
-    fitted : the recommended model; others : every model that was fitted, by name
+    recommended : name of the recommended model; `model`, `terms`, `parameters`, `covariance`: that model
+    models : every model that was fitted, by name
     gyro : the recommended model with a gyro, None where a log has none
     logs : what it was fitted to
     held_out : scores by model, horizon and log, each predicted without that log, or block of a single one
-    pooled : scores of all these trials together; empty in files of earlier versions
-    controller : errors of what a controller can express; None where the drive is too short to measure them
-    sources, gyro_sources : variances of what the model leaves out, wheels alone and with a gyro; None where the drive
-        is too short to measure them
+    held_out_pooled : scores of all these trials together; empty in files of earlier versions
+    geometry, geometry_std : ICRs [m], multiplier and radius factors, from one fit
+    controller : what a controller is given, and the errors of that, where the drive is long enough to measure them
+    error_sources : variances of what the model leaves out, for wheels alone; None where the drive is too short
     warnings : what to know before use
     created : date and time, UTC, ISO 8601
-    name : stem of its file; empty for one just made
+    name : stem of the file that it was read from, which does not hold it
+
+    Raises
+    ------
+    LookupError, ValueError
+        Its terms or numbers are not those of a motion model.
     """
 
-    robot: CalibratedRobot
-    fitted: FittedModel
-    others: Mapping[str, FittedModel]
-    gyro: FittedModel | None
-    logs: tuple[CalibrationLog, ...]
-    held_out: tuple[HeldOutScore, ...]
-    controller: ControllerErrors | None
-    warnings: tuple[str, ...]
-    created: str
-    tool_version: str
-    name: str = field(default="", compare=False)
-    sources: ErrorSources | None = None
-    gyro_sources: ErrorSources | None = None
-    pooled: tuple[PooledScore, ...] = ()
+    name: str | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        for name, one in self.models.items():
+            fitted_model(name, one)
+        _ = self.fitted_with_gyro
+        if not set(TrackGeometry._fields) <= self.geometry.keys() & self.geometry_std.keys():
+            raise ValueError("its geometry is not complete")
+        with np.errstate(all="ignore"):
+            geometry, covariance = self._geometry()
+            if not (np.isfinite(geometry).all() and np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
+                raise ValueError("its parameters give no geometry of the tracks")
 
     @property
-    def recommended(self) -> str:
-        """Name of the recommended model."""
-        return self.fitted.model.name
+    def fitted(self) -> FittedModel:
+        """The recommended model."""
+        return fitted_model(self.model, self)
+
+    @property
+    def fitted_with_gyro(self) -> FittedModel | None:
+        """The recommended model with a gyro, None where a log has none."""
+        gyro = self.gyro
+        return None if gyro is None else replace(fitted_model(gyro.model, gyro), wheels=self.fitted)
 
     @property
     def width_m(self) -> float:
         """Track width b [m]."""
         return self.robot.track_width_m
 
-    def geometry(self) -> tuple[TrackGeometry, Floats]:
+    def _geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs [m], multiplier and radius factors, from one fit, and their covariance (6, 6)."""
-        return self.others.get(FIVE, self.fitted).geometry(self.width_m)
+        five = self.models.get(FIVE)
+        return (self.fitted if five is None else fitted_model(FIVE, five)).geometry(self.width_m)
 
-    def controller_numbers(self) -> ControllerNumbers:
-        """Return multiplier and radius factors for a controller."""
-        return controller_numbers(*self.geometry(), self.robot)
+    @property
+    def controller_errors(self) -> ControllerErrors | None:
+        """Errors of what a controller can express; None where the drive is too short to measure them."""
+        errors = msgspec.structs.asdict(self.controller)
+        return None if errors["pose_variance"] is UNSET else msgspec.convert(errors, ControllerErrors)
 
     def log_names(self) -> str:
         """Return the names of the logs that it was fitted to, and their number."""
@@ -111,7 +129,7 @@ class Calibration:
 
         A file of an earlier version has them by log or block alone: then the median over these.
         """
-        scores: tuple[PooledScore | HeldOutScore, ...] = self.pooled or self.held_out
+        scores: tuple[PooledScore | HeldOutScore, ...] = self.held_out_pooled or self.held_out
         rows = [one for one in scores if one.model == model and one.horizon_m == horizon_m]
         if not rows:
             return float("nan"), float("nan")
@@ -165,7 +183,7 @@ class Calibration:
 
     def warm_start(self) -> WarmStart:
         """Return the three ICRs [m] and their covariance [m^2] for a filter to begin with (`icrtool.fit`)."""
-        geometry, covariance = self.geometry()
+        geometry, covariance = self._geometry()
         return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m)
 
     def fitted_to(self, sha256: str) -> bool:
@@ -185,7 +203,8 @@ class Calibration:
         OutputError
             Something that is not a calibration is there, or it cannot be written.
         """
-        file: Path = call_output("files.documents", "write_calibration", self.document(), Path(path))
+        document = msgspec.structs.replace(self, name=UNSET)
+        file: Path = call_output("files.documents", "write_calibration", document, Path(path))
         return file
 
     def __repr__(self) -> str:
@@ -196,44 +215,21 @@ class Calibration:
             f"95 % within {p95:.2f} m after 10 m, held out>"
         )
 
-    def document(self, sensors: CalibrationFile | None = None) -> CalibrationDocument:
-        """Return what the calibration file holds; `sensors`: what the only log shows of its sensors."""
-        geometry, covariance = self.geometry()
-        own = fitted_document(self.fitted, geometry, covariance, self.robot)
-        errors = {} if self.controller is None else msgspec.structs.asdict(self.controller)
-        of_log = (
-            {} if sensors is None else {name: getattr(sensors, name) for name in CalibrationFile.__struct_fields__[1:]}
-        )
-        return CalibrationDocument(
-            schema=CALIBRATION_SCHEMA,
-            **of_log,
-            tool_version=self.tool_version,
-            created=self.created,
-            robot=self.robot,
-            recommended=self.recommended,
-            model=own.model,
-            terms=own.terms,
-            parameters=own.parameters,
-            covariance=own.covariance,
-            not_shown=own.not_shown,
-            geometry=own.geometry,
-            geometry_std=own.geometry_std,
-            controller=ControllerDocument(**msgspec.structs.asdict(own.controller), **errors),
-            gyro=None
-            if self.gyro is None
-            else GyroDocument(self.gyro.model.name, *_parameters(self.gyro), self.gyro_sources),
-            models={name: FittedDocument(*_parameters(one)) for name, one in self.others.items()},
-            logs=self.logs,
-            held_out=self.held_out,
-            held_out_pooled=self.pooled,
-            error_sources=self.sources,
-            warnings=self.warnings,
-        )
-
     def summary(self) -> dict[str, Any]:
         """Return what the calibration file holds, as plain data."""
-        found: dict[str, Any] = plain(self.document())
+        found: dict[str, Any] = plain(msgspec.structs.replace(self, name=UNSET))
         return found
+
+
+def stored_calibration(document: CalibrationDocument) -> Calibration:
+    """Return the calibration that a report holds.
+
+    Raises
+    ------
+    LookupError, ValueError
+        Its terms or numbers are not those of a motion model.
+    """
+    return Calibration(**msgspec.structs.asdict(document))
 
 
 def fitted_document(
@@ -242,7 +238,7 @@ def fitted_document(
     """Return a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
     std = np.sqrt(np.diag(covariance)).tolist()
     return RecommendedDocument(
-        fitted.model.label, fitted.model.name, *_parameters(fitted), fitted.not_shown, geometry._asdict(),
+        fitted.model.label, fitted.model.name, *parameter_documents(fitted), fitted.not_shown, geometry._asdict(),
         dict(zip(geometry._fields, std, strict=True)), controller_numbers(geometry, covariance, robot),
     )  # fmt: skip
 
@@ -258,7 +254,7 @@ def controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: Calib
     )  # fmt: skip
 
 
-def _parameters(one: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
+def parameter_documents(one: FittedModel) -> tuple[tuple[str, ...], dict[str, ParameterDocument], list[list[float]]]:
     """Return terms, parameters and covariance of a model."""
     rows = zip(one.model.terms, one.parameters.tolist(), one.std.tolist(), strict=True)
     unseen = one.not_shown
@@ -270,39 +266,14 @@ LARGEST = 1e6
 """Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
 
 
-def calibration_of(document: CalibrationDocument) -> Calibration:
-    """Return the calibration of a document.
+def fitted_model(name: str, document: CalibrationDocument | FittedDocument | GyroDocument) -> FittedModel:
+    """Return the motion model that a document holds.
 
     Raises
     ------
     LookupError, ValueError
         Its terms or numbers are not those of a motion model.
     """
-    fitted, gyro = _fitted(document.model, document), document.gyro
-    errors = msgspec.structs.asdict(document.controller)
-    found = Calibration(
-        robot=document.robot,
-        fitted=fitted,
-        others={name: _fitted(name, one) for name, one in document.models.items()},
-        gyro=None if gyro is None else replace(_fitted(gyro.model, gyro), wheels=fitted),
-        logs=document.logs,
-        held_out=document.held_out,
-        pooled=document.held_out_pooled,
-        controller=None if errors["pose_variance"] is UNSET else msgspec.convert(errors, ControllerErrors),
-        warnings=document.warnings,
-        created=document.created or "",
-        tool_version=document.tool_version,
-        sources=document.error_sources,
-        gyro_sources=None if gyro is None else gyro.error_sources,
-    )
-    with np.errstate(all="ignore"):
-        geometry, covariance = found.geometry()
-        if not (np.isfinite(geometry).all() and np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all()):
-            raise ValueError("its parameters give no geometry of the tracks")
-    return found
-
-
-def _fitted(name: str, document: CalibrationDocument | FittedDocument | GyroDocument) -> FittedModel:
     model = find_model(name)
     k = len(model.terms)
     if document.terms != model.terms:
@@ -314,3 +285,51 @@ def _fitted(name: str, document: CalibrationDocument | FittedDocument | GyroDocu
     if not (np.abs(parameters).max(initial=0) < LARGEST and np.abs(covariance).max(initial=0) < LARGEST):
         raise ValueError(f"parameters of {name}")
     return FittedModel(model, parameters, covariance)
+
+
+POSE_AFTER_M = CHOICE_HORIZON_M
+"""Distance after which the errors of a calibration are stated to controllers."""
+
+LARGEST_SHARE = 0.5
+"""A calibration whose 95 % error is more than this share of the distance is not fit for use."""
+
+
+def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
+    """Return why a calibration is not fit for use, by what it was tested on; empty where it is."""
+    reasons = [one for one in calibration.warnings if one.startswith("not usable")]
+    p95, expected = calibration.held_out_m(RECOMMENDED, POSE_AFTER_M)
+    _, without = calibration.held_out_m(NO_SLIP, POSE_AFTER_M)
+    if p95 > LARGEST_SHARE * POSE_AFTER_M:
+        reasons.append(f"its error after {POSE_AFTER_M:g} m is {p95:.1f} m (95 %, held out of the fit)")
+    if expected >= without:
+        errors = f"expected error {expected:.2f} m and {without:.2f} m, held out of the fit"
+        reasons.append(f"it is no better than no slip: {errors}")
+    if "omega_w" in calibration.fitted.not_shown:
+        reasons.append("the driving did not show how the robot turns (omega_w)")
+    return tuple(reasons)
+
+
+def export_warnings(calibration: Calibration) -> tuple[str, ...]:
+    """Return what to know before a controller uses a calibration, a sentence each."""
+    warnings = [one for one in unfit_reasons(calibration) if one not in calibration.warnings]
+    warnings += not_shown_sentences(calibration.fitted)
+    if (multiplier := calibration.controller.multiplier) < 1.0:
+        why = "a skid-steer robot turns less than its wheels, not more"
+        warnings.append(f"a multiplier of {multiplier:.2f} is below 1: {why}")
+    return (*calibration.warnings, *warnings)
+
+
+def not_shown_sentences(fitted: FittedModel) -> list[str]:
+    """Return a sentence for each parameter that rests on its prior."""
+    return [
+        f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
+        for name in fitted.not_shown
+    ]
+
+
+def factor_to_old(calibration: Calibration) -> float | None:
+    """Return the multiplier over the one that the log's odometry was made with, None where that is not known."""
+    old_width_m = calibration.robot.twist_width_m
+    if old_width_m is UNSET:
+        return None
+    return calibration.controller.multiplier * calibration.width_m / old_width_m

@@ -30,7 +30,7 @@ from icrtool.kernels.error_statistics import (
     sort_trials,
 )
 from icrtool.kernels.track import Track
-from icrtool.motion.models import RECOMMENDED, TrackGeometry
+from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Recording, cut_trials
 from icrtool.records.calibration_document import (
     COMPARE_SCHEMA,
@@ -126,7 +126,7 @@ def compare_calibrations(
 
 
 def _group(calibration: Calibration) -> ComparedGroup:
-    return ComparedGroup(calibration.recommended, calibration.logs, calibration.geometry()[0]._asdict())
+    return ComparedGroup(calibration.recommended, calibration.logs, calibration.geometry)
 
 
 def _verdict(first: str, second: str, parameters: Sequence[ParameterDifference], cost: TransferCost) -> str:
@@ -235,10 +235,9 @@ def _check_apart(recordings: Mapping[str, Sequence[Recording]]) -> None:
 
 
 def _parameter_differences(first: Calibration, second: Calibration) -> tuple[ParameterDifference, ...]:
-    (before, covariance_before), (after, covariance_after) = first.geometry(), second.geometry()
     found = []
     for name in COMPARED:
-        k = TrackGeometry._fields.index(name)
-        difference, std = after[k] - before[k], math.sqrt(covariance_before[k, k] + covariance_after[k, k])
-        found.append(ParameterDifference(name, before[k], after[k], difference, std, abs(difference) > TWO_SIDED * std))
+        before, after = first.geometry[name], second.geometry[name]
+        difference, std = after - before, math.hypot(first.geometry_std[name], second.geometry_std[name])
+        found.append(ParameterDifference(name, before, after, difference, std, abs(difference) > TWO_SIDED * std))
     return tuple(found)

@@ -13,9 +13,8 @@ from icrtool.cli.inputs import check_run_config, runs_of, runs_or_logs
 from icrtool.cli.printing import print_json, show, warn, warn_of
 
 if TYPE_CHECKING:
-    from icrtool.calibration.one_log import LogCalibration
     from icrtool.config import Config
-    from icrtool.records.calibration_document import CalibrationFile
+    from icrtool.records.calibration_document import CalibrationFile, SensorDocument
     from icrtool.records.run import Run
 
 
@@ -58,6 +57,7 @@ def command(
     if output is not None:
         calibration_file(output)
     runs = _runs(sources, config, quiet=quiet)
+    from icrtool.calibration.one_log import with_sensors
     from icrtool.calibration.pooled import calibrate_runs
 
     sensors = _sensors(runs[0], x_icr, quiet=quiet, verbose=verbose) if len(runs) == 1 else None
@@ -73,8 +73,9 @@ def command(
     from icrtool.output.text_blocks import printed
 
     texts: list[str] = [printed(calibration_blocks(result, sensors), verbose=verbose)]
-    document: CalibrationFile | None = sensors.document() if sensors is not None else None
-    document = result.calibration.document(document) if result is not None else document
+    document: CalibrationFile | None = sensors
+    if result is not None:
+        document = result.calibration if sensors is None else with_sensors(result.calibration, sensors)
     if output is not None and document is not None:
         texts.append(f"written to {write_calibration(document, output)}")
     if plot is not None:
@@ -112,7 +113,7 @@ def _load_models() -> None:
     load_compiler()
 
 
-def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> LogCalibration:
+def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> SensorDocument:
     """Return what one log shows of antenna, offsets, delays and scales."""
     from icrtool.calibration.one_log import calibrate_log
 

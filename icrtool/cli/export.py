@@ -145,7 +145,7 @@ def _run(source: Path | None, output: Path | None = None) -> Run:
 
 def _calibration(source: Path | None, *, force: bool) -> Calibration:
     """Read a calibration file, or calibrate from a run; one that is not fit for use is refused without `force`."""
-    from icrtool.calibration.controller_numbers import unfit_reasons
+    from icrtool.calibration.record import unfit_reasons
     from icrtool.errors import DataError
 
     name, found = read_calibration(source, force=force, advice=f"; {ALL_THE_SAME}")

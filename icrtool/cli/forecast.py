@@ -68,7 +68,7 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
     from icrtool.calibration.forecast import forecast_drive, forecast_plan
     from icrtool.output.run_directory import is_run_directory
 
-    with_gyro = calibration.gyro_sources is not None
+    with_gyro = calibration.gyro is not None and calibration.gyro.error_sources is not None
     if is_run_directory(path):
         from icrtool.calibration.run_recording import turning_recording_of
         from icrtool.output.stored_run import open_run

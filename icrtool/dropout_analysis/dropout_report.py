@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Literal
 
 import msgspec
+from msgspec import UNSET
 from msgspec.structs import astuple
 
 from icrtool.calibration.model_comparison import ComparedModels, compare_models
@@ -24,6 +25,7 @@ from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.track import TrialCounts
+from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.dropout import DEFAULT_SEED, CheckedGate, EventCost, Gate, Outage, UsedCalibration
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type
@@ -167,15 +169,17 @@ def _calibration_rows(
         label = "calibration" if len(calibrations) == 1 else stem
         if recording is None:
             continue
-        kept = msgspec.structs.replace(one.document(), models={}, held_out=())
+        created = one.created or ""
+        of_sensors = dict.fromkeys(CalibrationFile.__struct_fields__[1:], UNSET)
+        kept = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
         seen = one.fitted_to(recording.sha256)
         fitted = "fitted to this log" if seen else "not fitted to this log"
         rows = [(name, label, one.recommended, False)]
         if one.gyro is not None and recording.track.gyro is not None:
-            rows.append((f"{name}_gyro", f"{label} + gyro", one.gyro.model.name, True))
+            rows.append((f"{name}_gyro", f"{label} + gyro", one.gyro.model, True))
         for name, label, model, with_gyro in rows:
             models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=with_gyro)))
-            used.append(UsedCalibration(name, label, model, len(one.logs), seen, one.created, with_gyro, kept, fitted))
+            used.append(UsedCalibration(name, label, model, len(one.logs), seen, created, with_gyro, kept, fitted))
     return tuple(used), models
 
 

@@ -322,7 +322,7 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
     icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}
     controller = summary.controller
     if controller is None and report.calibration is not None:
-        controller = report.calibration.controller_numbers()
+        controller = report.calibration.controller
     unusable = f"not usable: {summary.unusable_because}" if not summary.usable else ""
     cut = truncation(summary.warnings)
     return FleetLog(

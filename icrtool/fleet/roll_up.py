@@ -18,7 +18,7 @@ from icrtool.output.files.atomic import make_folders
 from icrtool.output.files.documents import logs_of_fleet, read_fleet, write_calibration
 from icrtool.records.fleet_document import BUDGET_M, FLEET_FILE, FleetCalibration, FleetFile, FleetLog
 from icrtool.records.regular_file import is_regular
-from icrtool.records.run import Run
+from icrtool.records.run import ICR_COLUMNS, Run
 
 CALIBRATIONS = "calibrations"
 """Folder of the calibration files below that of the batch."""
@@ -116,11 +116,11 @@ def _pooled(
     try:
         result = calibrate_runs(usable(), allow_unusable=allow_unusable)
         make_folders(directory / CALIBRATIONS, directory)
-        write_calibration(result.calibration.document(), directory / file, directory)
+        write_calibration(result.calibration, directory / file, directory)
     except IcrToolError as err:
         left_out = tuple(log for log in one.logs if log not in used)
         return replace(one, left_out=left_out, reason=str(err))
-    numbers = result.calibration.controller_numbers()
+    numbers = result.calibration.controller
     table = str(printed(held_out_blocks(result.table), verbose=True))
     reached = result.table.score("recommended").within(result.table.horizons_m, BUDGET_M)
     short = {name for name, _ in result.left_out}
@@ -129,7 +129,7 @@ def _pooled(
         one, logs=tuple(used), left_out=tuple(log for log in one.logs if log not in used), file=file,
         recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),
         multiplier_std=float(numbers.multiplier_std), table=table,
-        icrs_m=tuple(result.calibration.geometry()[0][:3]),
+        icrs_m=tuple(result.calibration.geometry[name] for name in ICR_COLUMNS),
         within_m=None if reached is None else float(reached.distance_m),
         within_beyond=reached is not None and reached.beyond,
     )  # fmt: skip

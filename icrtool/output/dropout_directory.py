@@ -158,7 +158,7 @@ def report_document(report: DropoutReport) -> DropoutDocument:
         by_learning=_learned_document(report),
         calibrations=report.calibrations,
         # Without when it was made: the same run, the same file.
-        recommended=None if made is None else msgspec.structs.replace(made.document(), created=msgspec.UNSET),
+        recommended=None if made is None else msgspec.structs.replace(made, created=msgspec.UNSET),
         budgets=report.budgets,
         by_turning=report.by_turning,
         ladder=comparison_document(report),

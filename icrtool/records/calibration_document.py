@@ -167,12 +167,12 @@ class SensorParameter(Record, frozen=True):
 class SensorDrive(Record, frozen=True):
     """Distance, turns and speeds of the drive of one log; speeds are those while moving."""
 
-    distance_m: float | None = field(name="way_m")
-    turned_right_deg: float | None
-    turned_left_deg: float | None
-    turn_rate_p95_degps: float | None
-    speed_mean_mps: float | None
-    speed_std_mps: float | None
+    distance_m: float = field(name="way_m")
+    turned_right_deg: float
+    turned_left_deg: float
+    turn_rate_p95_degps: float
+    speed_mean_mps: float
+    speed_std_mps: float
 
 
 class CalibrationFile(Record, frozen=True, kw_only=True):
@@ -199,8 +199,21 @@ class CalibrationFile(Record, frozen=True, kw_only=True):
 
 
 class SensorDocument(CalibrationFile, frozen=True, kw_only=True):
-    """A calibration file without a motion model; `parameters` are those of `alignment`."""
+    """What one log shows of its sensors: a calibration file without a motion model.
 
+    Attributes
+    ----------
+    parameters : as `alignment`: the estimates, then those derived from them, by `icrtool.calibration.one_log.LABELS`
+    """
+
+    log: str
+    inputs: tuple[InputFile, ...]
+    windows: int
+    independent_stretches: int
+    window_miss_m: float | None
+    drive: SensorDrive
+    settings: dict[str, float]
+    alignment: dict[str, SensorParameter]
     parameters: dict[str, SensorParameter]
 
 

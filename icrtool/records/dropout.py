@@ -168,7 +168,8 @@ class UsedCalibration(Record, frozen=True):
     logs : how many it was fitted to; fitted_to_this : this log is among them
     created : date and time, UTC
     with_gyro : its row uses the gyro of the log
-    calibration : what its file holds, without the models that were not recommended and without its scores
+    calibration : what its file holds, without the models that were not recommended, its scores, and what it shows of
+        sensors
     fitted : whether this log was among those it was fitted to, in words
     """
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -123,8 +122,10 @@ def test_a_calibration_that_is_not_fit_for_use_is_exported_by_force_only(icrtool
     import icrtool as library
 
     good = library.calibrate(library.open_run(runs / "icrtool-runs" / "mower"))
-    bad = tuple(msgspec.structs.replace(one, p95_m=14.8) if one.model == "recommended" else one for one in good.pooled)
-    file = replace(good, pooled=bad).write(runs / "bad.json")
+    bad = tuple(
+        msgspec.structs.replace(one, p95_m=14.8) if one.model == "recommended" else one for one in good.held_out_pooled
+    )
+    file = msgspec.structs.replace(good, held_out_pooled=bad).write(runs / "bad.json")
     status, out, err = icrtool("export", "--for", "clearpath", file)
     assert (status, out) == (1, "")
     assert "not fit for use: its error after 10 m" in err

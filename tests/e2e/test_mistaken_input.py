@@ -105,7 +105,7 @@ def test_a_log_that_was_cut_off_is_left_out_beside_the_whole_one(tmp_path: Path,
     assert [str(one) for one in result.left_out] == ["short: left out: a part of whole"]
     assert [log.name for log in result.calibration.logs] == ["whole"]
     alone = library.calibrate(runs[0])
-    assert result.calibration.geometry()[0] == alone.geometry()[0]
+    assert result.calibration.geometry == alone.geometry
 
 
 def test_drives_of_the_same_wheels_with_other_fixes_are_both_calibrated(tmp_path: Path, icrtool) -> None:

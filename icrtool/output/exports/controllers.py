@@ -11,9 +11,8 @@ import msgspec
 import numpy as np
 
 from icrtool import __version__
-from icrtool.calibration.controller_numbers import POSE_AFTER_M, export_warnings, factor_to_old
 from icrtool.calibration.error_growth import TWIST_OVER_M
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.record import POSE_AFTER_M, Calibration, export_warnings, factor_to_old
 from icrtool.errors import DataError
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
 from icrtool.motion.models import TERMS, Term, wheel_motion
@@ -22,6 +21,7 @@ from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import controller_error_text
 from icrtool.records.calibration_document import ControllerErrors
 from icrtool.records.plain_data import plain
+from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.run_document import ControllerNumbers
 
 Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]
@@ -65,10 +65,10 @@ def format_export(calibration: Calibration, target: Target) -> str:
     """
     if target == "icr":
         return format_twist(calibration)
-    if calibration.controller is None:
+    errors = calibration.controller_errors
+    if errors is None:
         advice = "covariances need a longer drive"
         raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
-    errors = calibration.controller
     if target == "json":
         return _json(calibration, errors)
     if target == "nav2":
@@ -80,8 +80,7 @@ def format_export(calibration: Calibration, target: Target) -> str:
 
 
 def _json(calibration: Calibration, errors: ControllerErrors) -> str:
-    numbers, robot = calibration.controller_numbers(), calibration.robot
-    geometry, covariance = calibration.geometry()
+    numbers, robot = calibration.controller, calibration.robot
     document = {
         "schema": EXPORT_SCHEMA,
         "tool_version": __version__,
@@ -93,15 +92,15 @@ def _json(calibration: Calibration, errors: ControllerErrors) -> str:
         "track_width_m": calibration.width_m,
         "wheel_radius_m": robot.wheel_radius_m,
         "model": calibration.recommended,
-        "created": calibration.created,
+        "created": calibration.created or "",
         "separation_multiplier": numbers.multiplier,
         "separation_multiplier_std": numbers.multiplier_std,
         "left_radius_multiplier": numbers.left_radius,
         "left_radius_multiplier_std": numbers.left_radius_std,
         "right_radius_multiplier": numbers.right_radius,
         "right_radius_multiplier_std": numbers.right_radius_std,
-        "icrs_m": geometry[:3],
-        "icr_std_m": np.sqrt(np.diag(covariance)[:3]),
+        "icrs_m": [calibration.geometry[name] for name in ICR_COLUMNS],
+        "icr_std_m": [calibration.geometry_std[name] for name in ICR_COLUMNS],
         **msgspec.structs.asdict(errors),
         "warnings": export_warnings(calibration),
         "twist_width_m": robot.twist_width_m or None,
@@ -139,7 +138,7 @@ def _controller(calibration: Calibration, errors: ControllerErrors, indent: int)
     lines = [f"wheel_separation: {_number(calibration.width_m)}"]
     if radius is not None:
         lines.append(f"wheel_radius: {_number(radius)}")
-    for key, value, std in controller_rows(calibration.controller_numbers()):
+    for key, value, std in controller_rows(calibration.controller):
         lines.append(f"{key}: {value:.4f}  # {f'± {std:.4f}' if std > 0.0 else 'not estimated'}")
     lines += [
         f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
@@ -161,9 +160,9 @@ def controller_rows(numbers: ControllerNumbers) -> list[tuple[str, float, float]
 
 def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     """Return the comments above: where the numbers come from, and what they cannot express."""
-    geometry, covariance = calibration.geometry()
-    right, left, x = geometry[:3]
-    std_right, std_left, std_x = np.sqrt(np.diag(covariance)[:3])
+    (right, left, x), (std_right, std_left, std_x) = (
+        [one[name] for name in ICR_COLUMNS] for one in (calibration.geometry, calibration.geometry_std)
+    )
     robot = f", {_one_line(name)}" if (name := calibration.robot.name) else ""
     # That of a report has no date: the same run, the same file.
     fitted = f", fitted {calibration.created[:10]}" if calibration.created else ""
@@ -182,7 +181,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     )
     sentences = [origin, icrs, held_out, lost]
     if (factor := factor_to_old(calibration)) is not None:
-        old = calibration.controller_numbers().multiplier / factor
+        old = calibration.controller.multiplier / factor
         sentences.append(
             f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
             f"{factor:.4f} times the old"
@@ -246,13 +245,12 @@ def format_twist(calibration: Calibration) -> str:
     free = [TERMS[name] for name in fitted.model.terms]
     signs = np.array([sign_in_rep103(term) for term in free])
     fixed = [term for term in TERMS.values() if term.nominal and term not in free]
-    geometry, covariance = calibration.geometry()
-    stds = np.sqrt(np.diag(covariance)).tolist()
+    geometry, stds = calibration.geometry, calibration.geometry_std
     p95, expected = calibration.held_out_m("recommended", POSE_AFTER_M)
     document = {
         "schema": TWIST_SCHEMA,
         "tool_version": __version__,
-        "created": calibration.created,
+        "created": calibration.created or "",
         "robot": plain(calibration.robot),
         "frame": "REP-103: x forward, y left, yaw counter-clockwise",
         "inputs": "v_left, v_right [m/s]: wheel speeds at the configured radius, forward positive",
@@ -272,9 +270,8 @@ def format_twist(calibration: Calibration) -> str:
             "matrix": (np.outer(signs, signs) * fitted.covariance).tolist(),
         },
         "icrs": {
-            "y_icr_right_m": -geometry.y_icr_right_m, "y_icr_left_m": -geometry.y_icr_left_m,
-            "x_icr_m": geometry.x_icr_m,
-            "std": dict(zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), stds[:3], strict=True)),
+            "y_icr_right_m": -geometry["y_icr_right_m"], "y_icr_left_m": -geometry["y_icr_left_m"],
+            "x_icr_m": geometry["x_icr_m"], "std": {name: stds[name] for name in ICR_COLUMNS},
         },
         "held_out": {"horizon_m": POSE_AFTER_M, "p95_m": p95, "expected_m": expected},
         "logs": plain(calibration.logs),

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.formats import json_bytes, read_document, schema_of
-from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationDocument, CalibrationFile
+from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationFile
 from icrtool.records.fleet_document import FLEET_FILE, FleetDocument, FleetLog
 from icrtool.records.regular_file import check_folders
 
@@ -32,11 +33,11 @@ def open_calibration(file: Path | str) -> Calibration:
     RunError
         It cannot be read, or is not a calibration.
     """
-    from icrtool.calibration.record import calibration_of
+    from icrtool.calibration.record import Calibration
 
     path = Path(file)
     try:
-        return replace(calibration_of(read_document(path, CalibrationDocument)), name=path.stem)
+        return msgspec.structs.replace(read_document(path, Calibration), name=path.stem)
     except OSError as err:
         raise RunError(path, "cannot be read", err.strerror or str(err)) from err
     except (ValueError, LookupError, ArithmeticError, RecursionError) as err:

@@ -20,7 +20,7 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 
 from icrtool.calibration.pooled import calibrated
-from icrtool.calibration.record import calibration_of
+from icrtool.calibration.record import stored_calibration
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
@@ -246,7 +246,7 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
         turned, document = one.with_gyro, one.calibration
         if recording is not None and document and not (turned and recording.track.gyro is None):
             with suppress(DataError):
-                model = calibrated(calibration_of(document), recording, with_gyro=turned)
+                model = calibrated(stored_calibration(document), recording, with_gyro=turned)
                 yield one.name, predicted_path(recording, *model)(recording.track.t[rows])
 
 

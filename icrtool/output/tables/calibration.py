@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 
-import numpy as np
-
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
-from icrtool.calibration.one_log import LogCalibration, Parameter
+from icrtool.calibration.one_log import LABELS
 from icrtool.calibration.pooled import CalibrationResult
-from icrtool.motion.models import ICRS, TERMS
+from icrtool.motion.models import TERMS
 from icrtool.output.tables.dropout import REACH_ROWS, parameter_table, reach_row
 from icrtool.output.tables.run import numbers_of
 from icrtool.output.text_blocks import VERBOSE, Block, Facts, Line, Section, Table, Title
 from icrtool.output.text_format import distance_text, model_text
+from icrtool.records.calibration_document import SensorDocument, SensorParameter
+from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.text import counted
 
 BUDGET_M = 0.5
 """Error within which a distance counts."""
 
 
-def calibration_blocks(result: CalibrationResult | None, sensors: LogCalibration | None) -> list[Block]:
+def calibration_blocks(result: CalibrationResult | None, sensors: SensorDocument | None) -> list[Block]:
     """Return what `icrtool calibrate` prints: numbers, how far on what they were not fitted to, settings of one log."""
     blocks = _result_blocks(result) if result is not None else []
     return [*blocks, *sensor_blocks(sensors)] if sensors is not None else blocks
@@ -29,8 +28,7 @@ def calibration_blocks(result: CalibrationResult | None, sensors: LogCalibration
 
 def _result_blocks(result: CalibrationResult) -> list[Block]:
     calibration, table = result.calibration, result.table
-    geometry, covariance = calibration.geometry()
-    icrs = list(zip(geometry[:ICRS], np.sqrt(np.diag(covariance)).tolist(), strict=False))
+    icrs = [(calibration.geometry[name], calibration.geometry_std[name]) for name in ICR_COLUMNS]
     driven = distance_text(sum(log.distance_m for log in calibration.logs))
     what = "log" if table.folds[0].whole else "block of distance"
     rows = [
@@ -39,14 +37,15 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
         if row.name in REACH_ROWS and (reached := row.within(table.horizons_m, BUDGET_M)) is not None
     ]
     unknown = "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown)
+    parameters = parameter_table(calibration.fitted, calibration.fitted_with_gyro)
     return [
         Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
-        *numbers_of(calibration.controller_numbers(), calibration.width_m, icrs),
+        *numbers_of(calibration.controller, calibration.width_m, icrs),
         Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?"),
         Facts([("not found", f"too small, or not driven; taken as usual: {unknown}")] if unknown else []),
         Section(
             f"Motion model: {model_text(calibration.fitted)}",
-            [parameter_table(calibration.fitted, calibration.gyro), *held_out_blocks(table), *result.notes], VERBOSE,
+            [parameters, *held_out_blocks(table), *result.notes], VERBOSE,
         ),
     ]  # fmt: skip
 
@@ -83,42 +82,43 @@ OPTIONS_WIDTH = 76
 DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
 
 
-def sensor_blocks(calibration: LogCalibration) -> list[Block]:
+def sensor_blocks(calibration: SensorDocument) -> list[Block]:
     """Return the settings that one log proposes, and the estimates that they come from."""
-    facts = calibration.facts
+    facts = calibration.drive
     right, left = facts.turned_right_deg, facts.turned_left_deg
     speed = f"{facts.speed_mean_mps:.2f} ± {facts.speed_std_mps:.2f} m/s"
-    compared = f"{calibration.windows} windows of driven distance, {calibration.stretches} independent stretches"
+    stretches = f"{calibration.independent_stretches} independent stretches"
+    compared = f"{calibration.windows} windows of driven distance, {stretches}"
     head = [
         ("drive", f"{facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left"),
         ("compared", compared),
     ]
     rows = [
-        (one.label, value_text(one), one.verdict + (f": {one.note}" if one.note else ""))
-        for one in calibration.parameters
+        (LABELS[key], value_text(key, one), one.verdict + (f": {one.note}" if one.note else ""))
+        for key, one in calibration.parameters.items()
     ]
     table = Table("l", rows, ("parameter", "value ± std", "verdict"))
-    return [Section(calibration.name, [Facts(head), table, MEANINGS, ""], VERBOSE), *setting_blocks(calibration)]
+    return [Section(calibration.log, [Facts(head), table, MEANINGS, ""], VERBOSE), *setting_blocks(calibration)]
 
 
-def value_text(one: Parameter) -> str:
-    """Return value and standard deviation with their unit; a dash where there is none."""
-    if not math.isfinite(one.value):
+def value_text(key: str, one: SensorParameter) -> str:
+    """Return value and standard deviation of a parameter with their unit; a dash where there is none."""
+    if one.value is None:
         return "–"
-    digits, unit = next(form for ending, form in DIGITS.items() if one.key.endswith(ending))
-    number = f"{one.value:+.{digits}f}" if not one.key.endswith("scale") else f"{one.value:.{digits}f}"
+    digits, unit = next(form for ending, form in DIGITS.items() if key.endswith(ending))
+    number = f"{one.value:+.{digits}f}" if not key.endswith("scale") else f"{one.value:.{digits}f}"
     spread = f" ± {one.std:.{digits}f}" if one.verdict != "given" else ""
     return f"{number}{spread} {unit}".rstrip()
 
 
-def setting_blocks(calibration: LogCalibration) -> list[Block]:
+def setting_blocks(calibration: SensorDocument) -> list[Block]:
     """Return the settings that one log proposes."""
     if not calibration.settings:
-        shown = any(one.verdict == "shown" for one in calibration.parameters)
+        shown = any(one.verdict == "shown" for one in calibration.parameters.values())
         why = "the drive confirms the configuration" if shown else "the drive showed nothing well enough"
         return [f"nothing to configure: {why}"]
     # an option and its value stay together
-    options = " ".join(f"--set\u00a0{setting.key}={setting.value:g}" for setting in calibration.settings)
+    options = " ".join(f"--set\u00a0{key}={value:g}" for key, value in calibration.settings.items())
     lines = textwrap.wrap(options, OPTIONS_WIDTH, break_long_words=False, break_on_hyphens=False)
     # a shell joins the lines again
     joined = " \\\n  ".join(lines).replace("\u00a0", " ")

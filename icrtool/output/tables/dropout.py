@@ -8,7 +8,7 @@ from typing import Literal
 
 from msgspec import UNSET
 
-from icrtool.calibration.record import calibration_of
+from icrtool.calibration.record import fitted_model, stored_calibration
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
@@ -293,7 +293,7 @@ def model_sections(report: DropoutDocument) -> Iterator[Section]:
     """Yield the parameters of the recommended motion model, and how the models were compared."""
     blocks: list[Block] = []
     if (found := report.recommended) is not None:
-        parameters: list[Block] = [parameter_table(calibration_of(found).fitted), *found.warnings]
+        parameters: list[Block] = [parameter_table(fitted_model(found.model, found)), *found.warnings]
         blocks.append(Section("Parameters of the motion model", parameters, VERBOSE))
     blocks += report.ladder.notes if report.ladder.notes is not UNSET else ()
     if blocks:
@@ -316,10 +316,10 @@ def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:
     width_m = summary.config.robot.track_width_m
     blocks = number_blocks(summary)
     if report.recommended is not None and width_m is not None:
-        calibration = calibration_of(report.recommended)
+        calibration = stored_calibration(report.recommended)
         icrs = [summary.icr_of_drive(column) for column in ICR_COLUMNS]
-        blocks = numbers_of(calibration.controller_numbers(), width_m, icrs)
-        if alone := controller_error_text(calibration.controller):
+        blocks = numbers_of(calibration.controller, width_m, icrs)
+        if alone := controller_error_text(calibration.controller_errors):
             blocks.append(alone)
         with suppress(DataError):
             text = format_export(calibration, "diff_drive_controller")

@@ -46,7 +46,7 @@ def forecast_document(
     return ForecastDocument(
         schema="icrtool/forecast/1",
         tool_version=__version__,
-        calibration=ForecastSource(calibration.name, calibration.recommended, calibration.created),
+        calibration=ForecastSource(calibration.name or "", calibration.recommended, calibration.created or ""),
         measured_to_m=measured_to_m(calibration),
         budgets=tuple(
             ForecastBudget(
@@ -62,7 +62,7 @@ def forecast_document(
 
 def measured_to_m(calibration: Calibration) -> float:
     """Return the length [m] of the longest held-out windows; beyond it a forecast extrapolates."""
-    return 0.0 if calibration.sources is None else calibration.sources.measured_to_m
+    return 0.0 if calibration.error_sources is None else calibration.error_sources.measured_to_m
 
 
 def reach(forecast: Forecast, budget_m: float) -> float:

@@ -15,13 +15,13 @@ from scipy.optimize import nnls
 from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonnegative, radius
 from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
 from icrtool.calibration.pooled import calibrate_recordings, predictor
-from icrtool.calibration.record import Calibration, ErrorSources, calibration_of
+from icrtool.calibration.record import Calibration, parameter_documents
 from icrtool.errors import DataError, IcrToolError
 from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
 from icrtool.motion.recording import cut_trials
 from icrtool.output.files.formats import read_numbers
 from icrtool.output.tables.forecast import forecast_csv, reach
-from icrtool.records.calibration_document import CalibrationDocument
+from icrtool.records.calibration_document import ErrorSources
 from support.recordings import WIDTH_M, draw_parameters, make_recording, trials_from_all
 
 SIX = FAMILY["six"]
@@ -32,7 +32,7 @@ ROUNDING = 1e-6
 
 def stored(document: dict[str, object]) -> Calibration:
     """The calibration of plain data of a file."""
-    return calibration_of(msgspec.convert(document, CalibrationDocument))
+    return msgspec.convert(document, Calibration)
 
 
 def calibrated(seed: int) -> Calibration:
@@ -50,7 +50,10 @@ def only(calibration: Calibration, **variances: float) -> Calibration:
     """Return a calibration with exact parameters and the given sources of error alone."""
     exact = replace(calibration.fitted, covariance=0.0 * calibration.fitted.covariance)
     sources = msgspec.structs.replace(ErrorSources(*[0.0] * SOURCES, 1.0, 1.0), **variances)
-    return replace(calibration, fitted=exact, sources=sources)
+    terms, parameters, covariance = parameter_documents(exact)
+    return msgspec.structs.replace(
+        calibration, terms=terms, parameters=parameters, covariance=covariance, error_sources=sources
+    )
 
 
 def test_the_95_percent_error_holds_on_drives_that_were_not_calibrated_with() -> None:
@@ -134,7 +137,7 @@ def test_a_budget_is_reached_between_metres(calibration: Calibration) -> None:
 
 def test_the_sources_come_back_from_a_file_and_an_older_file_has_none(calibration: Calibration) -> None:
     document = calibration.summary()
-    assert stored(document).sources == calibration.sources
+    assert stored(document).error_sources == calibration.error_sources
     older = stored({key: value for key, value in document.items() if key != "error_sources"})
     with pytest.raises(DataError, match="calibrate again"):
         forecast_plan(older, np.zeros(2), np.array([0.0, 9.0]))
@@ -207,8 +210,9 @@ def test_a_gyro_narrows_the_forecast_and_holds() -> None:
     parameters = draw_parameters(SIX, np.random.default_rng([1, 3]))
     logs = [make_recording(SIX, parameters, k, 150.0, gyro=True, name=f"log {k}") for k in range(3)]
     found = calibrate_recordings(logs).calibration
-    assert found.gyro_sources is not None
-    assert stored(json.loads(json.dumps(found.summary()))).gyro_sources == found.gyro_sources
+    assert found.gyro is not None
+    assert found.gyro.error_sources is not None
+    assert stored(json.loads(json.dumps(found.summary()))).gyro == found.gyro
     new = make_recording(SIX, parameters, 9, 300.0, gyro=True, name="new")
     trials = cut_trials(new, HORIZONS_M)
     errors = predictor(found, new, with_gyro=True)(trials).position
@@ -220,13 +224,13 @@ def test_a_gyro_narrows_the_forecast_and_holds() -> None:
 
 
 def test_long_drives_measure_errors_further_than_short_ones(calibration: Calibration) -> None:
-    assert calibration.sources is not None
-    assert calibration.sources.measured_to_m == 20.0
+    assert calibration.error_sources is not None
+    assert calibration.error_sources.measured_to_m == 20.0
     longer = calibrate_recordings(
         [make_recording(SIX, SIX.prior_mean, k, 700.0, name=f"log {k}") for k in range(2)]
     ).calibration
-    assert longer.sources is not None
-    assert longer.sources.measured_to_m >= 50.0
+    assert longer.error_sources is not None
+    assert longer.error_sources.measured_to_m >= 50.0
 
 
 @pytest.mark.parametrize("columns", [2, 8])

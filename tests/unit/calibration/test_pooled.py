@@ -6,6 +6,7 @@ import json
 from dataclasses import astuple, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -98,7 +99,7 @@ def test_a_block_that_is_spoilt_does_not_change_what_it_is_predicted_by() -> Non
 
 
 def test_a_file_comes_back_as_it_was(result: CalibrationResult, tmp_path: Path) -> None:
-    file = write_calibration(result.calibration.document(), tmp_path)
+    file = write_calibration(result.calibration, tmp_path)
     document = json.loads(file.read_text())
     keys = {"schema", "model", "terms", "parameters", "covariance", "robot", "logs", "held_out", "recommended"}
     assert keys | {"created", "tool_version"} <= set(document)
@@ -140,7 +141,7 @@ def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
 @pytest.mark.parametrize(("unit", "metres"), [("rad", 0.165), ("counts", 2.0 * np.pi * 0.165 / 4096.0)])
 def test_odometry_takes_wheels_in_the_unit_of_the_log(result: CalibrationResult, unit: str, metres: float) -> None:
     robot = CalibratedRobot(wheel_radius_m=0.165, encoder_counts_per_rev=4096.0, track_width_m=WIDTH_M)
-    calibration, log = replace(result.calibration, robot=robot), make_log(0, 30.0)
+    calibration, log = msgspec.structs.replace(result.calibration, robot=robot), make_log(0, 30.0)
     sent = replace(log.wheels, left=log.wheels.left / metres, right=log.wheels.right / metres, unit=unit)
     for found, expected in zip(calibration.odometry(replace(log, wheels=sent)), calibration.odometry(log), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-9)

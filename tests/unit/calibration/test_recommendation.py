@@ -38,7 +38,7 @@ def test_it_is_the_reports_first_line_too(run: Run) -> None:
     report = icrtool.dropout_report(run)
     assert report.calibration is not None
     assert report.calibration.recommended == run.summary["recommended"]["model"]
-    assert report.calibration.controller_numbers() == run.document.recommended.controller
+    assert report.calibration.controller.multiplier == run.document.recommended.controller.multiplier
 
 
 @pytest.mark.parametrize(("seconds", "width"), [(4.0, 0.6), (60.0, None)])

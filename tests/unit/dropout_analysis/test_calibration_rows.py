@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -45,7 +44,7 @@ def own(drive: Run) -> Calibration:
 def report(drive: Run, own: Calibration, tmp_path_factory: pytest.TempPathFactory) -> DropoutReport:
     """With the run's own calibration and one that says it is of other logs, both read back from files."""
     folder = tmp_path_factory.mktemp("calibrations")
-    other = replace(own, logs=(msgspec.structs.replace(own.logs[0], sha256="b"),), others=own.others)
+    other = msgspec.structs.replace(own, logs=(msgspec.structs.replace(own.logs[0], sha256="b"),))
     files = [own.write(folder / "own.json"), other.write(folder / "last.season.json")]
     calibrations = [icrtool.open_calibration(file) for file in files]
     gates = ["calibration:last.season.p95@10m <= 9", "recommended.expected@5m <= 0", "controller.p95@10m <= 9"]
@@ -71,7 +70,9 @@ def test_ranges_of_starts_without_a_trial_have_no_errors(
 ) -> None:
     """From the last metres of a drive no trial starts."""
     monkeypatch.setattr(trials, "STARTS_AT_ONCE", 100)
-    pieces = dropout_report(drive, horizons_m=HORIZONS, calibrations=[replace(own, name="own")], starts="all")
+    pieces = dropout_report(
+        drive, horizons_m=HORIZONS, calibrations=[msgspec.structs.replace(own, name="own")], starts="all"
+    )
     for name, known in (("recommended", "recommended"), ("calibration", "calibration:own")):
         ours, theirs = pieces.result(name), report.result(known)
         assert ours is not None
@@ -98,8 +99,8 @@ def test_what_is_recommended_is_not_better_than_what_knew_the_drive(report: Drop
 
 def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, report: DropoutReport) -> None:
     assert report.calibration is not None
-    numbers, exported = report.calibration.controller_numbers(), json.loads(format_export(own, "json"))
-    assert numbers == own.controller_numbers()
+    numbers, exported = report.calibration.controller, json.loads(format_export(own, "json"))
+    assert numbers == own.controller
     assert exported["separation_multiplier"] == numbers.multiplier
     assert exported["separation_multiplier_std"] == numbers.multiplier_std
     assert f"wheel_separation_multiplier {numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}" in " ".join(
@@ -111,7 +112,7 @@ def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, rep
         assert (result := report.result(row)) is not None
         assert exported[key] == pytest.approx(result.summary.p95[1], rel=1e-9)
     assert exported["p95_m"] != exported["full_p95_m"]
-    pooled = {(one.model, one.horizon_m): one.p95_m for one in own.pooled}
+    pooled = {(one.model, one.horizon_m): one.p95_m for one in own.held_out_pooled}
     assert pooled["recommended", 10.0] == exported["full_p95_m"]
     assert own.held_out_m("recommended", 10.0)[0] == exported["full_p95_m"]
     assert f"within {exported['full_p95_m']:.2f} m" in repr(own)
@@ -141,6 +142,6 @@ def test_one_calibration_has_the_plain_name_and_no_comparison_no_recommended_row
     assert [result.name for result in report.results] == ["icr", "no_slip", "icr_final", "calibration"]
     wide = msgspec.structs.replace(own.robot, track_width_m=1.0)
     with pytest.raises(ConfigError, match="width"):
-        dropout_report(drive, calibrations=[replace(own, robot=wide)])
+        dropout_report(drive, calibrations=[msgspec.structs.replace(own, robot=wide)])
     with pytest.raises(ConfigError, match="recommended"):
         dropout_report(drive, horizons_m=[5.0], comparison=False, gates=["recommended.p95@5m < 1"])

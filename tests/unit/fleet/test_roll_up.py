@@ -53,7 +53,7 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
     assert (grass.group, grass.logs, grass.left_out) == ("grass", ("a", "b"), ("c", "copy"))
     calibration = open_calibration(place / grass.file)
     assert (len(calibration.logs), calibration.recommended) == (2, grass.recommended)
-    assert grass.multiplier == pytest.approx(calibration.controller_numbers().multiplier)
+    assert grass.multiplier == pytest.approx(calibration.controller.multiplier)
     assert "each log left out in turn (2 logs)" in grass.table
     assert (ice.file, ice.logs) == ("", ("c",))
     assert "usable" in ice.reason

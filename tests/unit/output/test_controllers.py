@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import msgspec
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from icrtool.calibration.controller_numbers import factor_to_old, unfit_reasons
 from icrtool.calibration.pooled import calibrate
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.record import Calibration, factor_to_old, fitted_model, parameter_documents, unfit_reasons
 from icrtool.errors import ConfigError, DataError
 from icrtool.motion.models import FAMILY, FittedModel, Lever, controller_model, wheel_motion
 from icrtool.output.exports.controllers import TARGETS, format_export
 from icrtool.output.text_blocks import TEXT_WIDTH
+from icrtool.records.calibration_document import ControllerDocument
+from icrtool.records.run_document import ControllerNumbers
 
 CONTROLLER_KEYS = {
     "wheel_separation", "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
@@ -67,7 +67,7 @@ def test_nav2_gets_filter_and_amcl(calibration: Calibration) -> None:
 
 def test_json_holds_every_number(calibration: Calibration) -> None:
     document = json.loads(format_export(calibration, "json"))
-    assert document["separation_multiplier"] == calibration.controller_numbers().multiplier
+    assert document["separation_multiplier"] == calibration.controller.multiplier
     assert document["schema"] == "icrtool/export/1"
 
 
@@ -83,12 +83,14 @@ def test_comments_say_log_date_doubt_and_what_is_lost(calibration: Calibration, 
 
 def test_a_log_with_a_wild_name_stays_a_comment(calibration: Calibration) -> None:
     (log,) = calibration.logs
-    wild = replace(calibration, logs=(msgspec.structs.replace(log, name="a\nwheel_separation: 3\n\t# b"),))
+    wild = msgspec.structs.replace(
+        calibration, logs=(msgspec.structs.replace(log, name="a\nwheel_separation: 3\n\t# b"),)
+    )
     assert load(wild, "clearpath") == load(calibration, "clearpath")
 
 
 def test_error_growth_is_measured(calibration: Calibration) -> None:
-    errors = calibration.controller
+    errors = calibration.controller_errors
     assert errors is not None
     along, across, yaw = errors.pose_variance
     assert 0 < along < 0.1
@@ -103,7 +105,8 @@ def test_a_run_without_width_has_no_multiplier(make_run) -> None:
 
 
 def test_without_measured_errors_only_the_twist_model_is_given(calibration: Calibration) -> None:
-    short = replace(calibration, controller=None)
+    numbers = {name: getattr(calibration.controller, name) for name in ControllerNumbers.__struct_fields__}
+    short = msgspec.structs.replace(calibration, controller=ControllerDocument(**numbers))
     with pytest.raises(DataError):
         format_export(short, "nav2")
     assert json.loads(format_export(short, "icr"))["held_out"]["p95_m"] > 0.0
@@ -115,7 +118,10 @@ def test_the_twist_model_is_the_calibration_in_rep_103(calibration: Calibration)
     for model in FAMILY.values():
         k = len(model.terms)
         fitted = FittedModel(model, rng.normal(size=k), np.eye(k))
-        one = replace(calibration, fitted=fitted)
+        terms, parameters, covariance = parameter_documents(fitted)
+        one = msgspec.structs.replace(
+            calibration, model=model.name, terms=terms, parameters=parameters, covariance=covariance
+        )
         document = json.loads(format_export(one, "icr"))
         for v_left, v_right in ((0.4, 1.1), (-0.7, 0.9), (1.0, 1.0)):
             symbols = dict.fromkeys(("v_x", "v_y", "yaw_rate"), 0.0)
@@ -131,26 +137,27 @@ def test_the_twist_model_is_the_calibration_in_rep_103(calibration: Calibration)
 
 def test_a_controller_drives_as_its_model_was_tested(calibration: Calibration) -> None:
     """The twist of a diff_drive_controller with the exported numbers, written out, is that of the tested model."""
-    numbers = calibration.controller_numbers()
+    numbers = calibration.controller
     v_left, v_right, b = 0.4, 1.1, calibration.width_m
     left, right = numbers.left_radius * v_left, numbers.right_radius * v_right
     expected = [(left + right) / 2, 0.0, (left - right) / (numbers.multiplier * b)]
     motion = wheel_motion(np.array([v_left]), np.array([v_right]), b)
-    tested = controller_model(calibration.others["five"], Lever(ahead=True, aside=True), b)
+    tested = controller_model(fitted_model("five", calibration.models["five"]), Lever(ahead=True, aside=True), b)
     assert tested.twist(motion)[:, 0] == pytest.approx(expected)
 
 
 def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> None:
     assert unfit_reasons(calibration) == ()
     far = tuple(
-        msgspec.structs.replace(one, p95_m=14.8) if one.model == "recommended" else one for one in calibration.pooled
+        msgspec.structs.replace(one, p95_m=14.8) if one.model == "recommended" else one
+        for one in calibration.held_out_pooled
     )
     worse = tuple(
         msgspec.structs.replace(one, expected_m=99.0) if one.model == "recommended" else one
-        for one in calibration.pooled
+        for one in calibration.held_out_pooled
     )
     for pooled, word in ((far, "14.8 m"), (worse, "no slip")):
-        spoilt = replace(calibration, pooled=pooled)
+        spoilt = msgspec.structs.replace(calibration, held_out_pooled=pooled)
         (reason,) = unfit_reasons(spoilt)
         assert word in reason
         assert f"WARNING: {reason.split(':')[0]}" in " ".join(format_export(spoilt, "clearpath").split("\n# "))
@@ -158,7 +165,7 @@ def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> Non
 
 def test_the_factor_to_the_multiplier_that_made_the_odometry_is_given(calibration: Calibration) -> None:
     robot = msgspec.structs.replace(calibration.robot, twist_width_m=1.5 * calibration.width_m)
-    made = replace(calibration, robot=robot)
-    assert factor_to_old(made) == pytest.approx(made.controller_numbers().multiplier / 1.5)
+    made = msgspec.structs.replace(calibration, robot=robot)
+    assert factor_to_old(made) == pytest.approx(made.controller.multiplier / 1.5)
     assert "wheel_separation_multiplier 1.5000" in " ".join(format_export(made, "clearpath").split("\n# "))
     assert factor_to_old(calibration) is None

@@ -59,7 +59,7 @@ def calibration(run: Run) -> Calibration:
 def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
     report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0])
     study = small_study("rate")
-    table = calibration.document()
+    table = calibration
 
     def named_levels(text: str) -> Iterator[Level]:
         for level in study.levels:

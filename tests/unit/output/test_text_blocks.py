@@ -7,10 +7,10 @@ import sys
 
 import pytest
 
-from icrtool.calibration.one_log import DriveFacts, LogCalibration, Setting
 from icrtool.cli.printing import show
 from icrtool.output.tables.calibration import setting_blocks
 from icrtool.output.text_blocks import TEXT_WIDTH, Facts, Line, Table, Text, printed
+from icrtool.records.calibration_document import CALIBRATION_SCHEMA, SensorDocument, SensorDrive
 
 TABLE = Table("lr", [("wheels", "50.0 Hz"), ("a [bold]b", "1.25 Hz")], ("stream", "rate"))
 
@@ -31,13 +31,16 @@ def test_sentences_are_wrapped_and_what_is_copied_is_not() -> None:
 
 
 def test_settings_to_copy_are_words_that_a_shell_joins_and_a_terminal_holds() -> None:
-    settings = [Setting(f"frames.heading_delay_{number}_s", 0.1234567, "") for number in range(5)]
-    log = LogCalibration("log", (), tuple(settings), 1, 1, 0.1, DriveFacts(*[0.0] * len(DriveFacts._fields)), ())
+    settings = {f"frames.heading_delay_{number}_s": 0.1234567 for number in range(5)}
+    log = SensorDocument(
+        schema=CALIBRATION_SCHEMA, log="log", inputs=(), windows=1, independent_stretches=1, window_miss_m=0.1,
+        drive=SensorDrive(*[0.0] * len(SensorDrive.__struct_fields__)), settings=settings, alignment={}, parameters={},
+    )  # fmt: skip
     text = printed(setting_blocks(log), verbose=False)
     assert max(map(len, text.splitlines())) <= 80
     script = f"printf '%s\\n' {text.partition(':')[2].strip()}"
     options = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True).stdout.splitlines()
-    assert options == [word for one in settings for word in ("--set", f"{one.key}=0.123457")]
+    assert options == [word for key in settings for word in ("--set", f"{key}=0.123457")]
 
 
 PAGE = printed([Line("NOT USABLE: x", "bad"), TABLE, Facts([("drive", " ".join(["word"] * 30))])], verbose=True)

@@ -87,7 +87,7 @@ def test_the_answer_is_that_of_the_report(page: str, run: Run, report: DropoutRe
     reached = next(one for one in report.budgets if one.model == "recommended")
     assert f"{reached.distance_m:.1f} m" in text or f"more than {reached.distance_m:g} m" in text
     assert report.calibration is not None
-    assert f"{report.calibration.controller_numbers().multiplier:.3f}" in text
+    assert f"{report.calibration.controller.multiplier:.3f}" in text
     assert "No: an acceptance limit" in text
     assert f"{report.worst[0].errors_m['recommended']:.3f} m" in text
 
