@@ -41,8 +41,7 @@ from icrtool.motion.models import (
     controller_model,
 )  # fmt: skip
 from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_trials, cut_windows, totals_of
-from icrtool.output.run_directory import RUN_FILE, is_run_directory
-from icrtool.output.stored_run import open_run
+from icrtool.output.run_directory import RUN_FILE, is_run_directory, open_run
 
 SLIP_TERMS = ("vy_vw", "omega_sw", "omega_vw")
 WIDE, WIDTHS = 10.0, np.geomspace(0.003, 1.0, 60)

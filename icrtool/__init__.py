@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from icrtool.logs.read_log import read_log
     from icrtool.output.files.documents import open_calibration
     from icrtool.output.page.run_page import write_page
-    from icrtool.output.stored_run import open_run
+    from icrtool.output.run_directory import open_run
     from icrtool.records.run import Run, WarmStart
     from icrtool.records.tables import RobotLog
 
@@ -82,7 +82,7 @@ _HOMES = {
     "fit": "icrtool.calibration.fit",
     "load_config": "icrtool.config",
     "open_calibration": "icrtool.output.files.documents",
-    "open_run": "icrtool.output.stored_run",
+    "open_run": "icrtool.output.run_directory",
     "read_log": "icrtool.logs.read_log",
     "write_page": "icrtool.output.page.run_page",
 }

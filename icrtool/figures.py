@@ -2,8 +2,7 @@
 
 from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_histograms, dropout_summary
 from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
-from icrtool.output.figures.gnss_difference import gnss_difference
-from icrtool.output.figures.icrs import icr_clusters, icr_estimates
+from icrtool.output.figures.filter_estimates import gnss_difference, icr_clusters, icr_estimates
 from icrtool.output.figures.trajectory import trajectory
 
 __all__ = [

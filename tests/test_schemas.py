@@ -23,7 +23,7 @@ from icrtool.estimation.fit import fit
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.files.formats import json_bytes
-from icrtool.output.tables.forecast import forecast_document
+from icrtool.output.tables.calibration import forecast_document
 from icrtool.records.dropout import CheckedGate
 from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.text import LogText

@@ -143,7 +143,7 @@ def write_exports(
         write_file(markdown, format_fleet_markdown(rows, missing))
     if page is not None:
         from icrtool.fleet.fleet_files import fleet_document
-        from icrtool.output.page.fleet_page import fleet_page
+        from icrtool.output.page.group_pages import fleet_page
         from icrtool.output.run_directory import PAGE_FILE
 
         write_file(page / PAGE_FILE, fleet_page(fleet_document(rows, calibrations), page), page, is_page)

@@ -130,7 +130,7 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     from icrtool.logs.read_log import read_log
     from icrtool.output.figures.calibrations import residuals_figure
     from icrtool.output.files.formats import save_picture
-    from icrtool.output.stored_run import log_of
+    from icrtool.output.run_directory import log_of
 
     log = read_log(source if run.directory is None else log_of(run), run.config)
     fit = align_streams(with_wheel_speeds(choose_reference(log, run.config), run.config), run.config).fit

@@ -45,7 +45,7 @@ def command(
     from icrtool.calibration.transfer import compare_groups
     from icrtool.output.files.atomic import write_file
     from icrtool.output.files.formats import json_bytes, save_picture
-    from icrtool.output.tables.transfer import transfer_blocks, transfer_csv
+    from icrtool.output.tables.calibration import transfer_blocks, transfer_csv
     from icrtool.output.text_blocks import printed
 
     config = options.load(config_file, robot, sets)

@@ -150,8 +150,7 @@ def plan_sources(
     its place.
     """
     from icrtool.errors import ConfigError
-    from icrtool.output.run_directory import RUN_FILE, is_run_directory
-    from icrtool.output.stored_run import newest_run
+    from icrtool.output.run_directory import RUN_FILE, is_run_directory, newest_run
 
     sources = logs_of(sources or (newest_run(RUNS),), quiet=quiet)
     logs = tuple(source for source in sources if not ((source / RUN_FILE).is_file() or is_run_directory(source)))
@@ -237,7 +236,7 @@ def _read(directory: Path) -> Run:
     """Read a run; what the analysis needs is loaded beside it."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from icrtool.output.stored_run import open_run
+    from icrtool.output.run_directory import open_run
 
     with ThreadPoolExecutor(1) as pool:
         reading = pool.submit(open_run, directory)

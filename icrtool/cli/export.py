@@ -89,10 +89,10 @@ def _path_text(run: Run, target: str) -> str:
 
         return format_trajectory(paths_of(run)[0], cast("TrajectoryFormat", target))
     if target == "qgis":
-        from icrtool.output.exports.geojson import format_geojson
+        from icrtool.output.exports.maps import format_geojson
 
         return f"{format_geojson(run)}\n"
-    from icrtool.output.exports.kml import format_kml
+    from icrtool.output.exports.maps import format_kml
 
     return f"{format_kml(run)}\n"
 
@@ -131,7 +131,7 @@ def _write_foxglove(run: Run, output: Path) -> None:
 def _run(source: Path | None, output: Path | None = None) -> Run:
     """Read the run whose paths are asked for; one that is not usable has them too. Its log is never the output."""
     from icrtool.errors import OutputError, RunError
-    from icrtool.output.stored_run import newest_run, open_run
+    from icrtool.output.run_directory import newest_run, open_run
 
     if source is not None and source.is_file():
         raise RunError(source, "is a file, and paths come from a run", "name a directory that icrtool fit wrote")

@@ -101,7 +101,7 @@ def _warm_start(source: Path) -> WarmStart:
         from icrtool.output.files.documents import open_calibration
 
         return open_calibration(source).warm_start()
-    from icrtool.output.stored_run import open_run
+    from icrtool.output.run_directory import open_run
 
     return open_run(source).ended_with
 

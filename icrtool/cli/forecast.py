@@ -47,7 +47,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.output.files.atomic import write_file
     from icrtool.output.files.formats import save_picture
-    from icrtool.output.tables.forecast import forecast_csv, forecast_document, format_forecast, measured_to_m
+    from icrtool.output.tables.calibration import forecast_csv, forecast_document, format_forecast, measured_to_m
 
     _, calibration = read_calibration(calibration_file)
     forecast, gyro = _forecasts(calibration, path)
@@ -71,7 +71,7 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
     with_gyro = calibration.gyro is not None and calibration.gyro.error_sources is not None
     if is_run_directory(path):
         from icrtool.calibration.run_recording import turning_recording_of
-        from icrtool.output.stored_run import open_run
+        from icrtool.output.run_directory import open_run
 
         recording = turning_recording_of(open_run(path))
         with_gyro = with_gyro and recording.track.gyro is not None

@@ -62,7 +62,7 @@ def _run_of(path: Path, config: Config) -> Run:
     from icrtool.output.run_directory import is_run_directory
 
     if is_run_directory(path):
-        from icrtool.output.stored_run import open_run
+        from icrtool.output.run_directory import open_run
 
         return open_run(path)
     from icrtool.estimation.fit import fit
@@ -111,7 +111,7 @@ def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | No
 
 def read_calibration(source: Path | None, *, force: bool = False, advice: str = "") -> tuple[str, Calibration]:
     """Return a calibration and its name: of a calibration file, or of a run, which is calibrated."""
-    from icrtool.output.stored_run import newest_run, open_run
+    from icrtool.output.run_directory import newest_run, open_run
 
     if source is not None and source.is_file():
         from icrtool.output.files.documents import open_calibration

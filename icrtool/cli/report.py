@@ -34,8 +34,7 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
     from icrtool.errors import ConfigError
     from icrtool.output.files.atomic import write_file
     from icrtool.output.files.own_files import check_place, is_page
-    from icrtool.output.run_directory import PAGE_FILE
-    from icrtool.output.stored_run import newest_run
+    from icrtool.output.run_directory import PAGE_FILE, newest_run
 
     sources = sources or (newest_run(RUNS),)
     if output is not None and len(sources) > 1:
@@ -57,8 +56,7 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
     from icrtool.errors import RunError
     from icrtool.output.files.documents import read_fleet
     from icrtool.output.files.formats import schema_of
-    from icrtool.output.page.comparison_page import comparison_in, comparison_page, read_comparison
-    from icrtool.output.page.fleet_page import fleet_page
+    from icrtool.output.page.group_pages import comparison_in, comparison_page, fleet_page, read_comparison
     from icrtool.output.run_directory import is_run_directory
     from icrtool.records.fleet_document import FLEET_FAMILY, FLEET_FILE
     from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
@@ -82,7 +80,7 @@ def _page_of_run(directory: Path, *, coordinates: bool) -> str:
     """Return the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
     from icrtool.output.dropout_directory import report_document
     from icrtool.output.page.run_page import draw_pictures, pictures_of_run, read_report, run_page
-    from icrtool.output.stored_run import open_run
+    from icrtool.output.run_directory import open_run
 
     run, report, pictures = open_run(directory), read_report(directory), pictures_of_run(directory)
     if "trajectory" not in pictures:

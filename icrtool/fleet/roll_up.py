@@ -91,7 +91,7 @@ def _pooled(
     one: FleetCalibration, members: Sequence[FleetLog], directory: Path, place: Path, name: str, *, allow_unusable: bool
 ) -> FleetCalibration:
     from icrtool.calibration.pooled import calibrate_runs
-    from icrtool.output.stored_run import open_run
+    from icrtool.output.run_directory import open_run
     from icrtool.output.tables.calibration import held_out_blocks
     from icrtool.output.text_blocks import printed
 

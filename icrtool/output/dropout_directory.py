@@ -1,4 +1,4 @@
-"""``RUN/dropout/``: what `icrtool dropout-report` leaves behind, whole or not at all."""
+"""``RUN/dropout/``: what `icrtool dropout-report` leaves behind, whole or not at all, and what report.json holds."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ import msgspec
 import numpy as np
 
 from icrtool import __version__
+from icrtool.calibration.model_comparison import FITTED_TO, ModelComparison
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.kernels.arrays import Ints
 from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS, Summary
 from icrtool.kernels.open_loop import TOLERANCE_M
+from icrtool.motion.models import FittedModel
 from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, schema_of
 from icrtool.output.files.own_files import files_in
 from icrtool.output.files.states_file import trials_file
 from icrtool.output.run_directory import is_run_directory
-from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
-from icrtool.output.text_format import distance_text
+from icrtool.output.text_format import FITTED, distance_text
 from icrtool.records.dropout import ExampleTrial, ModelResult, error_columns
 from icrtool.records.dropout_document import (
     DROPOUT_SCHEMA,
@@ -32,12 +33,15 @@ from icrtool.records.dropout_document import (
     DropoutDocument,
     ErrorRow,
     EventCostDocument,
+    FitDocument,
     IntervalsDocument,
+    LadderDocument,
     LearnedDocument,
     ModelDocument,
     OutageDocument,
     ReferenceRow,
     RunOfReport,
+    ScoreDocument,
     SummaryRow,
     TrialDocument,
 )
@@ -288,3 +292,64 @@ def _worst_rows(worst: Sequence[ExampleTrial]) -> Iterator[tuple[Any, ...]]:
     for rank, trial in enumerate(worst, start=1):
         *columns, errors = msgspec.structs.astuple(_trial_document(trial))
         yield rank, *columns, *(errors.get(model) for model in ERROR_COLUMNS)
+
+
+COMPARISON_COLUMNS = (
+    "model", "fitted", "heading", "horizon_m", "trials", "expected_error_m", "p50_m", "p95_m", "max_m",
+    "expected_pct", "p95_pct",
+)  # fmt: skip
+
+
+def compared_results(report: DropoutReport) -> list[ModelResult]:
+    """Return the rows of the comparison: all of the report but those of calibrations."""
+    given = {one.name for one in report.calibrations}
+    return [one for one in report.results if one.name not in given]
+
+
+def fitted_text(name: str, heading: str) -> str:
+    """Return what the numbers of a row were fitted to; `heading` is what rows with a measured one go by."""
+    return FITTED[FITTED_TO.get(name.removesuffix(f"_{heading}") if heading else name, "others")]
+
+
+def comparison_rows(report: DropoutReport, comparison: ModelComparison) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of ladder.csv, a model and horizon each; see `COMPARISON_COLUMNS`."""
+    for one in compared_results(report):
+        fitted, heading = fitted_text(one.name, comparison.heading), _heading(one.name, comparison)
+        for row in rows_of({"horizon_m": report.horizons_m, **error_columns(one.summary)}):
+            shares = (100.0 * row[name] / row["horizon_m"] for name in ("expected_error_m", "p95_m"))
+            yield one.name, fitted, heading, *row.values(), *shares
+
+
+def comparison_document(report: DropoutReport) -> LadderDocument:
+    """Return what report.json holds; why there is none where it was left out."""
+    comparison = report.comparison
+    if comparison is None:
+        return LadderDocument(left_out=report.no_comparison)
+    heading = comparison.heading
+    return LadderDocument(
+        horizons_m=report.horizons_m.tolist(),
+        blocks=comparison.blocks,
+        starts=comparison.starts,
+        heading=heading or None,
+        notes=list(comparison.notes),
+        models=[
+            ScoreDocument(
+                one.name, one.label, fitted_text(one.name, heading), _heading(one.name, comparison),
+                *plain(list(error_columns(one.summary).values())),
+            )
+            for one in compared_results(report)
+        ],
+        width_m=comparison.width_m,
+        fits={name: _fit(fit) for name, fit in comparison.fits.items()},
+    )  # fmt: skip
+
+
+def _fit(fit: FittedModel) -> FitDocument:
+    """Return the parameters of a fit with one standard deviation."""
+    columns = (fit.parameters, np.sqrt(np.diag(fit.covariance)))
+    return FitDocument(*(plain(dict(zip(fit.model.terms, column, strict=True))) for column in columns))
+
+
+def _heading(name: str, comparison: ModelComparison) -> str:
+    turned = comparison.heading and name.endswith(f"_{comparison.heading}")
+    return comparison.heading if turned else "wheels"

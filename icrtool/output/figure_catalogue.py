@@ -84,17 +84,17 @@ FIGURES = {
     "icr_estimates": Entry(
         "run", "ICR estimates over time",
         "Good: the lines settle soon and the bands become narrow. A later step: other ground, or a faulty sensor.",
-        "icrs.icr_estimates",
+        "filter_estimates.icr_estimates",
     ),
     "icr_clusters": Entry(
         "run", "Where the ICRs lay",
         "Good: three narrow peaks. A wide one is ground that changed, or an ICR that the drive hardly shows.",
-        "icrs.icr_clusters", further=True,
+        "filter_estimates.icr_clusters", further=True,
     ),
     "gnss_difference": Entry(
         "run", "Filter and position reference",
         "Good: noise about a constant mean. Steps and long deviations are trouble of the receiver or of the clocks.",
-        "gnss_difference.gnss_difference",
+        "filter_estimates.gnss_difference",
     ),
     "examples_": Entry(
         "report", "Two trials of {} m",

@@ -61,7 +61,7 @@ def test_an_unknown_target_is_wrong_usage(icrtool) -> None:
 
 
 def test_a_run_that_is_not_usable_is_exported_by_force_only(icrtool, runs: Path) -> None:
-    from icrtool.output.stored_run import open_run
+    from icrtool.output.run_directory import open_run
 
     run = open_run(runs / "icrtool-runs" / "mower")
     spoilt = with_summary(run, usable=False, unusable_because="42 % of the headings rejected")
@@ -102,7 +102,7 @@ def test_foxglove_needs_a_file_and_gets_a_layout_beside_it(icrtool, tmp_path: Pa
 
 
 def test_the_paths_of_a_run_that_is_not_usable_are_exported_with_a_warning(icrtool, runs: Path) -> None:
-    from icrtool.output.stored_run import open_run
+    from icrtool.output.run_directory import open_run
 
     run = open_run(runs / "icrtool-runs" / "mower")
     with_summary(run, usable=False, unusable_because="it hopped").write(runs / "hopping", plots=())

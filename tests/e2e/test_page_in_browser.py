@@ -27,8 +27,7 @@ from icrtool.motion.recording import Trials, cut_windows, predicted_path
 from icrtool.output.dropout_directory import report_document
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.page import drive_data
-from icrtool.output.page.comparison_page import comparison_page
-from icrtool.output.page.fleet_page import fleet_page
+from icrtool.output.page.group_pages import comparison_page, fleet_page
 from icrtool.output.page.render import pictures_of
 from icrtool.output.page.run_page import run_page
 from icrtool.records.calibration_document import GroupComparison

@@ -21,7 +21,7 @@ from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums
 from icrtool.output.files.own_files import is_page
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
-from icrtool.output.stored_run import check_sum
+from icrtool.output.run_directory import check_sum
 from icrtool.output.tables.dropout import answer_sections, model_sections, outage_blocks, verdict_lines, worst_section
 from icrtool.output.tables.errors import errors_section, main_rows
 from icrtool.output.tables.run import (

@@ -1,20 +1,55 @@
-"""Calibrations as blocks: a motion model from one log or many, and what one log shows of its sensors."""
+"""Calibrations as blocks: a model from one log or many, its settings, a forecast, and groups of runs compared."""
 
 from __future__ import annotations
 
+import math
 import textwrap
 
+from msgspec import UNSET
+
+from icrtool import __version__
+from icrtool.calibration.forecast import Forecast
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
 from icrtool.calibration.one_log import LABELS
 from icrtool.calibration.pooled import CalibrationResult
+from icrtool.calibration.record import Calibration
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS
+from icrtool.output.files.formats import csv_bytes
 from icrtool.output.tables.dropout import REACH_ROWS, parameter_table, reach_row
 from icrtool.output.tables.run import numbers_of
-from icrtool.output.text_blocks import VERBOSE, Block, Facts, Line, Section, Table, Title
+from icrtool.output.text_blocks import (
+    PAGE,
+    VERBOSE,
+    Block,
+    Facts,
+    Figure,
+    Items,
+    Line,
+    Section,
+    Table,
+    Text,
+    Title,
+    printed,
+)
 from icrtool.output.text_format import distance_text, model_text
-from icrtool.records.calibration_document import SensorDocument, SensorParameter
+from icrtool.records.calibration_document import (
+    ComparedPair,
+    ErrorsAt,
+    ForecastBudget,
+    ForecastColumns,
+    ForecastDocument,
+    ForecastSource,
+    GroupComparison,
+    SensorDocument,
+    SensorParameter,
+    TransferCell,
+)
+from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS
-from icrtool.records.text import counted
+from icrtool.records.text import counted, with_interval, with_std
 
 BUDGET_M = 0.5
 """Error within which a distance counts."""
@@ -123,3 +158,140 @@ def setting_blocks(calibration: SensorDocument) -> list[Block]:
     # a shell joins the lines again
     joined = " \\\n  ".join(lines).replace("\u00a0", " ")
     return [Line(f"to configure:\n  {joined}", "as is")]
+
+
+SHOWN_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+
+
+def forecast_csv(forecast: Forecast, gyro: Forecast | None = None) -> str:
+    """Return a row for each metre."""
+    columns = _columns(forecast, gyro)
+    lines = [",".join(columns)]
+    lines += [",".join(f"{value:.6g}" for value in row) for row in zip(*columns.values(), strict=True)]
+    return "\n".join(lines) + "\n"
+
+
+def _columns(forecast: Forecast, gyro: Forecast | None) -> dict[str, Floats]:
+    """Return the columns of a forecast, last the errors with a gyro."""
+    error = {"expected_m": "expected_error_m", "p95_m": "p95_error_m"}
+    columns = {error.get(name, name): column for name, column in forecast._asdict().items()}
+    if gyro is not None:
+        columns |= {"expected_error_gyro_m": gyro.expected_m, "p95_error_gyro_m": gyro.p95_m}
+    return columns
+
+
+def forecast_document(
+    forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
+) -> ForecastDocument:
+    """Return what ``icrtool forecast --json`` prints."""
+    columns = {name: column.tolist() for name, column in _columns(forecast, gyro).items()}
+    return ForecastDocument(
+        schema="icrtool/forecast/1",
+        tool_version=__version__,
+        calibration=ForecastSource(calibration.name or "", calibration.recommended, calibration.created or ""),
+        measured_to_m=measured_to_m(calibration),
+        budgets=tuple(
+            ForecastBudget(
+                budget, known(reach(forecast, budget)), UNSET if gyro is None else known(reach(gyro, budget))
+            )
+            for budget in budgets_m
+        ),
+        not_shown=calibration.fitted.not_shown,
+        warnings=calibration.warnings,
+        along=ForecastColumns(**columns),
+    )
+
+
+def measured_to_m(calibration: Calibration) -> float:
+    """Return the length [m] of the longest held-out windows; beyond it a forecast extrapolates."""
+    return 0.0 if calibration.error_sources is None else calibration.error_sources.measured_to_m
+
+
+def reach(forecast: Forecast, budget_m: float) -> float:
+    """Return the distance [m] up to which 95 % of the errors stay within a budget."""
+    found = within_budget(forecast.distance_m, forecast.p95_m, budget_m)
+    return math.nan if found is None else found[0]
+
+
+def format_forecast(
+    forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
+) -> Text:
+    """Return the table of a forecast, no line end."""
+    total = float(forecast.distance_m[-1])
+    fitted, logs = calibration.fitted, counted(len(calibration.logs), "log")
+    model = f"{model_text(fitted)} from {logs}"
+    kinds = [("", forecast)] if gyro is None else [("", forecast), (", with gyro", gyro)]
+    rows = []
+    for metres in sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)}):
+        k = int(metres) - 1
+        errors = [f"{column[k]:.2f}" for _, one in kinds for column in (one.expected_m, one.p95_m)]
+        rows.append((f"{metres:g}", *errors, f"{forecast.heading_std_deg[k]:.1f}"))
+    head = [f"{name}{kind} [m]" for kind, _ in kinds for name in ("expected", "95 %")]
+    blocks: list[Block] = [
+        f"{distance_text(total)} without GNSS from the start, wheels alone; {model}",
+        "",
+        Table("r", rows, ("distance [m]", *head, "heading ± [deg]")),
+        "",
+    ]
+    for budget in budgets_m:
+        far = [(kind, reach(one, budget)) for kind, one in kinds]
+        reached = [f"{'all of it' if metres >= total else f'{metres:.1f} m'}{kind}" for kind, metres in far]
+        blocks.append(f"within {budget:g} m (95 %): {'; '.join(reached)}")
+    if total > (longest := measured_to_m(calibration)):
+        blocks.append(f"errors were measured up to {longest:g} m; what is beyond is extrapolated")
+    if unknown := "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown):
+        blocks.append(f"not found by the calibration, too small or not driven: {unknown}")
+    return printed([*blocks, *calibration.warnings], verbose=True)
+
+
+def transfer_csv(found: GroupComparison) -> bytes:
+    """Return the transfer matrix as CSV, a row and column of it and a horizon each."""
+    columns = ("calibrated_on", "tested_on", "horizon_m", "trials", *ErrorsAt.__struct_fields__[1:])
+    return csv_bytes(columns, ([getattr(cell, name) for name in columns] for cell in found.transfer))
+
+
+def transfer_blocks(found: GroupComparison) -> list[Block]:
+    """Return what `icrtool compare` prints: verdicts, the transfer matrix, differences of each pair, the logs."""
+    names = list(found.groups)
+    cells = {(one.calibrated_on, one.tested_on): one for one in found.transfer if one.horizon_m == CHOICE_HORIZON_M}
+    matrix = [(row, *(_errors(cells.get((row, column))) for column in names)) for row in names]
+    caption = f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column"
+    cost: list[Block] = [
+        Figure((), "comparison"),
+        Figure(("transfer",), folded=False),
+        Table("lr", matrix, ("", *names), caption),
+        "on the diagonal each trial is predicted by a fit that does not contain it",
+    ]
+    logs = [f"{name}: {one.name}, {distance_text(one.distance_m)}" for name in names for one in found.groups[name].logs]
+    return [
+        Section("Do they differ?", [Items([pair.verdict for pair in found.pairs])]),
+        Section("What a calibration costs elsewhere", cost),
+        *(Section(f"{pair.second} compared with {pair.first}", _pair_tables(pair), VERBOSE) for pair in found.pairs),
+        Section("Logs", [Items(logs)], PAGE),
+    ]
+
+
+def _pair_tables(pair: ComparedPair) -> list[Table]:
+    """Return how parameters and held-out errors of two groups differ."""
+    rows = [
+        (one.quantity, *(f"{round(value, 3) + 0.0:+.3f}" for value in (one.first, one.second)),
+         with_std(one.difference, one.std, 3), "yes" if one.significant else "no, may be chance")
+        for one in pair.parameters
+    ]  # fmt: skip
+    head = ("quantity", pair.first, pair.second, "difference ± std", "significant")
+    errors = [
+        (
+            f"{one.horizon_m:g} m", with_interval(one.p95_m, one.p95_low_m, one.p95_high_m),
+            with_interval(one.expected_m, one.expected_low_m, one.expected_high_m),
+        )
+        for one in pair.errors if one.p95_m is not None and one.expected_m is not None
+    ]  # fmt: skip
+    route = ", the same route" if any(one.paired for one in pair.errors) else ""
+    caption = f"Error of a fit to other trials, {pair.second} minus {pair.first}{route}, with its 95 % interval"
+    return [Table("lrrrl", rows, head), Table("lr", errors, ("after", "95 %", "expected"), caption)]
+
+
+def _errors(cell: TransferCell | None) -> str:
+    if cell is None or cell.p95_m is None or cell.expected_m is None:
+        return "-"
+    return f"{cell.p95_m:.2f} / {cell.expected_m:.2f}"

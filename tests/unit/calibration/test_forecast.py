@@ -20,7 +20,7 @@ from icrtool.errors import DataError, IcrToolError
 from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
 from icrtool.motion.recording import cut_trials
 from icrtool.output.files.formats import read_numbers
-from icrtool.output.tables.forecast import forecast_csv, reach
+from icrtool.output.tables.calibration import forecast_csv, reach
 from icrtool.records.calibration_document import ErrorSources
 from support.recordings import WIDTH_M, draw_parameters, make_recording, trials_from_all
 

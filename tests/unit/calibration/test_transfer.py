@@ -17,7 +17,7 @@ from icrtool.errors import ConfigError
 from icrtool.motion.models import MODELS
 from icrtool.motion.recording import Recording
 from icrtool.output.files.formats import json_bytes
-from icrtool.output.tables.transfer import transfer_blocks, transfer_csv
+from icrtool.output.tables.calibration import transfer_blocks, transfer_csv
 from icrtool.output.text_blocks import printed
 from icrtool.records.calibration_document import GroupComparison
 from support.recordings import make_recording

@@ -18,7 +18,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import JUMP, trial_ends
 from icrtool.motion.recording import cut_trials, cut_windows
 from icrtool.output.dropout_directory import report_document
-from icrtool.output.stored_run import open_run
+from icrtool.output.run_directory import open_run
 from icrtool.records.run import Run, track_of
 from icrtool.records.samples import GyroSamples, HeadingSamples
 from support.drives import make_log

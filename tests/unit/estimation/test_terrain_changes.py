@@ -11,7 +11,7 @@ import pytest
 
 from icrtool.config import parse_config
 from icrtool.estimation.fit import fit
-from icrtool.output.figures.icrs import icr_estimates
+from icrtool.output.figures.filter_estimates import icr_estimates
 from icrtool.output.tables.run import format_run
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import Icrs, RobotLog

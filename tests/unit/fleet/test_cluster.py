@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.output.stored_run import open_run
+from icrtool.output.run_directory import open_run
 from support.servers import object_store
 
 pytest.importorskip("distributed", reason="needs the extra icrtool[cluster]")

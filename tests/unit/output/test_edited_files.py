@@ -18,8 +18,7 @@ from icrtool.errors import IcrToolError
 from icrtool.output.files.documents import open_calibration
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.files.states_file import COLUMNS, INTEGER_COLUMNS
-from icrtool.output.run_directory import events_csv
-from icrtool.output.stored_run import log_of
+from icrtool.output.run_directory import events_csv, log_of
 from icrtool.output.tables.run import format_run
 from support.edits import edited
 

@@ -14,7 +14,7 @@ from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.filter_records import GATED
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.calibrations import transfer
-from icrtool.output.figures.gnss_difference import gnss_difference
+from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style
 from icrtool.output.page.render import drawn_pictures
 from icrtool.records.calibration_document import COMPARE_SCHEMA, ComparedGroup, GroupComparison, TransferCell

@@ -8,8 +8,8 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.output.dropout_directory import COMPARISON_COLUMNS, comparison_document, comparison_rows
 from icrtool.output.files.formats import json_bytes
-from icrtool.output.tables.model_comparison import COMPARISON_COLUMNS, comparison_document, comparison_rows
 
 
 @pytest.fixture(scope="module")

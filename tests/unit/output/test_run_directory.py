@@ -17,8 +17,7 @@ from icrtool.output import run_directory
 from icrtool.output.dropout_directory import write_report
 from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.formats import file_b2sum, json_bytes, read_sums
-from icrtool.output.run_directory import check_target, write_run
-from icrtool.output.stored_run import open_run
+from icrtool.output.run_directory import check_target, open_run, write_run
 from icrtool.records.run import Run
 from support.contract import RUN_KEYS
 

@@ -20,8 +20,7 @@ from icrtool.output.dropout_directory import report_document
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.style import picture_bytes
 from icrtool.output.files.formats import file_b2sum, json_bytes
-from icrtool.output.run_directory import write_run
-from icrtool.output.stored_run import log_of, newest_run, open_run
+from icrtool.output.run_directory import log_of, newest_run, open_run, write_run
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
 from icrtool.records.run import Run
