@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,16 +102,8 @@ def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run
     with ThreadPoolExecutor(1) as other:
         if finished:
             # takes as long as to read a run of an hour, most of which is done outside of the interpreter
-            other.submit(_load_models)
+            other.submit(import_module, "icrtool.calibration.pooled")
         return runs_of(sources, config, quiet=quiet)
-
-
-def _load_models() -> None:
-    """Import what calibrates, and the compiler of its kernels."""
-    from icrtool.calibration.pooled import calibrate_runs  # noqa: F401
-    from icrtool.kernels.compiled import load_compiler
-
-    load_compiler()
 
 
 def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> SensorDocument:

@@ -14,30 +14,26 @@ from typing import Any, ClassVar, TypeVar, cast
 
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
-from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 from numba.extending import overload
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-_BLAS = "scipy.linalg.cython_blas"
-if _BLAS not in sys.modules:
-    # numba looks for scipy's BLAS when its array functions are loaded, which takes longer than to load all the rest of
-    # it. No kernel of ours multiplies matrices; numba finds it again when someone else's does.
-    sys.modules[_BLAS] = None  # type: ignore[assignment]  # Python's mark for "cannot be imported"
-    try:
-        importlib.import_module("numba.np.arraymath")
-    finally:
-        del sys.modules[_BLAS]
 
+def _load_compiler() -> None:
+    """Load what numba compiles with, except scipy's BLAS.
 
-def load_compiler() -> None:
-    """Make numba ready to load kernels, as the first call of one does; another thread may read files meanwhile."""
-    # numba takes this lock where it compiles; two threads that refresh at once fail
-    with global_compiler_lock:
-        for context in (cpu_target.typing_context, cpu_target.target_context):
-            context.refresh()
+    To look for it takes longer than all the rest. No kernel multiplies matrices; numba finds it again when someone
+    else's does.
+    """
+    blas = "scipy.linalg.cython_blas"
+    if blas not in sys.modules:
+        sys.modules[blas] = None  # type: ignore[assignment]  # Python's mark for "cannot be imported"
+        try:
+            importlib.import_module("numba.np.arraymath")
+        finally:
+            del sys.modules[blas]
 
 
 @functools.cache
@@ -77,6 +73,18 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     _impl_class = _Places
 
+    def load_overload(self, sig: object, target_context: object) -> object:
+        """Return the machine code of a kernel, None where it is to be compiled.
+
+        Without what numba compiles with, which its own method loads before it looks: that takes longer than to import
+        numba.
+        """
+        with self._guard_against_spurious_io_errors():
+            kept = self._load_overload(sig, target_context)
+        if kept is None:
+            _load_compiler()
+        return kept
+
     def save_overload(self, sig: object, data: object) -> None:
         """Keep newly compiled code; on a full disk or in a read-only directory it serves this process alone."""
         with suppress(OSError):
@@ -99,8 +107,10 @@ def njit(function: Kernel) -> Kernel:
     The plain Python function stays reachable as ``.py_func``.
     """
     dispatcher = numba.njit(**_OPTIONS)(function)
-    with suppress(RuntimeError):
+    try:
         dispatcher._cache = _Cache(function)  # noqa: SLF001 - as numba's own `cache=True` does, with its class
+    except RuntimeError:
+        _load_compiler()
     return cast(Kernel, dispatcher)
 
 
