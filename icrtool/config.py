@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 from importlib import resources
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -254,6 +254,18 @@ def load_config(path: str | Path | None = None, robot: str | None = None, sets: 
             else:
                 merged[section] = values
     return parse_config(merged)
+
+
+class ConfigSources(NamedTuple):
+    """What a configuration is loaded from: the arguments of `load_config`."""
+
+    path: Path | None = None
+    robot: str | None = None
+    sets: tuple[str, ...] = ()
+
+    def load(self) -> Config:
+        """Return the configuration; errors as of `load_config`."""
+        return load_config(*self)
 
 
 def _builtin_robot(name: str) -> dict[str, Any]:

@@ -12,46 +12,64 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from icrtool.cli import options
-from icrtool.cli.printing import error, print_json, warn
+from icrtool.cli.options import LOG, PLACE, POSITIVE, Exports, flag, option
+from icrtool.cli.printing import Printer, error
 from icrtool.records.text import LogText, counted, escaped, shortened
 
 if TYPE_CHECKING:
     from icrtool.fleet.batch import BatchOptions
-    from icrtool.fleet.one_log import ReportOptions, Request
-    from icrtool.records.fleet_document import FleetCalibration, FleetLog
+    from icrtool.fleet.one_log import Request
+    from icrtool.records.fleet_document import FleetLog
 
 LONGEST_STAGE, LEAST_NAME = 28, 12
 """Characters of the live line for the stage of a log with its separators, and for its name at least."""
 
 
+class Workers(NamedTuple):
+    """Where logs are processed, as `icrtool.fleet.processes.executor_of` takes it."""
+
+    jobs: int | None = None
+    scheduler: str | None = None
+    worker_timeout_s: float = 60.0
+
+
+WORKERS = options.together(
+    "workers",
+    Workers,
+    option("-j --jobs", "N", click.IntRange(min=1), "Logs at the same time; default: one per core, fewer where memory "
+           "is short."),
+    option("--scheduler", "ADDRESS", None, "Process on a Dask cluster, for example tcp://host:8786."),
+    option("--worker-timeout worker_timeout_s", "SECONDS", POSITIVE, "Give up a cluster that has no scheduler or no "
+           "worker for so long.", default=60.0),
+)  # fmt: skip
+
+
+BATCH = options.together(
+    "batch",
+    "icrtool.fleet.batch:BatchOptions",
+    option("--timeout timeout_s", "SECONDS", POSITIVE, "Stop a log that takes longer.", default=1800.0),
+    flag("--redo", "Also process logs that are done."),
+    flag("--overwrite", "Also replace runs of other recordings."),
+    options.REPORT,
+    options.CONFIGURATION,
+)
+
+
 @click.command("batch")
-@click.argument("places", metavar="LOG|FOLDER|MANIFEST...", nargs=-1, required=True, type=options.LOG)
-@click.option("-o", "--output", metavar="DIR", required=True, type=options.PLACE,
-              help="Folder for the tables, or its address; the run directories go to runs/ in it.")  # fmt: skip
-@click.option("-j", "--jobs", metavar="N", type=click.IntRange(min=1),
-              help="Logs at the same time; default: one per core, fewer where memory is short.")  # fmt: skip
-@click.option("--scheduler", metavar="ADDRESS", help="Process on a Dask cluster, for example tcp://host:8786.")
-@click.option("--worker-timeout", "worker_timeout_s", metavar="SECONDS", type=options.POSITIVE, default=60.0,
-              show_default=True, help="Give up a cluster that has no scheduler or no worker for so long.")  # fmt: skip
-@click.option("--timeout", "timeout_s", metavar="SECONDS", type=options.POSITIVE, default=1800.0, show_default=True,
-              help="Stop a log that takes longer.")  # fmt: skip
-@click.option("--redo", is_flag=True, help="Also process logs that are done.")
-@click.option("--overwrite", is_flag=True, help="Also replace runs of other recordings.")
-@options.report
-@options.as_json
-@options.configuration
-@options.verbosity
+@click.argument("places", metavar="LOG|FOLDER|MANIFEST...", nargs=-1, required=True, type=LOG)
+@option("-o --output", "DIR", PLACE, "Folder for the tables, or its address; the run directories go to runs/ in it.",
+        required=True)  # fmt: skip
+@WORKERS
+@BATCH
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def command(
-    places: tuple[Path, ...], output: Path, jobs: int | None, scheduler: str | None,
-    worker_timeout_s: float, timeout_s: float, redo: bool, overwrite: bool,
-    asked: ReportOptions, baseline: Path | None, junit: Path | None, markdown: Path | None, as_json: bool,
-    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
-) -> None:  # fmt: skip
+    places: tuple[Path, ...], output: Path, workers: Workers, batch: BatchOptions, exports: Exports, printer: Printer
+) -> None:
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
 
     A FOLDER is searched recursively. A MANIFEST (CSV or TOML) lists logs or patterns with their robot, configuration,
@@ -65,32 +83,38 @@ def command(
       icrtool batch season/ -o results --robot husky-a200
       icrtool batch logs.csv -o results -j 4 --gate "recommended.p95@10m <= 1.5"
     """  # noqa: D301 - click reads the escape
-    from icrtool.fleet.batch import BatchOptions, plan
-    from icrtool.fleet.fleet_files import FOLDERS, PLOTS, write_fleet
+    from msgspec.structs import replace
+
+    from icrtool.fleet import fleet_files
+    from icrtool.fleet.batch import plan
     from icrtool.fleet.roll_up import pooled_calibrations
     from icrtool.output.files.remote_place import on_disk
 
-    compared = options.baseline_of(baseline, asked.gates)
-    batch = BatchOptions(config_file, robot, sets, asked, redo, timeout_s, overwrite, baseline)
-    with on_disk(output, parts=FOLDERS) as folder:
+    asked = batch.report
+    compared = options.baseline_of(batch.baseline, asked.gates)
+    with on_disk(output, parts=fleet_files.FOLDERS) as folder:
         requests = plan(places, output, batch, folder)
         folder.mkdir(parents=True, exist_ok=True)
-        view = View(len(requests), quiet=quiet, as_json=as_json, verbose=verbose)
-        rows = run_all(requests, jobs, scheduler, worker_timeout_s, batch, view, folder)
+        view = View(len(requests), printer)
+        rows = run_all(requests, workers, batch, view, folder)
     missing = compared.missing(row.log for row in rows) if compared is not None else []
     # Of an address once more: it has the runs now.
-    with on_disk(output, parts=FOLDERS) as folder:
+    with on_disk(output, parts=fleet_files.FOLDERS) as folder:
         pooled = pooled_calibrations(rows, folder, output, allow_unusable=asked.allow_unusable) if asked.ladder else ()
         calibrations = list(pooled)
         new = any((row.status, row.this_time) == ("done", "processed") for row in rows)
-        write_fleet(rows, folder, calibrations, asked.plots if new or not (folder / PLOTS).is_dir() else ())
-        write_exports(rows, calibrations, missing, folder if asked.page else None, junit=junit, markdown=markdown)
+        plots = asked.plots if new or not (folder / fleet_files.PLOTS).is_dir() else ()
+        document = fleet_files.write_fleet(rows, folder, calibrations, plots, page=asked.page)
         written = files_written(folder)
     if compared is not None:
-        from icrtool.fleet.fleet_files import changes_of
-
-        warn([escaped(change) for change in changes_of(rows, missing)], quiet=quiet)
-    print_results(rows, calibrations, output, written, quiet=quiet, as_json=as_json)
+        printer.warn(map(escaped, fleet_files.changes_of(rows, missing)))
+    exports.write(
+        "batch", lambda: fleet_files.suites_of(rows), lambda: fleet_files.format_fleet_markdown(rows, missing)
+    )
+    printer.json("batch", replace(document, output=escaped(str(output))))
+    printer.text(summary_of(rows, output, written))
+    if calibrations:
+        printer.text(f"\n{fleet_files.calibrations_text(calibrations, tables=False)}".rstrip())
     options.check_compared(one for row in rows for one in row.verdicts)
     missed = any(row.gates_failed for row in rows)
     if missed or any(row.status == "failed" for row in rows):
@@ -98,9 +122,8 @@ def command(
 
 
 def run_all(
-    requests: Sequence[Request], jobs: int | None, scheduler: str | None, worker_timeout_s: float,
-    batch: BatchOptions, view: View, folder: Path,
-) -> list[FleetLog]:  # fmt: skip
+    requests: Sequence[Request], workers: Workers, batch: BatchOptions, view: View, folder: Path
+) -> list[FleetLog]:
     """Process all logs, and return a row of each, in the order of the requests.
 
     Parameters
@@ -113,7 +136,7 @@ def run_all(
 
     rows: list[FleetLog] = []
     with (
-        executor_of([path_of(one.path) for one in requests], jobs, scheduler, worker_timeout_s) as (executor, lost),
+        executor_of([path_of(one.path) for one in requests], *workers) as (executor, lost),
         closing(view),
         closing(run_batch(requests, executor, batch, view.stage, lost, folder)) as coming,
     ):
@@ -124,57 +147,13 @@ def run_all(
     return sorted(rows, key=lambda row: order[row.log])
 
 
-def write_exports(
-    rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibration], missing: Sequence[str], page: Path | None, *,
-    junit: Path | None, markdown: Path | None,
-) -> None:  # fmt: skip
-    """Write the page of the fleet, and what machines that watch pull requests read, where they are asked for."""
-    from icrtool.output.files.atomic import write_file
-    from icrtool.output.files.own_files import is_page
-
-    if junit is not None:
-        from icrtool.fleet.fleet_files import suites_of
-        from icrtool.output.exports.acceptance import write_junit
-
-        write_junit(junit, suites_of(rows), "batch")
-    if markdown is not None:
-        from icrtool.fleet.fleet_files import format_fleet_markdown
-
-        write_file(markdown, format_fleet_markdown(rows, missing))
-    if page is not None:
-        from icrtool.fleet.fleet_files import fleet_document
-        from icrtool.output.page.group_pages import fleet_page
-        from icrtool.output.run_directory import PAGE_FILE
-
-        write_file(page / PAGE_FILE, fleet_page(fleet_document(rows, calibrations), page), page, is_page)
-
-
-def print_results(
-    rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibration], output: Path, written: str, *, quiet: bool,
-    as_json: bool,
-) -> None:  # fmt: skip
-    """Print the results of the logs; `written`: what stands in the folder of the results."""
-    from icrtool.fleet.fleet_files import calibrations_text, fleet_document
-
-    if as_json:
-        from msgspec.structs import replace
-
-        print_json("batch", replace(fleet_document(rows, calibrations), output=escaped(str(output))))
-    elif not quiet:
-        click.echo(summary_of(rows, output, written))
-        if calibrations:
-            click.echo(f"\n{calibrations_text(calibrations, tables=False)}", nl=False)
-
-
 class View:
     """What is shown of a batch while it runs: a line per log, and on a terminal a line about those that run."""
 
-    def __init__(self, logs: int, *, quiet: bool, as_json: bool, verbose: bool) -> None:
+    def __init__(self, logs: int, printer: Printer) -> None:
         self._logs = logs
-        self._prints = not quiet and not as_json
-        self._reports = not quiet
-        self._verbose = verbose
-        self._live = not quiet and sys.stderr.isatty()
+        self._printer = printer
+        self._live = not printer.quiet and sys.stderr.isatty()
         self._begun = time.monotonic()
         self._counts: Counter[str] = Counter()
         self._processed = 0
@@ -199,12 +178,12 @@ class View:
         self._processed += row.this_time == "processed"
         self.close()
         if row.status == "failed":
-            if self._reports:
+            if not self._printer.quiet:
                 error(f"{escaped(row.log)}: {escaped(row.reason)}")
-                if self._verbose and row.details:
-                    click.echo("\n".join(map(escaped, row.details.splitlines())), err=True)
-        elif self._prints:
-            click.echo(line_of(row))
+                if row.details:
+                    self._printer.detail("\n".join(map(escaped, row.details.splitlines())))
+        else:
+            self._printer.text(line_of(row))
         for verdict in row.verdicts:
             if not verdict.passed:
                 click.echo(escaped(verdict.line), err=True)

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import click
 
+from icrtool.cli.options import flag
+
 
 @click.group("cache")
 def command() -> None:
@@ -18,7 +20,7 @@ def command() -> None:
 
 
 @command.command("warm")
-@click.option("-q", "--quiet", is_flag=True, help="Print no result.")
+@flag("-q --quiet", "Print no result.")
 def warm(*, quiet: bool) -> None:
     """Compile all kernels and modules now, so that no later command waits for it: for an image or a CI cache.
 

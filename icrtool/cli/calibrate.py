@@ -11,30 +11,32 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.inputs import check_run_config, runs_of, runs_or_logs
-from icrtool.cli.printing import print_json, show, warn, warn_of
+from icrtool.cli.options import FILE, NEW_PICTURE, option
+from icrtool.cli.printing import Printer
 
 if TYPE_CHECKING:
-    from icrtool.config import Config
+    from icrtool.config import Config, ConfigSources
     from icrtool.records.calibration_document import CalibrationFile, SensorDocument
     from icrtool.records.run import Run
 
 
 @click.command("calibrate")
 @click.argument("sources", metavar="LOG|RUN|FOLDER...", nargs=-1, required=True, type=options.LOG)
-@click.option("-o", "--output", metavar="FILE|DIR", type=options.FILE, help="Write the calibration file here.")
-@click.option("--x-icr", metavar="METRES", type=float,
-              help="Forward position of the ICRs, where known: it gives that of the antenna. One log.")  # fmt: skip
-@click.option("--plot", metavar="FILE", type=options.NEW_PICTURE,
-              help="Draw the residuals before and after the calibration: png, svg, pdf. One log.")  # fmt: skip
-@options.allow_unusable
-@options.as_json
-@options.configuration
-@options.verbosity
+@option("-o --output", "FILE|DIR", FILE, "Write the calibration file here.")
+@option("--x-icr", "METRES", float, "Forward position of the ICRs, where known: it gives that of the antenna. One log.")
+@option("--plot", "FILE", NEW_PICTURE, "Draw the residuals before and after the calibration: png, svg, pdf. One log.")
+@options.ALLOW_UNUSABLE
+@options.CONFIGURATION
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def command(
-    sources: tuple[Path, ...], output: Path | None, x_icr: float | None, plot: Path | None, allow_unusable: bool,
-    as_json: bool,
-    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
-) -> None:  # fmt: skip
+    sources: tuple[Path, ...],
+    output: Path | None,
+    x_icr: float | None,
+    plot: Path | None,
+    allow_unusable: bool,
+    settings: ConfigSources,
+    printer: Printer,
+) -> None:
     """Calibrate the motion model of a robot from one log or many, tested on what it was not fitted to.
 
     Several logs are fitted together, and each is left out in turn to test the model. With one log, each trial is
@@ -51,29 +53,28 @@ def command(
     from icrtool.errors import IcrToolError
     from icrtool.output.files.documents import calibration_file, write_calibration
 
-    config = options.load(config_file, robot, sets)
+    config = settings.load()
     sources = tuple(one for source in sources for one in runs_or_logs(source))
     if len(sources) > 1 and (plot is not None or x_icr is not None):
         raise click.UsageError("--plot and --x-icr are for one log")
     if output is not None:
         calibration_file(output)
-    runs = _runs(sources, config, quiet=quiet)
+    runs = _runs(sources, config, printer)
     from icrtool.calibration.one_log import with_sensors
     from icrtool.calibration.pooled import calibrate_runs
 
-    sensors = _sensors(runs[0], x_icr, quiet=quiet, verbose=verbose) if len(runs) == 1 else None
+    sensors = _sensors(runs[0], x_icr, printer) if len(runs) == 1 else None
     result = None
     try:
         result = calibrate_runs(runs, allow_unusable=allow_unusable)
-        warn([str(one) for one in result.left_out], quiet=quiet)
+        printer.warn(map(str, result.left_out))
     except IcrToolError as err:
         if sensors is None or not (runs[0].usable or allow_unusable):
             raise
-        warn([f"no motion model: {err}"], quiet=quiet)
+        printer.warn([f"no motion model: {err}"])
     from icrtool.output.tables.calibration import calibration_blocks
-    from icrtool.output.text_blocks import printed
 
-    texts: list[str] = [printed(calibration_blocks(result, sensors), verbose=verbose)]
+    texts = []
     document: CalibrationFile | None = sensors
     if result is not None:
         document = result.calibration if sensors is None else with_sensors(result.calibration, sensors)
@@ -82,17 +83,13 @@ def command(
     if plot is not None:
         _draw(sources[0], runs[0], plot)
         texts.append(f"drawn to {plot}")
-    if as_json:
-        print_json("calibrate", {"calibration": document})
-    elif not quiet:
-        show(texts[0])
-        for text in texts[1:]:
-            if verbose:
-                click.echo()
-            show(text)
+    printer.json("calibrate", {"calibration": document})
+    printer.show(calibration_blocks(result, sensors))
+    for text in texts:
+        printer.text(f"\n{text}" if printer.verbose else text)
 
 
-def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run]:
+def _runs(sources: tuple[Path, ...], config: Config, printer: Printer) -> list[Run]:
     """Read runs, and fit logs."""
     from icrtool.output.run_directory import is_run_directory
 
@@ -103,14 +100,14 @@ def _runs(sources: tuple[Path, ...], config: Config, *, quiet: bool) -> list[Run
         if finished:
             # takes as long as to read a run of an hour, most of which is done outside of the interpreter
             other.submit(import_module, "icrtool.calibration.pooled")
-        return runs_of(sources, config, quiet=quiet)
+        return runs_of(sources, config, printer)
 
 
-def _sensors(run: Run, x_icr: float | None, *, quiet: bool, verbose: bool) -> SensorDocument:
+def _sensors(run: Run, x_icr: float | None, printer: Printer) -> SensorDocument:
     """Return what one log shows of antenna, offsets, delays and scales."""
     from icrtool.calibration.one_log import calibrate_log
 
-    warn_of(run, quiet=quiet, verbose=verbose)
+    printer.warn_of(run)
     return calibrate_log(run, x_icr_m=x_icr)
 
 

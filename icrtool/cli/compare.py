@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,28 +9,31 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.inputs import runs_of, runs_or_logs
-from icrtool.cli.printing import answer
+from icrtool.cli.options import NEW_FILE, NEW_PICTURE, option
+from icrtool.cli.printing import Printer
 from icrtool.records.text import LogText
 from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
+    from icrtool.config import ConfigSources
     from icrtool.records.run import Run
 
 
 @click.command("compare")
 @click.argument("sources", metavar="[NAME=]RUN|LOG|FOLDER...", nargs=-1, required=True)
-@click.option("--csv", "csv_file", metavar="FILE", type=options.NEW_FILE,
-              help="Write the transfer matrix: the errors of each calibration in each group.")  # fmt: skip
-@click.option("-o", "--output", metavar="FILE", type=options.NEW_FILE,
-              help="Write the comparison as JSON, for icrtool report.")  # fmt: skip
-@click.option("--plot", metavar="FILE", type=options.NEW_PICTURE, help="Draw the comparison: png, svg, pdf.")
-@options.as_json
-@options.configuration
-@options.verbosity
+@option("--csv", "FILE", NEW_FILE, "Write the transfer matrix: the errors of each calibration in each group.")
+@option("-o --output", "FILE", NEW_FILE, "Write the comparison as JSON, for icrtool report.")
+@option("--plot", "FILE", NEW_PICTURE, "Draw the comparison: png, svg, pdf.")
+@options.CONFIGURATION
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def command(
-    sources: tuple[str, ...], csv_file: Path | None, output: Path | None, plot: Path | None, as_json: bool,
-    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
-) -> None:  # fmt: skip
+    sources: tuple[str, ...],
+    csv: Path | None,
+    output: Path | None,
+    plot: Path | None,
+    settings: ConfigSources,
+    printer: Printer,
+) -> None:
     """Compare groups of runs: ICRs, multiplier and errors, and what the calibration of one costs on another.
 
     Each argument is a group: a run, a log, or a folder of runs or logs; arguments of one NAME are one group. The first
@@ -46,25 +48,24 @@ def command(
     from icrtool.output.files.atomic import write_file
     from icrtool.output.files.formats import json_bytes, save_picture
     from icrtool.output.tables.calibration import transfer_blocks, transfer_csv
-    from icrtool.output.text_blocks import printed
 
-    config = options.load(config_file, robot, sets)
+    config = settings.load()
     places = _groups(sources)
     found = [(name, one) for name, paths in places.items() for path in paths for one in runs_or_logs(path)]
     groups: dict[str, list[Run]] = {}
-    runs = runs_of([path for _, path in found], config, quiet=quiet, verbose=verbose)
+    runs = runs_of([path for _, path in found], config, printer)
     for (name, _), run in zip(found, runs, strict=True):
         groups.setdefault(name, []).append(run)
     compared = compare_groups(groups)
-    for file, content in ((csv_file, transfer_csv(compared)), (output, json_bytes(compared))):
+    for file, content in ((csv, transfer_csv(compared)), (output, json_bytes(compared))):
         if file is not None:
             write_file(file, content)
     if plot is not None:
         from icrtool.output.figures.calibrations import transfer as transfer_figure
 
         save_picture(transfer_figure(compared), plot)
-    text = partial(printed, transfer_blocks(compared), verbose=verbose)
-    answer("compare", compared, text, as_json=as_json, quiet=quiet)
+    printer.json("compare", compared)
+    printer.show(transfer_blocks(compared))
 
 
 def _groups(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from icrtool.cli import options
 from icrtool.cli.printing import write_or_print
 
+if TYPE_CHECKING:
+    from icrtool.config import ConfigSources
+
 
 @click.command("config")
-@options.configuration
-@click.option("-o", "--output", metavar="FILE", type=options.NEW_FILE, help="File to write; default: standard output.")
-def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], output: Path | None) -> None:
+@options.CONFIGURATION
+@options.option("-o --output", "FILE", options.NEW_FILE, "File to write; default: standard output.")
+def command(settings: ConfigSources, output: Path | None) -> None:
     """Print all configuration keys as a TOML file: meaning, type and bounds, and value.
 
     Without options these are the defaults; --robot, --config and --set change them. Keys without default stand in
@@ -26,4 +30,4 @@ def command(config_file: Path | None, robot: str | None, sets: tuple[str, ...], 
     """  # noqa: D301 - click reads the escape
     from icrtool.output.tables.configuration import format_configuration
 
-    write_or_print(format_configuration(options.load(config_file, robot, sets)), output)
+    write_or_print(format_configuration(settings.load()), output)

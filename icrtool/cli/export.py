@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from icrtool.cli import options
 from icrtool.cli.inputs import RUNS, read_calibration
-from icrtool.cli.printing import warn, write_or_print
+from icrtool.cli.options import FILE, PLACE, choice, flag, option
+from icrtool.cli.printing import Printer, write_or_print
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
@@ -28,12 +28,11 @@ ALL_THE_SAME = "--force exports it all the same"
 
 
 @click.command("export")
-@click.argument("source", metavar="[RUN|CAL.json]", required=False, type=options.PLACE)
-@click.option("--for", "target", required=True, type=click.Choice(TARGETS), help="What the result is for.")
-@click.option("-o", "--output", metavar="FILE", type=options.FILE,
-              help="File to write; for evo and kitti a directory with a file for each path of the run, "
-              "or a file with the suffix .tum, .kitti, .txt or .csv.")  # fmt: skip
-@click.option("--force", is_flag=True, help="Also export what is not fit for use.")
+@click.argument("source", metavar="[RUN|CAL.json]", required=False, type=PLACE)
+@choice("--for target", TARGETS, "What the result is for.", required=True)
+@option("-o --output", "FILE", FILE, "File to write; for evo and kitti a directory with a file for each path of the "
+        "run, or a file with the suffix .tum, .kitti, .txt or .csv.")  # fmt: skip
+@flag("--force", "Also export what is not fit for use.")
 def command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
     """Print a calibration for a robot's controller, or a run for other programs.
 
@@ -139,7 +138,7 @@ def _run(source: Path | None, output: Path | None = None) -> Run:
     if output is not None and output.resolve() in (Path(file.path).resolve() for file in run.document.inputs):
         raise OutputError(output, "is the log that the run was made from", "name another file")
     if not run.usable:
-        warn([f"{run.name}: its ICRs are not usable: {run.document.unusable_because}"], quiet=False)
+        Printer().warn([f"{run.name}: its ICRs are not usable: {run.document.unusable_because}"])
     return run
 
 

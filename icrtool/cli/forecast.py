@@ -10,7 +10,8 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.inputs import read_calibration
-from icrtool.cli.printing import answer
+from icrtool.cli.options import NEW_FILE, NEW_PICTURE, PLACE, option
+from icrtool.cli.printing import Printer
 
 LARGEST_PLAN_BYTES = 50_000_000
 
@@ -20,19 +21,22 @@ if TYPE_CHECKING:
 
 
 @click.command("forecast")
-@click.option("--calibration", "calibration_file", metavar="CAL.json|RUN", required=True, type=options.PLACE,
-              help="File that icrtool calibrate -o wrote, or a run, which is calibrated.")  # fmt: skip
-@click.option("--path", "path", metavar="PLAN.csv|RUN", required=True, type=options.PLACE,
-              help="Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven again.")  # fmt: skip
-@options.budgets
-@click.option("-o", "--output", metavar="FILE.csv", type=options.NEW_FILE, help="Write a row for each metre.")
-@click.option("--plot", metavar="FILE", type=options.NEW_PICTURE, help="Draw the errors: png, svg, pdf.")
-@options.as_json
-@options.quiet
+@option("--calibration calibration_file", "CAL.json|RUN", PLACE, "File that icrtool calibrate -o wrote, or a run, "
+        "which is calibrated.", required=True)  # fmt: skip
+@option("--path", "PLAN.csv|RUN", PLACE, "Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven "
+        "again.", required=True)  # fmt: skip
+@options.BUDGETS
+@option("-o --output", "FILE.csv", NEW_FILE, "Write a row for each metre.")
+@option("--plot", "FILE", NEW_PICTURE, "Draw the errors: png, svg, pdf.")
+@options.printing(options.AS_JSON, options.QUIET_RESULTS)
 def command(
-    calibration_file: Path, path: Path, budgets: tuple[float, ...], output: Path | None, plot: Path | None,
-    as_json: bool, quiet: bool,
-) -> None:  # fmt: skip
+    calibration_file: Path,
+    path: Path,
+    budgets_m: tuple[float, ...],
+    output: Path | None,
+    plot: Path | None,
+    printer: Printer,
+) -> None:
     """Forecast the error of driving a path without GNSS, with a calibrated motion model.
 
     The expected and the 95 % error are given after each metre of the path: for wheels alone and, where the calibration
@@ -57,10 +61,9 @@ def command(
         from icrtool.output.figures.calibrations import forecast_figure
 
         measured_m = measured_to_m(calibration)
-        save_picture(forecast_figure(forecast, path.name, budgets, measured_m, gyro), plot)
-    document = forecast_document(forecast, calibration, budgets, gyro)
-    text = partial(format_forecast, forecast, calibration, budgets, gyro)
-    answer("forecast", document, text, as_json=as_json, quiet=quiet)
+        save_picture(forecast_figure(forecast, path.name, budgets_m, measured_m, gyro), plot)
+    printer.json("forecast", forecast_document(forecast, calibration, budgets_m, gyro))
+    printer.text(format_forecast(forecast, calibration, budgets_m, gyro))
 
 
 def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast | None]:

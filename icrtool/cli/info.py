@@ -12,11 +12,12 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.inputs import logs_of
-from icrtool.cli.printing import Inputs, Stages, print_json, show, warn
+from icrtool.cli.options import Span
+from icrtool.cli.printing import Inputs, Printer, Stages
 from icrtool.records.text import LogText, escaped
 
 if TYPE_CHECKING:
-    from icrtool.config import Config
+    from icrtool.config import Config, ConfigSources
     from icrtool.errors import IcrToolError
     from icrtool.logs.streams.assembly import Survey
     from icrtool.records.run import Run
@@ -25,14 +26,10 @@ if TYPE_CHECKING:
 
 @click.command("info")
 @options.LOGS
-@options.as_json
-@options.cut
-@options.configuration
-@options.verbosity
-def command(
-    logs: tuple[Path, ...], as_json: bool, start: str | None, end: str | None,
-    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
-) -> None:  # fmt: skip
+@options.CUT
+@options.CONFIGURATION
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+def command(logs: tuple[Path, ...], span: Span, settings: ConfigSources, printer: Printer) -> None:
     """List what each log holds, which topics are used for wheels, position and heading, and the problems found.
 
     The filter runs too, but nothing is written. The report names the ICRs that the drive shows and, where
@@ -42,28 +39,26 @@ def command(
     """
     from icrtool.errors import IcrToolError
 
-    config = options.load(config_file, robot, sets)
-    given = options.given(config_file, robot, sets, start, end)
+    config, given = settings.load(), options.given(settings, span)
     inputs = Inputs("log")
-    for log in logs_of(logs, quiet=quiet):
+    for log in logs_of(logs, printer):
         with inputs.each(log) as document:
             found = Found(log)
             try:
-                with Stages(LogText(log.name), quiet=quiet, verbose=verbose) as stages:
-                    _examine(found, config, (start, end), stages)
+                with printer.stages(LogText(log.name)) as stages:
+                    _examine(found, config, span, stages)
             except IcrToolError as err:
                 found.problem = err
-            if as_json:
+            if printer.as_json:
                 document.update(_document(found, given))
-            elif not quiet:
-                _print(found, config, given, everything=verbose)
+            elif printer.shows:
+                _print(found, config, given, printer)
             # On a terminal the answer names the gravest one.
-            if verbose or as_json or not sys.stderr.isatty():
-                warn(found.warnings, quiet=quiet)
+            if printer.verbose or printer.as_json or not sys.stderr.isatty():
+                printer.warn(found.warnings)
             if found.problem is not None:
                 raise found.problem
-    if as_json:
-        print_json("info", {"logs": inputs.documents})
+    printer.json("info", {"logs": inputs.documents})
     inputs.leave("logs")
 
 
@@ -91,7 +86,7 @@ class Found:
         return self.survey.problems if self.survey is not None else ()
 
 
-def _examine(found: Found, config: Config, part: tuple[str | None, str | None], stages: Stages) -> None:
+def _examine(found: Found, config: Config, part: Span, stages: Stages) -> None:
     """Read and fit a log: only the filter shows which ICRs the drive determines, and which sensors disagree.
 
     Raises
@@ -117,19 +112,17 @@ def _examine(found: Found, config: Config, part: tuple[str | None, str | None], 
     found.run = fit(found.measured, config, watch=stages.begin)
 
 
-def _print(found: Found, config: Config, given: Sequence[str], *, everything: bool) -> None:
+def _print(found: Found, config: Config, given: Sequence[str], printer: Printer) -> None:
     """Print whether a log can be fitted, what it holds, and the command to run next; with -v all that was found."""
     from icrtool.logs.describe import describe_log, describe_survey
     from icrtool.output.tables.overview import info_blocks, next_command
-    from icrtool.output.text_blocks import printed
 
     command = next_command(escaped(str(found.log)), given, found.run)
-    if everything and found.survey is not None:
+    if printer.verbose and found.survey is not None:
         click.echo(f"{describe_survey(found.survey, found.measured)}\n")
-    elif everything and found.measured is not None:
+    elif printer.verbose and found.measured is not None:
         click.echo(f"{describe_log(found.measured)}\n")
-    blocks = info_blocks(found.survey, found.measured, found.run, found.problem, found.names, config, command)
-    show(printed(blocks, verbose=everything))
+    printer.show(info_blocks(found.survey, found.measured, found.run, found.problem, found.names, config, command))
 
 
 def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:

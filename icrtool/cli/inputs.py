@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from icrtool.cli.printing import progress_bar, warn
+from icrtool.cli.printing import Printer
 from icrtool.records.text import escaped
 from icrtool.records.urls import UrlPath
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 RUNS = Path("icrtool-runs")
 
 
-def logs_of(places: tuple[Path, ...], *, quiet: bool) -> tuple[Path, ...]:
+def logs_of(places: tuple[Path, ...], printer: Printer) -> tuple[Path, ...]:
     """Return the logs among the arguments of a command, those in folders too, and warn of files that are none."""
     from icrtool.fleet.recordings import logs_among
 
     logs, beside = logs_among(places)
-    warn([f"{escaped(str(file))}: not a log: left out" for file in beside], quiet=quiet)
+    printer.warn(f"{escaped(str(file))}: not a log: left out" for file in beside)
     return tuple(logs)
 
 
@@ -45,13 +45,12 @@ def runs_or_logs(place: Path) -> list[Path]:
     return runs or [one.path for one in find_recordings([place])]
 
 
-def runs_of(paths: Sequence[Path], config: Config, *, quiet: bool, verbose: bool = False) -> list[Run]:
+def runs_of(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run]:
     """Read runs, and fit logs without a recommendation; nothing is written."""
     found = []
-    with progress_bar("reading", quiet=quiet) as progress:
+    with printer.progress("reading") as progress:
         for path in paths:
-            if verbose:
-                click.echo(str(path), err=True)
+            printer.detail(str(path))
             found.append(_run_of(path, config))
             if progress is not None:
                 progress(len(found) / len(paths))
@@ -80,6 +79,13 @@ def check_run_config(config: Config, *, free: str = "") -> None:
         raise ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
 
 
+class ResultPlace(NamedTuple):
+    """Where the runs of a command go, by -o and --into."""
+
+    output: Path | None = None
+    into: Path | None = None
+
+
 class RunPlace(NamedTuple):
     """Where the run of a log goes; `inside` is the folder of the runs, below which no link is followed."""
 
@@ -87,7 +93,7 @@ class RunPlace(NamedTuple):
     inside: Path | None
 
 
-def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | None) -> list[RunPlace]:
+def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[RunPlace]:
     """Return where each log's run goes: ``icrtool-runs/NAME``, DIR of `output`, or ``DIR/NAME`` for several or `into`.
 
     Logs of one name are distinguished by what their paths differ in.
@@ -96,6 +102,7 @@ def run_directories(logs: tuple[Path, ...], output: Path | None, into: Path | No
     from icrtool.fleet.recordings import distinct_names
     from icrtool.output.run_directory import RUN_FILE
 
+    output, into = place
     if output is not None and into is not None:
         raise click.UsageError("-o and --into both state where the runs go: give one of them")
     if output is not None and len(logs) == 1:

@@ -1,4 +1,7 @@
-"""Options that several commands share, and what reads their values."""
+"""Options that several commands share, and what reads their values.
+
+Each is declared by `option`, `choice` or `flag`; those that go together reach the command as one argument (`together`).
+"""
 
 from __future__ import annotations
 
@@ -6,27 +9,86 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import click
 
+from icrtool.cli.completion import complete_robot, complete_setting
+from icrtool.cli.inputs import ResultPlace
+from icrtool.cli.printing import Printer
 from icrtool.records.text import escaped
 from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
-    from click.shell_completion import CompletionItem
-
-    from icrtool.config import Config
+    from icrtool.config import ConfigSources
+    from icrtool.output.exports.acceptance import Suite
     from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.dropout import Verdict
     from icrtool.records.fleet_document import FleetVerdict
-    from icrtool.records.run import FigureSet
 
-Command = TypeVar("Command", bound=Callable[..., Any])
+Command = Callable[..., Any]
+Option = Callable[[Command], Command]
 
 POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
+
+
+def option(names: str, metavar: str | None, kind: object, text: str, **further: Any) -> Option:
+    """Return an option with a value; a default is shown.
+
+    Parameters
+    ----------
+    names : as ``-o --output directory``: the last one, if it has no dash, is that of the argument
+    kind : type of the value, or what reads it
+    text : help
+    further : as click has it
+    """
+    further = {"show_default": further.get("default") is not None} | further
+    return click.option(*names.split(), metavar=metavar, type=kind, help=text, **further)
+
+
+def choice(names: str, words: Sequence[str], text: str, **further: Any) -> Option:
+    """Return an option whose value is one of some words."""
+    return option(names, None, click.Choice(words), text, **further)
+
+
+def flag(names: str, text: str, **further: Any) -> Option:
+    """Return an option without a value."""
+    return click.option(*names.split(), is_flag=True, help=text, **further)
+
+
+def together(name: str, home: str | Callable[..., object], *options: Option) -> Option:
+    """Return what adds options to a command, in this order, and gives it a record of them as one argument.
+
+    Parameters
+    ----------
+    name : of the argument
+    home : the record, or where it is: ``icrtool.config:ConfigSources``, imported when the command is called. Options
+        that have the names of its fields become these, if they are given; the command gets the others as they are
+    """
+
+    def add(command: Command) -> Command:
+        @wraps(command)
+        def call(**given: Any) -> object:
+            module, _, record = home.partition(":") if isinstance(home, str) else ("", "", "")
+            make = getattr(import_module(module), record) if isinstance(home, str) else home
+            values = {one: given.pop(one) for one in signature(make).parameters if one in given}
+            made = make(**{one: value for one, value in values.items() if value is not None})
+            return command(**{name: made}, **given)
+
+        return add_options(call, *options)
+
+    return add
+
+
+def add_options(command: Command, *options: Option) -> Command:
+    """Add options to a command, in this order."""
+    for one in reversed(options):
+        command = one(command)
+    return command
 
 
 class _Place(click.Path):
@@ -38,9 +100,7 @@ class _Place(click.Path):
     def __init__(self) -> None:
         super().__init__(path_type=Path, readable=False)
 
-    def convert(
-        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
-    ) -> Path:  # fmt: skip
+    def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Return the path."""
         place = place_of(os.fspath(value))
         # click's own would lose a slash, and what stands behind a question mark.
@@ -52,89 +112,40 @@ LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LO
 
 
 class _File(click.Path):
-    """A file or directory on disk."""
+    """A file or directory on disk.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    check : refuses a place that cannot be written, before any work is done
+    """
+
+    def __init__(self, check: Callable[[Path], None] | None = None) -> None:
         super().__init__(path_type=Path)
+        self._check = check
 
-    def convert(
-        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
-    ) -> Path:  # fmt: skip
+    def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Return the path; refuse an address."""
         if isinstance(address := place_of(os.fspath(value)), UrlPath):
             self.fail(f"{escaped(str(address))}: an address is not taken here; name a place on disk", param, ctx)
-        return cast("Path", super().convert(value, param, ctx))
-
-
-FILE = _File()
-
-
-class _NewFile(_File):
-    """A file that the command writes: a place that cannot be written is refused before any work is done."""
-
-    def __init__(self, *, picture: bool = False) -> None:
-        super().__init__()
-        self._picture = picture
-
-    def convert(
-        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
-    ) -> Path:  # fmt: skip
-        """Return the path."""
-        path = super().convert(value, param, ctx)
-        if self._picture:
-            from icrtool.output.files.formats import check_picture
-
-            check_picture(path)
-        else:
-            from icrtool.output.files.own_files import check_place
-
-            check_place(path)
+        path = cast("Path", super().convert(value, param, ctx))
+        if self._check is not None:
+            self._check(path)
         return path
 
 
-NEW_FILE, NEW_PICTURE = _NewFile(), _NewFile(picture=True)
+def _check_file(path: Path) -> None:
+    from icrtool.output.files.own_files import check_place
+
+    check_place(path)
 
 
-def configuration(command: Command) -> Command:
-    """Add --config, --robot and --set."""
-    options = (
-        click.option("--config", "config_file", metavar="FILE.toml", type=FILE, help="Configuration file."),
-        click.option("--robot", metavar="NAME", shell_complete=_robots,
-                     help="Built-in robot, for example husky-a200; icrtool robots lists them."),
-        click.option("--set", "sets", metavar="SECTION.KEY=VALUE", multiple=True, shell_complete=_settings,
-                     help="Set a configuration key; icrtool config lists them; repeatable."),
-    )  # fmt: skip
-    return add_options(command, *options)
+def _check_picture(path: Path) -> None:
+    from icrtool.output.files.formats import check_picture
+
+    check_picture(path)
 
 
-def add_options(command: Command, *options: Callable[[Command], Command]) -> Command:
-    """Add options to a command, in this order."""
-    for option in reversed(options):
-        command = option(command)
-    return command
-
-
-def _robots(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    from icrtool.cli.completion import complete_robot
-
-    return complete_robot(ctx, param, incomplete)
-
-
-def _settings(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    from icrtool.cli.completion import complete_setting
-
-    return complete_setting(ctx, param, incomplete)
-
-
-def place(command: Command) -> Command:
-    """Add -o, --into and --overwrite, as `output`, `into` and `overwrite`."""
-    return add_options(
-        command,
-        click.option("-o", "--output", metavar="DIR", type=PLACE,
-                     help="Run directory of the log; with several logs: the folder of their run directories."),
-        click.option("--into", metavar="DIR", type=PLACE, help="Folder of the run directories, also for one log."),
-        click.option("--overwrite", is_flag=True, help="Also replace the run of another recording."),
-    )  # fmt: skip
+FILE, NEW_FILE, NEW_PICTURE = _File(), _File(_check_file), _File(_check_picture)
 
 
 def numbers(text: str, form: str, count: int | None = None) -> tuple[float, ...]:
@@ -148,10 +159,57 @@ def numbers(text: str, form: str, count: int | None = None) -> tuple[float, ...]
     return found
 
 
-def seed(command: Command) -> Command:
-    """Add --seed, by default 0."""
-    text = "Seed of all noise; the same seed, the same numbers."
-    return click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help=text)(command)
+CONFIGURATION = together(
+    "settings",
+    "icrtool.config:ConfigSources",
+    option("--config path", "FILE.toml", FILE, "Configuration file."),
+    option("--robot", "NAME", None, "Built-in robot, for example husky-a200; icrtool robots lists them.",
+           shell_complete=complete_robot),
+    option("--set sets", "SECTION.KEY=VALUE", None, "Set a configuration key; icrtool config lists them; repeatable.",
+           multiple=True, shell_complete=complete_setting),
+)  # fmt: skip
+"""--config, --robot and --set, as `settings`."""
+
+
+PLACES = together(
+    "place",
+    ResultPlace,
+    option("-o --output", "DIR", PLACE, "Run directory of the log; with several logs: the folder of their run "
+           "directories."),
+    option("--into", "DIR", PLACE, "Folder of the run directories, also for one log."),
+    flag("--overwrite", "Also replace the run of another recording."),
+)  # fmt: skip
+"""-o and --into as `place`, and --overwrite."""
+
+
+class Span(NamedTuple):
+    """From when to when a log is read, by --from and --to."""
+
+    start: str | None = None
+    end: str | None = None
+
+
+CUT = together(
+    "span",
+    Span,
+    option("--from start", "TIME", None, "Read the log from here: seconds since the log's first message, or a time in "
+           "ISO 8601 (UTC without a zone)."),
+    option("--to end", "TIME", None, "Read the log up to here."),
+)  # fmt: skip
+"""--from and --to, as `span`."""
+
+AS_JSON = flag("--json as_json", "Print one JSON document on standard output, and nothing else there.")
+QUIET_RESULTS = flag("-q --quiet", "Print no results.")
+QUIET = flag("-q --quiet", "Print no results and no warnings.")
+VERBOSE = flag("-v --verbose", "Print more details.")
+
+
+def printing(*options: Option) -> Option:
+    """Add some of the options above, as `printer`."""
+    return together("printer", Printer, *options)
+
+
+SEED = option("--seed", None, click.IntRange(min=0), "Seed of all noise; the same seed, the same numbers.", default=0)
 
 
 def plot_formats(text: str) -> tuple[str, ...]:
@@ -167,72 +225,60 @@ def plot_formats(text: str) -> tuple[str, ...]:
     return formats
 
 
-def plots(command: Command) -> Command:
-    """Add --plots, as a tuple of formats."""
-    return click.option("--plots", default="png", show_default=True, metavar="png,svg,pdf|none", type=plot_formats,
-                        help="Formats of the pictures.")(command)  # fmt: skip
+PLOTS = option("--plots", "png,svg,pdf|none", plot_formats, "Formats of the pictures.", default="png")
+FIGURES = choice(
+    "--figures", ("default", "all"), "all: also those of the paper, such as a histogram a distance.", default="default"
+)
+BUDGETS = option(
+    "--budget budgets_m", "METRES", POSITIVE, "Report how far 95 % of the errors stay within this; repeatable.",
+    multiple=True, default=(0.5,),
+)  # fmt: skip
+ALLOW_UNUSABLE = flag("--allow-unusable", "Give distances and numbers of runs that are not usable, too.")
 
 
-def figures(command: Command) -> Command:
-    """Add --figures, as a `FigureSet`."""
-    return click.option("--figures", type=click.Choice(["default", "all"]), default="default", show_default=True,
-                        help="all: also those of the paper, such as a histogram a distance.")(command)  # fmt: skip
+def _lines(_context: click.Context, _option: click.Parameter, gates: tuple[str, ...]) -> tuple[str, ...]:
+    """Return limits, of which a text may hold several; one that is all blank stays, and is refused as no limit."""
+    return tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
 
 
-def budgets(command: Command) -> Command:
-    """Add --budget, as `budgets`."""
-    return click.option("--budget", "budgets", metavar="METRES", type=POSITIVE, multiple=True, default=(0.5,),
-                        show_default=True, help="Report how far 95 % of the errors stay within this; repeatable.",
-                        )(command)  # fmt: skip
+class Exports(NamedTuple):
+    """What machines that watch pull requests read, by --junit and --markdown."""
+
+    junit: Path | None = None
+    markdown: Path | None = None
+
+    def write(self, command: str, suites: Callable[[], Sequence[Suite]], text: Callable[[], str]) -> None:
+        """Write what is asked for: the acceptance limits of the logs, and a summary in Markdown."""
+        from icrtool.output.exports.acceptance import write_junit
+        from icrtool.output.files.atomic import write_file
+
+        if self.junit is not None:
+            write_junit(self.junit, suites(), command)
+        if self.markdown is not None:
+            write_file(self.markdown, text())
 
 
-def report(command: Command) -> Command:
-    """Add the options of a dropout report that are the same for one log and for many.
-
-    The command gets them as `asked`, a `ReportOptions`; and `baseline`, `junit` and `markdown`.
-    """
-
-    @wraps(command)
-    def with_options(
-        *, plots: tuple[str, ...], gates: tuple[str, ...], budgets: tuple[float, ...], ladder: bool, strict: bool,
-        page: bool, allow_unusable: bool, figures: FigureSet, junit: Path | None, markdown: Path | None,
-        **others: object,
-    ) -> object:  # fmt: skip
-        from icrtool.fleet.one_log import ReportOptions
-
-        # one that is all blank stays, and is refused as no limit
-        limits = tuple(line for gate in gates for line in [one for one in gate.splitlines() if one.strip()] or [gate])
-        asked = ReportOptions(plots, limits, budgets, ladder, strict, page, allow_unusable, figures)
-        return command(asked=asked, junit=junit, markdown=markdown, **others)
-
-    return add_options(
-        cast("Command", with_options),
-        budgets,
-        click.option("--gate", "gates", metavar="LIMIT", multiple=True,
-                     help="Acceptance limit, or several, one a line: exit status 3 if one is not met; repeatable."),
-        click.option("--baseline", metavar="REPORT.json|DIR", type=FILE,
-                     help="Earlier report, run or batch to compare with; a limit may then read "
-                     "\"icr.p95@10m <= 1.1 * baseline\"."),
-        click.option("--strict-gates", "strict", is_flag=True,
-                     help="Compare limits relative to the baseline by their number alone, without the "
-                     "confidence interval of the difference."),
-        click.option("--ladder/--no-ladder", default=True, show_default=True,
-                     help="Also test the motion model and the controller numbers, with a gyro too, on distance "
-                     "that they were not fitted to."),
-        click.option("--junit", metavar="FILE", type=NEW_FILE, help="Write the verdicts on the limits as JUnit XML."),
-        click.option("--markdown", metavar="FILE", type=NEW_FILE, help="Write a summary for a pull request."),
-        allow_unusable,
-        plots,
-        figures,
-        click.option("--page/--no-page", default=True, show_default=True,
-                     help="Also write report.html: pictures, tables and an interactive map in one file."),
-    )  # fmt: skip
-
-
-def allow_unusable(command: Command) -> Command:
-    """Add --allow-unusable."""
-    return click.option("--allow-unusable", is_flag=True,
-                        help="Give distances and numbers of runs that are not usable, too.")(command)  # fmt: skip
+REPORT = together("exports", Exports, together(
+    "report",
+    "icrtool.fleet.one_log:ReportOptions",
+    BUDGETS,
+    option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one a line: exit status 3 if one is not met; "
+           "repeatable.", multiple=True, callback=_lines),
+    option("--baseline", "REPORT.json|DIR", FILE, "Earlier report, run or batch to compare with; a limit may then read "
+           "\"icr.p95@10m <= 1.1 * baseline\"."),
+    flag("--strict-gates strict", "Compare limits relative to the baseline by their number alone, without the "
+         "confidence interval of the difference."),
+    flag("--ladder/--no-ladder", "Also test the motion model and the controller numbers, with a gyro too, on distance "
+         "that they were not fitted to.", default=True, show_default=True),
+    option("--junit", "FILE", NEW_FILE, "Write the verdicts on the limits as JUnit XML."),
+    option("--markdown", "FILE", NEW_FILE, "Write a summary for a pull request."),
+    ALLOW_UNUSABLE,
+    PLOTS,
+    FIGURES,
+    flag("--page/--no-page", "Also write report.html: pictures, tables and an interactive map in one file.",
+         default=True, show_default=True),
+))  # fmt: skip
+"""The options of a dropout report that are the same for one log and for many, as `report`, `exports` and `baseline`."""
 
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
@@ -259,47 +305,8 @@ def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
         raise ConfigError("--baseline", "none of these logs is in it", "logs are matched by content, else by name")
 
 
-def cut(command: Command) -> Command:
-    """Add --from and --to, as `start` and `end`."""
-    what = "seconds since the log's first message, or a time in ISO 8601 (UTC without a zone)"
-    return add_options(
-        command,
-        click.option("--from", "start", metavar="TIME", help=f"Read the log from here: {what}."),
-        click.option("--to", "end", metavar="TIME", help="Read the log up to here."),
-    )
-
-
-def as_json(command: Command) -> Command:
-    """Add --json, as `as_json`."""
-    text = "Print one JSON document on standard output, and nothing else there."
-    return click.option("--json", "as_json", is_flag=True, help=text)(command)
-
-
-def quiet(command: Command) -> Command:
-    """Add -q alone."""
-    return click.option("-q", "--quiet", is_flag=True, help="Print no results.")(command)
-
-
-def verbosity(command: Command) -> Command:
-    """Add -q and -v."""
-    return add_options(
-        command,
-        click.option("-q", "--quiet", is_flag=True, help="Print no results and no warnings."),
-        click.option("-v", "--verbose", is_flag=True, help="Print more details."),
-    )
-
-
-def load(config_file: Path | None, robot: str | None, sets: tuple[str, ...]) -> Config:
-    """Load the configuration the options describe."""
-    from icrtool.config import load_config
-
-    return load_config(config_file, robot, sets)
-
-
-def given(
-    config_file: Path | None, robot: str | None, sets: tuple[str, ...], start: str | None, end: str | None
-) -> list[str]:
+def given(settings: ConfigSources, span: tuple[str | None, str | None]) -> list[str]:
     """Return the options of a call that the next command takes too."""
-    pairs = [("--config", config_file), ("--robot", robot), *(("--set", one) for one in sets)]
-    pairs += [("--from", start), ("--to", end)]
+    pairs = [("--config", settings.path), ("--robot", settings.robot), *(("--set", one) for one in settings.sets)]
+    pairs += [("--from", span[0]), ("--to", span[1])]
     return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]

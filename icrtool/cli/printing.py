@@ -12,11 +12,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import click
 
-from icrtool.output.text_blocks import Line, Table, Text, narrowed
+from icrtool.output.text_blocks import Block, Line, Table, Text, narrowed, printed
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
 
@@ -124,21 +124,6 @@ def print_json(command: str, document: msgspec.Struct | Mapping[str, object]) ->
     click.echo(json_bytes(own | {key: value for key, value in plain(document).items() if key not in own}), nl=False)
 
 
-def answer(
-    command: str,
-    document: msgspec.Struct | Mapping[str, object],
-    text: Callable[[], str],
-    *,
-    as_json: bool,
-    quiet: bool,
-) -> None:
-    """Print what a command found, as JSON or as text."""
-    if as_json:
-        print_json(command, document)
-    elif not quiet:
-        show(text())
-
-
 def write_or_print(text: str, output: Path | None) -> None:
     """Write a text to its file, or print it where none is named."""
     if output is None:
@@ -157,29 +142,71 @@ def signal_word(word: str, color: str) -> str:
     return style(word, fg=color, bold=True) if wanted else word
 
 
-def warn(warnings: Iterable[str], *, quiet: bool) -> None:
-    """Print warnings on standard error."""
-    if not quiet:
-        for warning in warnings:
-            click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
-
-
-def warn_of(run: Run, *further: str, quiet: bool, verbose: bool) -> None:
-    """Print the warnings of a run and further ones, with -v also why each stream was chosen."""
-    # On a terminal the answer names the gravest one.
-    everything = verbose or not sys.stderr.isatty()
-    warn((*(run.warnings if everything else ()), *further), quiet=quiet)
-    if verbose:
-        from icrtool.output.text_format import topics_text
-        from icrtool.records.samples import ROLE_WORDS
-
-        for stream in run.document.streams:
-            click.echo(f"{ROLE_WORDS[stream.role]}: {topics_text(stream.topic)}: {stream.why}", err=True)
-
-
 def error(text: str) -> None:
     """Print the line about an error on standard error."""
     click.echo(f"{signal_word('Error:', 'red')} {text}", err=True)
+
+
+class Printer(NamedTuple):
+    """What a command prints, by its options -q, -v and --json."""
+
+    quiet: bool = False
+    verbose: bool = False
+    as_json: bool = False
+
+    @property
+    def shows(self) -> bool:
+        """Whether results are printed as text."""
+        return not (self.quiet or self.as_json)
+
+    def show(self, blocks: Iterable[Block]) -> None:
+        """Print a document as text, with -v all of it."""
+        if self.shows:
+            show(printed(blocks, verbose=self.verbose))
+
+    def text(self, text: str) -> None:
+        """Print a result that is laid out."""
+        if self.shows:
+            show(text)
+
+    def json(self, command: str, document: msgspec.Struct | Mapping[str, object]) -> None:
+        """Print the document of a command, with --json; parameters as of `print_json`."""
+        if self.as_json:
+            print_json(command, document)
+
+    def detail(self, text: str) -> None:
+        """Print a line on standard error, with -v."""
+        if self.verbose:
+            click.echo(text, err=True)
+
+    def warn(self, warnings: Iterable[str]) -> None:
+        """Print warnings on standard error."""
+        if not self.quiet:
+            for warning in warnings:
+                click.echo(f"{signal_word('Warning:', 'yellow')} {warning}", err=True)
+
+    def warn_of(self, run: Run, *further: str) -> None:
+        """Print the warnings of a run and further ones, with -v also why each stream was chosen."""
+        # On a terminal the answer names the gravest one.
+        everything = self.verbose or not sys.stderr.isatty()
+        self.warn((*(run.warnings if everything else ()), *further))
+        if self.verbose:
+            from icrtool.output.text_format import topics_text
+            from icrtool.records.samples import ROLE_WORDS
+
+            for stream in run.document.streams:
+                self.detail(f"{ROLE_WORDS[stream.role]}: {topics_text(stream.topic)}: {stream.why}")
+
+    def stages(self, name: str) -> Stages:
+        """Return the stages of the work on one log."""
+        return Stages(name, quiet=self.quiet, verbose=self.verbose)
+
+    @contextmanager
+    def progress(self, label: str) -> Iterator[Callable[[float], None] | None]:
+        """Give a function that shows the share done of work of one stage; None where there is no terminal."""
+        with Stages(label, quiet=self.quiet) as stages:
+            stages.begin("")
+            yield stages.share if stages.on_terminal else None
 
 
 class Inputs:
@@ -275,11 +302,3 @@ class Stages:
     def _write(self, text: str) -> None:
         sys.stderr.write(text)
         sys.stderr.flush()
-
-
-@contextmanager
-def progress_bar(label: str, *, quiet: bool) -> Iterator[Callable[[float], None] | None]:
-    """Give a function that shows the share done of work of one stage; None where there is no terminal."""
-    with Stages(label, quiet=quiet) as stages:
-        stages.begin("")
-        yield stages.share if stages.on_terminal else None

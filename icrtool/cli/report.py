@@ -10,16 +10,16 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.inputs import RUNS
+from icrtool.cli.options import FILE, flag, option
+from icrtool.cli.printing import Printer
 
 
 @click.command("report")
-@click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=options.FILE)
-@click.option("-o", "--output", metavar="FILE", type=options.FILE,
-              help="The page; default: report.html in the directory of the run or fleet.")  # fmt: skip
-@click.option("--no-coordinates", is_flag=True,
-              help="Leave out the place on the globe, for a page that others will read.")  # fmt: skip
-@options.quiet
-def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, quiet: bool) -> None:
+@click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=FILE)
+@option("-o --output", "FILE", FILE, "The page; default: report.html in the directory of the run or fleet.")
+@flag("--no-coordinates", "Leave out the place on the globe, for a page that others will read.")
+@options.printing(options.QUIET_RESULTS)
+def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, printer: Printer) -> None:
     """Write a run, a fleet or a comparison as one HTML file that needs no network.
 
     RUN is a directory that `icrtool fit` wrote, with or without its dropout report; FLEET the folder of `icrtool
@@ -47,8 +47,7 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
         check_place(place, inside, ours)
         page = _page_of(source, coordinates=not no_coordinates)
         write_file(place, page, inside, ours)
-        if not quiet:
-            click.echo(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
+        printer.text(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
 
 
 def _page_of(source: Path, *, coordinates: bool) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import click
 
 from icrtool.cli import options
-from icrtool.cli.printing import print_json, show
+from icrtool.cli.printing import Printer
 from icrtool.output.text_blocks import Line, Table, Text
 
 
 @click.command("robots")
-@options.as_json
-def command(as_json: bool) -> None:
+@options.printing(options.AS_JSON)
+def command(printer: Printer) -> None:
     """List the built-in robots for --robot, with their numbers and sources.
 
     For another robot, give --set robot.track_width_m=… and --set robot.wheel_radius_m=…, or a file: icrtool config
@@ -20,11 +20,9 @@ def command(as_json: bool) -> None:
     from icrtool.config import builtin_robots
 
     robots = builtin_robots()
-    if as_json:
-        keys = ("track_width_m", "wheel_radius_m", "encoder_counts_per_rev", "source")
-        listed = [{"name": name} | {key: robot.get(key) for key in keys} for name, robot in robots.items()]
-        print_json("robots", {"robots": listed})
-        return
+    keys = ("track_width_m", "wheel_radius_m", "encoder_counts_per_rev", "source")
+    listed = [{"name": name} | {key: robot.get(key) for key in keys} for name, robot in robots.items()]
+    printer.json("robots", {"robots": listed})
     rows = [
         (
             name, f"{robot['track_width_m']:.3f} m", f"{robot['wheel_radius_m']:.4f} m",
@@ -34,4 +32,4 @@ def command(as_json: bool) -> None:
     ]  # fmt: skip
     head = ("robot", "track width", "wheel radius", "counts per turn")
     sources = Table("l", [(f"  {name}", robot["source"]) for name, robot in robots.items()])
-    show(Text([Table("lr", rows, head), "", Line("Sources", "title"), sources]))
+    printer.text(Text([Table("lr", rows, head), "", Line("Sources", "title"), sources]))

@@ -11,10 +11,21 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
-from icrtool.cli.options import NOT_NEGATIVE, POSITIVE, Command, add_options, numbers
+from icrtool.cli.options import (
+    FILE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Command,
+    Option,
+    add_options,
+    flag,
+    numbers,
+    option,
+)
+from icrtool.cli.printing import Printer
 
 if TYPE_CHECKING:
-    from icrtool.config import Config
+    from icrtool.config import Config, ConfigSources
     from icrtool.logs.writing.log import WriteOptions
     from icrtool.records.tables import Icrs
     from icrtool.simulation.drives import DrivePlan, Sensors
@@ -83,38 +94,60 @@ def degrees(within: click.FloatRange | None = None) -> Callable[[Any], float]:
     return radians
 
 
-OPTIONS: dict[str, tuple[str, str | None, Any, str]] = {
-    "--icrs": ("icrs_m", "YR,YL,X", icrs_text, "True ICRs [m]; default: by the robot's width, or the study's."),
-    "--path": ("kind", None, click.Choice(PATHS), "Path to drive; study convergence then has no other."),
-    "--duration": ("duration_s", "S", POSITIVE, "Duration of a drive [s]; default: 100, or the study's."),
-    "--speed": ("speed_mps", "MPS", POSITIVE, "Speed of the body; on the spot: of the faster track."),
-    "--radius": ("radius_m", "M", NOT_NEGATIVE, "Radius of circles and of the tightest bends."),
-    "--leg": ("leg_m", "M", POSITIVE, "Length of a lawnmower's legs."),
-    "--encoder-counts": ("encoder_counts", "N", POSITIVE, "Counts per wheel turn; default: the robot's, or 8192."),
-    "--input-noise": ("input_noise_mps", "MPS", NOT_NEGATIVE, "White noise of each sample of the track speeds."),
-    "--input-bias": ("input_bias_mps", "MPS", float, "Bias of both track speeds."),
-    "--gnss": ("gnss_std_m", "rtk|waas|METRES", gnss_text, "Noise of north and east: rtk 0.01 m, waas 0.30 m."),
-    "--gnss-rate": ("gnss_rate_hz", "HZ", POSITIVE, "Fixes per second."),
-}
+DRIVE = (
+    ("--icrs icrs_m", "YR,YL,X", icrs_text, "True ICRs [m]; default: by the robot's width, or the study's."),
+    ("--path kind", None, click.Choice(PATHS), "Path to drive; study convergence then has no other."),
+    ("--duration duration_s", "S", POSITIVE, "Duration of a drive [s]; default: 100, or the study's."),
+    ("--speed speed_mps", "MPS", POSITIVE, "Speed of the body; on the spot: of the faster track."),
+    ("--radius radius_m", "M", NOT_NEGATIVE, "Radius of circles and of the tightest bends."),
+    ("--leg leg_m", "M", POSITIVE, "Length of a lawnmower's legs."),
+    ("--encoder-counts", "N", POSITIVE, "Counts per wheel turn; default: the robot's, or 8192."),
+    ("--input-noise input_noise_mps", "MPS", NOT_NEGATIVE, "White noise of each sample of the track speeds."),
+    ("--input-bias input_bias_mps", "MPS", float, "Bias of both track speeds."),
+    ("--gnss gnss_std_m", "rtk|waas|METRES", gnss_text, "Noise of north and east: rtk 0.01 m, waas 0.30 m."),
+    ("--gnss-rate gnss_rate_hz", "HZ", POSITIVE, "Fixes per second."),
+)
 """Options of `simulate` and `study`: the field of the plan, path or sensors that each sets, metavar, type, help."""
 
+DRIVE_DEFAULTS: dict[str, object] = {
+    "kind": "curved", "speed_mps": 0.4, "radius_m": 1.5, "leg_m": 10.0, "input_noise_mps": 0.0, "input_bias_mps": 0.0,
+    "gnss_std_m": "rtk", "gnss_rate_hz": 20.0,
+}  # fmt: skip
+"""Of `simulate`, by field; a study has its own."""
 
-def drive_options(**defaults: object) -> Callable[[Command], Command]:
-    """Add `OPTIONS` and --change to a command; `defaults`: by field, none for the others."""
+RECORDED = (
+    ("--start-heading start_heading_rad", "DEG", degrees(), "Heading at the start, clockwise from north.", 30.0),
+    ("--wheels", None, click.Choice(["encoder", "commanded"]),
+     "Content of the wheel messages: counted travel, or the motor commands.", "encoder"),
+    ("--wheel-messages", None, click.Choice(WHEEL_MESSAGES), "Message type of the wheels.", "joint_states"),
+    ("--wheel-rate wheel_rate_hz", "HZ", POSITIVE, "Wheel messages a second; default 100, commanded 10.", None),
+    ("--motor-lag motor_lag_s", "S", NOT_NEGATIVE, "Time constant with which the tracks follow their commands.", 0.0),
+    ("--outage outages_s", "BEGIN:END", span_text, "No fixes between these seconds; repeatable.", ()),
+    ("--antenna", "FORWARD,RIGHT", place_text, "Position of the antenna, from the body origin [m].", "0,0"),
+    ("--gnss-delay gnss_delay_s", "S", float, "The stamps of the fixes lag by this.", 0.0),
+    ("--heading convention", None, click.Choice(["enu", "ned"]), "Convention of the Imu: REP-103, or REP-145's NED.",
+     "enu"),
+    ("--heading-std heading_std_rad", "DEG", degrees(NOT_NEGATIVE), "White noise of the heading.", 1.0),
+    ("--heading-resolution heading_resolution_rad", "DEG", degrees(NOT_NEGATIVE), "Headings are rounded to this.",
+     0.05),
+    ("--heading-rate heading_rate_hz", "HZ", POSITIVE, "Headings a second.", 100.0),
+    ("--heading-offset heading_offset_rad", "DEG", degrees(), "Added to every heading, clockwise.", 0.0),
+    ("--heading-delay heading_delay_s", "S", float, "The stamps of the headings lag by this.", 0.0),
+)  # fmt: skip
+"""Further options of `simulate`, as in `DRIVE`, with their default; the one with an empty one is repeatable."""
 
-    def add(command: Command) -> Command:
-        text = "The ICRs become these after T seconds; repeatable."
-        change = click.option("--change", "changes", metavar="T:YR,YL,X", type=change_text, multiple=True, help=text)
-        fields = [
-            click.option(
-                name, field, metavar=metavar, type=kind, default=defaults.get(field),
-                show_default=defaults.get(field) is not None, help=text,
-            )
-            for name, (field, metavar, kind, text) in OPTIONS.items()
-        ]  # fmt: skip
-        return add_options(command, *fields, change)
 
-    return add
+def drive_options(**defaults: object) -> Option:
+    """Return what adds `DRIVE` and --change to a command; `defaults`: by field, none for the others."""
+    text = "The ICRs become these after T seconds; repeatable."
+    change = option("--change changes", "T:YR,YL,X", change_text, text, multiple=True)
+    of_drive = [option(*row, default=defaults.get(row[0].split()[-1])) for row in DRIVE]
+    return lambda command: add_options(command, *of_drive, change)
+
+
+def recorded_options(command: Command) -> Command:
+    """Add `RECORDED` to a command."""
+    return add_options(command, *(option(*row, default=default, multiple=default == ()) for *row, default in RECORDED))
 
 
 def given_fields(record: type, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -124,50 +157,15 @@ def given_fields(record: type, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @click.command("simulate")
-@click.option("-o", "--output", "log", metavar="LOG", required=True, type=options.FILE,
-              help="Log to make: .mcap, .bag, or a ROS 2 directory.")  # fmt: skip
-@click.option("--force", is_flag=True, help="Replace a log that is there.")
-@options.seed
-@click.option("--speeds", metavar="FILE.csv", type=options.FILE,
-              help="Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")  # fmt: skip
-@drive_options(
-    kind="curved", speed_mps=0.4, radius_m=1.5, leg_m=10.0, input_noise_mps=0.0, input_bias_mps=0.0, gnss_std_m="rtk",
-    gnss_rate_hz=20.0,
-)  # fmt: skip
-@click.option("--start-heading", "start_heading_rad", metavar="DEG", type=degrees(), default=30.0, show_default=True,
-              help="Heading at the start, clockwise from north.")  # fmt: skip
-@click.option("--wheels", type=click.Choice(["encoder", "commanded"]), default="encoder", show_default=True,
-              help="Content of the wheel messages: counted travel, or the motor commands.")  # fmt: skip
-@click.option("--wheel-messages", type=click.Choice(WHEEL_MESSAGES), default="joint_states", show_default=True,
-              help="Message type of the wheels.")  # fmt: skip
-@click.option("--wheel-rate", "wheel_rate_hz", metavar="HZ", type=POSITIVE,
-              help="Wheel messages a second; default 100, commanded 10.")  # fmt: skip
-@click.option("--motor-lag", "motor_lag_s", metavar="S", type=NOT_NEGATIVE, default=0.0, show_default=True,
-              help="Time constant with which the tracks follow their commands.")  # fmt: skip
-@click.option("--outage", "outages_s", metavar="BEGIN:END", type=span_text, multiple=True,
-              help="No fixes between these seconds; repeatable.")  # fmt: skip
-@click.option("--antenna", metavar="FORWARD,RIGHT", type=place_text, default="0,0",
-              help="Position of the antenna, from the body origin [m].")  # fmt: skip
-@click.option("--gnss-delay", "gnss_delay_s", metavar="S", type=float, default=0.0, show_default=True,
-              help="The stamps of the fixes lag by this.")  # fmt: skip
-@click.option("--heading", "convention", type=click.Choice(["enu", "ned"]), default="enu", show_default=True,
-              help="Convention of the Imu: REP-103, or REP-145's NED.")  # fmt: skip
-@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=degrees(NOT_NEGATIVE), default=1.0,
-              show_default=True, help="White noise of the heading.")  # fmt: skip
-@click.option("--heading-resolution", "heading_resolution_rad", metavar="DEG", type=degrees(NOT_NEGATIVE), default=0.05,
-              show_default=True, help="Headings are rounded to this.")  # fmt: skip
-@click.option("--heading-rate", "heading_rate_hz", metavar="HZ", type=POSITIVE, default=100.0, show_default=True,
-              help="Headings a second.")  # fmt: skip
-@click.option("--heading-offset", "heading_offset_rad", metavar="DEG", type=degrees(), default=0.0, show_default=True,
-              help="Added to every heading, clockwise.")  # fmt: skip
-@click.option("--heading-delay", "heading_delay_s", metavar="S", type=float, default=0.0, show_default=True,
-              help="The stamps of the headings lag by this.")  # fmt: skip
-@options.configuration
-@options.verbosity
-def command(
-    log: Path, config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool,
-    **given: Any,
-) -> None:  # fmt: skip
+@option("-o --output log", "LOG", FILE, "Log to make: .mcap, .bag, or a ROS 2 directory.", required=True)
+@flag("--force", "Replace a log that is there.")
+@options.SEED
+@option("--speeds", "FILE.csv", FILE, "Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")
+@drive_options(**DRIVE_DEFAULTS)
+@recorded_options
+@options.CONFIGURATION
+@options.printing(options.QUIET, options.VERBOSE)
+def command(log: Path, settings: ConfigSources, printer: Printer, **given: Any) -> None:
     """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth beside it.
 
     The kinematics are the paper's (Eqs. 8-10), integrated without error; the sensors those of its Section 4. The robot
@@ -179,7 +177,7 @@ def command(
       icrtool simulate -o drive.mcap --robot husky-a200 --path figure-eight
       icrtool fit drive.mcap --robot husky-a200
     """  # noqa: D301 - click reads the escape
-    config = simulated_robot(config_file, robot, sets)
+    config = simulated_robot(settings)
     plan, sensors = _plan(config, given), _sensors(config, given)
     writing = _write_options(log, config, sensors, given)
     from icrtool.logs.writing.log import write_log
@@ -190,18 +188,15 @@ def command(
         recorded, truth = simulate(plan, sensors, given["seed"])
         write_log(fresh_log, recorded, writing)
         write_truth(truth, fresh_truth)
-    if not quiet:
-        click.echo(_summary(config, plan, truth, given))
-        click.echo(f"\nwritten to {log}, truth to {truth_path(log)}")
-    if verbose:
-        click.echo(f"sensors: {sensors}", err=True)
+    printer.text(f"{_summary(config, plan, truth, given)}\n\nwritten to {log}, truth to {truth_path(log)}")
+    printer.detail(f"sensors: {sensors}")
 
 
-def simulated_robot(config_file: Path | None, robot: str | None, sets: tuple[str, ...]) -> Config:
+def simulated_robot(settings: ConfigSources) -> Config:
     """Return the configuration; without any setting of a robot, it is the paper's."""
-    config = options.load(config_file, robot, sets)
-    if robot is None and config.robot.track_width_m is None and config.robot.wheel_radius_m is None:
-        return options.load(config_file, DEFAULT_ROBOT, sets)
+    config = settings.load()
+    if settings.robot is None and config.robot.track_width_m is None and config.robot.wheel_radius_m is None:
+        return settings._replace(robot=DEFAULT_ROBOT).load()
     return config
 
 

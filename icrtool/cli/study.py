@@ -11,12 +11,12 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.inputs import RUNS
-from icrtool.cli.options import POSITIVE, numbers
-from icrtool.cli.printing import progress_bar, show
+from icrtool.cli.options import FILE, POSITIVE, choice, numbers, option
+from icrtool.cli.printing import Printer
 from icrtool.cli.simulate import check_changes, default_icrs, degrees, drive_options, encoder_counts, given_fields
 
 if TYPE_CHECKING:
-    from icrtool.config import Config
+    from icrtool.config import Config, ConfigSources
     from icrtool.simulation.drives import Sensors
     from icrtool.simulation.study_records import StudyName, StudyRequest
 
@@ -33,31 +33,28 @@ def values_text(text: str) -> tuple[float, ...]:
 
 @click.command("study")
 @click.argument("name", metavar="NAME", type=click.Choice(NAMES))
-@click.option("-o", "--output", metavar="DIR", type=options.FILE,
-              help="Study directory; default icrtool-runs/study-NAME.")  # fmt: skip
-@click.option("--runs", metavar="N", type=click.IntRange(min=1),
-              help="Runs for each value (in study initial: for each start).")  # fmt: skip
-@options.seed
-@click.option("--values", metavar="V,V,...", type=values_text,
-              help="Values of the quantity that the study varies, in its unit.")  # fmt: skip
-@click.option("--preset", type=click.Choice(["paper", "field"]),
-              help="Study this preset alone; default: both; initial: paper; convergence: paper, or field with --robot.",
-              )  # fmt: skip
+@option("-o --output", "DIR", FILE, "Study directory; default icrtool-runs/study-NAME.")
+@option("--runs", "N", click.IntRange(min=1), "Runs for each value (in study initial: for each start).")
+@options.SEED
+@option("--values", "V,V,...", values_text, "Values of the quantity that the study varies, in its unit.")
+@choice("--preset", ("paper", "field"), "Study this preset alone; default: both; initial: paper; convergence: paper, "
+        "or field with --robot.")  # fmt: skip
 @drive_options()
-@click.option("--wheels", type=click.Choice(["ideal", "encoder"]),
-              help="Wheel speeds without error, or counted travel.")  # fmt: skip
-@click.option(
-    "--rate", metavar="HZ", type=click.FloatRange(min=1, max=200), help="Wheel and heading samples per second."
-)
-@click.option("--heading-std", "heading_std_rad", metavar="DEG", type=degrees(POSITIVE),
-              help="White noise of the heading.")  # fmt: skip
-@options.plots
-@options.configuration
-@options.verbosity
+@choice("--wheels", ("ideal", "encoder"), "Wheel speeds without error, or counted travel.")
+@option("--rate", "HZ", click.FloatRange(min=1, max=200), "Wheel and heading samples per second.")
+@option("--heading-std heading_std_rad", "DEG", degrees(POSITIVE), "White noise of the heading.")
+@options.PLOTS
+@options.CONFIGURATION
+@options.printing(options.QUIET, options.VERBOSE)
 def command(
-    name: StudyName, output: Path | None, seed: int, plots: tuple[str, ...],
-    config_file: Path | None, robot: str | None, sets: tuple[str, ...], quiet: bool, verbose: bool, **given: Any,
-) -> None:  # fmt: skip
+    name: StudyName,
+    output: Path | None,
+    seed: int,
+    plots: tuple[str, ...],
+    settings: ConfigSources,
+    printer: Printer,
+    **given: Any,
+) -> None:
     """Simulate and filter many drives, and report accuracy, convergence time and consistency of the ICRs.
 
     \b
@@ -82,20 +79,18 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.output.study_directory import check_study_target, write_study
 
-    request = replace(_request(name, options.load(config_file, robot, sets), given), seed=seed)
+    request = replace(_request(name, settings.load(), given), seed=seed)
     directory = output if output is not None else RUNS / f"study-{name}"
     check_study_target(directory)
     from icrtool.output.tables.study import format_study
     from icrtool.simulation.studies import run_study
 
-    with progress_bar(f"study {name}", quiet=quiet) as progress:
+    with printer.progress(f"study {name}") as progress:
         result = run_study(request, progress)
     write_study(result, directory, plots=plots)
-    if not quiet:
-        show(format_study(result))
-        click.echo(f"\nwritten to {directory}")
-    if verbose:
-        click.echo(f"settings: {request.settings()}", err=True)
+    printer.text(format_study(result))
+    printer.text(f"\nwritten to {directory}")
+    printer.detail(f"settings: {request.settings()}")
 
 
 def _request(name: StudyName, config: Config, given: dict[str, Any]) -> StudyRequest:

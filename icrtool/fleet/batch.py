@@ -14,11 +14,11 @@ import msgspec
 from msgspec.structs import replace
 
 from icrtool import __version__
-from icrtool.config import Config, builtin_robots, load_config
+from icrtool.config import Config, ConfigSources, builtin_robots
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
 from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
-from icrtool.fleet.one_log import KnownLog, ReportOptions, Request, failed, files_of, path_of
+from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import FoundRecording, as_text, find_recordings, logs_among
 from icrtool.logs.containers.remote_file import RemoteFile
@@ -40,16 +40,14 @@ class BatchOptions:
 
     Attributes
     ----------
-    config_file, robot, sets : as in `icrtool.load_config`; a manifest's line comes before the first two
+    settings : a manifest's line comes before its file and robot
     redo : process logs again that are done
     timeout_s : a log that takes longer is ended
     overwrite : the run of another recording may be replaced
     baseline : earlier report, run or batch to compare with
     """
 
-    config_file: Path | None = None
-    robot: str | None = None
-    sets: tuple[str, ...] = ()
+    settings: ConfigSources = field(default_factory=ConfigSources)
     report: ReportOptions = field(default_factory=ReportOptions)
     redo: bool = False
     timeout_s: float = 1800.0
@@ -206,13 +204,13 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
                 "budgets": report.budgets_m, "ladder": report.ladder, "robot": known.robot,
                 "baseline": baseline, "strict": report.strict, "allow_unusable": report.allow_unusable}  # fmt: skip
     key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
-    about_log = KnownLog(
-        log=one.log, run=f"{RUNS}/{one.name}", robot=known.robot or config.robot.name or "", group=known.group,
+    row = FleetLog(
+        one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot or config.robot.name or "", group=known.group,
         tags=known.tags, key=key,
     )  # fmt: skip
     # Workers of a cluster may have another working directory.
     return Request(
-        path=os.fsencode(one.path.absolute()), known=about_log, folder=os.fsencode(output.absolute()),
+        path=os.fsencode(one.path.absolute()), known=row, folder=os.fsencode(output.absolute()),
         config=config, report=report, overwrite=options.overwrite,
         baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
     )  # fmt: skip
@@ -221,11 +219,11 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
 def _config(one: FoundRecording, known: About, options: BatchOptions) -> Config:
     """Return a log's configuration; a robot that is not built in is a name, which needs a configuration of its own."""
     builtin = known.robot in builtin_robots()
-    if known.robot and not builtin and known.config is None and options.config_file is None:
+    if known.robot and not builtin and known.config is None and options.settings.path is None:
         advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
         raise ConfigError(f"{one.log}: robot {known.robot!r}", "not a built-in robot", advice)
-    robot = known.robot if builtin else options.robot if not known.robot else None
-    return load_config(known.config or options.config_file, robot, options.sets)
+    robot = known.robot if builtin else options.settings.robot if not known.robot else None
+    return options.settings._replace(path=known.config or options.settings.path, robot=robot).load()
 
 
 def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:

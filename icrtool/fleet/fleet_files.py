@@ -118,13 +118,19 @@ def fleet_columns(rows: Sequence[FleetLog]) -> dict[str, list[object]]:
 
 
 def write_fleet(
-    rows: Sequence[FleetLog], directory: Path, calibrations: Sequence[FleetCalibration] = (), plots: Sequence[str] = ()
-) -> None:
-    """Write the tables and figures of a batch; those of an earlier one are replaced.
+    rows: Sequence[FleetLog],
+    directory: Path,
+    calibrations: Sequence[FleetCalibration] = (),
+    plots: Sequence[str] = (),
+    *,
+    page: bool = False,
+) -> FleetDocument:
+    """Write the tables, figures and page of a batch, and return its document; those of an earlier one are replaced.
 
     Parameters
     ----------
     plots : formats of the figures
+    page : write report.html
 
     Raises
     ------
@@ -141,8 +147,14 @@ def write_fleet(
         write_file(directory / "calibrations.txt", calibrations_text(calibrations), directory)
     if plots:
         write_figures(rows, directory, tuple(plots))
-    # Last: where it is, the others are of the same batch.
-    write_file(directory / FLEET_FILE, json_bytes(fleet_document(rows, calibrations)), directory)
+    document = fleet_document(rows, calibrations)
+    # After the tables: where it is, these are of the same batch.
+    write_file(directory / FLEET_FILE, json_bytes(document), directory)
+    if page:
+        from icrtool.output.page.group_pages import fleet_page
+
+        write_file(directory / PAGE_FILE, fleet_page(document, directory), directory, is_page)
+    return document
 
 
 def calibrations_text(calibrations: Sequence[FleetCalibration], *, tables: bool = True) -> str:

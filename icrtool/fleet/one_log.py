@@ -1,23 +1,24 @@
 """The work on one log: from its file to a run directory and a dropout report, and to its row in a batch.
 
-`fit_and_write` and `report_and_write` serve `fit`, `dropout-report` and `batch`; `process` is the work of a batch.
+`fitted` and `report_and_write` serve `fit`, `dropout-report` and `batch`; `process` is the work of a batch.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import os
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
-from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import msgspec
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from icrtool import __version__
 from icrtool.config import Config
@@ -27,7 +28,7 @@ from icrtool.logs.containers.channel import truncation
 from icrtool.logs.containers.split_files import file_sha256, files_of_log, log_name
 from icrtool.records.dropout import DEFAULT_SEED
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
-from icrtool.records.plain_data import Record, plain
+from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, FigureSet
 from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
@@ -86,58 +87,102 @@ class TrialOptions:
     with_jumps: bool = False
     seed: int = DEFAULT_SEED
 
+    def configured(self, config: Config, calibrations: Iterable[Calibration]) -> TrialOptions:
+        """Return it with calibrations, and the configuration's horizons and outages if set and no others asked for."""
+        dropout, given = config.dropout, config.given
+        horizons_m = dropout.horizons_m if "dropout.horizons_m" in given else None
+        outage_s = dropout.forced_outage_s if "dropout.forced_outage_s" in given else None
+        return dataclasses.replace(
+            self,
+            horizons_m=self.horizons_m or horizons_m,
+            outage_s=self.outage_s or outage_s,
+            calibrations=tuple(calibrations),
+        )
 
-def fit_and_write(
+
+@dataclass(frozen=True, slots=True)
+class FitOptions:
+    """What is asked of a fit and its run directory.
+
+    Attributes
+    ----------
+    overwrite : the run of another recording may be replaced
+    plots, figures, states : as in `icrtool.output.run_directory.new_run`
+    span : from when to when the log is read, as in `icrtool.read_log`
+    warm_start : run or calibration file to start from
+    changes_s, smooth : as in `icrtool.fit`
+    """
+
+    overwrite: bool = False
+    plots: tuple[str, ...] = ("png",)
+    figures: FigureSet = "default"
+    states: Literal["csv", "parquet"] | None = None
+    span: tuple[str | None, str | None] = (None, None)
+    warm_start: Path | None = None
+    changes_s: tuple[float, ...] = ()
+    smooth: bool = False
+
+
+@contextmanager
+def fitted(
     log: Path,
     directory: Path,
     config: Config,
+    asked: FitOptions,
     begin: Stage,
     *,
-    overwrite: bool = False,
-    plots: tuple[str, ...] = ("png",),
-    figures: FigureSet = "default",
-    states: Literal["csv", "parquet"] | None = None,
-    span: tuple[str | None, str | None] = (None, None),
-    warm_start: WarmStart | None = None,
-    changes_s: tuple[float, ...] = (),
-    smooth: bool = False,
     share: Callable[[float], None] | None = None,
     note: Callable[[str], None] | None = None,
     inside: Path | None = None,
-    then: Callable[[Run, Path], None] | None = None,
-) -> Run:
-    """Fit a log and write its run directory.
+) -> Iterator[tuple[Run, Path]]:
+    """Fit a log, write its run, and give the run and its new directory, which is put in place at the end of the block.
 
     Parameters
     ----------
     directory : may be at an address, as `icrtool.output.files.remote_place.on_disk` takes it
-    overwrite : the run of another recording may be replaced
-    plots, figures, states, note, inside : as in `icrtool.output.run_directory.write_run`
-    span : from when to when the log is read, as in `icrtool.read_log`
-    warm_start, changes_s, smooth : as in `icrtool.fit`
     share : called with the share of the log that was read
-    then : called with the run and its new directory before that is put in place: writes what belongs to the result
+    note, inside : as in `icrtool.output.run_directory.new_run`
     """
     from icrtool.output.files.remote_place import on_disk
-    from icrtool.output.run_directory import check_target, replaced_log, write_run
+    from icrtool.output.run_directory import check_target, new_run, replaced_log
 
+    start = _warm_start(asked.warm_start, config, note)
     with on_disk(directory, begin=begin) as place:
         inside = inside if place is directory else None
-        check_target(place, log, overwrite=overwrite, inside=inside)
+        check_target(place, log, overwrite=asked.overwrite, inside=inside)
         begin("reading")
         from icrtool.logs.read_log import read_log
 
-        logs = [read_log(log, config, share, start=span[0], end=span[1])]
+        logs = [read_log(log, config, share, start=asked.span[0], end=asked.span[1])]
         from icrtool.calibration.fit import fit
 
         # The callee alone holds the log, and frees its columns where they are needed no longer.
-        run = fit(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=begin)
+        run = fit(logs.pop(), config, warm_start=start, changes_s=asked.changes_s, smooth=asked.smooth, watch=begin)
         if note is not None and (before := replaced_log(place, run)) is not None:
             note(f"{directory}: replaced the run of another recording ({before})")
-        begin("writing, pictures" if plots else "writing")
-        more = partial(then, run) if then is not None else None
-        write_run(run, place, states=states, plots=plots, figures=figures, note=note, inside=inside, then=more)
-    return run
+        begin("writing, pictures" if asked.plots else "writing")
+        with new_run(
+            run, place, states=asked.states, plots=asked.plots, figures=asked.figures, note=note, inside=inside
+        ) as partial:
+            yield run, partial
+
+
+def _warm_start(source: Path | None, config: Config, note: Callable[[str], None] | None) -> WarmStart | None:
+    """Return the ICRs that a run ended with, or those of a calibration file; note where its track width is another."""
+    if source is None:
+        return None
+    if source.is_file():
+        from icrtool.output.files.documents import open_calibration
+
+        start = open_calibration(source).warm_start()
+    else:
+        from icrtool.output.run_directory import open_run
+
+        start = open_run(source).ended_with
+    theirs, ours = start.track_width_m, config.robot.track_width_m
+    if note is not None and theirs is not None and ours is not None and not math.isclose(theirs, ours, rel_tol=0.01):
+        note(f"{source}: made with a track width of {theirs:g} m, not {ours:g} m: are its ICRs this robot's?")
+    return start
 
 
 def report_and_write(
@@ -186,17 +231,6 @@ def report_and_write(
     return report
 
 
-class KnownLog(Record, frozen=True, kw_only=True):
-    """What a batch knows of a log before it is processed, as the keys of `FleetLog`."""
-
-    log: str
-    run: str
-    robot: str = ""
-    group: str = ""
-    tags: tuple[str, ...] = ()
-    key: str = ""
-
-
 @dataclass(frozen=True, slots=True)
 class Request:
     """All that processing a log needs; travels to the process that does it as JSON. Paths are bytes: of any name.
@@ -204,12 +238,13 @@ class Request:
     Attributes
     ----------
     path : of the log
+    known : its row as far as it is known before
     folder : of the batch
     baseline : place of an earlier report or batch to compare with; empty: none
     """
 
     path: bytes
-    known: KnownLog
+    known: FleetLog
     folder: bytes
     config: Config
     report: ReportOptions
@@ -276,9 +311,9 @@ def failed(request: Request, reason: str, *, details: str = "", repeatable: bool
     inputs: tuple[FleetFile, ...] = ()
     with suppress(OSError):  # a log that was removed meanwhile, or is a device
         inputs = files_of(path_of(request.path)) if repeatable else ()
-    return FleetLog(
-        **asdict(request.known), status="failed", reason=reason, usable=False, details=details, repeatable=repeatable,
-        inputs=inputs, tool_version=__version__,
+    return replace(
+        request.known, reason=reason, usable=False, details=details, repeatable=repeatable, inputs=inputs,
+        tool_version=__version__,
     )  # fmt: skip
 
 
@@ -305,17 +340,14 @@ def _results(request: Request, stage: Stage) -> FleetLog:
     from icrtool.output.files.baseline_file import open_baseline
 
     folder, place = path_of(request.folder), path_of(request.baseline) if request.baseline else None
-    reports: list[DropoutReport] = []
-
-    def report(run: Run, partial: Path) -> None:
+    asked = FitOptions(request.overwrite, request.report.plots, request.report.figures)
+    with fitted(path_of(request.path), folder / request.known.run, request.config, asked, stage, inside=folder) as (
+        run,
+        partial,
+    ):
         baseline = open_baseline(place).find(request.known.log, run.document.content) if place is not None else None
-        reports.append(report_and_write(run, partial, request.report, stage, baseline=baseline))
-
-    run = fit_and_write(
-        path_of(request.path), folder / request.known.run, request.config, stage, overwrite=request.overwrite,
-        plots=request.report.plots, figures=request.report.figures, inside=folder, then=report,
-    )  # fmt: skip
-    return _row(request, run.document, int(run.table.stamp_ns[0]), reports[0])
+        report = report_and_write(run, partial, request.report, stage, baseline=baseline)
+    return _row(request, run.document, int(run.table.stamp_ns[0]), report)
 
 
 def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> FleetLog:
@@ -325,8 +357,8 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         controller = report.calibration.controller
     unusable = f"not usable: {summary.unusable_because}" if not summary.usable else ""
     cut = truncation(summary.warnings)
-    return FleetLog(
-        **asdict(request.known),
+    return replace(
+        request.known,
         status="done",
         reason="; ".join(filter(None, [unusable, f"truncated: {cut}" if cut else ""])),
         usable=summary.usable,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,14 @@ def _is_made_from(directory: Path, log: Path) -> bool:
     )
 
 
-def write_run(
+def write_run(run: Run, directory: Path, **options: Any) -> None:
+    """Write a run directory, whole or not at all; parameters and errors as of `new_run`."""
+    with new_run(run, directory, **options):
+        pass
+
+
+@contextmanager
+def new_run(
     run: Run,
     directory: Path,
     *,
@@ -103,9 +111,10 @@ def write_run(
     figures: FigureSet = "default",
     note: Callable[[str], None] | None = None,
     inside: Path | None = None,
-    then: Callable[[Path], None] | None = None,
-) -> None:
-    """Write a run directory, whole or not at all.
+) -> Iterator[Path]:
+    """Write a run, and give its new directory before that is put in its place at the end of the block.
+
+    What the block writes there belongs to the run, and where it fails the old run stays.
 
     Parameters
     ----------
@@ -116,8 +125,6 @@ def write_run(
     figures : ``all``: those of the paper too
     note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
     inside : as in `check_directory`
-    then : called with the new directory before it is put in place: what it writes there belongs to the run, and where
-        it fails the old run stays
 
     Raises
     ------
@@ -159,8 +166,7 @@ def write_run(
         sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE, *pictures)}
         sums[states_name] = states_sum.result()
         write_sums(partial, sums)
-        if then is not None:
-            then(partial)
+        yield partial
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:

@@ -57,26 +57,14 @@ def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-rep
     write_file(path, ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
-def write_markdown(path: Path, outcomes: Sequence[tuple[str, Outcome]]) -> None:
-    """Write a summary for a pull request.
-
-    Parameters
-    ----------
-    path : as in `write_junit`
-    outcomes : name and outcome of each run
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
-    parts = []
-    for name, outcome in outcomes:
-        if isinstance(outcome, IcrToolError):
-            parts.append(f"## {escaped_markdown(name)}\n\nCould not be used: {escaped_markdown(str(outcome))}\n")
-        else:
-            parts.append(format_markdown(outcome))
-    write_file(path, "\n".join(parts))
+def format_outcomes(outcomes: Iterable[tuple[str, Outcome]]) -> str:
+    """Return a summary for a pull request, of the name and outcome of each run."""
+    return "\n".join(
+        f"## {escaped_markdown(name)}\n\nCould not be used: {escaped_markdown(str(outcome))}\n"
+        if isinstance(outcome, IcrToolError)
+        else format_markdown(outcome)
+        for name, outcome in outcomes
+    )
 
 
 def format_markdown(report: DropoutReport) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from icrtool.config import ConfigSources
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet import processes
 from icrtool.fleet.batch import BatchOptions, finished, plan, run_batch
@@ -26,10 +27,9 @@ from icrtool.records.fleet_document import FleetLog
 SCRIPT = """
 import os, signal, sys, time
 from pathlib import Path
-from msgspec.structs import asdict
+from msgspec.structs import replace
 from icrtool.errors import DataError
 from icrtool.fleet import one_log, processes
-from icrtool.records.fleet_document import FleetLog
 
 def results(request, stage):
     stage("reading")
@@ -55,7 +55,7 @@ def results(request, stage):
     (directory / "B2SUMS").touch()
     if request.report.page:
         (directory / "report.html").touch()
-    return FleetLog(**asdict(request.known), status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
+    return replace(request.known, status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
                    inputs=one_log.files_of(path))
 
 one_log._results = results
@@ -77,9 +77,11 @@ def add(season: Path, *names: str) -> None:
         (season / f"{name}.mcap").write_bytes(b"\x89MCAP0\r\n" + name.encode())
 
 
-def run(season: Path, jobs: int = 2, **options: object) -> dict[str, FleetLog]:
+def run(
+    season: Path, jobs: int = 2, robot: str | None = None, sets: tuple[str, ...] = (), **options: object
+) -> dict[str, FleetLog]:
     report = ReportOptions(page=bool(options.pop("page", True)))
-    asked = BatchOptions(report=report, timeout_s=20.0, **options)  # type: ignore[arg-type]
+    asked = BatchOptions(ConfigSources(None, robot, sets), report, timeout_s=20.0, **options)  # type: ignore[arg-type]
     requests = plan([season], season.parent / "out", asked)
     with ThreadPoolExecutor(jobs) as executor:
         rows = list(run_batch(requests, executor, asked))
@@ -198,7 +200,7 @@ def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
 def test_a_request_survives_its_journey_whatever_its_path(season: Path) -> None:
     name = os.fsdecode(b"\xff\n.mcap")
     (season / name).write_bytes(b"\x89MCAP0\r\n")
-    request = plan([season], season.parent / "out", BatchOptions(sets=("robot.track_width_m=0.5",)))[0]
+    request = plan([season], season.parent / "out", BatchOptions(ConfigSources(sets=("robot.track_width_m=0.5",))))[0]
     from icrtool.fleet.one_log import decode_request
 
     again = decode_request(request.encode())
