@@ -9,7 +9,7 @@ from matplotlib.patches import Circle
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import within_budget
-from icrtool.output.figures.style import CHANGE, FILTER, HALF_WIDTH, ICR, MEAN, add_legend, drawable, new_figure, styled
+from icrtool.output.figures import style
 from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout import CHOICE_HORIZON_M
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 CIRCLES = 20
 
 
-@styled
+@style.styled
 def forecast_figure(
     forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, gyro: Forecast | None = None
 ) -> Figure:
@@ -34,28 +34,28 @@ def forecast_figure(
         answer = f"Within {budgets_m[0]:g} m (95 %) for {reached[0]:.1f} m, {answer}"
     by = "wheels alone" if gyro is None else "wheels alone, and with gyro"
     subtitle = f"{title}: forecast error without GNSS from the start: {by}, by the calibration"
-    figure = new_figure(
+    figure = style.new_figure(
         answer, subtitle, width_in=9.0, height_in=4.2, margins_in=(0.7, 0.25, 0.75, 0.95), wspace=0.28
     )  # fmt: skip
     grown, path = figure.subplots(1, 2)
     for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
         if one is not None:
-            grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **ICR.keywords() | dash)
-            grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **FILTER.keywords() | dash)
+            grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **style.ICR.keywords() | dash)
+            grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **style.FILTER.keywords() | dash)
     for budget in budgets_m:
-        grown.axhline(budget, label=f"budget {budget:g} m", **CHANGE.keywords())
+        grown.axhline(budget, label=f"budget {budget:g} m", **style.CHANGE.keywords())
     if forecast.distance_m[-1] > measured_m:
-        grown.axvline(measured_m, label="measured up to here", **MEAN.keywords())
+        grown.axvline(measured_m, label="measured up to here", **style.MEAN.keywords())
     grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, None), ylim=(0.0, None))
-    path.plot(forecast.east_m, forecast.north_m, label="path", **HALF_WIDTH.keywords() | {"linestyle": "-"})
+    path.plot(forecast.east_m, forecast.north_m, label="path", **style.HALF_WIDTH.keywords() | {"linestyle": "-"})
     # Where the forecast is extrapolated its circles would bury the path.
     measured = np.flatnonzero(forecast.distance_m <= measured_m)
     rows = measured[:: max(len(measured) // CIRCLES, 1)]
     for east, north, radius in zip(forecast.east_m[rows], forecast.north_m[rows], forecast.p95_m[rows], strict=True):
         path.add_patch(
-            Circle((float(east), float(north)), float(radius), fill=False, edgecolor=ICR.color, linewidth=0.8)
+            Circle((float(east), float(north)), float(radius), fill=False, edgecolor=style.ICR.color, linewidth=0.8)
         )
-    path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=ICR.color, linewidth=0.8)
+    path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=style.ICR.color, linewidth=0.8)
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
     path.set(xlabel="East [m]", ylabel="North [m]")
@@ -74,15 +74,20 @@ BEFORE: dict[str, Any] = {
     "linestyle": "none",
     "markeredgewidth": 0.0,
 }
-AFTER: dict[str, Any] = BEFORE | {"label": "after: calibrated", "marker": "o", "color": ICR.color, "markersize": 2.8}
+AFTER: dict[str, Any] = BEFORE | {
+    "label": "after: calibrated",
+    "marker": "o",
+    "color": style.ICR.color,
+    "markersize": 2.8,
+}
 
 
-@styled
+@style.styled
 def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     """Return residuals of displacements and of heading changes over windows, before and after."""
     first, last = (float(np.median(np.hypot(*part))) for part in (residuals.before, residuals.after))
     windows = f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals"
-    figure = new_figure(
+    figure = style.new_figure(
         f"Windows of the drive are off by {last:.3f} m calibrated, {first:.3f} m before", f"{name}: {windows}",
         height_in=4.2, margins_in=(0.75, 0.2, 0.7, 1.0), wspace=0.32,
     )  # fmt: skip
@@ -99,7 +104,7 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     turn.set_ylim(-_reach(turned), _reach(turned))
     _label(place, residuals.before, residuals.after, 1.0, "m")
     _label(turn, residuals.turn_before[None], residuals.turn_after[None], float(np.degrees(1.0)), "°")
-    add_legend(figure, markerscale=2.0)
+    style.add_legend(figure, markerscale=2.0)
     return figure
 
 
@@ -118,12 +123,12 @@ def _label(axes: Axes, before: Floats, after: Floats, factor: float, unit: str) 
 LONGEST_NAME = 14
 
 
-@styled
+@style.styled
 def transfer(found: GroupComparison) -> Figure:
     """Return the figure: p95 after 10 m, calibrated on row and tested on column; costs with 95 % intervals."""
     names, rows = list(found.groups), [one for one in found.costs if one.p95_m is not None]
     subtitle = f"{' · '.join(names)}: on the diagonal each trial is predicted by a fit that does not contain it"
-    figure = new_figure(
+    figure = style.new_figure(
         _answer(found), subtitle, width_in=9.6, height_in=2.95 + 0.45 * len(names) + 0.12 * len(rows),
         margins_in=(1.3, 0.2, 1.35, 0.75), wspace=1.15,
     )  # fmt: skip
@@ -131,12 +136,12 @@ def transfer(found: GroupComparison) -> Figure:
     _draw_matrix(matrix, found, names)
     labels = []
     for y, one in enumerate(rows):
-        calibrated, tested = (drawable(name, LONGEST_NAME) for name in (one.calibrated_on, one.tested_on))
+        calibrated, tested = (style.drawable(name, LONGEST_NAME) for name in (one.calibrated_on, one.tested_on))
         labels.append(f"{calibrated} on {tested}, {one.horizon_m:g} m")
         if one.p95_low_m is not None and one.p95_high_m is not None:
-            costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **ICR.keywords() | {"linestyle": "-"})
-        costs.plot([one.p95_m], [y], "o", color=ICR.color, markersize=4)
-    costs.axvline(0.0, **HALF_WIDTH.keywords())
+            costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **style.ICR.keywords() | {"linestyle": "-"})
+        costs.plot([one.p95_m], [y], "o", color=style.ICR.color, markersize=4)
+    costs.axvline(0.0, **style.HALF_WIDTH.keywords())
     costs.set_yticks(range(len(rows)), labels, fontsize=7.5, parse_math=False)
     costs.invert_yaxis()
     costs.set_xlabel("95 % error more than with its own calibration [m]")
@@ -164,7 +169,7 @@ def _draw_matrix(axes: Axes, found: GroupComparison, names: list[str]) -> None:
     for row, column in np.ndindex(values.shape):
         text = f"{values[row, column]:.2f} m" if np.isfinite(values[row, column]) else "–"
         axes.text(column, row, text, ha="center", va="center", fontsize=8.5)
-    short = [drawable(name, LONGEST_NAME) for name in names]
+    short = [style.drawable(name, LONGEST_NAME) for name in names]
     axes.xaxis.tick_top()
     axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="left")
     axes.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)

@@ -9,18 +9,7 @@ import numpy as np
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.style import (
-    BUDGET,
-    LABEL_BOX,
-    MEAN,
-    Pen,
-    add_legend,
-    fill_bins,
-    logarithmic_errors,
-    model_pens,
-    new_figure,
-    styled,
-)
+from icrtool.output.figures import style
 from icrtool.output.text_format import MODEL_WORDS, error_text, run_title
 from icrtool.records.dropout import BudgetDistance, ModelResult
 
@@ -31,7 +20,7 @@ if TYPE_CHECKING:
 OF_THE_FILTER = ("icr", "no_slip")
 PANEL_HEIGHT_IN, LOW_PANEL_IN = 2.0, 1.45
 
-P95 = Pen("black", width=1.2)
+P95 = style.Pen("black", width=1.2)
 """The 95 % mark is a solid line, the expected value a dashed one (`MEAN`), in every picture."""
 
 THIN = 0.9
@@ -55,7 +44,7 @@ KEY_COLUMNS, KEY_IN = 3, 0.19
 MOSTLY_BEYOND_PCT = 90.0
 
 
-@styled
+@style.styled
 def dropout_summary(report: DropoutReport) -> Figure:
     """Return 95 % and expected error [m] over distance without GNSS [m]: how far each model stays within the budget.
 
@@ -73,7 +62,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
     # Beside the models: the mean of the first, budget, outages.
     most = int(report.counts.trials.max())
     keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
-    figure = new_figure(
+    figure = style.new_figure(
         title, f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals",
         height_in=4.6 + keys_in, margins_in=(0.75, 0.25, 0.65, 0.95 + keys_in),
     )  # fmt: skip
@@ -91,12 +80,14 @@ def dropout_summary(report: DropoutReport) -> Figure:
     low, high = _shown_errors(models, [*budgets_m, *(one.end_error_m for one in outages)])
     axes.set(xlim=(0, report.horizons_m[-1] * 1.02), ylim=(low, high), xlabel="Distance without GNSS [m]")
     axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
-    logarithmic_errors(axes, "y")
+    style.logarithmic_errors(axes, "y")
     for budget in budgets_m:
-        axes.axhline(budget, label=f"budget {' and '.join(f'{one:g}' for one in budgets_m)} m", **BUDGET.keywords())
+        axes.axhline(
+            budget, label=f"budget {' and '.join(f'{one:g}' for one in budgets_m)} m", **style.BUDGET.keywords()
+        )
         marked = [one for one in reached if one.budget_m == budget and one.model != "no_slip" and not one.beyond]
         _mark_reaches(axes, marked, pens, low)
-    add_legend(figure, ncols=KEY_COLUMNS)
+    style.add_legend(figure, ncols=KEY_COLUMNS)
     return figure
 
 
@@ -109,7 +100,7 @@ def _largest(report: DropoutReport, model: ModelResult) -> str:
     return error if report.usable else f"Do not use: {error}"
 
 
-@styled
+@style.styled
 def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
     """Return the percent of the trials by error [m] of the recommended model, a panel a horizon, and the budget."""
     asked = [_place(report, metres) for metres in horizons_m]
@@ -120,7 +111,7 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
     budgets_m = dict.fromkeys(one.budget_m for one in report.budgets)
     errors = ", ".join(error_text(float(model.summary.p95[h])).removesuffix(" m") for h in places)
     distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
-    figure = new_figure(
+    figure = style.new_figure(
         f"95 % of the trials end within {errors} m after {distances} m",
         f"{run_title(report.run_document)}: open-loop error, {MODEL_WORDS.get(model.name, model.label)}",
         height_in=1.55 + LOW_PANEL_IN * len(places), margins_in=(0.75, 0.25, 0.85, 0.9), hspace=0.38,
@@ -132,13 +123,13 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
         heading = f"after {report.horizons_m[h]:g} m, {int(model.summary.trials[h]):,} trials"
         _draw_bins(axes, model, h, _pens(report)[model.name].color, end, heading)
         for budget in budgets_m:
-            axes.axvline(budget, label=f"budget {budget:g} m", **BUDGET.keywords())
+            axes.axvline(budget, label=f"budget {budget:g} m", **style.BUDGET.keywords())
     panels[-1].set_xlabel("Error [m]")
-    add_legend(figure, columnspacing=3.0)
+    style.add_legend(figure, columnspacing=3.0)
     return figure
 
 
-@styled
+@style.styled
 def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     """Return the percent of the trials by error [m] at one of the report's horizons [m], a panel a model.
 
@@ -153,7 +144,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     # A model of constant parameters may have no trial of a length that others have.
     results = [result for result in found if len(result.histograms[h].left)]
     p95 = [float(result.summary.p95[h]) for result in results]
-    figure = new_figure(
+    figure = style.new_figure(
         f"After {horizon_m:g} m 95 % of the trials end within {min(p95):.2f} to {max(p95):.2f} m, by model",
         f"{run_title(report.run_document)}: open-loop error of {int(report.counts.trials[h]):,} trials",
         height_in=1.5 + PANEL_HEIGHT_IN * len(results), margins_in=(0.75, 0.2, 0.85, 0.9), hspace=0.45,
@@ -163,7 +154,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     for axes, result in zip(panels, results, strict=True):
         _draw_bins(axes, result, h, _pens(report)[result.name].color, end, MODEL_WORDS.get(result.name, result.label))
     panels[-1].set_xlabel("Error [m]")
-    add_legend(figure, columnspacing=3.0)
+    style.add_legend(figure, columnspacing=3.0)
     return figure
 
 
@@ -173,11 +164,11 @@ def _held_out(report: DropoutReport) -> list[ModelResult]:
     return found or [one for one in report.results if one.name == "icr"] or list(report.results[:1])
 
 
-def _pens(report: DropoutReport) -> dict[str, Pen]:
+def _pens(report: DropoutReport) -> dict[str, style.Pen]:
     """Return how the models are drawn that pictures show; final ICRs and rows with a gyro are in the tables alone."""
     own = ("icr_final", "icr_gyro", "icr_final_gyro", "no_slip_gyro", "recommended_gyro", "controller_gyro")
     left_out = {*own, *(one.name for one in report.calibrations if one.with_gyro)}
-    return model_pens([one.name for one in report.results if one.name not in left_out])
+    return style.model_pens([one.name for one in report.results if one.name not in left_out])
 
 
 def _place(report: DropoutReport, horizon_m: float) -> int:
@@ -187,7 +178,7 @@ def _place(report: DropoutReport, horizon_m: float) -> int:
 
 
 def _draw_model(
-    axes: Axes, result: ModelResult, horizons_m: Floats, first_m: float, pen: Pen, *, first: bool
+    axes: Axes, result: ModelResult, horizons_m: Floats, first_m: float, pen: style.Pen, *, first: bool
 ) -> None:  # fmt: skip
     """Draw the 95 % error of a model with its interval; of the `first` one also the expected error.
 
@@ -223,7 +214,7 @@ def _shown_errors(models: list[ModelResult], others_m: list[float]) -> tuple[flo
 
 
 def _mark_reaches(
-    axes: Axes, reached: list[BudgetDistance], pens: Mapping[str, Pen], lowest_m: float
+    axes: Axes, reached: list[BudgetDistance], pens: Mapping[str, style.Pen], lowest_m: float
 ) -> None:  # fmt: skip
     """Mark where models use up a budget: the nearest is named to the left of its curve, others below to the right."""
     below_pt = LABEL_PT
@@ -238,7 +229,7 @@ def _mark_reaches(
         axes.annotate(
             f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), xytext=(-5, 5) if left else (5, -below_pt),
             textcoords="offset points", ha="right" if left else "left", va="bottom" if left else "top",
-            color=pen.color, fontweight="bold", zorder=6, bbox=LABEL_BOX,
+            color=pen.color, fontweight="bold", zorder=6, bbox=style.LABEL_BOX,
         )  # fmt: skip
         below_pt += 0.0 if left else LABEL_LINE_PT
 
@@ -255,16 +246,16 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     p95, expected, largest = float(summary.p95[h]), float(summary.expected[h]), float(summary.largest[h])
     width = float(bins.right[0] - bins.left[0])
     edges = np.append(bins.left, bins.right[-1])
-    fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
+    style.fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
     axes.axvline(p95, label="95 % of the trials", **P95.keywords())
-    axes.axvline(expected, label="expected value", **MEAN.keywords())
+    axes.axvline(expected, label="expected value", **style.MEAN.keywords())
     axes.set_title(heading, loc="left", pad=4.0, fontweight="bold")
     facts = f"expected {error_text(expected)},  95 % within {error_text(p95)},  max {error_text(largest)}"
     axes.set_title(facts, loc="right", pad=4.0)
     axes.set_xlim(0, end_m)
     axes.locator_params(axis="y", nbins=4)
     beyond = float(bins.percent[bins.left >= end_m].sum())
-    where: dict[str, Any] = {"transform": axes.transAxes, "bbox": LABEL_BOX}
+    where: dict[str, Any] = {"transform": axes.transAxes, "bbox": style.LABEL_BOX}
     if beyond >= MOSTLY_BEYOND_PCT:
         # Hardly a bar to see: words in their place.
         text = f"{beyond:.0f} % of the trials lie beyond this scale →"

@@ -13,20 +13,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
-from icrtool.output.figures.style import (
-    FILTER,
-    FIX_COLOR,
-    FORCED,
-    LABEL_BOX,
-    REAL,
-    WIDTH_IN,
-    Pen,
-    add_legend,
-    model_pens,
-    new_figure,
-    spot,
-    styled,
-)
+from icrtool.output.figures import style
 from icrtool.output.figures.trajectory import (
     CELLS,
     JUMP_LOOK,
@@ -48,8 +35,8 @@ CELL_TITLE: dict[str, Any] = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
 
 PICTURED = ("no_slip",)
 """Drawn beside the model that trials were chosen by."""
-OUTAGES = {"forced": FORCED, "real": REAL}
-PATH = Pen(FIX_COLOR, width=1.4)
+OUTAGES = {"forced": style.FORCED, "real": style.REAL}
+PATH = style.Pen(style.FIX_COLOR, width=1.4)
 
 MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 5.3
 """Half the size of a mark, height of a line of text, usual width of a character, in points."""
@@ -70,7 +57,7 @@ LOST_LOOK: dict[str, Any] = {"color": "0.82", "linewidth": 6.0, "solid_capstyle"
 SLOWEST_MPS = 0.001
 
 
-@styled
+@style.styled
 def dropout_examples(report: DropoutReport) -> Figure:
     """Return a trial of about half a turn and the straightest one side by side [m]: reference, ICR, no slip.
 
@@ -82,7 +69,7 @@ def dropout_examples(report: DropoutReport) -> Figure:
     examples = _needed(report, report.examples, "example trials")
     errors = " and ".join(error_text(one.errors_m[one.model]) for one in examples)
     what = "about half a turn (left), as straight as the drive has it (right)"
-    figure = new_figure(
+    figure = style.new_figure(
         f"Typical trials of {examples[0].horizon_m:g} m end {errors} off", f"{run_title(report.run_document)}: {what}",
         height_in=4.7, margins_in=(0.75, 0.2, 1.0, 0.9), wspace=0.34,
     )  # fmt: skip
@@ -95,11 +82,11 @@ def dropout_examples(report: DropoutReport) -> Figure:
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
-    add_legend(figure)
+    style.add_legend(figure)
     return figure
 
 
-@styled
+@style.styled
 def dropout_worst(report: DropoutReport) -> Figure:
     """Return the worst trials [m], each in a cell with its own scale; the first cell shows where they start.
 
@@ -111,7 +98,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
     worst = _needed(report, report.worst, "worst trials")[: WORST_COLUMNS * WORST_ROWS - 1]
     rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), worst[0].model
     which = f"{_word(report, model)}, the {len(worst)} worst trials, none overlapping"
-    figure = new_figure(
+    figure = style.new_figure(
         f"The worst trial of {worst[0].horizon_m:g} m ends {error_text(worst[0].errors_m[model])} off",
         f"{run_title(report.run_document)}: {which}",
         width_in=WORST_WIDTH_IN, height_in=1.0 + rows * (WORST_CELL_IN + 0.5), margins_in=(0.15, 0.15, 0.98, 0.5),
@@ -130,7 +117,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
         axes.set_title(f"{rank}:  {error_text(drive.errors_m[model])}\n{facts}", **CELL_TITLE)
     for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
-    add_legend(figure)
+    style.add_legend(figure)
     return figure
 
 
@@ -157,7 +144,7 @@ def _draw_overview(axes: Axes, worst: Sequence[ExampleTrial], north_m: Floats, e
     for north, east, ranks in together:
         axes.text(
             east, north, " ".join(map(str, ranks)), fontsize=8.0, fontweight="bold", ha="center", va="center",
-            zorder=3, bbox=LABEL_BOX,
+            zorder=3, bbox=style.LABEL_BOX,
         )  # fmt: skip
     _draw_scale(axes)
     axes.set_title("where they start\non the whole path", **CELL_TITLE)
@@ -183,11 +170,11 @@ def _draw_scale(axes: Axes) -> None:
     axes.plot([x, x + length], [y, y], color="black", linewidth=1.6, zorder=7, solid_capstyle="butt")
     axes.annotate(
         f"{length:g} m", (x + length / 2, y), xytext=(0, 2), textcoords="offset points", ha="center", va="bottom",
-        fontsize=7.5, zorder=7, bbox=LABEL_BOX,
+        fontsize=7.5, zorder=7, bbox=style.LABEL_BOX,
     )  # fmt: skip
 
 
-@styled
+@style.styled
 def dropout_outages(report: DropoutReport) -> Figure:
     """Return the path [m] with its forced and real outages, and their end errors [m].
 
@@ -199,9 +186,9 @@ def dropout_outages(report: DropoutReport) -> Figure:
     outages = _needed(report, report.outages, "outages")
     norths = np.concatenate([report.reference_north_m, *(one.north_m for one in outages)])
     easts = np.concatenate([report.reference_east_m, *(one.east_m for one in outages)])
-    width_in = WIDTH_IN - 0.95
+    width_in = style.WIDTH_IN - 0.95
     box_in = fitted_box_in(norths, easts, width_in)
-    figure = new_figure(_outages_text(outages), run_title(report.run_document), height_in=box_in + 1.65)
+    figure = style.new_figure(_outages_text(outages), run_title(report.run_document), height_in=box_in + 1.65)
     axes = figure.subplots()
     cell = look_down(axes, norths, easts, width_in / box_in, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
@@ -209,10 +196,10 @@ def dropout_outages(report: DropoutReport) -> Figure:
         draw_path(axes, one.north_m, one.east_m, cell, OUTAGES[one.kind], zorder=3, label=f"{one.kind} outage")
     for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
         ends = [(one.east_m[row], one.north_m[row]) for one in outages]
-        axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **spot(fill))
+        axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **style.spot(fill))
     _write_errors(axes, outages)
     name_directions(axes)
-    add_legend(figure)
+    style.add_legend(figure)
     return figure
 
 
@@ -227,8 +214,8 @@ def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> t
 
 def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: float, ticks: int = 5) -> None:
     """Draw one trial about its start in axes `shape` times as wide as high."""
-    pens = model_pens(list(drive.paths))
-    lines = [(drive.reference_north_m, drive.reference_east_m, FILTER, "filter")]
+    pens = style.model_pens(list(drive.paths))
+    lines = [(drive.reference_north_m, drive.reference_east_m, style.FILTER, "filter")]
     lines += [
         (path.north, path.east, pens[name], _word(report, name))
         for name, path in drive.paths.items() if name in (*PICTURED, drive.model)
@@ -236,7 +223,7 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
     lines = [(north - drive.north_m, east - drive.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
     cell = look_down(axes, norths, easts, shape, ticks=ticks)
-    axes.plot([0.0], [0.0], zorder=6, label="start", **spot("white"))
+    axes.plot([0.0], [0.0], zorder=6, label="start", **style.spot("white"))
     for order, (north, east, pen, label) in enumerate(lines):
         draw_path(axes, north, east, cell, pen, zorder=2 + min(order, 1), label=label)
     for north, east, pen, _ in lines:
@@ -289,7 +276,7 @@ def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(*found) > LINE_FROM_PT else None
         axes.annotate(
             text, (float(one.east_m[-1]), float(one.north_m[-1])), xytext=found, textcoords="offset points",
-            ha="left" if found[0] > 0 else "right", va="center", fontsize=8.0, zorder=6, bbox=LABEL_BOX,
+            ha="left" if found[0] > 0 else "right", va="center", fontsize=8.0, zorder=6, bbox=style.LABEL_BOX,
             arrowprops=line,
         )  # fmt: skip
 

@@ -9,25 +9,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.output.decimate import extremes, percentiles
-from icrtool.output.figures.style import (
-    BAD_FIX_COLOR,
-    BAND_COLOR,
-    BAR_COLOR,
-    CHANGE,
-    FLOAT_COLOR,
-    HALF_WIDTH,
-    ICR,
-    LABEL_BOX,
-    MEAN,
-    Pen,
-    add_legend,
-    fill_bins,
-    new_figure,
-    shade_spans,
-    spot,
-    styled,
-    time_unit,
-)
+from icrtool.output.figures import style
 from icrtool.output.text_format import error_text, position_word, run_title, signed
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import IcrColumn
@@ -37,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-SEGMENT = Pen("#e08214", width=1.6)
+SEGMENT = style.Pen("#e08214", width=1.6)
 # Plain text: mathtext costs more than the rest of a figure.
 NAMES = {
     "y_icr_right_m": "ICR y right [m]",
@@ -47,7 +29,7 @@ NAMES = {
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 """Where no slip puts an ICR, in half track widths."""
 
-NO_SLIP_PLACE = {"label": "no slip (±b/2, 0)", **HALF_WIDTH.keywords()}
+NO_SLIP_PLACE = {"label": "no slip (±b/2, 0)", **style.HALF_WIDTH.keywords()}
 
 RANGE_PERCENT = (0.2, 99.8)
 BAND_RANGE_PERCENT = (2.0, 98.0)
@@ -73,7 +55,7 @@ def _answer(run: Run) -> str:
     return f"The ICRs end at {ends}{f'; not shown: {unknown}' if unknown else ''}"
 
 
-@styled
+@style.styled
 def icr_estimates(run: Run) -> Figure:
     """Return the three ICR estimates over time with ±2σ, their 10-90 % convergence, b/2 where known, and GNSS outages.
 
@@ -81,7 +63,7 @@ def icr_estimates(run: Run) -> Figure:
     """
     spans = _spans_s(run)
     learning = "; left: learning, right: after it" if len(spans) > 1 else ""
-    figure = new_figure(
+    figure = style.new_figure(
         _answer(run), f"{run_title(run.document)}: estimates of the filter{learning}",
         height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3,
     )  # fmt: skip
@@ -95,12 +77,12 @@ def icr_estimates(run: Run) -> Figure:
         row[0].set_title(_convergence_text(run, column), loc="left", pad=4.0)
         row[-1].set_title(_final_text(run, column), loc="right", pad=4.0)
     for axes, (begin, end) in zip(panels[-1], spans, strict=True):
-        axes.set_xlabel(f"Time [{time_unit(end - begin)[0]}]")
-    add_legend(figure, columnspacing=1.4, handlelength=2.0)
+        axes.set_xlabel(f"Time [{style.time_unit(end - begin)[0]}]")
+    style.add_legend(figure, columnspacing=1.4, handlelength=2.0)
     return figure
 
 
-@styled
+@style.styled
 def icr_clusters(run: Run) -> Figure:
     """Return histograms of the three ICR estimates [m] after convergence, in percent of the time."""
     settled = run.settled_s
@@ -108,7 +90,7 @@ def icr_clusters(run: Run) -> Figure:
     mean, std = run.document.icr.mean, run.document.icr.std
     spread = (f"{ICR_WORDS[column]} ±{std[column]:.3f} m" for column in ICR_COLUMNS if mean[column] is not None)
     known = any(mean[column] is not None for column in ICR_COLUMNS)
-    figure = new_figure(
+    figure = style.new_figure(
         f"The ICRs scatter by {', '.join(spread)}" if known else "No ICR is shown",
         f"{run_title(run.document)}: estimates from {settled:.1f} s on",
         height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.9),
@@ -122,7 +104,7 @@ def icr_clusters(run: Run) -> Figure:
     for axes, column, value in zip(panels, columns, values, strict=True):
         _draw_histogram(axes, run, column, value, weight, span)
     panels[0].set_ylabel("Time [%]")
-    add_legend(figure, columnspacing=3.0)
+    style.add_legend(figure, columnspacing=3.0)
     return figure
 
 
@@ -140,7 +122,7 @@ def _spans_s(run: Run) -> list[tuple[float, float]]:
 
 def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float, float], *, first: bool) -> None:
     """Draw one estimate over a span; the `first` panel also has b/2 and the convergence."""
-    table, unit = run.table, time_unit(span_s[1] - span_s[0])[1]
+    table, unit = run.table, style.time_unit(span_s[1] - span_s[0])[1]
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
     t, value = table.t_s[rows] / unit, getattr(table, column)[rows]
     band = 2 * getattr(table, f"std_{column}")[rows]
@@ -148,7 +130,7 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     shown = extremes(value)
     axes.plot(t[shown], value[shown], color="black", linewidth=1.0, label="estimate")
     shown = extremes(low, high)
-    axes.fill_between(t[shown], low[shown], high[shown], color=BAND_COLOR, linewidth=0, label="±2σ")
+    axes.fill_between(t[shown], low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="±2σ")
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
         # Here the band is as wide as the prior: it is shown as far as the estimates go.
@@ -160,12 +142,12 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
     axes.locator_params(axis="y", nbins=5)
     for change in run.changes_s:
-        axes.axvline(change / unit, zorder=2.6, label="terrain change", **CHANGE.keywords())
+        axes.axvline(change / unit, zorder=2.6, label="terrain change", **style.CHANGE.keywords())
     for segment in run.document.segments:
         if (mean := segment.mean[column]) is not None:
             stretch = segment.begin_s / unit, segment.end_s / unit
             axes.plot(stretch, (mean, mean), zorder=2.5, label="mean between", **SEGMENT.keywords())
-    shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit, label="no usable GNSS")
+    style.shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit, label="no usable GNSS")
     _mark_clipped(axes, t, value)
 
 
@@ -176,7 +158,7 @@ def _mark_clipped(axes: Axes, t: Floats, value: Floats) -> None:
         if not low <= value[row] <= high:
             axes.annotate(
                 f"{arrow} {signed(value[row])}", (t[row], edge), ha="left", va="top" if edge == high else "bottom",
-                fontsize=7.5, color=BAD_FIX_COLOR, bbox=LABEL_BOX,
+                fontsize=7.5, color=style.BAD_FIX_COLOR, bbox=style.LABEL_BOX,
             )  # fmt: skip
 
 
@@ -186,7 +168,7 @@ def _draw_convergence(axes: Axes, run: Run, column: IcrColumn, unit_s: float) ->
     marks = ("white", "10 %"), ("black", "90 % of the change")
     for second, (fill, label) in zip(run.convergence_s[column] or (), marks, strict=False):
         heights.append(float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)]))
-        axes.plot([second / unit_s], heights[-1:], zorder=4, clip_on=False, label=label, **spot(fill))
+        axes.plot([second / unit_s], heights[-1:], zorder=4, clip_on=False, label=label, **style.spot(fill))
     if (width := run.track_width_m) is not None:
         heights.append(SIDES[column] * width / 2)
         axes.axhline(heights[-1], **NO_SLIP_PLACE)
@@ -210,14 +192,18 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
     width = _bin_width(span_m)
     first, last = int(np.floor(low / width)), int(np.ceil(high / width))
     share, edges = np.histogram(value, bins=last - first, range=(first * width, last * width), weights=weight)
-    fill_bins(
-        axes, edges, 100 * share / max(weight.sum(), 1e-9), color=BAR_COLOR, label=f"estimates, bins of {width:g} m"
+    style.fill_bins(
+        axes,
+        edges,
+        100 * share / max(weight.sum(), 1e-9),
+        color=style.BAR_COLOR,
+        label=f"estimates, bins of {width:g} m",
     )
     axes.set_xlim(low, high)
     mean, std = run.document.icr.mean[column], run.document.icr.std[column]
     title = "not shown"
     if mean is not None:
-        axes.axvline(mean, label="mean", **MEAN.keywords())
+        axes.axvline(mean, label="mean", **style.MEAN.keywords())
         title = f"{signed(mean)} ± {std:.3f} m"
     if (track := run.track_width_m) is not None:
         place = SIDES[column] * track / 2
@@ -251,7 +237,7 @@ MARKS = 400
 """Rejected fixes drawn one by one; of more, the extremes."""
 
 
-@styled
+@style.styled
 def gnss_difference(run: Run) -> Figure:
     """Return the distance between filter and fixes [m] over time, rejected fixes apart.
 
@@ -261,24 +247,24 @@ def gnss_difference(run: Run) -> Figure:
     mean, most = facts.mean_difference_m, facts.max_difference_m
     of, word = facts.used + facts.rejected, position_word(run.document)
     apart = f"{error_text(mean)} from the {word} on average, " if mean is not None else ""
-    figure = new_figure(
+    figure = style.new_figure(
         f"Filter {apart}{100 * facts.rejected / max(of, 1):.0f} % rejected",
         f"{run_title(run.document)}: distance between filter and {word}, {of:,} of them", height_in=3.9,
     )  # fmt: skip
     axes = figure.subplots()
-    unit, seconds = time_unit(float(run.table.t_s[-1]))
+    unit, seconds = style.time_unit(float(run.table.t_s[-1]))
     t, difference = run.gnss.t_s / seconds, run.gnss.difference
     used, gated = run.gnss.used, run.gnss.rejected
     top = _top(difference[used])
     if mean is not None and most is not None:
         trusted = used & ~run.sensors.fixes.down_weighted
         _draw_used(axes, t[trusted], difference[trusted], f"used, max {error_text(most)}")
-        axes.axhline(mean, label=f"mean {error_text(mean)}", **MEAN.keywords())
-    _mark(axes, t, difference, gated, top, "rejected", "x", color=BAD_FIX_COLOR, markersize=4.5)
+        axes.axhline(mean, label=f"mean {error_text(mean)}", **style.MEAN.keywords())
+    _mark(axes, t, difference, gated, top, "rejected", "x", color=style.BAD_FIX_COLOR, markersize=4.5)
     weak = run.sensors.fixes.down_weighted & used
-    _mark(axes, t, difference, weak, top, "down-weighted", ".", color=FLOAT_COLOR, markersize=4.0)
+    _mark(axes, t, difference, weak, top, "down-weighted", ".", color=style.FLOAT_COLOR, markersize=4.0)
     lost = len(run.sensors.losses_ns) > 0
-    shade_spans(
+    style.shade_spans(
         axes,
         (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / seconds,
         label="no usable GNSS, or RTK lost" if lost else "no usable GNSS",
@@ -287,14 +273,14 @@ def gnss_difference(run: Run) -> Figure:
     axes.set(xlabel=f"Time [{unit}]", ylabel="Difference [m]")
     # Five short entries stand side by side; with more, or longer ones, there are two rows.
     ncols = 3 if lost or run.sensors.fixes.down_weighted.any() else 5
-    add_legend(figure, ncols=ncols, columnspacing=1.6, handlelength=2.0)
+    style.add_legend(figure, ncols=ncols, columnspacing=1.6, handlelength=2.0)
     return figure
 
 
 def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:
     """Draw the fixes that the filter used: one by one, or by range and median where they are many."""
     if len(t) <= MOST_SINGLE:
-        axes.plot(*_with_breaks(t, difference), color=BAR_COLOR, linewidth=0.7, label=label)
+        axes.plot(*_with_breaks(t, difference), color=style.BAR_COLOR, linewidth=0.7, label=label)
         return
     edges = np.linspace(t[0], t[-1], TIME_BINS + 1)
     bounds = np.searchsorted(t, edges)
@@ -303,8 +289,8 @@ def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:
     parts = [difference[a:b] for a, b in pairwise(bounds)]
     low, middle, high = np.array([np.percentile(part, (0, 50, 100)) if len(part) else empty for part in parts]).T
     centre = (edges[1:] + edges[:-1]) / 2
-    axes.fill_between(centre, low, high, color=BAND_COLOR, linewidth=0, label=label)
-    axes.plot(centre, middle, color=ICR.color, linewidth=1.0, label="median")
+    axes.fill_between(centre, low, high, color=style.BAND_COLOR, linewidth=0, label=label)
+    axes.plot(centre, middle, color=style.ICR.color, linewidth=1.0, label="median")
 
 
 def _mark(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from icrtool.output.figures.style import add_legend, drawable, logarithmic_errors, new_figure, styled
+from icrtool.output.figures import style
 from icrtool.output.text_format import error_text
 from icrtool.records.text import counted
 
@@ -43,7 +43,7 @@ class FleetNumbers(NamedTuple):
     model: str
 
 
-@styled
+@style.styled
 def fleet_icrs(fleet: FleetNumbers) -> Figure:
     """Return both lateral ICRs of every log over its date, ±σ, a colour and marker per robot."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
@@ -53,7 +53,7 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
         for side in ("right", "left")
     }
     answer = ", ".join(f"y {side} {' to '.join(ends)} m" for side, ends in ranges.items()).replace("-", "−")
-    figure = new_figure(
+    figure = style.new_figure(
         f"ICRs: {answer}", f"{fleet.title}: of each log, ±σ", height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95),
         hspace=0.12,
     )  # fmt: skip
@@ -61,7 +61,7 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     for axes, side in zip(panels, ("right", "left"), strict=True):
         for number, robot in enumerate(dict.fromkeys(point.robot for point in fleet.points)):
             mine = [point for point in fleet.points if point.robot == robot]
-            key = f" {drawable(robot or 'robot not named', LONGEST_ROBOT)}"  # matplotlib leaves out "_label"
+            key = f" {style.drawable(robot or 'robot not named', LONGEST_ROBOT)}"  # matplotlib leaves out "_label"
             when = date2num([np.datetime64(point.start_utc.rstrip("Z")) for point in mine])  # type: ignore[no-untyped-call]
             axes.errorbar(
                 when, [_icr(point, side) for point in mine],
@@ -79,7 +79,7 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
     years = sorted({point.start_utc[:4] for point in fleet.points})
     panels[-1].set_xlabel(f"Date, UTC, {' to '.join(dict.fromkeys((years[0], years[-1])))}")
-    add_legend(figure, ncols=4)
+    style.add_legend(figure, ncols=4)
     return figure
 
 
@@ -88,7 +88,7 @@ def _icr(point: FleetLog, side: str) -> float:
     return np.nan if value is None else value
 
 
-@styled
+@style.styled
 def fleet_errors(fleet: FleetNumbers) -> Figure:
     """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs those of the largest."""
     errors = [
@@ -100,8 +100,8 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
     shown = [one for one in errors if one in largest]
     cut = f", the {MOST_ROWS} largest" if len(errors) > MOST_ROWS else ""
     median = error_text(float(np.median([error for *_, error in errors])))
-    labels = [drawable(log, LONGEST_LOG) for _, log, _ in shown]
-    figure = new_figure(
+    labels = [style.drawable(log, LONGEST_LOG) for _, log, _ in shown]
+    figure = style.new_figure(
         f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}",
         f"{fleet.title}: 95 % error after 10 m without GNSS, {fleet.model}{cut}", height_in=1.9 + ROW_IN * len(shown),
         margins_in=(2.9, 0.7, 0.65, 1.05),
@@ -115,13 +115,13 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
         axes.plot(
             [shown[row][2] for row in rows], rows, linestyle="none", marker=MARKERS[number % len(MARKERS)],
             color=COLORS[number % len(COLORS)], markersize=5.5,
-            label=f" {drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}",
+            label=f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}",
         )  # fmt: skip
     for row, (*_, error) in enumerate(shown):
         axes.annotate(
             error_text(error), (error, row), xytext=(6, 0), textcoords="offset points", va="center", fontsize=8.0,
             annotation_clip=False,
         )  # fmt: skip
-    logarithmic_errors(axes)
-    add_legend(figure, ncols=2)
+    style.logarithmic_errors(axes)
+    style.add_legend(figure, ncols=2)
     return figure

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.output.figures.style import ICR_LOOKS, NO_SLIP, add_legend, new_figure, styled
+from icrtool.output.figures import style
 from icrtool.output.tables.study import capital, study_subtitle, study_title
 from icrtool.simulation.studies import shown_path
 from icrtool.simulation.study_measures import FATES, STATES, chi2_band, consistency_of
@@ -35,13 +35,13 @@ FATE_COLORS = np.array([(0.57, 0.77, 0.93), (0.50, 0.0, 0.10), (0.90, 0.90, 0.90
 """Red, green, blue by `FATES`, mixed by the share of the runs."""
 
 LOOKS: tuple[dict[str, Any], ...] = (
-    *({key: value for key, value in look.items() if key != "label"} for look in ICR_LOOKS.values()),
+    *({key: value for key, value in look.items() if key != "label"} for look in style.ICR_LOOKS.values()),
     {"color": "#1b7837", "linestyle": "-", "marker": "D", "markersize": 3.5},
 )
 """Of lines that are no ICRs, in turn."""
 
 OPEN_LOOP = {"label": "open loop, final ICRs", **LOOKS[3]}
-OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **NO_SLIP.keywords()}
+OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP.keywords()}
 PATH_COLORS = ("#2166ac", "#e08214", "#1b7837", "#b2182b")
 TRUTH: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (4, 2))}
 
@@ -49,14 +49,14 @@ Draw = Callable[["Axes", StudyResult, list[Level]], None]
 """Draws the levels of one series."""
 
 
-@styled
+@style.styled
 def study_figure(result: StudyResult) -> Figure:
     """Return the picture of a study."""
     rows = PICTURES[result.request.name]
     names = dict.fromkeys(level.setting.series for level in result.levels)
     of_series = [[level for level in result.levels if level.setting.series == name] for name in names]
     columns = [list(result.levels)] if result.request.name in TOGETHER else of_series
-    figure = new_figure(
+    figure = style.new_figure(
         study_title(result), study_subtitle(result), height_in=1.7 + PANEL_IN * len(rows),
         margins_in=(0.85, 0.2, 0.75, 1.2), wspace=0.12, hspace=0.5,
     )  # fmt: skip
@@ -68,7 +68,7 @@ def study_figure(result: StudyResult) -> Figure:
         for row, (label, draw) in enumerate(rows):
             draw(panels[row][column], result, levels)
             panels[row][0].set_ylabel(label)
-    add_legend(figure, title=NOTES.get(result.request.name, NOTE), ncols=5)
+    style.add_legend(figure, title=NOTES.get(result.request.name, NOTE), ncols=5)
     return figure
 
 
@@ -119,7 +119,7 @@ def errors(axes: Axes, result: StudyResult, levels: Sequence[Level], *, log: str
 
 
 def _by_icr(column: str) -> dict[str, dict[str, Any]]:
-    return {column.format(icr=icr): look for icr, look in ICR_LOOKS.items()}
+    return {column.format(icr=icr): look for icr, look in style.ICR_LOOKS.items()}
 
 
 def inversions(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
@@ -148,7 +148,7 @@ def estimates(axes: Axes, _result: StudyResult, levels: Sequence[Level], value: 
     t = traces[0, :, 0]
     truth = np.array([plan.icrs_m, *(icrs for _, icrs in plan.changes)])
     edges = [t[0], *(time for time, _ in plan.changes), max(t[-1], plan.duration_s)]
-    for place, look in enumerate(ICR_LOOKS.values()):
+    for place, look in enumerate(style.ICR_LOOKS.values()):
         along(axes, t, traces[..., 1 + place], look | {"linestyle": "-"})
         axes.step(edges, [*truth[:, place], truth[-1, place]], where="post", color=look["color"], **TRUTH)
     reach = 0.8 * max(LEAST_VIEW_M, float(np.ptp(truth)))

@@ -10,21 +10,7 @@ from icrtool.alignment.sensors.gnss_quality import CLASSES, REFERENCE
 from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats
 from icrtool.output.decimate import places
-from icrtool.output.figures.style import (
-    BAD_FIX_COLOR,
-    FILTER,
-    FIX_COLOR,
-    FLOAT_COLOR,
-    ICR,
-    LABEL_BOX,
-    NO_SLIP,
-    WIDTH_IN,
-    Pen,
-    add_legend,
-    new_figure,
-    spot,
-    styled,
-)
+from icrtool.output.figures import style
 from icrtool.output.text_format import distance_text, driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run
 from icrtool.records.run_document import OdometryDocument
@@ -55,25 +41,25 @@ TIME_CLEARANCE = 0.06
 Corners = tuple[Floats, Floats]
 """Least and greatest (north, east) [m]."""
 
-_DOT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": FIX_COLOR}
+_DOT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": style.FIX_COLOR}
 FIX_LOOKS: dict[int, dict[str, Any]] = {
     REFERENCE: _DOT,
     FIXED_FIX: _DOT,
-    FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": FLOAT_COLOR},
+    FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": style.FLOAT_COLOR},
     OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
 }
 SLIP_LOOK: dict[str, Any] = {
-    "marker": "D", "markersize": 6.5, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": FLOAT_COLOR,
+    "marker": "D", "markersize": 6.5, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": style.FLOAT_COLOR,
     "linestyle": "none", "zorder": 4.6,
 }  # fmt: skip
-REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": BAD_FIX_COLOR}
+REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
 """Markers by class: shape and luminance distinguish them."""
 
-ODOMETRIES = {"icr": (ICR, "ICR odometry", 3), "no_slip": (NO_SLIP, "no-slip odometry", 2)}
+ODOMETRIES = {"icr": (style.ICR, "ICR odometry", 3), "no_slip": (style.NO_SLIP, "no-slip odometry", 2)}
 """Pen, label and order of the paths that wheel speeds alone lead along."""
 
 
-@styled
+@style.styled
 def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
     table = run.table
@@ -82,9 +68,9 @@ def trajectory(run: Run) -> Figure:
     corners = [_corners(drive_wheels(table, run.in_gap, icrs)) for icrs, *_ in paths]
     lowest, highest = _extent(_corners(table), *corners)
     norths, easts = np.column_stack([lowest, highest])
-    width_in = WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
+    width_in = style.WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
-    figure = new_figure(
+    figure = style.new_figure(
         _end_errors_text(run.document.odometry), f"{run_title(run.document)}: {driven_text(run.document.drive)}",
         height_in=box_in + MARGINS_IN[2] + MARGINS_IN[3], margins_in=MARGINS_IN,
     )  # fmt: skip
@@ -92,16 +78,16 @@ def trajectory(run: Run) -> Figure:
     cell = look_down(axes, norths, easts, width_in / box_in, margin=0.04, ticks=9)
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
-    draw_path(axes, table.north_m, table.east_m, cell, FILTER, label="filter", zorder=4)
+    draw_path(axes, table.north_m, table.east_m, cell, style.FILTER, label="filter", zorder=4)
     for icrs, pen, name, order in paths:
         _draw_odometry(axes, drive_wheels(table, run.in_gap, icrs), cell, pen, name, order)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     _draw_events(axes, run)
-    axes.plot(table.east_m[:1], table.north_m[:1], zorder=5, label="start", **spot("white", 8.0))
-    axes.plot(table.east_m[-1:], table.north_m[-1:], zorder=5, label="end", **spot("black", 6.0))
+    axes.plot(table.east_m[:1], table.north_m[:1], zorder=5, label="start", **style.spot("white", 8.0))
+    axes.plot(table.east_m[-1:], table.north_m[-1:], zorder=5, label="end", **style.spot("black", 6.0))
     name_directions(axes)
-    add_legend(figure, ncols=2, columnspacing=3.0)
+    style.add_legend(figure, ncols=2, columnspacing=3.0)
     return figure
 
 
@@ -126,7 +112,7 @@ def _corners(path: States | OdometryPath) -> Corners:
     return np.array([north.min(), east.min()]), np.array([north.max(), east.max()])
 
 
-def _draw_odometry(axes: Axes, path: OdometryPath, cell_m: float, pen: Pen, name: str, order: int) -> None:
+def _draw_odometry(axes: Axes, path: OdometryPath, cell_m: float, pen: style.Pen, name: str, order: int) -> None:
     """Draw a wheels-only path and its end; the label states where it leaves the view."""
     low, high = _corners(path)
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
@@ -165,7 +151,7 @@ def _draw_events(axes: Axes, run: Run) -> None:
         rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
         if rows.any():
             east, north = table.east_m[rows], table.north_m[rows]
-            axes.plot(east, north, color=FLOAT_COLOR, linewidth=3.0, zorder=4.5)
+            axes.plot(east, north, color=style.FLOAT_COLOR, linewidth=3.0, zorder=4.5)
             axes.plot(east[:1], north[:1], label="slip event", **SLIP_LOOK)
 
 
@@ -195,7 +181,7 @@ def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
             axes.plot(*place, marker="|", color="black", markersize=7.0, zorder=4.7)
             axes.annotate(
                 text, (float(place[0]), float(place[1])), xytext=(3, 3), textcoords="offset points", fontsize=7.0,
-                color="0.25", zorder=4.9, bbox=LABEL_BOX, annotation_clip=True,
+                color="0.25", zorder=4.9, bbox=style.LABEL_BOX, annotation_clip=True,
             )  # fmt: skip
 
 
@@ -209,7 +195,7 @@ CELLS = 1500.0
 
 
 JUMP_LOOK: dict[str, Any] = {
-    "marker": "s", "markersize": 6.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "color": BAD_FIX_COLOR,
+    "marker": "s", "markersize": 6.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "color": style.BAD_FIX_COLOR,
     "linestyle": "none", "zorder": 4.4,
 }  # fmt: skip
 """Where the position reference jumps."""
@@ -245,7 +231,7 @@ def name_directions(axes: Axes) -> None:
     axes.set_ylabel("North [m]" + _short_ticks(axes.yaxis, axes.get_ylim()[0]))
 
 
-def draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: Pen, **look: Any) -> None:
+def draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: style.Pen, **look: Any) -> None:
     """Draw a path (n,), a point for each cell it enters."""
     shown = places(north_m, east_m, cell_m)
     axes.plot(east_m[shown], north_m[shown], **pen.keywords(), **look)
