@@ -19,6 +19,7 @@ from icrtool.records.text import LogText, escaped
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
     from icrtool.errors import IcrToolError
+    from icrtool.logs.describe import SurveyDocument
     from icrtool.logs.streams.assembly import Survey
     from icrtool.records.run import Run
     from icrtool.records.tables import RobotLog
@@ -78,6 +79,13 @@ class Found:
         return self.survey.name if self.survey is not None else LogText(self.log.stem), escaped(str(self.log))
 
     @property
+    def holds(self) -> SurveyDocument | None:
+        """Its files, topics and candidates; None of a table."""
+        from icrtool.logs.describe import survey_document
+
+        return survey_document(self.survey) if self.survey is not None else None
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Those of the last step that was done."""
         found = self.run if self.run is not None else self.measured
@@ -114,26 +122,21 @@ def _examine(found: Found, config: Config, part: Span, stages: Stages) -> None:
 
 def _print(found: Found, config: Config, given: Sequence[str], printer: Printer) -> None:
     """Print whether a log can be fitted, what it holds, and the command to run next; with -v all that was found."""
-    from icrtool.logs.describe import describe_log, describe_survey
     from icrtool.output.tables.overview import info_blocks, next_command
 
     command = next_command(escaped(str(found.log)), given, found.run)
-    if printer.verbose and found.survey is not None:
-        click.echo(f"{describe_survey(found.survey, found.measured)}\n")
-    elif printer.verbose and found.measured is not None:
-        click.echo(f"{describe_log(found.measured)}\n")
-    printer.show(info_blocks(found.survey, found.measured, found.run, found.problem, found.names, config, command))
+    printer.show(info_blocks(found.holds, found.measured, found.run, found.problem, found.names, config, command))
 
 
 def _document(found: Found, given: Sequence[str]) -> dict[str, Any]:
     """Return what a log holds as plain data; ``run`` as in run.json, null where the log cannot be fitted."""
-    from icrtool.logs.describe import streams_document, survey_document
     from icrtool.output.tables.overview import next_command, verdict
+    from icrtool.records.plain_data import plain
 
     return {
         "reason": None,
-        **(survey_document(found.survey) if found.survey is not None else {}),
-        "streams": streams_document(found.measured) if found.measured is not None else [],
+        **(plain(found.holds) if found.holds is not None else {}),
+        "streams": plain(found.measured.streams) if found.measured is not None else [],
         "warnings": list(found.warnings),
         "verdict": verdict(found.run, found.problem, found.names),
         "next": next_command(escaped(str(found.log)), given, found.run),

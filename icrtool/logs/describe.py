@@ -1,151 +1,100 @@
-"""What ``icrtool info`` states of a log before it is fitted: as text, and as JSON."""
+"""What a log holds before anything is chosen: its files, its topics, and the candidates of each role."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.streams.assembly import Survey
 from icrtool.logs.streams.sources import Source
-from icrtool.records.plain_data import plain
-from icrtool.records.samples import ROLE_WORDS, StreamChoice, rate_and_jitter
-from icrtool.records.tables import RobotLog
-from icrtool.records.text import counted
+from icrtool.records.plain_data import Record
+from icrtool.records.samples import InputFile, Role, rate_and_jitter
 
-GAP_IN_INTERVALS = 5.0
+GAP_IN_INTERVALS, SHORTEST_GAP_S = 5.0, 0.1
+"""A gap is longer than so many times the median interval, and than this."""
 
 
-def describe_survey(survey: Survey, measured: RobotLog | None) -> str:
-    """Return the text of ``icrtool info -v``: topics, rates, gaps, stamps, candidates by role, the choice.
+class SurveyedTopic(Record, frozen=True, kw_only=True):
+    """A topic of a log.
 
-    Parameters
+    Attributes
     ----------
-    measured : the assembled log, None when it cannot be used
+    messages : how many; None where nothing counts them
+    read : whether it may have a role, so that its messages were read
+    rate_hz : 1 / median interval; None where it was not read
+    gaps : intervals far longer than the median, with the `longest_gap_s`
+    unreadable : messages that do not fit their type
+    not_read_because : of a type that has a role
     """
-    size = sum(file.bytes for file in survey.inputs)
-    topics, files = counted(len(survey.channels), "topic"), counted(len(survey.inputs), "file")
-    lines = [f"{survey.path}: {topics}, {size / 1e6:.3g} MB in {files}"]
-    lines += [f"  {survey.transfer}"] if survey.transfer else []
-    lines += _topics(survey)
-    chosen = {stream.role: stream for stream in measured.streams} if measured is not None else {}
-    for role, sources in survey.candidates.by_role().items():
-        lines.append(f"\n{ROLE_WORDS[role]} (key topics.{role}; * chosen):")
-        lines += _candidates(sources, chosen[role].topic if role in chosen else None)
-        if role in chosen:
-            stream = chosen[role]
-            lines.append(f"  -> {stream.topic}: {stream.why}")
-            lines.append(f"     {stream.samples_text} by {stream.clock} stamps{_jitter(stream)}")
-    if measured is not None and measured.gyro is not None:
-        gyro = measured.gyro
-        lines.append(f"\ngyro:\n  -> {gyro.topic}: {len(gyro.stamp_ns)} turn rates, not used by the filter")
-    spans = [one.stamp_ns for one in (measured.wheels, measured.gnss, measured.heading)] if measured is not None else []
-    if spans and all(map(len, spans)):
-        overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9
-        lines.append(f"\nall three overlap for {max(overlap, 0):.1f} s")
-    return "\n".join(lines)
+
+    topic: str
+    message_type: str
+    messages: int | None
+    read: bool = False
+    rate_hz: float | None = None
+    gaps: int = 0
+    longest_gap_s: float | None = None
+    unreadable: int = 0
+    not_read_because: str | None = None
 
 
-def describe_log(log: RobotLog) -> str:
-    """Return the text of ``icrtool info`` for a log that is a table."""
-    lines = [f"{log.name}: table"]
-    for stream in log.streams:
-        samples = f"{stream.samples_text}{_jitter(stream)}"
-        lines.append(f"  {ROLE_WORDS[stream.role]}: {stream.topic}: {samples}; {stream.why}")
-    return "\n".join(lines)
+class SurveyedSource(Record, frozen=True):
+    """A candidate of a role; `problem`: why it cannot be used; `stamps`: what is known of its clock."""
+
+    topic: str
+    message_type: str
+    why: str
+    problem: str | None
+    stamps: str
 
 
-def _jitter(stream: StreamChoice) -> str:
-    return f", jitter {stream.jitter_ms:.3g} ms" if stream.jitter_ms is not None else ""
+class SurveyDocument(Record, frozen=True):
+    """What `icrtool info` states of a log as it lies there; `transfer`: how much came over a connection."""
+
+    inputs: tuple[InputFile, ...]
+    transfer: str | None
+    topics: tuple[SurveyedTopic, ...]
+    candidates: dict[Role, tuple[SurveyedSource, ...]]
 
 
-def _topics(survey: Survey) -> list[str]:
-    tables = {table.topic: table for table in survey.tables}
-    lines, width = [], max((len(str(channel.topic)) for channel in survey.channels), default=0)
-    for topic, channel in {channel.topic: channel for channel in survey.channels}.items():
-        table = tables.get(topic)
-        text = f"  {topic:<{width}}  {channel.message_type}"
-        if table is not None:
-            rate, _ = rate_and_jitter(table.log_time_ns)
-            text += f"  {counted(len(table), 'message')}{f', {rate:.4g} Hz' if rate else ''}{_gaps(table.log_time_ns)}"
-            if table.unreadable:
-                text += f", {table.unreadable} unreadable"
-        elif topic in survey.candidates.unread:
-            text += f"  not read: {survey.candidates.unread[topic]}"
-        elif channel.count is not None:
-            text += f"  {counted(channel.count, 'message')}, no role"
-        else:
-            text += "  no role"
-        lines.append(text)
-    return lines
-
-
-def _gaps(stamps: Ints) -> str:
-    """Return a text: how many intervals are far longer than the median, and the longest [s]; empty for none."""
-    if len(stamps) < 3:
-        return ""
-    interval = np.diff(stamps) / 1e9
-    long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), 0.1)
-    if not long.any():
-        return ""
-    return f", {counted(int(np.count_nonzero(long)), 'gap')} up to {float(interval.max()):.1f} s"
-
-
-def _candidates(sources: Sequence[Source], chosen: str | None) -> list[str]:
-    if not sources:
-        return ["  no candidate"]
-    lines = []
-    for source in sources:
-        mark = "*" if source.topic == chosen else "-"
-        clock = (
-            source.stamps.note
-            or f"header stamps, {round(source.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms before log time"
-        )
-        refused = "used although unsuitable, because it is configured" if source.topic == chosen else "cannot be used"
-        verdict = f"{refused}: {source.problem}" if source.problem else source.why
-        lines.append(f"  {mark} {source.topic} ({source.message_type}; {clock}): {verdict}")
-    return lines
-
-
-def survey_document(survey: Survey) -> dict[str, Any]:
+def survey_document(survey: Survey) -> SurveyDocument:
     """Return the files of a log, its topics, and the candidates of each role with the reason for or against each."""
+    roles = survey.candidates.by_role()
+    return SurveyDocument(
+        survey.inputs, survey.transfer or None, _topics(survey),
+        {role: tuple(map(_source, sources)) for role, sources in roles.items()},
+    )  # fmt: skip
+
+
+def _topics(survey: Survey) -> tuple[SurveyedTopic, ...]:
     tables = {table.topic: table for table in survey.tables}
-    topics = []
+    found = []
     for channel in {channel.topic: channel for channel in survey.channels}.values():
-        table = tables.get(channel.topic)
-        rate_hz = rate_and_jitter(table.log_time_ns)[0] if table is not None else None
-        topics.append(
-            {
-                "topic": str(channel.topic),
-                "message_type": str(channel.message_type),
-                "messages": len(table) if table is not None else channel.count,
-                "rate_hz": rate_hz,
-                "unreadable": table.unreadable if table is not None else 0,
-                "not_read_because": survey.candidates.unread.get(channel.topic),
-            }
-        )
-    return {
-        "inputs": plain(survey.inputs),
-        "transfer": survey.transfer or None,
-        "topics": topics,
-        "candidates": {
-            role: [
-                {
-                    "topic": str(one.topic),
-                    "message_type": str(one.message_type),
-                    "why": one.why,
-                    "problem": one.problem or None,
-                }
-                for one in sources
-            ]
-            for role, sources in survey.candidates.by_role().items()
-        },
-    }
+        topic, kind, table = str(channel.topic), str(channel.message_type), tables.get(channel.topic)
+        if table is None:
+            why = survey.candidates.unread.get(channel.topic)
+            found.append(SurveyedTopic(topic=topic, message_type=kind, messages=channel.count, not_read_because=why))
+            continue
+        gaps, longest_s = _gaps(table.log_time_ns)
+        found.append(
+            SurveyedTopic(
+                topic=topic, message_type=kind, messages=len(table), read=True, gaps=gaps, longest_gap_s=longest_s,
+                rate_hz=rate_and_jitter(table.log_time_ns)[0], unreadable=table.unreadable,
+                not_read_because=survey.candidates.unread.get(channel.topic),
+            )
+        )  # fmt: skip
+    return tuple(found)
 
 
-def streams_document(log: RobotLog) -> list[dict[str, Any]]:
-    """Return the topic that each role uses, and why."""
-    return [asdict(stream) for stream in log.streams]
+def _gaps(stamps: Ints) -> tuple[int, float | None]:
+    """Return how many intervals are far longer than the median, and the longest of them [s]; None without any."""
+    if len(stamps) < 3:
+        return 0, None
+    interval = np.diff(stamps) / 1e9
+    long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), SHORTEST_GAP_S)
+    return int(np.count_nonzero(long)), float(interval.max()) if long.any() else None
+
+
+def _source(one: Source) -> SurveyedSource:
+    stamps = one.stamps.note or f"header stamps, {round(one.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms before log time"
+    return SurveyedSource(str(one.topic), str(one.message_type), one.why, one.problem or None, stamps)

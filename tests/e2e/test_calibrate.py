@@ -101,7 +101,7 @@ def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> 
     assert (status, err) == (0, "")
     assert re.search(r"excitation all three ICRs shown.* turned 9\d\d° right, 8\d\d° left", " ".join(out.split()))
     assert re.search(r"heading +/imu/data \(gyro too\): 100 Hz", out)
-    assert "gyro:\n  -> /imu/data: 20000 turn rates" in icrtool("info", LOG, *ROBOT, "-v")[1]
+    assert "gyro\n  -> /imu/data: 20000 turn rates" in icrtool("info", LOG, *ROBOT, "-v")[1]
     icrtool("simulate", "-o", "straight.mcap", "--path", "straight", "--duration", "60", "-q")
     status, out, err = icrtool("info", "straight.mcap", *ROBOT)
     assert status == 0

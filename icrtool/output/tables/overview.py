@@ -1,4 +1,4 @@
-"""What a log is at a glance, and what to do with it: what `icrtool info` prints, with -v its last lines."""
+"""What `icrtool info` prints: what a log is at a glance and what to do with it; with -v every topic and candidate."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
-from icrtool.logs.streams.assembly import Survey
+from icrtool.logs.describe import SurveyDocument, SurveyedSource, SurveyedTopic
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.output.tables.run import Row, copied, excitation_row, gravest
-from icrtool.output.text_blocks import Block, Facts, Section
+from icrtool.output.text_blocks import VERBOSE, Block, Facts, Section, Table
 from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
-from icrtool.records.samples import ROLE_WORDS
+from icrtool.records.samples import ROLE_WORDS, StreamChoice
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
 
@@ -42,20 +42,20 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
 
 
 def info_blocks(
-    survey: Survey | None, log: RobotLog | None, run: Run | None, problem: IcrToolError | None, names: Sequence[str],
-    config: Config, command: str | None,
+    survey: SurveyDocument | None, log: RobotLog | None, run: Run | None, problem: IcrToolError | None,
+    names: tuple[str, str], config: Config, command: str | None,
 ) -> list[Block]:  # fmt: skip
     """Return what `icrtool info` prints: the verdict, what was driven, each topic once, what is missing and next.
 
     Parameters
     ----------
-    survey, log, run : as far as reading and fitting came
+    survey, log, run : as far as reading and fitting came; a table has no survey
     problem : why the log cannot be fitted
-    names : of the log, which stand before the problem where it is printed alone
+    names : of the log, and its path; they stand before the problem where it is printed alone
     command : to run next
     """
     decision, good = verdict(run, problem, names), run is not None and run.usable
-    rows = [*_holds_rows(survey, log), *(overview_rows(log, run) if log is not None else [])]
+    rows = [*_holds_rows(names[0], survey, log), *(overview_rows(log, run) if log is not None else [])]
     rows += [excitation_row(run)] if run is not None else []
     rows += _topic_rows(survey, log)
     warnings = run.warnings if run is not None else log.warnings if log is not None else ()
@@ -68,23 +68,21 @@ def info_blocks(
         rows.append(("missing", missing))
     answer = Section("", [], lead=decision, label="verdict", grade="good" if good else "bad")
     last: list[Block] = [copied("next", command)] if command is not None else []
-    return [answer, Facts(rows), *last]
+    return [answer, Facts(rows), *last, *_survey_sections(names[1], survey, log)]
 
 
-def _holds_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
+def _holds_rows(name: str, survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Row]:
     if survey is not None:
         size = sum(file.bytes for file in survey.inputs)
-        holds = (
-            f"{counted(len(survey.channels), 'topic')}, {size / 1e6:.3g} MB in {counted(len(survey.inputs), 'file')}"
-        )
-        yield "log", f"{survey.name}: {holds}"
+        topics, files = counted(len(survey.topics), "topic"), counted(len(survey.inputs), "file")
+        yield "log", f"{name}: {topics}, {size / 1e6:.3g} MB in {files}"
         if survey.transfer:
             yield "read", survey.transfer
     elif log is not None:
         yield "log", f"{log.name}: table"
 
 
-def _topic_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
+def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Row]:
     """Yield each topic that is used, or those that come nearest to it, and how many others there are."""
     used: set[str] = set()
     if log is not None:
@@ -100,16 +98,61 @@ def _topic_rows(survey: Survey | None, log: RobotLog | None) -> Iterator[Row]:
             used.add(log.gyro.topic)
             yield "gyro", f"{log.gyro.topic}: turn rates; not used by the filter"
     elif survey is not None:
-        for role, sources in survey.candidates.by_role().items():
+        for role, sources in survey.candidates.items():
             used |= {sources[0].topic} if sources else set()
             text = next((f"{one.topic}: {one.problem or one.why}" for one in sources), "no topic could be used")
             yield ROLE_WORDS[role], text
     if survey is not None:
-        others = {channel.topic for channel in survey.channels} - {
+        others = {one.topic for one in survey.topics} - {
             topic_of_side(one) for name in used for one in name.split(" + ")
         }
         if others:
             yield "others", f"{counted(len(others), 'topic')} (-v names them, and why they are not used)"
+
+
+def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Section]:
+    """Yield each topic, the candidates of each role with the one that is used, and what they have in common."""
+    chosen = {stream.role: stream for stream in log.streams} if log is not None else {}
+    if survey is not None:
+        rows = [(one.topic, one.message_type, _topic_text(one)) for one in survey.topics]
+        yield Section(f"Topics of {path}", [Table("l", rows)], VERBOSE)
+    for role, word in ROLE_WORDS.items():
+        stream, sources = chosen.get(role), survey.candidates[role] if survey is not None else ()
+        blocks = [_source_text(one, stream) for one in sources] or ["  no candidate"] * (survey is not None)
+        if stream is not None:
+            jitter = f", jitter {stream.jitter_ms:.3g} ms" if stream.jitter_ms is not None else ""
+            blocks += [f"  -> {stream.topic}: {stream.why}"]
+            blocks += [f"     {stream.samples_text} by {stream.clock} stamps{jitter}"]
+        if blocks:
+            yield Section(f"{word} (key topics.{role}; * chosen)", blocks, VERBOSE)
+    if log is None:
+        return
+    if (gyro := log.gyro) is not None:
+        text = f"  -> {gyro.topic}: {len(gyro.stamp_ns)} turn rates, not used by the filter"
+        yield Section("gyro", [text], VERBOSE)
+    spans = [one.stamp_ns for one in (log.wheels, log.gnss, log.heading)]
+    if all(map(len, spans)):
+        overlap = (min(int(s[-1]) for s in spans) - max(int(s[0]) for s in spans)) / 1e9
+        yield Section("", [f"all three overlap for {max(overlap, 0):.1f} s"], VERBOSE)
+
+
+def _topic_text(one: SurveyedTopic) -> str:
+    if one.not_read_because is not None and not one.read:
+        return f"not read: {one.not_read_because}"
+    parts = [] if one.messages is None else [counted(one.messages, "message")]
+    if not one.read:
+        return ", ".join([*parts, "no role"])
+    parts += [f"{one.rate_hz:.4g} Hz"] if one.rate_hz else []
+    parts += [f"{counted(one.gaps, 'gap')} up to {one.longest_gap_s:.1f} s"] if one.gaps else []
+    return ", ".join([*parts, f"{one.unreadable} unreadable"] if one.unreadable else parts)
+
+
+def _source_text(one: SurveyedSource, used: StreamChoice | None) -> str:
+    """Return a candidate, whether it is the one that is used, and why or why not."""
+    is_used = used is not None and one.topic == used.topic
+    refused = "used although unsuitable, because it is configured" if is_used else "cannot be used"
+    verdict = f"{refused}: {one.problem}" if one.problem else one.why
+    return f"  {'*' if is_used else '-'} {one.topic} ({one.message_type}; {one.stamps}): {verdict}"
 
 
 def verdict(run: Run | None, problem: IcrToolError | None, names: Sequence[str]) -> str:
