@@ -200,8 +200,11 @@ def _printed(blocks: Iterable[Block], verbose: bool) -> Iterator[Printed]:
         if isinstance(block, str | Line):
             yield block
         elif isinstance(block, Title):
-            longest = TEXT_WIDTH if verbose else max(BRIEF_WIDTH - len(block.facts) - 3, LABEL + 2)
-            yield Line(f"{shortened(block.text, longest)}   {block.facts}", "title")
+            name = shortened(block.text, TEXT_WIDTH if verbose else BRIEF_WIDTH)
+            if verbose or len(name) + 3 + len(block.facts) <= BRIEF_WIDTH:
+                yield Line(f"{name}   {block.facts}", "title")
+            else:
+                yield from (Line(name, "title"), Line(f"{'':{LABEL + 2}}{block.facts}", "as is"))
         elif isinstance(block, Facts | Checks):
             for first, text, most in _fact_lines(block) if isinstance(block, Facts) else _check_lines(block, verbose):
                 yield _sentence(first, text, most, verbose=verbose)
