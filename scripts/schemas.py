@@ -5,6 +5,7 @@ Numbers that are not known are null. A document may hold more keys than its sche
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 
@@ -32,6 +33,10 @@ def schemas() -> dict[str, str]:
         schema = msgspec.json.schema(kind)
         if "Config" in schema["$defs"]:
             del schema["$defs"]["Config"]["properties"]["given"]  # which keys were set is not written
+        for record in schema["$defs"].values():
+            if "description" in record:
+                # A docstring, which Python 3.13 and later keep without its indentation.
+                record["description"] = inspect.cleandoc(record["description"])
         head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": f"icrtool/{name}/1"}
         found[f"{name}-1.json"] = json.dumps(head | schema, indent=1, sort_keys=True) + "\n"
     return found

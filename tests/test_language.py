@@ -46,8 +46,7 @@ PUBLISHED = (
     "sold_as_fixed",
     "gyro_course",
     "wheels_course",
-    "change*_rise_*_s",
-    "rise_{name}_s",
+    "rise_",
     '"way_m"',
 )
 """Keys and values in files that users read: they never change."""
@@ -92,6 +91,10 @@ def found_in_text(text: str) -> list[str]:
     return [f"{hit.group()}: write {WORDS[hit.group().lower()]}" for hit in PATTERN.finditer(rest)]
 
 
+# Python 3.12 and later split an f-string into tokens of its own.
+TEXT_TOKENS = {tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
+
+
 def found_in_source(source: str) -> list[str]:
     """List the words not to use in names, strings and comments.
 
@@ -101,7 +104,7 @@ def found_in_source(source: str) -> list[str]:
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", token.string) if token.type == tokenize.NAME else token.string
         name = token.type == tokenize.NAME and before != "."
-        if name or token.type in {tokenize.STRING, tokenize.COMMENT}:
+        if name or token.type in TEXT_TOKENS:
             found += [
                 f"{token.start[0]}: {what}"
                 for what in found_in_text(words)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -28,9 +29,9 @@ def test_recordings_are_known_by_content_and_sidecars_are_left_out(tmp_path: Pat
     make(tmp_path, "tue/b.bag", content=BAG)
     make(tmp_path, "mon/a.json", "mon/a.truth.npz", "notes.txt", "tue/b.bag.md5", content=b"text")
     make(tmp_path, ".trash/c.mcap", "mon/.hidden.mcap")
-    with sqlite3.connect(tmp_path / "photos.sqlite") as other:
+    with closing(sqlite3.connect(tmp_path / "photos.sqlite")) as other:
         other.execute("create table photos (name text)")
-    with sqlite3.connect(tmp_path / "rosbag.sqlite") as bag:
+    with closing(sqlite3.connect(tmp_path / "rosbag.sqlite")) as bag:
         bag.execute("create table topics (name text)")
         bag.execute("create table messages (data blob)")
     assert names(tmp_path) == ["mon/a", "mon/renamed", "rosbag", "tue/b"]
