@@ -11,7 +11,7 @@ import numpy as np
 
 from icrtool.alignment.conventions import apply_convention, decide_conventions
 from icrtool.alignment.corrections import AlignedStreams, align_streams
-from icrtool.alignment.estimator import Geometry, estimate_alignment
+from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import check_streams, cut_windows, track_of_log
 from icrtool.alignment.sensors.gnss_quality import fixes_of, grade_fixes
 from icrtool.alignment.sensors.sensor_noise import heading_variance, reference_noise, without_frozen
@@ -21,7 +21,7 @@ from icrtool.alignment.slip.slip_events import find_disagreements
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.records.measurements import Finding, IcrStart, Measurements, SensorData
-from icrtool.records.run import width_or_usual_m
+from icrtool.records.run import ICR_COLUMNS, width_or_usual_m
 from icrtool.records.tables import RobotLog
 
 
@@ -69,7 +69,8 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
     position_std_m, heading_std_rad = reference_noise(found.log, config.filter, fix_steps, heading_steps)
     quality = grade_fixes(found.log, config, fix_steps, position_std_m)
     check_streams(found.log)
-    headings = found.log.heading
+    headings, antenna_m = found.log.heading, _antenna_m(log, config)
+    findings = alignment_findings(found, antenna_m)
     if derived is None:
         noise = heading_variance(headings, config.filter, math.radians(heading.applied_std_deg), heading_std_rad)
         corrected = headings.heading_rad - math.radians(heading.applied_offset_deg)
@@ -82,9 +83,9 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
         gyro=found.log.gyro,
         heading_from_position=found.log.heading_is_of_position,
         heading_correlation_s=max(config.filter.heading_correlation_s, found.heading.correlation_s),
-        antenna_m=(antenna_m := _antenna_m(log, config)),
+        antenna_m=antenna_m,
         losses_ns=quality.losses_ns,
-        icr_start=start_icrs(found.geometry, antenna_m, config),
+        icr_start=start_icrs(findings, config),
         heading_is_estimated=derived is not None,
         heading_is_measured=math.isfinite(heading_std_rad),
         turn_wander_rad=math.inf if found.fit is None else found.fit.turn_wander_rad,
@@ -92,7 +93,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
     )
     return Measurements(
         sensors=sensors,
-        findings=alignment_findings(found, antenna_m),
+        findings=findings,
         wheels=found.wheels.facts,
         heading=heading,
         streams=found.log.streams,
@@ -148,7 +149,7 @@ START = "start of the filter"
 
 
 def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
-    """Return all estimates of the alignment, by name with unit.
+    """Return all estimates of the alignment, by name with unit; side scales and ICRs where there is an estimate.
 
     Parameters
     ----------
@@ -156,7 +157,7 @@ def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) ->
     """
     wheels, heading, delays = found.wheels.facts, found.heading.facts, found.delays
     offset = None if heading.offset_deg is None else -heading.offset_deg
-    return {
+    findings = {
         "wheel_scale": _finding(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
         "heading_offset_deg": _finding(offset, heading.offset_std_deg, -heading.applied_offset_deg),
         "heading_delay_s": _finding(*delays.heading, delays.applied_heading_s),
@@ -164,25 +165,18 @@ def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) ->
         "position_delay_against_heading_s": _finding(
             *delays.apart, delays.applied_gnss_s - delays.applied_heading_s if not delays.together else 0.0
         ),
-    } | _robot_findings(found, antenna_m)
-
-
-def _robot_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
-    """Return side scales, ICRs and the antenna's place against them; none without an estimate."""
-    geometry = found.geometry
-    if geometry is None:
-        return {}
-    (right, left, x, left_scale, right_scale, width), covariance = geometry.values.tolist(), geometry.covariance
-    forward_m, right_m = antenna_m
+    }
+    if found.fit is None:
+        return findings
+    (right, left, x, multiplier, left_scale, right_scale), covariance = found.fit.geometry()
+    (forward_m, right_m), width = antenna_m, found.fit.width_m
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    half_sum = np.array([0.5, 0.5, 0.0, 0.0, 0.0, 0.0])
-    middle_std = math.sqrt(max(float(half_sum @ covariance @ half_sum), 0.0))
+    middle_std = math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)) / 2
     place = "only the position of the antenna relative to the ICRs is determined"
-    scales = found.wheels.applied
-    return {
-        "left_scale": _finding(left_scale, std[3], scales[0], nothing=1.0),
-        "right_scale": _finding(right_scale, std[4], scales[1], nothing=1.0),
-        "icr_separation_m": Finding(width, std[5], 0.0, START),
+    return findings | {
+        "left_scale": _finding(left_scale, std[4], found.wheels.applied[0], nothing=1.0),
+        "right_scale": _finding(right_scale, std[5], found.wheels.applied[1], nothing=1.0),
+        "icr_separation_m": Finding(width * multiplier, width * std[3], 0.0, START),
         "antenna_forward_minus_x_icr_m": Finding(-x, std[2], forward_m, place),
         "antenna_right_minus_icr_middle_m": Finding(-(right + left) / 2, middle_std, right_m, place),
         "y_icr_right_m": Finding(right + right_m, std[0], 0.0, START),
@@ -204,7 +198,7 @@ def _finding(value: float | None, std: float | None, applied: float, nothing: fl
     return Finding(value, std, applied, why)
 
 
-def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: Config) -> IcrStart | None:
+def start_icrs(findings: dict[str, Finding], config: Config) -> IcrStart | None:
     """Return the ICRs to start the filter from; None in preset ``paper``.
 
     They are those of the alignment with an inflated standard deviation, where the drive shows them; else those of
@@ -214,14 +208,13 @@ def start_icrs(found: Geometry | None, antenna_m: tuple[float, float], config: C
         return None
     b = width_or_usual_m(config.robot.track_width_m)
     least = LEAST_START_STD * b
-    if found is not None:
-        right, left, x = found.values[:3].tolist()
-        std, width = np.sqrt(np.maximum(np.diag(found.covariance), 0.0)), float(found.values[5])
-        shown = std[5] < LARGEST_WIDTH_STD * width and WIDTHS[0] * b < width < WIDTHS[1] * b
-        icrs = (right + antenna_m[1], left + antenna_m[1], x + antenna_m[0])
-        if shown and icrs[0] > least > -least > icrs[1] and float(std[:3].max()) < b:
-            inflated = [max(INFLATION * float(one), least) for one in std[:3]]
-            return IcrStart(icrs, (inflated[0], inflated[1], inflated[2]))
+    known = [findings[name] for name in ("icr_separation_m", *ICR_COLUMNS) if name in findings]
+    if known:
+        (width, right, left, x), std = [one.value or 0.0 for one in known], [one.std or 0.0 for one in known]
+        shown = std[0] < LARGEST_WIDTH_STD * width and WIDTHS[0] * b < width < WIDTHS[1] * b
+        if shown and right > least > -least > left and max(std[1:]) < b:
+            inflated = [max(INFLATION * one, least) for one in std[1:]]
+            return IcrStart((right, left, x), (inflated[0], inflated[1], inflated[2]))
     return IcrStart((USUAL_WIDTH * b / 2, -USUAL_WIDTH * b / 2, 0.0), (b / 2, b / 2, b / 2))
 
 

@@ -23,7 +23,7 @@ from icrtool.alignment.conventions import (
     gyro_sense,
     senses_by_distance,
 )
-from icrtool.alignment.estimator import PRIOR_STD, TP, AlignmentFit, Geometry, estimate_alignment
+from icrtool.alignment.estimator import PRIOR_STD, TP, AlignmentFit, estimate_alignment
 from icrtool.alignment.heading.heading_alignment import (
     FEWEST_WINDOWS,
     OPPOSITE_SENSE,
@@ -226,11 +226,6 @@ class AlignedStreams(NamedTuple):
     def warnings(self) -> tuple[str, ...]:
         """What was found, in sentences."""
         return (*self.wheels.warnings, *self.heading.warnings, *self.delays.warnings)
-
-    @property
-    def geometry(self) -> Geometry | None:
-        """ICRs with covariance, from the same estimate; None without one."""
-        return None if self.fit is None else self.fit.geometry()
 
     def steps(self) -> tuple[FixSteps, FixSteps]:
         """Return steps of position and of heading [rad] between the fixes, beyond the motion of the wheels.

@@ -25,6 +25,7 @@ from icrtool.alignment.log_track import DriveWindows
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.kernels.track import Track
+from icrtool.motion.models import FIVE, MODELS, FittedModel, TrackGeometry
 from icrtool.records.measurements import RESPONSE_S
 
 NAMES = (
@@ -93,18 +94,8 @@ MOUNTING_STD_RAD = math.radians(3.0)
 FEWEST_WINDOWS = 16
 MOST_STEPS = 15
 
-
-class Geometry(NamedTuple):
-    """The geometry of the robot, with covariance.
-
-    Attributes
-    ----------
-    values : (6,) y_icr_right, y_icr_left, x_icr [m], left scale, right scale, W [m]
-    covariance : (6, 6)
-    """
-
-    values: Floats
-    covariance: Floats
+FIVE_TERMS = MODELS[FIVE]
+"""The motion model of the displacements and turns, but for drag and drift."""
 
 
 class ResidualsByEstimate(NamedTuple):
@@ -190,20 +181,19 @@ class AlignmentFit(NamedTuple):
         """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,), by this estimate."""
         return _Model(self.windows, self.width_m).until_fixes(self.fit.x)
 
-    def geometry(self) -> Geometry:
-        """Return ICRs and side scales, and their covariance by complex-step differentiation of first order."""
-        x, b = self.fit.x, self.width_m
-        columns = []
-        for i in range(len(x)):
-            moved = x.astype(np.complex128)
-            moved[i] += 1e-20j
-            columns.append(_geometry(moved, b, self.turning_speed_mps).imag / 1e-20)
-        jacobian = np.column_stack(columns)
-        values = _geometry(x.astype(np.complex128), b, self.turning_speed_mps).real
-        covariance = jacobian @ self.covariance @ jacobian.T
+    def geometry(self) -> tuple[TrackGeometry, Floats]:
+        """Return ICRs about the antenna, multiplier and side scales, and their covariance (6, 6)."""
+        x, b, speed = self.fit.x, self.width_m, self.turning_speed_mps
+        # sideways slip l v w of that speed displaces the centre as c does
+        aside = x[C] + x[L] * speed
+        by = np.zeros((len(FIVE_TERMS.terms), len(x)))
+        by[[0, 1, 2, 3], [A, M, K, Q]] = 1.0
+        by[4, [K, C, L]] = np.array([aside, x[K], x[K] * speed]) * 2.0 / b
+        parameters = np.array([x[A], x[M], x[K], x[Q], x[K] * aside * 2.0 / b])
+        values, covariance = FittedModel(FIVE_TERMS, parameters, by @ self.covariance @ by.T).geometry(b)
         # at one speed, positions that lag look like an antenna further back
-        covariance[2, 2] += (self.turning_speed_mps * _clock_std_s(self.windows.track, self.width_m)) ** 2
-        return Geometry(values, covariance)
+        covariance[2, 2] += (speed * _clock_std_s(self.windows.track, b)) ** 2
+        return values, covariance
 
 
 def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
@@ -222,14 +212,6 @@ def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
 def _clock_std_s(track: Track, width_m: float) -> float:
     """Return what no drive shows of the time between position and heading, or of a robot's response."""
     return RESPONSE_STD_S if track.same_clock else max(CLOCK_S_PER_M * width_m, RESPONSE_STD_S)
-
-
-def _geometry(x: Complexes, b: float, speed: float) -> Complexes:
-    left, right = (x[K] + x[Q] / 2) / b, (x[K] - x[Q] / 2) / b
-    y_right, y_left = (x[A] + x[M]) / 2 / left, -(x[A] - x[M]) / 2 / right
-    width = y_right - y_left
-    # sideways slip l v w of that speed displaces the centre as c does
-    return np.array([y_right, y_left, -x[C] - x[L] * speed, left * width, right * width, width])
 
 
 def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | None:

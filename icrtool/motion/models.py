@@ -13,9 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
@@ -247,7 +248,7 @@ ICRS = 3
 """So many values of a `TrackGeometry`, the first, are ICRs."""
 
 
-def track_geometry(model: MotionModel, parameters: Floats, width_m: float) -> TrackGeometry:
+def track_geometry(model: MotionModel, parameters: NDArray[Any], width_m: float) -> TrackGeometry:
     """Return ICRs, multiplier and radius factors of a model; terms that are not linear in the speeds do not enter.
 
     Notes
@@ -312,7 +313,7 @@ NOT_SHOWN, SHOWN_SIGMAS = 0.7, 3.0
 """A drive that leaves this share of a prior's standard deviation shows nothing of the parameter, unless it lies two
 standard deviations from the prior's mean; so many of them widen the prior."""
 
-STEP = 1e-6
+TINY = 1e-20
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,14 +354,13 @@ class FittedModel:
 
     def geometry(self, width_m: float) -> tuple[TrackGeometry, Floats]:
         """Return ICRs, multiplier and radius factors, and their covariance (6, 6)."""
-        at = np.array(track_geometry(self.model, self.parameters, width_m))
-        by_parameter = np.zeros((len(at), len(self.parameters)))
-        for k in range(len(self.parameters)):
-            moved = self.parameters.copy()
-            moved[k] += STEP
-            by_parameter[:, k] = (np.array(track_geometry(self.model, moved, width_m)) - at) / STEP
-        covariance: Floats = by_parameter @ self.covariance @ by_parameter.T
-        return TrackGeometry(*at.tolist()), covariance
+        at = track_geometry(self.model, self.parameters, width_m)
+        # complex steps (Squire and Trapp 1998)
+        moved = self.parameters + TINY * 1j * np.eye(len(self.parameters))
+        columns = [np.imag(track_geometry(self.model, one, width_m)) / TINY for one in moved]
+        by_parameter = np.reshape(columns, (len(moved), len(at)))
+        covariance: Floats = by_parameter.T @ self.covariance @ by_parameter
+        return at, covariance
 
 
 class Lever(NamedTuple):

@@ -27,12 +27,12 @@ def estimate(seed: int, **track: float) -> AlignmentFit:
 
 
 def test_two_standard_deviations_cover_the_truth_over_many_drives() -> None:
-    truth = np.array([*ICRS, *SCALES, ICRS[0] - ICRS[1]])
+    truth = np.array([*ICRS, (ICRS[0] - ICRS[1]) / WIDTH_M, *SCALES])
     inside, others = [], []
     for seed in range(SEEDS):
         found = estimate(seed)
-        geometry = found.geometry()
-        inside.append(np.abs(geometry.values - truth) < 2.0 * np.sqrt(np.diag(geometry.covariance)))
+        geometry, covariance = found.geometry()
+        inside.append(np.abs(geometry - truth) < 2.0 * np.sqrt(np.diag(covariance)))
         offset, std = found.estimate("offset")
         others.append(abs(offset + math.radians(OFFSET_DEG)) < 2.0 * std)
         for name in ("heading_delay", "position_delay"):
@@ -45,10 +45,10 @@ def test_two_standard_deviations_cover_the_truth_over_many_drives() -> None:
 
 def test_the_estimate_is_as_sharp_as_the_sensors_allow() -> None:
     """A coverage that large standard deviations buy would be worth nothing."""
-    geometry = estimate(0).geometry()
-    assert np.abs(geometry.values[:2] - ICRS[:2]).max() < 0.02
-    assert np.abs(geometry.values[3:5] - SCALES).max() < 0.02
-    assert np.sqrt(geometry.covariance[5, 5]) < 0.03
+    geometry, covariance = estimate(0).geometry()
+    assert np.abs(np.array(geometry[:2]) - ICRS[:2]).max() < 0.02
+    assert np.abs(np.array(geometry[4:]) - SCALES).max() < 0.02
+    assert WIDTH_M * np.sqrt(covariance[3, 3]) < 0.03
 
 
 @pytest.mark.parametrize(("gnss", "heading"), [(0.15, 0.0), (0.0, 0.12), (0.3, 0.1)])
@@ -70,8 +70,8 @@ def test_a_straight_drive_knows_that_it_shows_no_separation() -> None:
     track = track_of_log(log)
     found = estimate_alignment(cut_windows(track), WIDTH_M)
     assert found is not None
-    geometry = found.geometry()
-    assert np.sqrt(geometry.covariance[5, 5]) > 0.3 * abs(geometry.values[5])
+    geometry, covariance = found.geometry()
+    assert np.sqrt(covariance[3, 3]) > 0.3 * abs(geometry.multiplier)
     assert found.estimate("scale")[0] == pytest.approx(1.0, abs=0.01)
 
 
@@ -91,8 +91,8 @@ def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
     track = track_of_log(replace(log, gnss=replace(log.gnss, north_m=north)))
     found = estimate_alignment(cut_windows(track), WIDTH_M)
     assert found is not None
-    assert np.abs(found.geometry().values[:2] - ICRS[:2]).max() < 0.02
-    assert np.abs(found.geometry().values[3:5] - SCALES).max() < 0.02
+    assert np.abs(np.array(found.geometry()[0][:2]) - ICRS[:2]).max() < 0.02
+    assert np.abs(np.array(found.geometry()[0][4:]) - SCALES).max() < 0.02
 
 
 def test_the_jacobian_equals_differences() -> None:

@@ -97,6 +97,6 @@ def test_a_heading_that_is_a_course_over_ground_is_left_out() -> None:
     found = align_streams(of_course, EXACT)
     assert any("it is a course over ground" in warning for warning in found.log.warnings)
     assert found.derived is not None
-    assert found.geometry is not None
-    assert found.geometry.values[:2] == pytest.approx(ICRS[:2], abs=0.02)
+    assert found.fit is not None
+    assert found.fit.geometry()[0][:2] == pytest.approx(ICRS[:2], abs=0.02)
     assert align_streams(log, EXACT).derived is None
