@@ -24,7 +24,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.log_track import LEAST_CHORD_M, DriveWindows, cut_chords
+from icrtool.alignment.log_track import (
+    FEWEST_OVERLAPPING,
+    FEWEST_WINDOWS,
+    LEAST_CHORD_M,
+    STARTS_A_WINDOW,
+    DriveWindows,
+    cut_chords,
+)
 from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares, sandwich_covariance, soft_l1_loss
 from icrtool.kernels.track import Track
@@ -37,7 +44,6 @@ EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
 DECISIVE = 25.0
 """Twice the log-likelihood, five standard deviations: less does not overrule that everything is as it is named."""
 
-OVERLAP = 8.0
 PRIOR_STD = 10.0
 """Hardly any prior, of parameters near one."""
 
@@ -127,7 +133,7 @@ def decide_conventions(
     gyro_sense : +1 where a gyro turns as the heading is named, -1 where in the opposite sense, 0 without one
     mirror_allowed : whether the heading's handedness is free
     """
-    if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
+    if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return Decision(AS_NAMED, None)
     track = windows.track
     shown = {hand: _show(windows, hand) for hand in (1, -1)}
@@ -172,8 +178,6 @@ def senses_by_distance(track: Track) -> Convention:
 TIE = 9.0
 """Hypotheses this near the best are as good."""
 
-FEWEST_WINDOWS = 16
-
 
 def _show(windows: DriveWindows, hand: int) -> _Shown:
     """Fit displacements and turns for one handedness, with hardly any prior."""
@@ -199,13 +203,15 @@ def _show(windows: DriveWindows, hand: int) -> _Shown:
 def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:
     """Return twice the negative log-likelihood of either handedness, both in the noise of the better one."""
     scale = max(min(mad_std(one.residuals, 0.0) for one in shown.values()), least)
-    return {hand: soft_l1_loss(one.residuals / scale) / OVERLAP for hand, one in shown.items()}
+    return {hand: soft_l1_loss(one.residuals / scale) / STARTS_A_WINDOW for hand, one in shown.items()}
 
 
 def _linear(design: Floats, target: Floats) -> RobustFit:
     zero = np.zeros(design.shape[1])
     prior_std = np.full(len(zero), PRIOR_STD)
-    return robust_least_squares(lambda x: (design @ x - target, design), zero, zero, prior_std, overlap=OVERLAP)
+    return robust_least_squares(
+        lambda x: (design @ x - target, design), zero, zero, prior_std, overlap=float(STARTS_A_WINDOW)
+    )
 
 
 def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:

@@ -25,7 +25,6 @@ from icrtool.alignment.conventions import (
 )
 from icrtool.alignment.estimator import PRIOR_STD, TP, AlignmentFit, estimate_alignment
 from icrtool.alignment.heading.heading_alignment import (
-    FEWEST_WINDOWS,
     OPPOSITE_SENSE,
     HeadingAlignment,
     align_heading,
@@ -200,10 +199,6 @@ def _delay_notes(
     return notes
 
 
-FAR_IN_POSITION_STD, SHORT_DRIVE_M = 30.0, 0.3
-"""A drive of so many standard deviations of the fixes, at least of this each, is no short one."""
-
-
 class AlignedStreams(NamedTuple):
     """A log whose streams fit together, and what was done for that.
 
@@ -272,7 +267,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
             scatter = fit.heading_scatter if fit is not None and config.frames.heading == "auto" else 0.0
             if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
                 return align_streams(bare, config)
-            refuse_unexplained(log, course)
+            refuse_unexplained(log, fit)
         derived = fuse_heading(log, windows.track) if free and config.frames.heading == "auto" else None
         heading = align_heading(log, config, (fit, course, convention), derived)
         if derived is not None:
@@ -340,16 +335,6 @@ def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     """Return the heading of a log without one; a robot that stands is refused as such."""
     try:
         return derive_heading(log, width_m)
-    except DataError as error:
+    except DataError:
         refuse_parked(log)
-        if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < FEWEST_WINDOWS:
-            raise
-        track = track_of_log(log)
-        if track.travel[-1] < FAR_IN_POSITION_STD * max(track.place_std_m, SHORT_DRIVE_M):
-            raise
-        raise DataError(
-            log.name,
-            f"no heading in it, and a drive of {track.travel[-1]:.0f} m is too short to find one from positions of "
-            f"±{track.place_std_m:.1f} m",
-            "record an orientation (AHRS), use RTK, or drive several times as far",
-        ) from error
+        raise

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.log_track import DriveWindows
+from icrtool.alignment.log_track import FEWEST_OVERLAPPING, DriveWindows
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, correlated_covariance, robust_least_squares
 from icrtool.kernels.track import Track
@@ -91,7 +91,6 @@ ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
 MOUNTING_STD_RAD = math.radians(3.0)
 """A sensor whose offset no drive shows points ahead to within this."""
 
-FEWEST_WINDOWS = 16
 MOST_STEPS = 15
 
 FIVE_TERMS = MODELS[FIVE]
@@ -227,7 +226,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     Soft-L1 weights, each residual kind (along, across, turn) with its own robust scale; covariance from groups of
     distance (`icrtool.kernels.robust`).
     """
-    if len(windows.begin) < FEWEST_WINDOWS or len(windows.turn_begin) < FEWEST_WINDOWS:
+    if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return None
     track, model = windows.track, _Model(windows, width_m)
     start = PRIOR_MEAN.copy()
@@ -300,7 +299,7 @@ class _Model:
         at = self.track.laid
         laid = at[self.windows.end] - at[self.windows.begin]
         unit = (self.seen * np.conj(laid))[np.abs(laid) > self.windows.length_m / 3]
-        if len(unit) < FEWEST_WINDOWS:
+        if len(unit) < FEWEST_OVERLAPPING:
             return None
         return float(np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12))))
 

@@ -25,7 +25,10 @@ WINDOW_IN_POSITION_STD = 12.0
 WINDOW_IN_VALUES = 12.0
 """A value that is held while the robot accelerates moves the end of a window by a part of its own distance."""
 
-STARTS_A_WINDOW = 8
+STARTS_A_WINDOW, FEWEST_WINDOWS = 8, 8
+FEWEST_OVERLAPPING = 2 * STARTS_A_WINDOW
+"""Fewer windows that follow one another show nothing, nor do less than two that overlap."""
+
 LONGEST_WINDOW_S = 30.0
 """A window that takes longer holds an outage or a stop."""
 

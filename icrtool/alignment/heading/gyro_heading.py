@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from icrtool.alignment.heading.turn_rates import Guess, TurnRate, fit_middle, measure_courses
+from icrtool.alignment.log_track import FEWEST_WINDOWS
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.robust import long_run_factor, mad_std
+from icrtool.kernels.robust import long_run_factor
 from icrtool.kernels.track import Track
 
 if TYPE_CHECKING:
@@ -38,7 +39,6 @@ LARGEST_RATE_HZ = 20.0
 
 STANDING_S = 0.6
 STANDING_RATE_STD = math.radians(0.05)
-FEWEST_COURSES = 8
 PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1])
 ABSOLUTE_PRIOR_STD = np.array([math.pi, math.radians(1.0), 0.05])
 ANY_DIRECTION_STD = math.pi / math.sqrt(3.0)
@@ -100,7 +100,6 @@ class HeadingEstimate:
     constants, constants_std : (k,) heading and bias at the end, scale error, x [m], delay [s]; then offset, wandering
         error at the end, delay of each absolute heading
     noises : what the likelihood chose; those of an absolute heading have its number in front
-    spread : robust standard deviation of the courses' innovations, in theirs
     """
 
     t: Floats
@@ -111,7 +110,6 @@ class HeadingEstimate:
     constants: Floats
     constants_std: Floats
     noises: dict[str, float]
-    spread: float
 
     @property
     def median_std(self) -> float:
@@ -137,13 +135,13 @@ def estimate_heading(
     stands : whether the rate is zero while the wheels stand
     """
     problem = _Problem(track, turn, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std), (), stands=stands)
-    if problem.courses < FEWEST_COURSES:
+    if problem.courses < FEWEST_WINDOWS:
         return None
     noises = problem.usual()
     guess = problem.guess(noises)
     for _ in range(ROUNDS):
         problem = _Problem(track, turn, guess, (), stands=stands)
-        if problem.courses < FEWEST_COURSES:
+        if problem.courses < FEWEST_WINDOWS:
             return None
         # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
         noises = problem.choose(NOISES, noises)
@@ -188,7 +186,7 @@ class _Problem:
         self.turn, self.absolute, self.G = turn, absolute, turn.integrated()
         courses = measure_courses(track, turn, guess)
         self.courses = len(courses.end)
-        if self.courses < FEWEST_COURSES:
+        if self.courses < FEWEST_WINDOWS:
             return
         self.middle = fit_middle(courses, guess)
         self.window_s = float(np.median(courses.end - courses.begin))
@@ -308,19 +306,14 @@ class _Problem:
         x[fixed] = states[-1][fixed]
         P[np.ix_(fixed, fixed)] = covariances[-1][np.ix_(fixed, fixed)]
         causal = filter_headings(events, model._replace(x=x, P=P, fixed=fixed))
-        return self._at_rate_samples(causal, states, covariances, noises, mad_std(self._settled(causal), 0.0))
-
-    def _settled(self, passes: HeadingPasses) -> Floats:
-        """Return the courses' innovations in standard deviations, except the first ones."""
-        course = self.kind == COURSE
-        z = passes.innovation[course] / np.sqrt(passes.variance[course])
-        settled: Floats = z[len(z) // 20 + 2 :]
-        return settled
+        return self._at_rate_samples(causal, states, covariances, noises)
 
     def _alike(self, passes: HeadingPasses) -> float:
         """Return by how much courses of windows that follow one another err alike, by slip that the model lacks."""
-        z = np.clip(self._settled(passes), -SETTLED_SIGMAS, SETTLED_SIGMAS)
-        return float(long_run_factor(z[:, None])[0])
+        course = self.kind == COURSE
+        z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
+        # the first ones find the states
+        return float(long_run_factor(z[len(z) // 20 + 2 :, None])[0])
 
     def usual(self) -> dict[str, float]:
         """Return noises to start from."""
@@ -347,7 +340,7 @@ class _Problem:
         return noises
 
     def _at_rate_samples(
-        self, causal: HeadingPasses, states: Floats, covariances: Floats, noises: dict[str, float], spread: float
+        self, causal: HeadingPasses, states: Floats, covariances: Floats, noises: dict[str, float]
     ) -> HeadingEstimate:
         """Return the estimates at samples of the rate: carried on from the last event, or between events."""
         t, turn, G = self.t, self.turn, self.G
@@ -370,5 +363,5 @@ class _Problem:
         smoothed_std = np.sqrt(np.interp(s, t, covariances[:, PSI, PSI]) + stamp)
         return HeadingEstimate(
             s, carried, np.sqrt(np.maximum(variance, 0.0) + stamp), smoothed, smoothed_std,
-            constants, np.sqrt(variances), noises, spread,
+            constants, np.sqrt(variances), noises,
         )  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.alignment.conventions import Convention
 from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.heading.heading_choice import NOISY_SCATTER_RAD, DerivedHeading, stated_source
-from icrtool.alignment.log_track import STARTS_A_WINDOW, DriveWindows
+from icrtool.alignment.log_track import FEWEST_WINDOWS, STARTS_A_WINDOW, DriveWindows
 from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -107,7 +107,6 @@ def _declination_deg(datum: Datum, stamp_ns: int) -> float | None:
         return None
 
 
-FEWEST_WINDOWS = 8
 SIGNIFICANT_SIGMAS = 4.0
 SMALLEST_OFFSET_RAD = math.radians(1.0)
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
@@ -115,9 +114,8 @@ OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over gro
 EXPLAINED = 0.8
 """Mean resultant length of heading minus course over ground above which they are one direction."""
 
-NEAR_RAD, NEAR_SHARE = math.radians(45.0), 0.6
-"""A heading without agreement is refused where no offset brings this share of the windows this near to the course
-over ground: outliers among the fixes disturb some windows, not most."""
+UNEXPLAINED_RAD = math.radians(40.0)
+"""A heading that scatters by more about the motion of wheels and fixes is refused: noise with half of that is used."""
 
 STUCK_S, STUCK_TURN_M, STUCK_SHARE = 5.0, 0.3, 0.1
 """A heading that is constant for so long, while one side gains so much on the other, over this share of the distance,
@@ -136,14 +134,12 @@ class CourseAngles(NamedTuple):
     angle : (w,) heading minus course over ground [rad], in (-pi, pi]
     mirrored : (w,) the same for a heading of the other handedness
     backwards : (w,) whether the wheels ran backwards
-    scattered : windows in which the fixes moved on, but the wheels laid along the heading did not
     duration_s : median duration of a window
     """
 
     angle: Floats
     mirrored: Floats
     backwards: Bools
-    scattered: int
     duration_s: float
 
     @property
@@ -165,13 +161,8 @@ class CourseAngles(NamedTuple):
         about = np.cos(back - np.angle(np.exp(1j * ahead).mean())) < 0.0
         return _resultant_length(ahead) > EXPLAINED and float(about.mean()) > EXPLAINED
 
-    @property
-    def is_explained(self) -> bool:
-        """Whether there are enough windows, and the heading follows the course over ground in one of the senses."""
-        return len(self.angle) >= FEWEST_WINDOWS and max(self.agreement, self.mirrored_agreement) >= EXPLAINED
 
-
-NO_COURSE = CourseAngles(np.empty(0), np.empty(0), np.empty(0, np.bool_), 0, 0.0)
+NO_COURSE = CourseAngles(np.empty(0), np.empty(0), np.empty(0, np.bool_), 0.0)
 
 
 def compare_with_course(windows: DriveWindows) -> CourseAngles:
@@ -182,13 +173,11 @@ def compare_with_course(windows: DriveWindows) -> CourseAngles:
     along, mirrored = track.at_places(v * nose), track.at_places(v * np.conj(nose))
     laid, other = (at[end] - at[begin] for at in (along, mirrored))
     travel = track.at_places(v)
-    went, led = np.abs(seen) > windows.length_m / 3, np.abs(laid) > windows.length_m / 3
-    moved = went & led
+    moved = (np.abs(seen) > windows.length_m / 3) & (np.abs(laid) > windows.length_m / 3)
     return CourseAngles(
         np.angle(laid * np.conj(seen))[moved],
         np.angle(other * np.conj(seen))[moved],
         (travel[end] < travel[begin])[moved],
-        int(np.count_nonzero(went & ~led)),
         float(np.median((track.place_t[end] - track.place_t[begin])[moved])) if moved.any() else 0.0,
     )
 
@@ -230,7 +219,7 @@ def align_heading(
             turn, std = fit.estimate("offset")
             offset, scatter = math.remainder(-turn, 2 * math.pi), fit.across_scatter
             applied, name, notes = _correction(log, config, fit, convention, (offset, std), applied)
-    noisy = derived is None and corrects and scatter > NOISY_SCATTER_RAD and course.is_explained
+    noisy = derived is None and corrects and scatter > NOISY_SCATTER_RAD
     if noisy:
         correlation_s = course.duration_s
         notes.append(
@@ -319,19 +308,11 @@ def _significant(offset: float, std: float) -> bool:
     return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * std)
 
 
-def refuse_unexplained(log: RobotLog, course: CourseAngles) -> None:
-    """Raise where the heading points nowhere, or no convention and no offset makes it follow the course over ground."""
-    windows, scattered = len(course.angle), course.scattered
-    if scattered >= FEWEST_WINDOWS and scattered > windows:
-        raise _no_heading(
-            log, "scatters over all directions", f"in {scattered} of the windows in which it was averaged"
-        )
-    if windows < FEWEST_WINDOWS or max(_near_share(course.angle), _near_share(course.mirrored)) >= NEAR_SHARE:
-        return
-    best = max(course.agreement, course.mirrored_agreement)
-    if best < EXPLAINED:
-        spread = math.degrees(math.sqrt(-2.0 * math.log(max(best, 1e-3))))
-        tried = f"with ENU, NED and any offset it scatters by {spread:.0f}° or more ({windows} windows)"
+def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None) -> None:
+    """Raise where no convention and no offset makes the heading follow the motion of wheels and fixes."""
+    if fit is not None and fit.heading_scatter > UNEXPLAINED_RAD:
+        spread = min(math.degrees(fit.heading_scatter), 180.0)
+        tried = f"with ENU, NED and any offset it scatters by {spread:.0f}° ({len(fit.windows.begin)} windows)"
         raise _no_heading(log, "does not follow the course over ground", tried)
 
 
@@ -368,13 +349,6 @@ def _clearly_ahead(ahead: Floats, gone: Floats) -> Floats:
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
     advice = "choose another with topics.heading, or use this one with --set frames.heading_offset_deg=0"
     return DataError(log.name, " ".join(filter(None, ("the heading", log.topic("heading"), why))), f"{found}; {advice}")
-
-
-def _near_share(angle: Floats) -> float:
-    """Return the largest share of angles within `NEAR_RAD` of one of 16 directions."""
-    directions = np.arange(16) * math.pi / 8
-    away = np.abs(np.angle(np.exp(1j * (angle[:, None] - directions))))
-    return float((away < NEAR_RAD).mean(axis=0).max())
 
 
 def _resultant_length(angle: Floats) -> float:

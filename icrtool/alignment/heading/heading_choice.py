@@ -12,11 +12,11 @@ from icrtool.alignment.estimator import ATTITUDE_STD_RAD
 from icrtool.alignment.heading.gyro_heading import LAG, OFFSET, AbsoluteHeading, HeadingEstimate, estimate_heading
 from icrtool.alignment.heading.turn_rates import TurnRate, gyro_rate, wheel_rate
 from icrtool.alignment.log_track import fix_std_m, track_of_log
+from icrtool.alignment.sensors.sensor_noise import is_hole
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats, trapezoids
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
-from icrtool.motion.turns import compare_turns
 from icrtool.records.samples import (
     NO_HEADINGS,
     GyroAxes,
@@ -51,7 +51,7 @@ def antenna_heading(log: RobotLog, other: PositionFixes, turn: TurnRate) -> tupl
     epoch = int(log.wheels.stamp_ns[0])
     t, s = (mine.stamp_ns - epoch) / 1e9, (other.stamp_ns - epoch) / 1e9
     after = np.clip(np.searchsorted(s, t), 1, len(s) - 1)
-    near = (t >= s[0]) & (t <= s[-1]) & (s[after] - s[after - 1] < 3.0 * float(np.median(np.diff(s))))
+    near = (t >= s[0]) & (t <= s[-1]) & ~is_hole(np.diff(s))[after - 1]
     there = np.interp(t, s, other.north_m) + 1j * np.interp(t, s, other.east_m)
     line = (there - (mine.north_m + 1j * mine.east_m))[near]
     if len(line) < 2:
@@ -92,18 +92,8 @@ DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING"
 LARGEST_START_STD_RAD = math.radians(5.0)
 """Headings less certain than this are not given to the filter."""
 
-LARGEST_SPREAD = 2.0
-"""Courses that scatter about the estimate by more than so many standard deviations contradict the turn rate."""
-
 LARGEST_DRIFT = math.radians(10.0)
 """A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
-
-COMPARED_S, LEFT_SHARE, LEAST_GAIN, LARGEST_GAIN = 1.0, 0.3, 0.15, 1.3
-"""A gyro whose turns within a second are those of the wheels but for this share, with such a gain, turns with the
-robot."""
-
-LONGEST_HOLE_S = 1.0
-"""No heading is estimated within a longer hole of the turn rate."""
 
 NOISY_SCATTER_RAD = math.radians(6.0)
 """Scatter about the course over ground above which a heading is no attitude sensor's: it drifts, or is noise."""
@@ -161,28 +151,25 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             log.name, "no heading in it, and too few wheel or position samples", "record at least two of each"
         )
     track = track_of_log(log)
-    found, against = _with_gyro(log, track, None)
+    found = _with_gyro(log, track, None)
     if found is not None and _is_alive(found.estimate):
         return found
     turn = wheel_rate(track, width_m)
     pair, length = _pair(log, turn)
     estimate = estimate_heading(track, turn, [pair] if pair is not None else [], stands=False)
-    doubted = found if found is not None else against
-    if doubted is not None and _follows_wheels(doubted, track, width_m, int(log.wheels.stamp_ns[0])):
-        # what contradicts it contradicts the wheels as much: it is the fixes that err
-        return doubted
     if estimate is not None and (found is None or estimate.median_std < found.estimate.median_std):
         why = "no turn rate in the log"
         if found is not None:
             why = "the turn rate drifts more"
-        elif against is not None:
-            why = "the turn rate contradicts the course over ground more"
         elif log.gyros:
             why = "the turn rate does not cover enough of the drive"
         return _derived(log, estimate, turn, None, length, None, instead=why)
     if found is None:
         raise DataError(
-            log.name, "no heading in it, and too little distance to find one from positions", "drive some metres"
+            log.name,
+            f"no heading in it, and a drive of {track.travel[-1]:.0f} m is too short to find one from positions of "
+            f"±{track.place_std_m:.2f} m",
+            "record an orientation (AHRS), use RTK, or drive several times as far",
         )
     return found
 
@@ -190,8 +177,8 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
 def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
     """Estimate the heading from gyro, course over ground and the heading that the log states.
 
-    None without a gyro, where the gyro is dead or contradicts the courses over ground, where the stated heading alone
-    is as good, and where it is the position reference's own.
+    None without a gyro, where the gyro is dead, where the stated heading alone is as good, and where it is the position
+    reference's own.
 
     Parameters
     ----------
@@ -199,7 +186,7 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
     """
     if track.same_clock:
         return None
-    found, _ = _with_gyro(log, track, log.heading)
+    found = _with_gyro(log, track, log.heading)
     if found is None or not _is_alive(found.estimate):
         return None
     return found if found.estimate.median_std <= math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD) else None
@@ -210,33 +197,14 @@ def _is_alive(estimate: HeadingEstimate) -> bool:
     return estimate.noises["angle"] < LARGEST_DRIFT
 
 
-def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, epoch_ns: int) -> bool:
-    """Return whether a gyro turns as the wheels of a robot that may slip do, in windows of time."""
-    gyro = derived.gyro
-    if gyro is None:
-        return False
-    t = (gyro.stamp_ns - epoch_ns) / 1e9
-    turning = track._replace(heading_t=t, heading=trapezoids(t, gyro.rate_radps))
-    found = compare_turns(turning, width_m, 0.0, COMPARED_S)
-    if found is None:
-        return False
-    return found.left_rad < LEFT_SHARE * found.turn_rad and LEAST_GAIN < found.ratio < LARGEST_GAIN
-
-
 def attitude_error(estimate: HeadingEstimate) -> float:
     """Return the standard deviation of the wandering error of the first absolute heading [rad]."""
     return estimate.noises["0 size"]
 
 
-def _with_gyro(
-    log: RobotLog, track: Track, stated: HeadingSamples | None
-) -> tuple[DerivedHeading | None, DerivedHeading | None]:
-    """Return the estimates with the gyro that follows the courses over ground best, and that contradicts them least.
-
-    None where no gyro does.
-    """
+def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> DerivedHeading | None:
+    """Return the estimate with the gyro that follows the courses over ground best; None where none covers them."""
     best: DerivedHeading | None = None
-    against: DerivedHeading | None = None
     epoch = int(log.wheels.stamp_ns[0])
     for gyro in log.gyros:
         found = gyro_rate(track, gyro, epoch)
@@ -252,12 +220,9 @@ def _with_gyro(
         if estimate is None:
             continue
         topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
-        if estimate.spread > LARGEST_SPREAD:
-            if against is None or estimate.spread < against.estimate.spread:
-                against = _derived(log, estimate, turn, topic, length, stated)
-        elif best is None or estimate.median_std < best.estimate.median_std:
+        if best is None or estimate.median_std < best.estimate.median_std:
             best = _derived(log, estimate, turn, topic, length, stated)
-    return best, against
+    return best
 
 
 def _pair(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]:
@@ -290,7 +255,7 @@ def _derived(
         lag = round(float(estimate.constants[LAG]) * 1e9)
         attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - attitude_offset[0], thin(stated.var_rad2))
     std = math.degrees(estimate.median_causal_std)
-    causal, smoothed = _samples(estimate, turn, epoch)
+    causal, smoothed = _samples(estimate, epoch)
     gyro = GyroSamples(gyro_topic, epoch + np.round(turn.t * 1e9).astype(np.int64), turn.rate) if gyro_topic else None
     return DerivedHeading(
         source,
@@ -305,22 +270,15 @@ def _derived(
     )
 
 
-def _samples(found: HeadingEstimate, turn: TurnRate, epoch: int) -> tuple[HeadingSamples, HeadingSamples]:
-    """Return causal and smoothed headings as samples, none within a long hole."""
-    inside = np.ones(len(found.t), np.bool_)
-    for begin, end in turn.holes[turn.holes[:, 1] - turn.holes[:, 0] > LONGEST_HOLE_S]:
-        inside &= (found.t <= begin) | (found.t >= end)
-    rows = np.flatnonzero(inside)
-    stamps = epoch + np.round(found.t[rows] * 1e9).astype(np.int64)
-
-    def as_samples(psi: Floats, std: Floats, some: slice) -> HeadingSamples:
-        return HeadingSamples(stamps[some], np.angle(np.exp(1j * psi[rows]))[some], (std[rows] ** 2)[some])
-
-    sure = found.causal_std[rows] < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(found.causal_std)))
-    first = int(np.argmax(sure))
+def _samples(found: HeadingEstimate, epoch: int) -> tuple[HeadingSamples, HeadingSamples]:
+    """Return causal and smoothed headings as samples, the causal ones from where they are known."""
+    stamps = epoch + np.round(found.t * 1e9).astype(np.int64)
+    known = found.causal_std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(found.causal_std)))
+    first = int(np.argmax(known))
+    causal, smoothed = (np.angle(np.exp(1j * psi)) for psi in (found.causal, found.smoothed))
     return (
-        as_samples(found.causal, found.causal_std, slice(first, None)),
-        as_samples(found.smoothed, found.smoothed_std, slice(None)),
+        HeadingSamples(stamps[first:], causal[first:], found.causal_std[first:] ** 2),
+        HeadingSamples(stamps, smoothed, found.smoothed_std**2),
     )
 
 

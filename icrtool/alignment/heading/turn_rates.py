@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.sensors.sensor_noise import is_hole
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import huber_weights, mad_std
 from icrtool.kernels.track import Track
@@ -256,8 +257,8 @@ BETTER = 0.9
 """Another axis than z up is used where turns of the course over ground scatter about it by no more than this share."""
 
 LARGEST_CHANGE_RAD = 2.5
-HOLE_IN_INTERVALS, SHORTEST_HOLE_S = 5.0, 0.1
-"""A turn rate has a hole where its interval is so many times the usual one, and at least so long."""
+SHORTEST_HOLE_S = 0.1
+"""Shorter ones are none in a turn rate."""
 
 LEAST_AXIS = 0.3
 """A gyro that shows less than this share of the changes of the course over ground shows no axis."""
@@ -332,8 +333,7 @@ def _wrapped(angle: Floats) -> Floats:
 
 def _bridged(t: Floats, rate: Floats, track: Track) -> TurnRate:
     """Return a gyro's rate with its holes bridged by the wheels' turn, scaled as the gyro shows it elsewhere."""
-    usual = float(np.median(np.diff(t)))
-    long = np.flatnonzero(np.diff(t) > max(HOLE_IN_INTERVALS * usual, SHORTEST_HOLE_S))
+    long = np.flatnonzero(is_hole(np.diff(t), SHORTEST_HOLE_S))
     holes = np.column_stack([t[long], t[long + 1]])
     if not len(holes):
         return TurnRate(t, rate, holes)

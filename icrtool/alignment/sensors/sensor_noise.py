@@ -31,14 +31,15 @@ PERSISTS_SHARE = 0.5
 MOVES_MPS = 0.05
 """Wheels on average faster than this: what delays and jitter of stamps add to the noise shows only then."""
 
-GAP_IN_INTERVALS = 5.0
-
 FROZEN_M, FROZEN_SHARE = 1.0, 0.5
 """A fix that repeats the one before to the last digit while the wheels go this far is old. Where they do so on more
 than half of the distance, the robot does not move."""
 
-LONGEST_INTERVAL_S, LONGEST_IN_INTERVALS = 1.0, 2.5
-"""Between wheel samples further apart, and further than so many usual intervals, the path is not known."""
+HOLE_IN_INTERVALS = 5.0
+"""A stream has a hole between samples that are so many usual intervals apart."""
+
+WHEEL_HOLE_S = 1.0
+"""... and the path is not known between wheel samples this far apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,7 @@ def measure_steps(t: Floats, place: Complexes, expected: Complexes) -> FixSteps:
         unknown = np.full(max(len(step) - 1, 0), np.nan)
         return FixSteps(step, unknown, np.zeros(len(step), np.bool_), np.empty(0, np.int64), np.empty(0, np.complex128))
     usual = float(np.median(dt))
-    step[dt > max(GAP_IN_INTERVALS * usual, 1e-6)] = np.nan
+    step[is_hole(dt)] = np.nan
     moves = np.abs(np.diff(expected)) > MOVES_MPS * dt
     moving = step[moves & np.isfinite(step)]
     scale = _scale(moving if len(moving) >= FEWEST_STEPS else step)
@@ -146,10 +147,15 @@ def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:
     return rows, step[found[stays]]
 
 
+def is_hole(interval_s: Floats, least_s: float = 1e-6) -> Bools:
+    """Return which intervals between the samples of a stream [s] are holes, of at least some length."""
+    usual = float(np.median(interval_s)) if len(interval_s) else 0.0
+    return np.asarray(interval_s > max(least_s, HOLE_IN_INTERVALS * usual))
+
+
 def unbroken(interval_s: Floats) -> Floats:
     """Return intervals between wheel samples [s], zero for those that are too long to show what happened in them."""
-    usual = float(np.median(interval_s)) if len(interval_s) else 0.0
-    return np.where(interval_s < max(LONGEST_INTERVAL_S, LONGEST_IN_INTERVALS * usual), interval_s, 0.0)
+    return np.where(is_hole(interval_s, WHEEL_HOLE_S), 0.0, interval_s)
 
 
 def without_frozen(log: RobotLog) -> RobotLog:

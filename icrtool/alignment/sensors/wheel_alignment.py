@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.estimator import TURNS_SLIPPING, AlignmentFit
-from icrtool.alignment.log_track import DriveWindows
+from icrtool.alignment.log_track import FEWEST_WINDOWS, DriveWindows
 from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -31,7 +31,6 @@ NEVER_MOVES_SHARE, DEAD_M = 0.02, 10.0
 """A side slower than this share of the other's speed over this distance has a dead encoder: no robot turns about one
 side for so long."""
 
-FEWEST_WINDOWS = 8
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
 

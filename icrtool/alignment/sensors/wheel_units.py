@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.log_track import CHORD_S, LEAST_CHORD_M, cut_chords, track_of_streams
+from icrtool.alignment.log_track import CHORD_S, FEWEST_WINDOWS, LEAST_CHORD_M, cut_chords, track_of_streams
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -16,7 +16,6 @@ from icrtool.kernels.robust import mad_std
 from icrtool.records.samples import NO_HEADINGS, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
 
-FEWEST_WINDOWS = 8
 STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
 """The distance by the position reference is compared with that of the wheels over spans of time: straight
 ones, in which the sides' distances differ by less than a tenth, else bent ones up to this change of direction."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import cut_windows, track_of_streams, window_length
+from icrtool.alignment.sensors.sensor_noise import is_hole
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapezoids
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
@@ -24,8 +25,8 @@ KNOT_S = 0.1
 SPEED_S = 0.1
 """The speed at a knot is the mean of this much time about it."""
 
-LONGEST_HOLE_S, HOLE_IN_INTERVALS = 0.6, 5.0
-"""Longer without a sample, and so many usual intervals: a hole, which no window spans."""
+LONGEST_HOLE_S = 0.6
+"""Longer without a sample: a hole, which no window spans."""
 
 FEWEST_KNOTS = 30
 LONGEST_HELD_IN_USUAL = 2.0
@@ -153,14 +154,13 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     ahead, behind = (track._replace(place_t=t + shift_s) for shift_s in (SPEED_S / 2, -SPEED_S / 2))
     speeds = [(ahead.at_places(speed) - behind.at_places(speed)) / SPEED_S for speed in (left, right)]
     heading = track.heading_at(t)
-    gap = np.diff(t) > max(LONGEST_HOLE_S, HOLE_IN_INTERVALS * float(np.median(np.diff(t))))
     return Knots(
         epoch_ns=int(wheels.stamp_ns[0]), track=track,
         variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2)[rows] / 2, LEAST_STD_M**2),
         heading=heading, turn_variance=_white_variance(heading),
         velocity=(speeds[0] + speeds[1]) / 2 * np.exp(1j * heading), apart=speeds[0] - speeds[1],
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
-        holes=_holes(t, track.t) + _holes(t, track.heading_t) + np.concatenate([[0], np.cumsum(gap)]),
+        holes=sum((_holes(t, sampled) for sampled in (track.t, track.heading_t, t)), np.zeros(len(t), np.int64)),
         fix_class=fixes.fix_class[rows], turn_follows_place=sensors.heading_is_estimated,
         gyro=_turn_by_gyro(sensors, t, heading),
     )  # fmt: skip
@@ -250,9 +250,7 @@ def _thinned(t: Floats, begin: float, end: float) -> Ints:
 
 def _holes(t: Floats, sampled: Floats) -> Ints:
     """Return the number of holes of a stream before each time (m,)."""
-    interval = np.diff(sampled)
-    holes = sampled[:-1][interval > max(LONGEST_HOLE_S, HOLE_IN_INTERVALS * float(np.median(interval)))]
-    return np.asarray(np.searchsorted(holes, t, side="left"))
+    return np.searchsorted(sampled[:-1][is_hole(np.diff(sampled), LONGEST_HOLE_S)], t)
 
 
 def _white_variance(values: Floats) -> float:

@@ -120,8 +120,8 @@ def constant(log: RobotLog) -> Floats:
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (random, "scatters over all directions"),
-        (wandering, "scatters over all directions"),
+        (random, "does not follow the course over ground"),
+        (wandering, "does not follow the course over ground"),
         (frozen, "stays the same while the wheels turn the robot"),
         (constant, "stays the same"),
     ],
