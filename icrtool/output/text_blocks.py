@@ -6,7 +6,7 @@ A document (a run, a report, a comparison) is a list of blocks. Whatever lays th
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple, Self
 
 from icrtool.records.text import shortened
@@ -48,11 +48,20 @@ class Line(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A cell with a second number beside the first, and further lines; a brief table has the first number alone."""
+    """A cell with a second number beside the first, and further lines; a brief table has the first number alone.
+
+    Attributes
+    ----------
+    order : of a table that a page sorts, what it is sorted by, "" last; None: by the text
+    link, note : on a page, where it leads, and what is shown where it is pointed at
+    """
 
     text: str
     aside: str = ""
     more: tuple[str, ...] = ()
+    order: float | str | None = None
+    link: str = ""
+    note: str = ""
 
     def lines(self) -> tuple[str, ...]:
         """Return its lines; numbers beside others stand in a column."""
@@ -65,10 +74,12 @@ class Table(NamedTuple):
     Attributes
     ----------
     align : ``l`` or ``r`` for each column; the last one holds for the columns after it too
-    rows : as many cells in each
+    rows : as many cells in each; in a row of a table that is searched fewer, the last of which is a sentence
     head : names of the columns; empty: none
     caption : what it shows
     moments : seconds at which each row begins, which a page shows on its map; empty: none
+    search : of each row the `words` in which a page looks for others, and by name what is chosen from lists; a page
+        then sorts the table too; empty: it does neither
     """
 
     align: str
@@ -76,6 +87,7 @@ class Table(NamedTuple):
     head: Sequence[str] = ()
     caption: str = ""
     moments: Sequence[float] = ()
+    search: Sequence[Mapping[str, str]] = ()
 
     def sides(self) -> str:
         """Return ``l`` or ``r`` for every column."""

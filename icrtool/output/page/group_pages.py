@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 from icrtool.motion.models import FAMILY
@@ -19,37 +20,13 @@ from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text
 from icrtool.records.calibration_document import GroupComparison, TransferCell
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
 from icrtool.records.regular_file import is_regular
+from icrtool.records.run import ICR_WORDS
 from icrtool.records.text import counted
 
 PLOTS = "plots"
 
 HORIZON_M = 10.0
 """At this distance the table shows the errors of each model."""
-
-MODELS = MODEL_WORDS
-
-
-class Sortable(NamedTuple):
-    """One cell of the table: what is shown, and the number it is sorted by (None: nothing to show)."""
-
-    text: str
-    order: float | str | None
-
-
-class Line(NamedTuple):
-    """One log of the table.
-
-    Attributes
-    ----------
-    log : what fleet.json holds of it
-    link : relative address of its page; empty where there is none
-    search : what words are looked for in
-    """
-
-    log: FleetLog
-    link: str
-    search: str
-    cells: tuple[Sortable, ...]
 
 
 def fleet_page(document: FleetDocument, folder: Path) -> str:
@@ -59,24 +36,19 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
     ----------
     folder : of the batch; pages of logs that are there are linked
     """
-    logs = document.logs
-    budgets = _budgets(logs)
-    lines = [Line(log, _link(log.run, folder), _search_text(log), tuple(_cells(log, budgets))) for log in logs]
-    choices = {key: sorted({getattr(log, key) for log in logs} - {""}) for key in ("status", "robot", "group")}
-    title = folder.absolute().name
+    logs, title = document.logs, folder.absolute().name
     blocks: list[Block] = [Title(title, _counts_text(document))]
     if document.calibrations:
         blocks.append(Section("The robot, from all logs together", [_robots(document.calibrations)], name="robots"))
-    blocks.append(Section("Logs", [Figure((), "fleet")], name="logs"))
+    blocks.append(Section("Logs", [_logs_table(logs, folder)], name="logs"))
     if reasons := Counter(_reason(log) for log in logs if log.status == "failed").most_common():
         table = Table("lr", [(reason, f"{count}") for reason, count in reasons], ("reason", "logs"))
         blocks.append(Section("Why logs failed", [table], name="failed"))
     if pictures := pictures_in(folder / PLOTS, folder):
         blocks.append(Section("All logs together", [Figure(tuple(pictures), folded=False)], name="pictures"))
     return render(
-        ("fleet.js",), None, title=title, kind="Drive without GNSS: report of many logs", blocks=blocks, lines=lines,
-        columns=_columns(budgets), choices=choices, pictures=pictures, horizon_m=HORIZON_M,
-        named=[key for key in ("robot", "group") if len(choices[key]) > 1],
+        ("fleet.js",), None, title=title, kind="Drive without GNSS: report of many logs", blocks=blocks,
+        pictures=pictures,
     )  # fmt: skip
 
 
@@ -114,49 +86,69 @@ def _reason(log: FleetLog) -> str:
 def _budgets(logs: Sequence[FleetLog]) -> list[str]:
     """Return the error names of distances within a budget, of the best model that some log has."""
     names = dict.fromkeys(name for log in logs for name in log.errors if "_within_" in name)
-    by_model = ([name for name in names if name.startswith(f"{model}_within_")] for model in MODELS)
+    by_model = ([name for name in names if name.startswith(f"{model}_within_")] for model in MODEL_WORDS)
     return next(filter(None, by_model), [])
 
 
-def _columns(budgets: Sequence[str]) -> list[str]:
-    within = [f"within {name.rpartition('_within_')[2].removesuffix('m_m')} m for" for name in budgets]
-    errors = [f"error, {label}" for label in MODELS.values()]
-    found = ["multiplier", "ICR y right", "ICR y left", "ICR x", "distance", "duration", "start"]
-    return [*within, *errors, *found, "events", "warnings", "limits not met"]
+def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
+    """Return a line a log, which leads to its page; of one that failed the reason stands in place of its numbers."""
+    named = [key for key in ("robot", "group") if len({getattr(log, key) for log in logs} - {""}) > 1]
+    columns, rows, search = _columns(logs), [], []
+    for log in logs:
+        status = Cell("not usable", note=log.reason) if log.status == "done" and not log.usable else log.status
+        numbers = [log.reason] if log.status == "failed" else [cell(log) for cell in columns.values()]
+        names = [getattr(log, key) for key in named]
+        rows.append([Cell(log.log, link=_link(log.run, folder)), status, *names, *numbers])
+        words = (log.log, log.status, log.robot, log.group, log.reason, *log.tags)
+        search.append({
+            "words": " ".join(words).casefold(), "status": log.status, "robot": log.robot, "group": log.group,
+        })  # fmt: skip
+    caption = f"One line a log; its name opens its page. Errors: 95 % of the trials of {HORIZON_M:g} m stay below."
+    head = ("log", "status", *named, *columns)
+    return Table(f"ll{'l' * len(named)}r", rows, head, caption, search=search)
 
 
-def _search_text(log: FleetLog) -> str:
-    words = (log.log, log.status, log.robot, log.group, log.reason, *log.tags)
-    return " ".join(words).casefold()
+def _columns(logs: Sequence[FleetLog]) -> dict[str, Callable[[FleetLog], Cell]]:
+    """Return what the table shows of a log, by the name of its column."""
+    within = {
+        f"within {name.rpartition('_within_')[2].removesuffix('m_m')} m for": partial(_within, name=name)
+        for name in _budgets(logs)
+    }
+    errors = {label: f"{model}_p95_{HORIZON_M:g}m_m" for model, label in MODEL_WORDS.items()}
+    return {
+        **within,
+        **{f"error, {label}": partial(_error, name=name) for label, name in errors.items()},
+        "multiplier": lambda log: _with_std(log.multiplier, log.multiplier_std, ""),
+        **{f"ICR {word}": partial(_icr, name=name) for name, word in ICR_WORDS.items()},
+        "distance": lambda log: _cell(log.distance_m, distance_text),
+        "duration": lambda log: _cell(log.duration_s, duration_text),
+        "start": lambda log: Cell(log.start_utc.replace("T", " ").removesuffix("Z"), order=log.start_utc),
+        "events": lambda log: _cell(log.events, str),
+        "warnings": lambda log: _cell(log.warnings, str),
+        "limits not met": lambda log: _cell(log.gates_failed, str),
+    }
 
 
-def _cells(log: FleetLog, budgets: Sequence[str]) -> Iterator[Sortable]:
-    icr, errors = log.icr, log.errors
-    for name in budgets:
-        yield _within(log, name)
-    for model in MODELS:
-        yield _cell(errors.get(f"{model}_p95_{HORIZON_M:g}m_m"), error_text)
-    yield _with_std(log.multiplier, log.multiplier_std, "")
-    for name in ("y_icr_right_m", "y_icr_left_m", "x_icr_m"):
-        yield _with_std(icr.get(name), icr.get(f"std_{name}"), "+")
-    yield _cell(log.distance_m, distance_text)
-    yield _cell(log.duration_s, duration_text)
-    yield Sortable(log.start_utc.replace("T", " ").removesuffix("Z"), log.start_utc or None)
-    for count in (log.events, log.warnings, log.gates_failed):
-        yield Sortable("" if count is None else f"{count}", count)
-
-
-def _within(log: FleetLog, name: str) -> Sortable:
+def _within(log: FleetLog, name: str) -> Cell:
     """Return a distance within a budget; it may be a lower bound."""
     beyond = name in log.bounds
     return _cell(log.errors.get(name), lambda metres: f"{'> ' if beyond else ''}{metres:.1f} m")
 
 
-def _cell(value: float | None, text: Any) -> Sortable:  # noqa: ANN401 - one of the functions of text_format
-    return Sortable("", None) if value is None else Sortable(text(value), value)
+def _error(log: FleetLog, name: str) -> Cell:
+    return _cell(log.errors.get(name), error_text)
 
 
-def _with_std(value: float | None, std: float | None, sign: str) -> Sortable:
+def _icr(log: FleetLog, name: str) -> Cell:
+    return _with_std(log.icr.get(name), log.icr.get(f"std_{name}"), "+")
+
+
+def _cell(value: float | None, text: Callable[[Any], str]) -> Cell:
+    """Return a number of a log; what is not known stands last, whatever the order."""
+    return Cell("", order="") if value is None else Cell(text(value), order=value)
+
+
+def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
     spread = f" ± {std:.3f}" if std is not None else ""
     return _cell(value, lambda number: f"{number:{sign}.3f}{spread}".replace("-", "−"))
 

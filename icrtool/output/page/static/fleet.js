@@ -29,7 +29,7 @@
     const wanted = words.value.toLowerCase().split(/\s+/).filter(Boolean);
     let shown = 0;
     for (const row of rows) {
-      const fits = wanted.every((word) => row.dataset.search.includes(word))
+      const fits = wanted.every((word) => row.dataset.words.includes(word))
         && choices.every((choice) => choice.value === "" || row.dataset[choice.dataset.name] === choice.value);
       row.hidden = !fits;
       shown += fits;
