@@ -14,7 +14,6 @@ from icrtool.alignment.sensors.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import GATED, UNSEEN
-from icrtool.output.decimate import places
 from icrtool.output.exports.paths import (
     ERROR_HORIZON_M,
     LABELS,
@@ -28,6 +27,7 @@ from icrtool.output.exports.paths import (
     rows_apart,
     utc_text,
 )
+from icrtool.output.series import places
 from icrtool.output.text_format import distance_text, driven_text, duration_text, run_title, xml_text
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run

@@ -18,7 +18,7 @@ from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.track import FrozenIcrs
-from icrtool.output.decimate import places
+from icrtool.output.series import places
 from icrtool.records.run import Run
 from icrtool.records.tables import Icrs, States
 

@@ -12,7 +12,6 @@ from matplotlib.transforms import Bbox, BboxBase
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
-from icrtool.output.decimate import places
 from icrtool.output.figures import style
 from icrtool.output.figures.trajectory import (
     CELLS,
@@ -22,6 +21,7 @@ from icrtool.output.figures.trajectory import (
     look_down,
     name_directions,
 )
+from icrtool.output.series import places
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout import ExampleTrial, Outage
 

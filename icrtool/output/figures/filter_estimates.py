@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
-from icrtool.output.decimate import extremes, percentiles
 from icrtool.output.figures import style
+from icrtool.output.series import breaks_after, extremes, percentiles, scale_end_m
 from icrtool.output.text_format import error_text, position_word, run_title, signed
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import IcrColumn
@@ -223,13 +223,6 @@ def _bin_width(span_m: float) -> float:
     return float(min((step * decade for step in (1.0, 2.0, 5.0, 10.0)), key=lambda step: abs(step - target)))
 
 
-TYPICAL_PERCENT = 99.5
-HEADROOM = 1.6
-"""The y range ends at this many times the 99.5 % difference: a few outliers do not flatten the rest."""
-LEAST_RANGE_M = 0.001
-BREAK_SHARE = 0.01
-BREAK_IN_INTERVALS = 5.0
-"""No line is drawn over a gap of this share of the time and this many times the usual interval."""
 MOST_SINGLE = 1500
 TIME_BINS = 300
 """More used fixes than `MOST_SINGLE` are drawn by their range and median in so many equal times."""
@@ -255,7 +248,7 @@ def gnss_difference(run: Run) -> Figure:
     unit, seconds = style.time_unit(float(run.table.t_s[-1]))
     t, difference = run.gnss.t_s / seconds, run.gnss.difference
     used, gated = run.gnss.used, run.gnss.rejected
-    top = _top(difference[used])
+    top = scale_end_m(difference[used])
     if mean is not None and most is not None:
         trusted = used & ~run.sensors.fixes.down_weighted
         _draw_used(axes, t[trusted], difference[trusted], f"used, max {error_text(most)}")
@@ -280,7 +273,8 @@ def gnss_difference(run: Run) -> Figure:
 def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:
     """Draw the fixes that the filter used: one by one, or by range and median where they are many."""
     if len(t) <= MOST_SINGLE:
-        axes.plot(*_with_breaks(t, difference), color=style.BAR_COLOR, linewidth=0.7, label=label)
+        broken = (np.insert(column, breaks_after(t) + 1, np.nan) for column in (t, difference))
+        axes.plot(*broken, color=style.BAR_COLOR, linewidth=0.7, label=label)
         return
     edges = np.linspace(t[0], t[-1], TIME_BINS + 1)
     bounds = np.searchsorted(t, edges)
@@ -303,21 +297,3 @@ def _mark(
             shown = extremes(difference[chosen], points=MARKS)
             y, words = np.minimum(difference[chosen][shown], top), f"{np.count_nonzero(chosen):,} {label}{where}"
             axes.plot(t[chosen][shown], y, marker=shape, linestyle="none", clip_on=False, label=words, **look)
-
-
-def _top(difference: Floats) -> float:
-    """Return the upper end of the y axis [m]."""
-    if not len(difference):
-        return 1.0
-    typical = HEADROOM * percentiles(difference, (TYPICAL_PERCENT,))[0]
-    return max(min(typical, 1.1 * float(difference.max())), LEAST_RANGE_M)
-
-
-def _with_breaks(t: Floats, difference: Floats) -> tuple[Floats, Floats]:
-    """Return the points with a NaN in every stretch without fixes, so that no line crosses it."""
-    if len(t) < 2:
-        return t, difference
-    interval = np.diff(t)
-    long = interval > max(BREAK_SHARE * float(t[-1] - t[0]), BREAK_IN_INTERVALS * float(np.median(interval)))
-    after = np.flatnonzero(long) + 1
-    return np.insert(t, after, np.nan), np.insert(difference, after, np.nan)

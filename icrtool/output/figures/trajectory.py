@@ -9,8 +9,8 @@ import numpy as np
 from icrtool.alignment.sensors.gnss_quality import CLASSES, REFERENCE
 from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats
-from icrtool.output.decimate import places
 from icrtool.output.figures import style
+from icrtool.output.series import places
 from icrtool.output.text_format import distance_text, driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run
 from icrtool.records.run_document import OdometryDocument

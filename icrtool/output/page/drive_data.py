@@ -28,10 +28,10 @@ from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.motion.fit import own_constants
 from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
 from icrtool.motion.recording import Recording, cut_windows, predicted_path
-from icrtool.output.decimate import extremes
+from icrtool.output.series import breaks_after, extremes, scale_end_m
 from icrtool.output.tables.errors import in_order, main_rows
 from icrtool.records.dropout_document import DropoutDocument, FitDocument
-from icrtool.records.run import Run, track_of, width_or_usual_m
+from icrtool.records.run import MeasurementOutcome, Run, track_of, width_or_usual_m
 
 MOST_STEPS = 150_000
 """Wheel samples of a page; of more, equally many are joined to one."""
@@ -143,26 +143,28 @@ def _series_data(run: Run, steps: PageSteps) -> dict[str, Any]:
 
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
-    fixes = run.sensors.fixes
-    found = {}
+    fixes, difference = run.sensors.fixes, run.gnss.difference
+    found: dict[str, Any] = {"top_m": scale_end_m(difference[run.gnss.used])}
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
-        rows = _extreme_rows(run.gnss.difference, chosen)
-        found[name] = {
-            "t": packed(run.gnss.t_s[rows]),
-            "north": packed(fixes.north_m[rows] - origin[0]),
-            "east": packed(fixes.east_m[rows] - origin[1]),
-            "difference": packed(run.gnss.difference[rows]),
-        }
+        rows = _extreme_rows(difference, chosen)
+        found[name] = _differences(run.gnss, chosen, rows, difference) | {
+            "north": packed(fixes.north_m[rows] - origin[0]), "east": packed(fixes.east_m[rows] - origin[1]),
+        }  # fmt: skip
     return found
 
 
 def _headings_data(run: Run) -> dict[str, Any]:
     """Return how far the headings that the filter used were from its own [deg]."""
     rows = _extreme_rows(run.heading.difference, run.heading.used)
-    return {
-        "t": packed(run.heading.t_s[rows]),
-        "difference_deg": packed(np.degrees(run.heading.difference[rows])),
-    }
+    return _differences(run.heading, run.heading.used, rows, np.degrees(run.heading.difference))
+
+
+def _differences(outcome: MeasurementOutcome, chosen: Bools, rows: Ints, difference: Floats) -> dict[str, Any]:
+    """Return differences at rows of the chosen measurements, and moments at which a line through them breaks."""
+    t = outcome.t_s[chosen]
+    after = breaks_after(t)
+    breaks = (t[after] + t[after + 1]) / 2
+    return {"t": packed(outcome.t_s[rows]), "difference": packed(difference[rows]), "breaks_s": breaks.tolist()}
 
 
 def _extreme_rows(difference: Floats, chosen: Bools) -> Ints:

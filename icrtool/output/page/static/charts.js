@@ -152,7 +152,7 @@ const icrtoolCharts = (() => {
     keys(document.getElementById("speeds-keys"), speeds);
     addIcrs(add, data);
     addDifferences(add, data);
-    add("headings", "difference [°]", withBreaks(data.headings.t, data.headings.difference_deg), [line({ label: "heading", color: "icr", width: 1 })]);
+    add("headings", "difference [°]", withBreaks(data.headings), [line({ label: "heading", color: "icr", width: 1 })]);
 
     return {
       charts,
@@ -170,16 +170,9 @@ const icrtoolCharts = (() => {
     };
   }
 
-  /** Return moments in the middle of stretches without samples. */
-  function breaksOf(t) {
-    const waits = Float64Array.from({ length: Math.max(t.length - 1, 0) }, (_, i) => t[i + 1] - t[i]).sort();
-    const long = Math.max(8 * (waits[waits.length >> 1] || 0), 1.5), found = [];
-    for (let i = 1; i < t.length; i++) if (t[i] - t[i - 1] > long) found.push((t[i] + t[i - 1]) / 2);
-    return found;
-  }
-
-  function withBreaks(t, values) {
-    const pairs = [...breaksOf(t).map((one) => [one, null]), ...Array.from(t, (one, i) => [one, values[i]])].sort((a, b) => a[0] - b[0]);
+  /** Return times and values of a line, null where it breaks. */
+  function withBreaks({ t, difference, breaks_s }) {
+    const pairs = [...breaks_s.map((one) => [one, null]), ...Array.from(t, (one, i) => [one, difference[i]])].sort((a, b) => a[0] - b[0]);
     return [pairs.map((pair) => pair[0]), pairs.map((pair) => pair[1])];
   }
 
@@ -198,7 +191,7 @@ const icrtoolCharts = (() => {
       }
       const first = columns.length;
       const edge = { label: one.label, stroke: "transparent", width: 0, points: { show: false } };
-      columns.push(one.value.map((value, i) => value + one.std[i]), one.value, one.value.map((value, i) => value - one.std[i]));
+      columns.push(one.value.map((value, i) => value + 2 * one.std[i]), one.value, one.value.map((value, i) => value - 2 * one.std[i]));
       series.push(edge, line(one), { ...edge });
       bands.push({ series: [first, first + 2], fill: faint(one.color, 0.22) });
     }
@@ -218,12 +211,9 @@ const icrtoolCharts = (() => {
   }
 
   function addDifferences(add, data) {
-    const { used, rejected } = data.fixes;
-    const sorted = Float32Array.from(used.difference).sort();
-    const most = sorted.length ? sorted[sorted.length - 1] : 0, typical = sorted.length ? sorted[Math.floor(0.995 * (sorted.length - 1))] : 0;
-    const top = Math.max(Math.min(1.6 * typical, 1.1 * most), 1e-3);
+    const { used, rejected, top_m: top } = data.fixes;
     // One time axis for both: what one has not is undefined, which a line passes over; at null it breaks.
-    const breaks = breaksOf(used.t);
+    const breaks = used.breaks_s;
     const t = Float64Array.from([...used.t, ...rejected.t, ...breaks]).sort();
     const spread = (group, cap) => {
       const column = new Array(t.length).fill(undefined);

@@ -20,6 +20,7 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.output.dropout_directory import report_document
+from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.page.drive_data import packed, packed_levels, packed_sums
 from icrtool.output.page.render import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
@@ -152,6 +153,14 @@ def test_the_numbers_of_the_drawings_are_those_of_the_run(page: str, run: Run) -
     driven = np.concatenate([[0.0], np.cumsum(held * table.v_left_mps[:-1])])
     # Half a unit of a 16-bit step, wherever on the drive.
     np.testing.assert_allclose(numbers(data["steps"]["left"]), driven, atol=1e-5)
+
+
+def test_page_and_picture_of_the_fixes_have_one_scale_and_one_kind_of_breaks(page: str, run: Run) -> None:
+    fixes = data_of(page)["fixes"]
+    axes = gnss_difference(run).axes[0]
+    assert fixes["top_m"] == pytest.approx(axes.get_ylim()[1])
+    line = next(one for one in axes.lines if str(one.get_label()).startswith("used"))
+    assert len(fixes["used"]["breaks_s"]) == np.count_nonzero(np.isnan(np.asarray(line.get_xdata(), float)))
 
 
 def test_a_report_on_the_smoothed_trajectory_is_drawn_along_it() -> None:

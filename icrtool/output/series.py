@@ -1,4 +1,4 @@
-"""Fewer points for the same picture: long columns are thinned before they are drawn."""
+"""Long columns as pictures and pages draw them: fewer points, where lines break, and where a scale ends."""
 
 from __future__ import annotations
 
@@ -11,6 +11,13 @@ LINE_POINTS = 2400
 
 SAMPLED_ROWS = 40_000
 """Rows enough to find the range of a column for drawing."""
+
+TYPICAL_PERCENT, HEADROOM = 99.5, 1.6
+LEAST_END_M = 0.001
+"""A scale of differences ends at `HEADROOM` times the 99.5 % one: a few outliers do not flatten the rest."""
+
+BREAK_SHARE, BREAK_IN_INTERVALS = 0.01, 5.0
+"""No line is drawn over a gap of this share of the time and this many times the usual interval."""
 
 
 def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
@@ -69,3 +76,20 @@ def places(north: Floats, east: Floats, cell_m: float) -> Ints:
         moved = (np.diff(np.floor(north[some] / cell_m)) != 0) | (np.diff(np.floor(east[some] / cell_m)) != 0)
         found.append(lo + 1 + np.flatnonzero(moved))
     return np.unique(np.concatenate(found))
+
+
+def scale_end_m(differences: Floats) -> float:
+    """Return the upper end of a scale [m] of differences (n,) [m]."""
+    if not len(differences):
+        return 1.0
+    typical = HEADROOM * percentiles(differences, (TYPICAL_PERCENT,))[0]
+    return max(min(typical, 1.1 * float(differences.max())), LEAST_END_M)
+
+
+def breaks_after(t: Floats) -> Ints:
+    """Return the rows (k,) of times (n,) behind which a line breaks: nothing was measured for long."""
+    interval = np.diff(t)
+    if not len(interval):
+        return np.empty(0, np.int64)
+    longest = max(BREAK_SHARE * float(t[-1] - t[0]), BREAK_IN_INTERVALS * float(np.median(interval)))
+    return np.flatnonzero(interval > longest)

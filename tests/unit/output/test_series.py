@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from icrtool.output.decimate import extremes, places
+from icrtool.output.series import breaks_after, extremes, places, scale_end_m
 
 
 @given(st.integers(1, 5000), st.integers(4, 600), st.integers(0, 99))
@@ -61,3 +61,17 @@ def test_a_path_keeps_a_point_in_every_cell_it_enters() -> None:
 @pytest.mark.parametrize("rows", [0, 1])
 def test_hardly_any_path_is_no_trouble(rows: int) -> None:
     assert len(places(np.zeros(rows), np.zeros(rows), 1.0)) == rows
+
+
+def test_a_line_breaks_where_nothing_was_measured_for_long() -> None:
+    t = np.concatenate([np.arange(0.0, 50.0, 0.1), np.arange(60.0, 100.0, 0.1)])
+    assert breaks_after(t).tolist() == [499]
+    assert breaks_after(np.delete(t, [100, 101])).tolist() == [497]
+    assert breaks_after(t[:1]).tolist() == []
+
+
+def test_a_few_outliers_do_not_flatten_a_scale_of_differences() -> None:
+    usual = np.linspace(0.01, 0.02, 10_000)
+    assert scale_end_m(usual) == pytest.approx(1.1 * 0.02)
+    assert scale_end_m(np.append(usual, 50.0)) == pytest.approx(1.6 * 0.02, rel=0.01)
+    assert scale_end_m(np.empty(0)) == 1.0
