@@ -45,8 +45,8 @@ CHORD_S, LEAST_CHORD_M = 2.0, 0.3
 STANDS_S = 5.0
 """A heading further than this from a turn of the wheels is one of a robot that stands."""
 
-MOST_WHEEL_SAMPLES = 50_000
-"""The samples of a longer drive are joined to about so many: 1 h at 14 Hz, where windows last seconds."""
+MOST_WHEEL_SAMPLES = 25_000
+"""The samples of a longer drive are joined to about so many: 1 h at 7 Hz, where windows last seconds."""
 
 
 class Chords(NamedTuple):
