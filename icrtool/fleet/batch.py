@@ -21,8 +21,8 @@ from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import FoundRecording, as_text, find_recordings, logs_among
-from icrtool.logs.containers.remote_file import RemoteFile
-from icrtool.logs.containers.split_files import files_of_log
+from icrtool.logs.containers.recording_files import files_of_log
+from icrtool.logs.containers.source import RemoteFile
 from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
 from icrtool.records.regular_file import read_regular
 from icrtool.records.urls import UrlPath

@@ -12,7 +12,7 @@ import msgspec
 
 from icrtool.config import parse_toml
 from icrtool.errors import ConfigError
-from icrtool.logs.containers.remote_file import find
+from icrtool.logs.containers.source import find
 from icrtool.records.regular_file import read_regular
 from icrtool.records.urls import UrlPath, place_of
 

@@ -31,7 +31,7 @@ from msgspec.structs import replace
 
 from icrtool.errors import ConfigError
 from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
-from icrtool.logs.containers.split_files import files_of_log
+from icrtool.logs.containers.recording_files import files_of_log
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.process_resources import give_back_freed, remove_unfinished
 

@@ -11,16 +11,20 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.one_recording import (
+from icrtool.logs.containers.open_log import container_of, open_log
+from icrtool.logs.containers.recording_files import (
     LEAST_OVERLAP_S,
     LOG_SUFFIXES,
+    NumberedFile,
     is_bag_directory,
+    log_name,
     natural_order,
+    numbered_file,
+    split_files,
+    split_path,
     unpacked_name,
 )
-from icrtool.logs.containers.open_log import container_of, open_log
-from icrtool.logs.containers.remote_file import find
-from icrtool.logs.containers.split_files import NumberedFile, log_name, numbered_file, split_files, split_path
+from icrtool.logs.containers.source import find
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.records.urls import UrlPath
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from icrtool.errors import DataError, LogError
-from icrtool.logs.containers.channel import LATEST_NS, WHOLE, Container, Cut
+from icrtool.logs.containers.channel import LATEST_NS, WHOLE, Cut
+from icrtool.logs.containers.container import Container
 from icrtool.records.samples import Samples
 from icrtool.records.tables import RobotLog
 

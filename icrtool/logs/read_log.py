@@ -12,9 +12,10 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
-from icrtool.logs.containers.channel import WHOLE, Container, Cut
+from icrtool.logs.containers.channel import WHOLE, Cut
+from icrtool.logs.containers.container import Container
 from icrtool.logs.containers.open_log import check_unchanged, open_log, states_of
-from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.containers.recording_files import log_name
 from icrtool.logs.cut import Moment, cut_of, moment
 from icrtool.logs.messages.collectors import collector_for
 from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable

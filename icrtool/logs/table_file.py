@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.one_recording import PACKED
 from icrtool.logs.containers.open_log import check_unchanged, plain_file, states_of
-from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.containers.recording_files import PACKED, log_name
 from icrtool.logs.cut import Moment, longest_part, moment, nanoseconds
 from icrtool.records.tables import RobotLog
 from icrtool.records.urls import UrlPath

@@ -14,7 +14,7 @@ import numpy as np
 
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, OutputError, RunError
-from icrtool.logs.containers.split_files import file_sha256, files_of_log, numbered_file, split_path
+from icrtool.logs.containers.recording_files import file_sha256, files_of_log, numbered_file, split_path
 from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.formats import (
     CHECKSUM_FILE,

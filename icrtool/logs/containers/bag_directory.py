@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Event
 from types import MappingProxyType
 from typing import Any
 
@@ -14,16 +13,15 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems, some_of
-from icrtool.logs.containers.chunked_file import MIXED, NotByRangesError
+from icrtool.logs.containers.channel import Block, Channel, Cut, some_of
+from icrtool.logs.containers.chunked_file import NotByRangesError
+from icrtool.logs.containers.container import Container
 from icrtool.logs.containers.mcap_file import McapFile
-from icrtool.logs.containers.one_recording import Span, check_spans, storage_files, unpacked_name
-from icrtool.logs.containers.remote_file import RemoteFile, read_by_ranges
+from icrtool.logs.containers.recording_files import Span, check_spans, storage_files, unpacked_name
 from icrtool.logs.containers.ros1_bag import Ros1Bag
-from icrtool.logs.containers.split_files import inputs_of
+from icrtool.logs.containers.source import RemoteFile
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.logs.containers.unpack import ScratchFolder, unpack
-from icrtool.records.samples import InputFile
 
 _LARGEST_METADATA_BYTES, _DEEPEST = 1 << 18, 20
 """Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""
@@ -40,7 +38,7 @@ class _Metadata:
     message_compression: str = ""
 
 
-class BagDirectory:
+class BagDirectory(Container):
     """A directory of storage files, or several files of one split recording, read as one log.
 
     Parameters
@@ -57,14 +55,12 @@ class BagDirectory:
     def __init__(
         self, path: Path, files: Sequence[Path] = (), distant: Mapping[str, RemoteFile] = MappingProxyType({})
     ) -> None:  # fmt: skip
-        self._path = path
+        super().__init__(path)
         self._distant = distant
-        self.own_problems = Problems(path.name)
         self._scratch: ScratchFolder | None = None
-        self._parts: list[Container] = []
+        self._parts: dict[Path, Container] = {}
         self._by_name = False
         self._reading = 0
-        self.files: list[Path] = []
         metadata = self._read_metadata() if not files else _Metadata()
         try:
             files = files or self._find_files(metadata.files)
@@ -73,47 +69,40 @@ class BagDirectory:
             for file in files:
                 self._open_part(file, metadata.message_compression)
             if not self._parts:
-                raise LogError(path, "no storage file in it can be read", "; ".join(self.own_problems))
+                raise LogError(path, "no storage file in it can be read", "; ".join(self.problems))
         except BaseException:
             self.close()
             raise
+        self.files = [*self._parts]
         self._numbers: list[tuple[Ints, Ints]] = []
         self.channels = self._merge_channels()
 
     @property
     def problems(self) -> list[str]:
         """What could not be read, of the directory and of each file."""
-        return self.own_problems + [problem for part in self._parts for problem in part.problems]
-
-    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
-        """Return the files with their SHA-256."""
-        return inputs_of(self.files, ended)
-
-    def transfer(self) -> str:
-        """Return how much was read of distant files, and why all of it."""
-        words = read_by_ranges(self._distant.values()) if self._distant else ""
-        return "; ".join(filter(None, [words, MIXED if any(MIXED in part.transfer() for part in self._parts) else ""]))
+        return super().problems + [problem for part in self._parts.values() for problem in part.problems]
 
     def share_read(self) -> float:
         """Return the mean over the files, which are read one after the other."""
-        return (self._reading + self._parts[self._reading].share_read()) / len(self._parts)
+        return (self._reading + [*self._parts.values()][self._reading].share_read()) / len(self._parts)
 
     def close(self) -> None:
         """Release all files."""
-        for part in self._parts:
+        for part in self._parts.values():
             part.close()
         if self._scratch is not None:
             self._scratch.close()
+        super().close()
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return first and last log time of all files, None where one of them has no index."""
-        known = [span for part in self._parts if (span := part.span_ns()) is not None]
+        known = [span for part in self._parts.values() if (span := part.span_ns()) is not None]
         if not known or len(known) < len(self._parts):
             return None
         begins, ends = zip(*known, strict=True)
         return min(begins), max(ends)
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages of the wanted channels, file by file.
 
         Raises
@@ -122,8 +111,8 @@ class BagDirectory:
             At the end: the files, found by name, are recordings of different times.
         """
         spans = []
-        parts = zip(self.files, self._parts, self._numbers, strict=True)
-        for self._reading, (file, part, (own, merged)) in enumerate(parts):
+        parts = zip(self._parts.items(), self._numbers, strict=True)
+        for self._reading, ((file, part), (own, merged)) in enumerate(parts):
             if not len(own):
                 continue
             begins, ends = [], []
@@ -134,24 +123,25 @@ class BagDirectory:
                     ends.append(int(block.log_time_ns.max()))
                 place = np.searchsorted(own, block.channel).clip(max=len(own) - 1)
                 yield block._replace(channel=np.where(own[place] == block.channel, merged[place], -1))
+            self.mixed |= part.mixed
             if begins:
                 spans.append(Span(min(begins), max(ends), file.name))
         if self._by_name:
-            for odd in check_spans(self._path, spans):
-                self.own_problems.add(odd)
+            for odd in check_spans(self.path, spans):
+                self.report(odd)
 
     def _read_metadata(self) -> _Metadata:
         """Return the content of metadata.yaml; a recorder that was killed leaves no such file, or half of it."""
-        file = self._path / "metadata.yaml"
+        file = self.path / "metadata.yaml"
         if not file.is_file():
-            self.own_problems.add("no metadata.yaml; its storage files were found by their names")
+            self.report("no metadata.yaml; its storage files were found by their names")
             return _Metadata()
         try:
             if file.stat().st_size > _LARGEST_METADATA_BYTES:
                 raise ValueError("too long")
             return _metadata(file.read_text(encoding="utf-8"))
         except (ValueError, OSError, RecursionError):
-            self.own_problems.add("its metadata.yaml cannot be read; its storage files were found by their names")
+            self.report("its metadata.yaml cannot be read; its storage files were found by their names")
             return _Metadata()
 
     def _find_files(self, names: tuple[str, ...]) -> list[Path]:
@@ -161,26 +151,25 @@ class BagDirectory:
         if len(there) < len(named):
             found = frozenset(there)
             missing = [file.name for file in named if file not in found]
-            self.own_problems.add(f"metadata.yaml names files that are not there: {some_of(missing)}")
+            self.report(f"metadata.yaml names files that are not there: {some_of(missing)}")
         if there:
             return there
         self._by_name = True
-        return storage_files(self._path)
+        return storage_files(self.path)
 
     def _there(self, name: str) -> Path:
         """Return the path of a file that metadata.yaml names; of one that was unpacked since, without that suffix."""
-        file, unpacked = self._path / name, self._path / unpacked_name(name)
+        file, unpacked = self.path / name, self.path / unpacked_name(name)
         return unpacked if not os.path.isfile(file) and os.path.isfile(unpacked) else file  # noqa: PTH113 - as below
 
     def _open_part(self, file: Path, message_compression: str) -> None:
         try:
             storage = file if unpacked_name(file.name) == file.name else self._unpacked(file)
-            self._parts.append(self._part(storage, message_compression))
-            self.files.append(file)
+            self._parts[file] = self._part(storage, message_compression)
         except LogError as err:
-            self.own_problems.add(f"{file.name}: {err.why}; {err.advice}")
+            self.report(f"{file.name}: {err.why}; {err.advice}")
         except OSError as err:
-            self.own_problems.add(f"{file.name}: cannot be read; {err.strerror}")
+            self.report(f"{file.name}: cannot be read; {err.strerror}")
 
     def _part(self, storage: Path, message_compression: str) -> Container:
         if storage.suffix == ".bag":
@@ -196,17 +185,17 @@ class BagDirectory:
         """Decompress a storage file to a temporary folder."""
         if self._scratch is None:
             self._scratch = ScratchFolder()
-        folder = self._scratch.path / str(len(self.files))
+        folder = self._scratch.path / str(len(self._parts))
         folder.mkdir(exist_ok=True)
         path, problem = unpack(file, folder)
         if problem:
-            self.own_problems.add(f"{file.name}: {problem}")
+            self.report(f"{file.name}: {problem}")
         return path
 
     def _merge_channels(self) -> list[Channel]:
         """Give a topic that stands in several files one number."""
         merged: dict[tuple[str, str, str], Channel] = {}
-        for part in self._parts:
+        for part in self._parts.values():
             numbers: dict[int, int] = {}
             for channel in part.channels:
                 key = (channel.topic, channel.message_type, channel.encoding)

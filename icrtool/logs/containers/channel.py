@@ -1,17 +1,15 @@
-"""What every container gives: channels, and blocks of raw messages."""
+"""What logs are read as: channels, blocks of raw messages, and sentences about what cannot be read."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from threading import Event
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.records.samples import InputFile
 from icrtool.records.text import LogText, escaped, shortened
 
 MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
@@ -102,47 +100,6 @@ class Block(NamedTuple):
     end: Ints
 
 
-class Container(Protocol):
-    """A log file or directory, opened."""
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """The topics, known before any block is read."""
-        ...
-
-    @property
-    def problems(self) -> Sequence[str]:
-        """What could not be read and was left out; complete after the last block."""
-        ...
-
-    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
-        """Return the files that make up this log, with their SHA-256: of their beginning once `ended` is set."""
-        ...
-
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
-        """Yield the messages of the channels in `wanted` in file order; others, and some outside the cut, among them.
-
-        What an index shows to be outside the cut is not read.
-        """
-        ...
-
-    def span_ns(self) -> tuple[int, int] | None:
-        """Return the log times of the first and the last message, None where only reading the log shows them."""
-        ...
-
-    def transfer(self) -> str:
-        """Return in words how much came over a connection; empty for nothing."""
-        ...
-
-    def share_read(self) -> float:
-        """Return the share of the log that has been read, 0 to 1."""
-        ...
-
-    def close(self) -> None:
-        """Release files."""
-        ...
-
-
 def made_ahead(blocks: Iterator[Block], stop: Callable[[], object] | None = None) -> Generator[Block]:
     """Yield blocks; the next one is made in a thread while one is used.
 
@@ -185,13 +142,13 @@ class Problems(list[str]):
             self.append(text if len(self) < MOST_PROBLEMS else f"{self._name}: and more of the kind")
 
 
-def with_possible_times(block: Block, problems: Problems) -> Block:
+def with_possible_times(block: Block, report: Callable[[str], None]) -> Block:
     """Return a block without the messages whose log time is negative or beyond `LATEST_NS`."""
     # Negative ones are above all others as unsigned numbers.
     possible = block.log_time_ns.view(np.uint64) < LATEST_NS
     if possible.all():
         return block
-    problems.add("messages with an impossible log time left out")
+    report("messages with an impossible log time left out")
     _, *columns = block
     return Block(block.data, *(column[possible] for column in columns))
 

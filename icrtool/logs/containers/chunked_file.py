@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from threading import Event
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import WHOLE, Block, Cut, Problems, made_ahead, with_possible_times
+from icrtool.logs.containers.channel import Block, Cut, made_ahead, with_possible_times
+from icrtool.logs.containers.container import Container
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
     DecompressionError,
@@ -23,9 +23,8 @@ from icrtool.logs.containers.decompress import (
     Space,
     decompress,
 )
-from icrtool.logs.containers.record_table import Records
-from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, Source
-from icrtool.records.samples import InputFile
+from icrtool.logs.containers.record_table import Chunk, Part, Records
+from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile, Source
 
 Item = TypeVar("Item")
 
@@ -41,44 +40,11 @@ FIRST_SPAN_BYTES, SPAN_BYTES = 1 << 22, 1 << 24
 JOINED_BYTES = 1 << 22
 """Of the wanted records of chunks that are made one block: each block has a cost of its own."""
 
+SMALL_PART = 0.5
+"""A chunk of which less is wanted is decompressed up to the last wanted message; its checksum is not computed.
 
-MIXED = "topics share compressed chunks, which are read whole"
-
-
-class Chunk(NamedTuple):
-    """A chunk in a file, and its entry in the index.
-
-    Attributes
-    ----------
-    at, length : where its content is in the file; of a bag's index where its record begins
-    channels : those it holds, None without an entry
-    begin_ns, end_ns : first and last log time in it, 0 where they are not known
-    index_length : of the message index records that follow it
-    size : of its records, decompressed; -1 where there is no chunk in its place
-    compression : as the log calls it
-    messages : where its messages begin in the records that are read, by the index; None without one
-    ranges : begin and end (2, n) of its wanted records, where only those are read
-    held : its bytes, read ahead of a distant file
-    records : the wanted ones, likewise
-    """
-
-    at: int
-    length: int = 0
-    channels: frozenset[int] | None = None
-    begin_ns: int = 0
-    end_ns: int = 0
-    index_length: int = 0
-    size: int = 0
-    compression: str = ""
-    messages: Ints | None = None
-    ranges: Ints | None = None
-    held: Held | None = None
-    records: bytes | None = None
-
-    @property
-    def wanted_bytes(self) -> int:
-        """Bytes of the records that are read."""
-        return max(self.size, 0) if self.ranges is None else int((self.ranges[1] - self.ranges[0]).sum())
+Of a chunk with images that is a few percent, and most recorders close a chunk behind the image that filled it.
+"""
 
 
 class NotByRangesError(Exception):
@@ -97,7 +63,7 @@ class Spaces(NamedTuple):
     joined: Space
 
 
-class ChunkedFile(ABC):
+class ChunkedFile(Container):
     """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end.
 
     Parameters
@@ -109,25 +75,34 @@ class ChunkedFile(ABC):
     _chunk_head = 0
     """Bytes before the content of a chunk, in which its record begins."""
 
-    def __init__(self, path: Path, source: Source | None = None) -> None:
-        self._path = path
-        self.problems = Problems(path.name)
+    _unpacks_parts = False
+    """Whether a compressed chunk is decompressed in part: without a checksum to compute, that saves nothing."""
+
+    _scan: Callable[[Bytes, int, Ints | None], Records]
+    """Finds records: a function of `icrtool.logs.containers.record_table`."""
+
+    _message_index: Callable[[bytes], tuple[Ints, Ints]]
+    """Returns where in its records the messages of a chunk begin (n,), and their channels (n,); none where damaged."""
+
+    def __init__(self, path: Path, message_compression: str = "", source: Source | None = None) -> None:
+        super().__init__(path, message_compression)
         self._inflation = Inflation()
         self._spaces: deque[Spaces] = deque()
         self._free()
-        self._mixed = False
         self._source: Source = source if source is not None else LocalFile(path)
+        self._remote = source if isinstance(source, RemoteFile) else None
         self._at = 0
         self._size = self._source.size
 
     @abstractmethod
-    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False) -> Packed:
+    def _packed(self, part: Part, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:
         """Read a chunk from the file.
 
         Parameters
         ----------
         space : for the chunk as it is in the file
-        cut : it is cut off
+        cut : it is cut off; what can be decompressed is not checked
+        needed : where not 0, so many bytes of its records are enough, and are not checked
 
         Raises
         ------
@@ -145,34 +120,38 @@ class ChunkedFile(ABC):
         """
 
     @abstractmethod
-    def _scan(self, data: Bytes, begin: int, hint: Ints | None = None) -> Records:
-        """Find records as `icrtool.logs.containers.record_table` does."""
-
-    @abstractmethod
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         """Remember a record that is no message, of `others` of the scan of `data`."""
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
+    def _described(self, chunk: Chunk) -> Chunk:
+        """Return a chunk of the index with what its own record states."""
+        return chunk
+
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages of the wanted channels, in the order of their chunks; the next are made meanwhile."""
-        if not wanted:
-            return
         if self._chunks is None:
             yield from made_ahead(self._read_in_order())
         else:
             needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
-            if self._source.distant:
-                yield from self._indexed(self._read_ahead(needed, wanted))
+            if self._remote is not None:
+                yield from self._indexed(self._read_ahead(self._remote, needed, wanted))
             else:
                 yield from self._indexed(self._located(chunk, wanted) for chunk in needed)
         self._free()
 
-    def _read_ahead(self, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Chunk]:
-        """Yield chunks of a distant file as `_located` does, with what is wanted of the next ones read meanwhile."""
-        pending: deque[tuple[int, Future[list[Chunk]]]] = deque()
+    def _read_ahead(self, remote: RemoteFile, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Part]:
+        """Yield parts of a distant file as `_located` does, with what is wanted of the next ones read meanwhile."""
+
+        def located(group: Sequence[Chunk], begin: int, end: int) -> list[Part]:
+            if 0 < end - begin <= 2 * LARGEST_CHUNK_BYTES:
+                remote.hold(begin, end - begin)
+            return [self._located(chunk, wanted) for chunk in group]
+
+        pending: deque[tuple[int, Future[list[Part]]]] = deque()
         with ThreadPoolExecutor(READERS) as pool:
             try:
-                for group, begin, end in self._spans(chunks, wanted):
-                    pending.append((end - begin, pool.submit(self._located_in, group, begin, end, wanted)))
+                for group, begin, end in _spans(chunks, wanted):
+                    pending.append((end - begin, pool.submit(located, group, begin, end)))
                     while len(pending) > SPANS_AHEAD or sum(length for length, _ in pending) > BYTES_AHEAD:
                         yield from pending.popleft()[1].result()
                 while pending:
@@ -181,56 +160,65 @@ class ChunkedFile(ABC):
                 for _, group_read in pending:
                     group_read.cancel()
 
-    def _spans(self, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[list[Chunk], int, int]]:
-        """Yield chunks that follow one another and are read whole, and begin and end of what is read in one piece."""
-        group: list[Chunk] = []
-        begin = end = 0
-        most = FIRST_SPAN_BYTES
-        for chunk in chunks:
-            first, last = self._span(chunk, wanted)
-            if group and not (end <= first <= end + NEAR_BYTES and last - begin <= most and last > first):
-                yield group, begin, end
-                group, most = [], SPAN_BYTES
-            begin, end = (begin if group else first), last
-            group.append(chunk)
-        if group:
-            yield group, begin, end
+    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Part:
+        """Return what is read of a chunk: its messages by the message index; of a small part also the wanted ranges.
 
-    def _located_in(self, group: Sequence[Chunk], begin: int, end: int, wanted: frozenset[int]) -> list[Chunk]:
-        if 0 < end - begin <= 2 * LARGEST_CHUNK_BYTES:
-            self._source.hold(begin, end - begin)
-        return [self._located(chunk, wanted) for chunk in group]
+        It has neither where the index cannot be right.
+        """
+        chunk = self._described(chunk)
+        if max(chunk.size, chunk.length, chunk.index_length) > LARGEST_CHUNK_BYTES:
+            return Part(chunk)
+        is_partly, by_message = chunk.is_partly(wanted), chunk.is_partly(wanted) and chunk.is_stored
+        held, behind = None, chunk.at + chunk.length
+        if self._remote is not None:
+            self.mixed |= is_partly and not by_message
+            begin = behind if by_message else chunk.at
+            held = self._remote.hold(begin, behind + chunk.index_length - begin)
+        places, channels = self._message_index(self._source.read_at(behind, chunk.index_length))
+        order = np.argsort(places, kind="stable")
+        begins = places[order]
+        ends = np.append(begins[1:], chunk.size)
+        if not len(begins) or (ends <= begins).any():
+            return Part(chunk, held=held)
+        is_wanted = np.isin(channels, list(wanted))[order] if is_partly else np.ones(len(begins), np.bool_)
+        sizes = (ends - begins)[is_wanted]
+        in_part = is_partly and (chunk.is_stored or self._unpacks_parts)
+        if not (in_part and 0 < sizes.sum() < SMALL_PART * chunk.size):
+            return Part(chunk, begins, held=held)
+        first, last = begins[is_wanted], ends[is_wanted]
+        apart = first[1:] != last[:-1]
+        ranges = np.stack([first[np.append(True, apart)], last[np.append(apart, True)]])
+        records = None
+        if by_message and self._remote is not None:
+            records = self._remote.gather(behind - chunk.size, ranges)
+        return Part(chunk, np.cumsum(sizes) - sizes, ranges, held, records)
 
-    @abstractmethod
-    def _span(self, chunk: Chunk, wanted: frozenset[int]) -> tuple[int, int]:
-        """Return begin and end of a chunk with its message index; an empty range where it is read in part."""
-
-    def _indexed(self, chunks: Iterable[Chunk]) -> Iterator[Block]:
+    def _indexed(self, parts: Iterable[Part]) -> Iterator[Block]:
         """Yield the messages in some chunks."""
         with ThreadPoolExecutor(THREADS) as pool:
-            groups = ((group, self._next_spaces()) for group in _groups(chunks))
+            groups = ((group, self._next_spaces()) for group in _groups(parts))
             begun = ((group, spaces, pool.submit(self._joined, group, spaces)) for group, spaces in groups)
             for group, spaces, pending in ahead(begun, BLOCKS_AHEAD):
-                self._at = group[-1].at
+                self._at = group[-1].chunk.at
                 yield from self._sound(group, spaces, pending.result)
 
     def _sound(
-        self, group: Sequence[Chunk], spaces: Spaces, made: Callable[[], tuple[Block, Inflation]]
+        self, group: Sequence[Part], spaces: Spaces, made: Callable[[], tuple[Block, Inflation]]
     ) -> Iterator[Block]:
         """Yield the block that is made of some chunks; where anything is damaged, one for each, or what is sound."""
         try:
             block, inflation = made()
         except (DecompressionError, MemoryError) as err:
-            for chunk in group:
+            for part in group:
                 if len(group) == 1 or isinstance(err, _PartError):
-                    yield from self._read_chunk(chunk, spaces)
+                    yield from self._read_chunk(part, spaces)
                 else:
-                    yield from self._sound([chunk], spaces, partial(self._joined, [chunk], spaces))
+                    yield from self._sound([part], spaces, partial(self._joined, [part], spaces))
         else:
             self._inflation.left += inflation.left
-            yield with_possible_times(block, self.problems)
+            yield with_possible_times(block, self.report)
 
-    def _joined(self, group: Sequence[Chunk], spaces: Spaces) -> tuple[Block, Inflation]:
+    def _joined(self, group: Sequence[Part], spaces: Spaces) -> tuple[Block, Inflation]:
         """Return the messages of some chunks, and how much less than allowed these inflate.
 
         Raises
@@ -238,46 +226,62 @@ class ChunkedFile(ABC):
         DecompressionError
             Something is damaged, or not as the index states.
         """
-        size = sum(chunk.wanted_bytes for chunk in group)
+        size = sum(part.wanted_bytes for part in group)
         if size > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {size} bytes")
         inflation = Inflation(0)
         joined = spaces.joined.of(size + 1)
         messages: list[Ints] = []
         data, stop = joined[:0], 0
-        for chunk in group:
+        for part in group:
             begin = stop
-            data = joined[: begin + self._unpack(chunk, spaces, joined[begin:], inflation)]
-            hint = None if chunk.messages is None else chunk.messages + begin
+            data = joined[: begin + self._unpack(part, spaces, joined[begin:], inflation)]
+            hint = None if part.messages is None else part.messages + begin
             found, _, stop = self._scan(data, begin, hint)
             if stop < len(data):
-                raise DecompressionError if chunk.ranges is None else _PartError
+                raise DecompressionError if part.ranges is None else _PartError
             messages.append(found)
         return Block(data, *np.concatenate(messages, axis=1)), inflation
 
-    def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
+    def _unpack(self, part: Part, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
         """Decompress the wanted records of a chunk, and return how many bytes they have.
+
+        Of a part, what is compressed is read up to the last of them, what is not from the first to the last.
 
         Raises
         ------
         DecompressionError
-            As `decompress`, or they have more than the index states.
+            As `decompress`, or they have more than the index states, or less.
         """
-        if chunk.records is not None:
-            target[: len(chunk.records)] = np.frombuffer(chunk.records, np.uint8)
-            return len(chunk.records)
-        packed = self._packed(chunk, spaces.packed)
+        chunk, at = part.chunk, 0
+        if part.records is not None:
+            target[: len(part.records)] = np.frombuffer(part.records, np.uint8)
+            return len(part.records)
+        if part.ranges is None:
+            packed = self._packed(part, spaces.packed)
+            inflation.count(len(packed.data), packed.claimed)
+            if packed.claimed >= len(target):
+                raise DecompressionError("larger than the index states")
+            data = decompress(packed, target)
+            if not np.may_share_memory(data, target):
+                target[: len(data)] = data
+            return len(data)
+        first, needed = int(part.ranges[0, 0]), int(part.ranges[1, -1])
+        if chunk.is_stored:
+            begin = chunk.at + chunk.length - chunk.size + first
+            packed = Packed(self._content(begin, needed - first, spaces.packed, part.held), "", needed - first)
+        else:
+            # A whole frame is decompressed in one step.
+            first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
+            packed = self._packed(part, spaces.packed, needed=needed)
         inflation.count(len(packed.data), packed.claimed)
-        if packed.claimed >= len(target):
-            raise DecompressionError("larger than the index states")
-        data = decompress(packed, target)
-        if not np.may_share_memory(data, target):
-            target[: len(data)] = data
-        return len(data)
-
-    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:  # noqa: ARG002 - all its records are read
-        """Return a chunk of the index with what reading its wanted records needs."""
-        return chunk
+        data = decompress(packed, spaces.records.of(packed.claimed + 1))
+        if len(data) < needed - first:
+            raise DecompressionError("smaller than the index states")
+        for begin, end in (part.ranges - first).T.tolist():
+            target[at : at + end - begin] = data[begin:end]
+            at += end - begin
+        return at
 
     def _learn_all(self) -> None:
         """Read a file without an index for what its records state about channels.
@@ -287,7 +291,7 @@ class ChunkedFile(ABC):
         NotByRangesError
             It is a distant one, which is better read from disk.
         """
-        if self._source.distant:
+        if self._remote is not None:
             raise NotByRangesError
         for _ in self._read_in_order(learn=True):
             pass
@@ -302,14 +306,6 @@ class ChunkedFile(ABC):
         self._spaces.rotate(1)
         return self._spaces[0]
 
-    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
-        """Return the file with its SHA-256."""
-        return self._source.inputs(ended)
-
-    def transfer(self) -> str:
-        """Return how much was read of a distant file, and why all of it."""
-        return "; ".join(filter(None, [self._source.transfer(), MIXED if self._mixed and self._source.distant else ""]))
-
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
         return self._at / max(self._size, 1)
@@ -317,15 +313,12 @@ class ChunkedFile(ABC):
     def close(self) -> None:
         """Release the file."""
         self._source.close()
+        super().close()
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return first and last log time by the index, None without one."""
         known = [chunk for chunk in self._chunks or () if chunk.begin_ns]
         return (min(chunk.begin_ns for chunk in known), max(chunk.end_ns for chunk in known)) if known else None
-
-    def _bytes(self, at: int, count: int) -> bytes:
-        """Return bytes of the file, as many as there are."""
-        return self._source.read_at(at, count)
 
     def _content(self, at: int, length: int, space: Space, held: Held | None = None) -> Bytes:
         """Return bytes of a chunk, as many as there are.
@@ -342,22 +335,22 @@ class ChunkedFile(ABC):
         if length > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {length} bytes")
         length = max(min(length, self._size - at), 0)
-        if held is not None and held.at <= at and at + length <= held.at + len(held.data):
+        if held is not None and held.has(at, at + length):
             return np.frombuffer(held.data, np.uint8, length, at - held.at)
         content = space.of(length)
         return content[: self._source.read_into(at, content)]
 
-    def _read_chunk(self, chunk: Chunk, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+    def _read_chunk(self, part: Part, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
         """Yield the messages of a chunk; `cut`: it is cut off."""
-        place = chunk.at - self._chunk_head
-        self._at = min(chunk.at, self._size)
+        place = part.chunk.at - self._chunk_head
+        self._at = min(part.chunk.at, self._size)
         try:
-            packed = self._packed(chunk, spaces.packed, cut=cut)
+            packed = self._packed(part, spaces.packed, cut=cut)
             self._inflation.count(len(packed.data), packed.claimed)
             data = decompress(packed, spaces.records.of(packed.claimed + 1))
         except (DecompressionError, MemoryError) as err:
             if not cut:
-                self.problems.add(f"chunk at byte {place} left out: {err}")
+                self.report(f"chunk at byte {place} left out: {err}")
             return
         stop, begin = 0, -1
         while begin < stop < len(data):
@@ -365,26 +358,43 @@ class ChunkedFile(ABC):
             block, stop = self._scanned(data, begin, learn=learn)
             yield block
         if stop < len(data) and not cut:
-            self.problems.add(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+            self.report(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
 
     def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
-        messages, others, stop = self._scan(data, begin)
+        messages, others, stop = self._scan(data, begin, None)
         for record in others if learn else ():
             self._learn(data, record)
-        return with_possible_times(Block(data, *messages), self.problems), stop
+        return with_possible_times(Block(data, *messages), self.report), stop
 
 
-def _groups(chunks: Iterable[Chunk]) -> Iterator[list[Chunk]]:
-    """Yield the chunks in groups of up to `JOINED_BYTES` of wanted records, or of one chunk."""
+def _spans(chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[list[Chunk], int, int]]:
+    """Yield chunks that follow one another and are read whole, and begin and end of what is read in one piece."""
     group: list[Chunk] = []
-    size = 0
+    begin = end = 0
+    most = FIRST_SPAN_BYTES
     for chunk in chunks:
-        size += chunk.wanted_bytes
+        by_message = chunk.is_partly(wanted) and chunk.is_stored
+        first, last = chunk.at, chunk.at + (0 if by_message else chunk.length + chunk.index_length)
+        if group and not (end <= first <= end + NEAR_BYTES and last - begin <= most and last > first):
+            yield group, begin, end
+            group, most = [], SPAN_BYTES
+        begin, end = (begin if group else first), last
+        group.append(chunk)
+    if group:
+        yield group, begin, end
+
+
+def _groups(parts: Iterable[Part]) -> Iterator[list[Part]]:
+    """Yield parts of chunks in groups of up to `JOINED_BYTES` of wanted records, or of one chunk."""
+    group: list[Part] = []
+    size = 0
+    for part in parts:
+        size += part.wanted_bytes
         if group and size > JOINED_BYTES:
             yield group
-            group, size = [], chunk.wanted_bytes
-        group.append(chunk)
+            group, size = [], part.wanted_bytes
+        group.append(part)
     if group:
         yield group
 

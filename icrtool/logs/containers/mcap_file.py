@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -12,19 +12,10 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import CUT_OFF, WHOLE, Block, Channel, Cut, ros_type_name
-from icrtool.logs.containers.chunked_file import Chunk, ChunkedFile, Spaces
-from icrtool.logs.containers.decompress import (
-    LARGEST_CHUNK_BYTES,
-    STORED,
-    DecompressionError,
-    Inflation,
-    Packed,
-    Space,
-    decompress,
-    unpack_messages,
-)
-from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Records, scan_mcap
+from icrtool.logs.containers.channel import CUT_OFF, Block, Channel, ros_type_name
+from icrtool.logs.containers.chunked_file import ChunkedFile
+from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Packed, Space
+from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, Part, scan_mcap
 from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
 
@@ -47,11 +38,19 @@ _ENCODINGS = {
 _LARGEST_BLOCK_BYTES = (1 << 17) + 1024
 """Of a zstd block with the frame's header: so many compressed bytes more give all bytes up to a place."""
 
-SMALL_PART = 0.5
-"""A chunk of which less is wanted is decompressed up to the last wanted message; its checksum is not computed.
 
-Of a chunk with images that is a few percent, and most recorders close a chunk behind the image that filled it.
-"""
+def _message_index(index: bytes) -> tuple[Ints, Ints]:
+    """Return where in its records the messages of a chunk begin (n,), and their channels (n,); none where damaged."""
+    places, channels, at = [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
+    while at + _INDEX_HEAD.size <= len(index):
+        code, length, channel, _ = _INDEX_HEAD.unpack_from(index, at)
+        if code != _MESSAGE_INDEX or not 6 <= length <= len(index) - at - _HEAD_BYTES or len(places) > 1 << 16:
+            return places[0], channels[0]
+        entries = np.frombuffer(index, "<u8", (length - 6) // 16 * 2, at + _INDEX_HEAD.size)
+        places.append(entries[1::2].astype(np.int64))
+        channels.append(np.full(len(entries) // 2, channel))
+        at += _HEAD_BYTES + length
+    return np.concatenate(places), np.concatenate(channels)
 
 
 class McapFile(ChunkedFile):
@@ -68,16 +67,18 @@ class McapFile(ChunkedFile):
     """
 
     _chunk_head = _HEAD_BYTES
+    _unpacks_parts = True
+    _scan = staticmethod(scan_mcap)
+    _message_index = staticmethod(_message_index)
 
     def __init__(self, path: Path, message_compression: str = "", source: Source | None = None) -> None:
-        super().__init__(path, source)
-        self._message_compression = message_compression
+        super().__init__(path, message_compression, source)
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
         self._counts: dict[int, int] = {}
         self._listed: list[int] = []
         try:
-            if self._bytes(0, len(MAGIC)) != MAGIC:
+            if self._source.read_at(0, len(MAGIC)) != MAGIC:
                 raise LogError(path, "not an MCAP file", "its first bytes are not those of MCAP")
             self._chunks: list[Chunk] | None = self._read_index()
             if self._chunks is None:
@@ -86,80 +87,6 @@ class McapFile(ChunkedFile):
             self.close()
             raise
         self.channels = [self._channel(number) for number in sorted(self._channels)]
-
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
-        """Yield the messages of the wanted channels, chunk by chunk."""
-        blocks: Iterator[Block] = super().blocks(wanted, cut)
-        if self._message_compression:
-            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
-        yield from blocks
-
-    def _unpack(self, chunk: Chunk, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
-        """Decompress the wanted records of a chunk.
-
-        What is compressed is read up to the last of them, what is not from the first to the last.
-        """
-        if chunk.ranges is None or chunk.records is not None:
-            return super()._unpack(chunk, spaces, target, inflation)
-        first, needed = int(chunk.ranges[0, 0]), int(chunk.ranges[1, -1])
-        if chunk.compression in STORED and chunk.size <= chunk.length:
-            at = chunk.at + chunk.length - chunk.size + first
-            packed = Packed(self._content(at, needed - first, spaces.packed, chunk.held), "", needed - first)
-        else:
-            # A whole frame is decompressed in one step.
-            first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
-            packed = self._packed(chunk, spaces.packed, needed=needed)
-        inflation.count(len(packed.data), packed.claimed)
-        data = decompress(packed, spaces.records.of(packed.claimed + 1))
-        if len(data) < needed - first:
-            raise DecompressionError("smaller than the index states")
-        at = 0
-        for begin, end in (chunk.ranges - first).T.tolist():
-            target[at : at + end - begin] = data[begin:end]
-            at += end - begin
-        return at
-
-    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:
-        """Return a chunk with its messages by the message index behind it; of a small part also the wanted ranges.
-
-        It has neither where the index cannot be right.
-        """
-        if max(chunk.size, chunk.length, chunk.index_length) > LARGEST_CHUNK_BYTES:
-            return chunk
-        partly, by_message = self._is_read(chunk, wanted)
-        self._mixed |= partly and not by_message
-        if by_message:
-            self._source.hold(chunk.at + chunk.length, chunk.index_length)
-        else:
-            chunk = chunk._replace(held=self._source.hold(chunk.at, chunk.length + chunk.index_length))
-        places, channels = _message_index(self._bytes(chunk.at + chunk.length, chunk.index_length))
-        order = np.argsort(places, kind="stable")
-        begins = places[order]
-        ends = np.append(begins[1:], chunk.size)
-        if not len(begins) or (ends <= begins).any():
-            return chunk
-        if partly:
-            is_wanted = np.isin(channels, list(wanted))[order]
-            sizes = (ends - begins)[is_wanted]
-            if 0 < sizes.sum() < SMALL_PART * chunk.size:
-                first, last = begins[is_wanted], ends[is_wanted]
-                apart = first[1:] != last[:-1]
-                ranges = np.stack([first[np.append(True, apart)], last[np.append(apart, True)]])
-                chunk = chunk._replace(messages=np.cumsum(sizes) - sizes, ranges=ranges)
-                if by_message and self._source.distant:
-                    records = self._source.gather(chunk.at + chunk.length - chunk.size, ranges)
-                    chunk = chunk._replace(records=records)
-                return chunk
-        return chunk._replace(messages=begins)
-
-    def _is_read(self, chunk: Chunk, wanted: frozenset[int]) -> tuple[bool, bool]:
-        """Return whether only a part of a chunk is wanted, and whether only that part can be read."""
-        partly = chunk.channels is not None and not chunk.channels <= wanted
-        return partly, partly and chunk.compression in STORED and chunk.index_length > 0 and chunk.size <= chunk.length
-
-    def _span(self, chunk: Chunk, wanted: frozenset[int]) -> tuple[int, int]:
-        by_message = self._is_read(chunk, wanted)[1]
-        return chunk.at, chunk.at if by_message else chunk.at + chunk.length + chunk.index_length
 
     def _channel(self, number: int) -> Channel:
         channel = self._channels[number]
@@ -211,17 +138,17 @@ class McapFile(ChunkedFile):
     def _summary_records(self) -> Iterator[tuple[int, bytes]]:
         """Yield opcode and content of the records of the summary that reading needs; none where it is damaged."""
         end = self._size - len(MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
-        footer = self._bytes(max(end, 0), _HEAD_BYTES + _FOOTER_BYTES)
+        footer = self._source.read_at(max(end, 0), _HEAD_BYTES + _FOOTER_BYTES)
         start = int.from_bytes(footer[9:17], "little")
         if (
             footer[:1] != bytes([_FOOTER])
-            or self._bytes(self._size - len(MAGIC), len(MAGIC)) != MAGIC
+            or self._source.read_at(self._size - len(MAGIC), len(MAGIC)) != MAGIC
             or not 0 < start <= end
         ):
             return
         if end - start > LARGEST_CHUNK_BYTES:
             return
-        summary = self._bytes(start, end - start)
+        summary = self._source.read_at(start, end - start)
         checksum = int.from_bytes(footer[-_CHECKSUM_BYTES:], "little")
         if checksum and zlib.crc32(footer[:-_CHECKSUM_BYTES], zlib.crc32(summary)) != checksum:
             return
@@ -246,8 +173,8 @@ class McapFile(ChunkedFile):
         while True:
             chunk = listed.pop(at, None)
             # What the index lists there, reading the chunk shows too; asking for each head alone takes minutes.
-            known = chunk is not None and self._source.distant
-            opcode, length = (_CHUNK, chunk.length) if chunk is not None and known else self._head(at)
+            is_known = chunk is not None and self._remote is not None
+            opcode, length = (_CHUNK, chunk.length) if chunk is not None and is_known else self._head(at)
             if opcode in (_FOOTER, _DATA_END):
                 return not listed and chunk is None
             if opcode in (0, MCAP_MESSAGE) or length > self._size - at - _HEAD_BYTES:
@@ -258,7 +185,7 @@ class McapFile(ChunkedFile):
 
     def _head(self, at: int) -> tuple[int, int]:
         """Return opcode and length of the record at a file offset; opcode 0 where there is none."""
-        head = self._bytes(at, _HEAD_BYTES) if 0 <= at < self._size else b""
+        head = self._source.read_at(at, _HEAD_BYTES) if 0 <= at < self._size else b""
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
@@ -271,7 +198,7 @@ class McapFile(ChunkedFile):
                 return
             if opcode == _CHUNK:
                 chunk = Chunk(at + _HEAD_BYTES, min(length, left))
-                yield from self._read_chunk(chunk, self._next_spaces(), learn=learn, cut=length > left)
+                yield from self._read_chunk(Part(chunk), self._next_spaces(), learn=learn, cut=length > left)
             elif opcode in (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE) and length <= left:
                 block, length = self._read_loose(at, length, learn=learn)
                 if block is not None:
@@ -282,33 +209,25 @@ class McapFile(ChunkedFile):
             further = next((place for place in self._listed if place > begin and self._head(place)[0] == _CHUNK), None)
             if further is None:
                 break
-            self.problems.add(f"damaged at byte {at}; reading goes on at byte {further}")
+            self.report(f"damaged at byte {at}; reading goes on at byte {further}")
             begin = at = further
-        self.problems.add(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
+        self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_loose(self, at: int, length: int, *, learn: bool) -> tuple[Block | None, int]:
         """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""
         stop = 0
         if length <= LARGEST_CHUNK_BYTES:
             self._at = at
-            piece = np.frombuffer(self._bytes(at, max(PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
+            piece = np.frombuffer(self._source.read_at(at, max(PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
             block, stop = self._scanned(piece, learn=learn)
             if stop:
                 return block, stop - _HEAD_BYTES
-        self.problems.add(f"record at byte {at} left out: damaged")
+        self.report(f"record at byte {at} left out: damaged")
         return None, length
 
-    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:
-        """Read a chunk from the file.
-
-        Parameters
-        ----------
-        space : for the chunk as it is in the file
-        cut : it is cut off; what can be decompressed is not checked
-        needed : where not 0, so many bytes of its records are enough, and are not checked
-        """
-        length = min(chunk.length, needed + _LARGEST_BLOCK_BYTES) if needed else chunk.length
-        content = self._content(chunk.at, length, space, chunk.held)
+    def _packed(self, part: Part, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:
+        length = min(part.chunk.length, needed + _LARGEST_BLOCK_BYTES) if needed else part.chunk.length
+        content = self._content(part.chunk.at, length, space, part.held)
         if len(content) < 40:
             raise DecompressionError("its header is cut off")
         size = int.from_bytes(content[16:24], "little")
@@ -325,9 +244,6 @@ class McapFile(ChunkedFile):
             raise DecompressionError("its header is damaged")
         return Packed(data, compression, size, checksum=checksum)
 
-    def _scan(self, data: Bytes, begin: int, hint: Ints | None = None) -> Records:
-        return scan_mcap(data, begin, hint)
-
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         from mcap.records import Channel as McapChannel
         from mcap.records import Schema
@@ -339,25 +255,11 @@ class McapFile(ChunkedFile):
         elif isinstance(described, McapChannel):
             known = self._channels.setdefault(described.id, described) == described
         else:
-            self.problems.add("a schema or channel that cannot be read was left out")
+            self.report("a schema or channel that cannot be read was left out")
             return
         if not known:
             what = f"{type(described).__name__.lower()} {described.id}"
-            self.problems.add(f"{what} is described twice, differently; the first description was used")
-
-
-def _message_index(index: bytes) -> tuple[Ints, Ints]:
-    """Return where in its records the messages of a chunk begin (n,), and their channels (n,); none where damaged."""
-    places, channels, at = [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
-    while at + _INDEX_HEAD.size <= len(index):
-        code, length, channel, _ = _INDEX_HEAD.unpack_from(index, at)
-        if code != _MESSAGE_INDEX or not 6 <= length <= len(index) - at - _HEAD_BYTES or len(places) > 1 << 16:
-            return places[0], channels[0]
-        entries = np.frombuffer(index, "<u8", (length - 6) // 16 * 2, at + _INDEX_HEAD.size)
-        places.append(entries[1::2].astype(np.int64))
-        channels.append(np.full(len(entries) // 2, channel))
-        at += _HEAD_BYTES + length
-    return np.concatenate(places), np.concatenate(channels)
+            self.report(f"{what} is described twice, differently; the first description was used")
 
 
 def _chunk_of_index(content: bytes) -> Chunk | None:

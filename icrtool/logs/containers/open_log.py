@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import stat
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -14,12 +14,12 @@ from typing import BinaryIO, NamedTuple
 
 from icrtool.errors import LogChangedError, LogError
 from icrtool.logs.containers.bag_directory import BagDirectory
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Container, Cut, Problems
 from icrtool.logs.containers.chunked_file import NotByRangesError
+from icrtool.logs.containers.container import Container, Origin
 from icrtool.logs.containers.mcap_file import McapFile, is_mcap
-from icrtool.logs.containers.remote_file import RemoteFile, changed_since, fetch_folder
+from icrtool.logs.containers.recording_files import STANDARD_INPUT, files_of_log, inputs_of, split_files
 from icrtool.logs.containers.ros1_bag import Ros1Bag, is_ros1_bag
-from icrtool.logs.containers.split_files import STANDARD_INPUT, files_of_log, inputs_of, split_files
+from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, read_by_ranges
 from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
 from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save, unpack
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
@@ -30,9 +30,6 @@ MOST_CHANNELS = 2048
 """Topics of a log, each publisher of a ROS 1 bag by itself, that are looked at: some 0.5 ms of time each."""
 
 KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file, also compressed"
-
-
-Plain = BagDirectory | McapFile | Ros1Bag | SqliteBag
 
 
 class Brought(NamedTuple):
@@ -50,69 +47,9 @@ class Brought(NamedTuple):
     transfer: str = ""
     distant: Mapping[str, RemoteFile] = MappingProxyType({})
 
-
-class UnpackedLog:
-    """A log that lies in a temporary folder, which is removed when it is closed.
-
-    Parameters
-    ----------
-    path : what the user named
-    brought : unpacked first where it is packed
-    share : called with the share of the file that was unpacked
-    """
-
-    def __init__(
-        self, path: Path, brought: Brought, scratch: ScratchFolder, share: Callable[[float], None] | None = None
-    ) -> None:  # fmt: skip
-        self._path, self._scratch, self._brought = path, scratch, brought
-        log, problem = brought.log, ""
-        try:
-            if _is_packed_file(log):
-                log, problem = unpack(log, scratch.path / "unpacked", share)
-            self._log = _plain_log(log, brought.distant)
-        except LogError as err:
-            # Its own path is gone when the user reads this.
-            raise LogError(path, err.why, "; ".join(filter(None, [problem, err.advice]))) from err
-        if problem:
-            _problems_of(self._log).add(problem)
-
-    @property
-    def channels(self) -> Sequence[Channel]:
-        """The topics."""
-        return self._log.channels
-
-    @property
-    def problems(self) -> Sequence[str]:
-        """What could not be read."""
-        return self._log.problems
-
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
-        """Yield the messages of the wanted channels."""
-        try:
-            yield from self._log.blocks(wanted, cut)
-        except LogError as err:
-            raise LogError(self._path, err.why, err.advice) from err
-
-    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
-        """Return the file that the user named, with its SHA-256."""
-        return self._brought.inputs or inputs_of([self._path], ended)
-
-    def transfer(self) -> str:
-        """Return how it came over a connection."""
-        return "; ".join(filter(None, [self._brought.transfer, self._log.transfer()]))
-
-    def span_ns(self) -> tuple[int, int] | None:
-        """Return first and last log time."""
-        return self._log.span_ns()
-
-    def share_read(self) -> float:
-        """Return the share of the log that has been read."""
-        return self._log.share_read()
-
-    def close(self) -> None:
-        """Release files, and remove what was unpacked."""
-        self._log.close()
-        self._scratch.close()
+    def words(self) -> str:
+        """Return how it came over a connection, and how much of what is distant was read since."""
+        return "; ".join(filter(None, [self.transfer, read_by_ranges(self.distant.values()) if self.distant else ""]))
 
 
 def open_log(path: Path, share: Callable[[float], None] | None = None) -> Container:
@@ -206,13 +143,32 @@ def _open(path: Path, share: Callable[[float], None] | None) -> Container:
         return _plain_log(path)
     scratch = ScratchFolder()
     try:
-        return UnpackedLog(path, _brought(path, scratch.path, remote, why, share), scratch, share)
+        return _unpacked_log(path, _brought(path, scratch.path, remote, why, share), scratch, share)
     except BaseException:
         scratch.close()
         raise
 
 
-def _by_ranges(path: Path, remote: RemoteFile) -> Plain | str:
+def _unpacked_log(
+    path: Path, brought: Brought, scratch: ScratchFolder, share: Callable[[float], None] | None
+) -> Container:
+    """Return the container of a log that lies in a temporary folder, or is unpacked there, which is removed with it."""
+    log, problem = brought.log, ""
+    try:
+        if _is_packed_file(log):
+            log, problem = unpack(log, scratch.path / "unpacked", share)
+        container = _plain_log(log, brought.distant)
+    except LogError as err:
+        # Its own path is gone when the user reads this.
+        raise LogError(path, err.why, "; ".join(filter(None, [problem, err.advice]))) from err
+    if problem:
+        container.report(problem)
+    container.path, container.files = path, [path]
+    container.origin = Origin(brought.inputs, brought.words, scratch.close)
+    return container
+
+
+def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:
     """Return the container of a file at an address, where it has an index; else why it has to be fetched."""
     if remote.is_folder:
         return "SQLite files, or packed"
@@ -227,9 +183,11 @@ def _by_ranges(path: Path, remote: RemoteFile) -> Plain | str:
     if kind is SqliteBag:
         return "an SQLite file"
     try:
-        return _usable(McapFile(path, source=remote) if kind is McapFile else Ros1Bag(path, remote), path)
+        container = McapFile(path, source=remote) if kind is McapFile else Ros1Bag(path, remote)
     except NotByRangesError:
         return "it has no index"
+    container.origin = Origin((remote.input,), lambda: read_by_ranges([remote]))
+    return _usable(container, path)
 
 
 def _brought(
@@ -263,28 +221,24 @@ def _is_packed_file(path: Path) -> bool:
         return is_packed(stream.read(512))
 
 
-def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType({})) -> Plain:
+def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType({})) -> Container:
     """Return the container of a log that is not packed; `distant` as in `BagDirectory`."""
     return _usable(BagDirectory(path, distant=distant) if distant else _container_at(path), path)
 
 
-def _usable(container: Plain, path: Path) -> Plain:
+def _usable(container: Container, path: Path) -> Container:
     """Return a container with the channels that are looked at; refuse one without any."""
     if (count := len(container.channels)) > MOST_CHANNELS:
         kept = sorted(container.channels, key=lambda channel: -(channel.count or 0))[:MOST_CHANNELS]
         container.channels = sorted(kept, key=lambda channel: channel.id)
-        _problems_of(container).add(f"{count:,} topics and publishers: the {MOST_CHANNELS:,} of most messages are used")
+        container.report(f"{count:,} topics and publishers: the {MOST_CHANNELS:,} of most messages are used")
     if container.problems and not container.channels:
         container.close()
         raise LogError(path, "nothing in it can be read", container.problems[0])
     return container
 
 
-def _problems_of(container: Plain) -> Problems:
-    return container.own_problems if isinstance(container, BagDirectory) else container.problems
-
-
-def _container_at(path: Path) -> Plain:
+def _container_at(path: Path) -> Container:
     if files := split_files(path):
         return BagDirectory(path, files)
     if stat.S_ISDIR(path.stat().st_mode):

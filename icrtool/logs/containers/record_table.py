@@ -1,7 +1,7 @@
-"""Where the records of a decompressed chunk are: by the file's own index of messages, else one after the other.
+"""Where chunks are in a file, and records in a chunk: by the file's own index, else one after the other.
 
-The index is only a hint. Each record begins where the one before it ends, which is checked for all of them at once;
-records that it lacks are found by following their lengths, and so are all records where it is wrong.
+The index of messages is only a hint. Each record begins where the one before it ends, which is checked for all of them
+at once; records that it lacks are found by following their lengths, and so are all records where it is wrong.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bytes, Ints
+from icrtool.logs.containers.decompress import STORED
+from icrtool.logs.containers.source import Held
 
 MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE = 3, 4, 5
 BAG_MESSAGE, BAG_CONNECTION = 2, 7
@@ -36,6 +38,61 @@ _MCAP_HEADS = np.dtype(
     [("code", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("time", "<i8"), ("published", "<u8")]
 )
 _LEAST_MESSAGE_BYTES = _MCAP_HEADS.itemsize - _MCAP_HEAD.size
+
+
+class Chunk(NamedTuple):
+    """A chunk in a file, by the index.
+
+    Attributes
+    ----------
+    at, length : where its content is in the file; before a bag's record is read: where that begins, and 0
+    channels : those it holds, None without an entry
+    begin_ns, end_ns : first and last log time in it, 0 where they are not known
+    index_length : of the message index records that follow it, and of what of a bag's record was not read
+    size : of its records, decompressed; -1 where there is no chunk in its place
+    compression : as the log calls it
+    """
+
+    at: int
+    length: int = 0
+    channels: frozenset[int] | None = None
+    begin_ns: int = 0
+    end_ns: int = 0
+    index_length: int = 0
+    size: int = 0
+    compression: str = ""
+
+    def is_partly(self, wanted: frozenset[int]) -> bool:
+        """Return whether it holds other channels, too."""
+        return self.channels is not None and not self.channels <= wanted
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether its records can be read one by one."""
+        return self.compression in STORED and self.index_length > 0 and self.size <= self.length
+
+
+class Part(NamedTuple):
+    """What is read of a chunk.
+
+    Attributes
+    ----------
+    messages : where messages begin in the records that are read, by the message index; None without one
+    ranges : begin and end (2, n) of the wanted records, where only those are read
+    held : its bytes, read ahead of a distant file
+    records : the wanted ones, likewise
+    """
+
+    chunk: Chunk
+    messages: Ints | None = None
+    ranges: Ints | None = None
+    held: Held | None = None
+    records: bytes | None = None
+
+    @property
+    def wanted_bytes(self) -> int:
+        """Bytes of the records that are read."""
+        return max(self.chunk.size, 0) if self.ranges is None else int((self.ranges[1] - self.ranges[0]).sum())
 
 
 class Records(NamedTuple):

@@ -12,9 +12,9 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import CUT_OFF, Block, Channel, ros_type_name
-from icrtool.logs.containers.chunked_file import Chunk, ChunkedFile, Spaces
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, STORED, DecompressionError, Packed, Space
-from icrtool.logs.containers.record_table import BAG_CONNECTION, Records, scan_bag
+from icrtool.logs.containers.chunked_file import ChunkedFile, Spaces
+from icrtool.logs.containers.decompress import STORED, DecompressionError, Packed, Space
+from icrtool.logs.containers.record_table import BAG_CONNECTION, Chunk, Part, scan_bag
 from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
 
@@ -24,7 +24,7 @@ _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
 _HEADER_BYTES = 1 << 12
 """Of a chunk that are read to learn how it is compressed, where it may be read in part."""
 
-NO_PLACES: Ints = np.empty(0, np.int64)
+_NONE: Ints = np.empty(0, np.int64)
 _MOST_FIELDS = 100
 """Of a header; real ones have ten at most."""
 
@@ -52,6 +52,36 @@ class _Record(NamedTuple):
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
+def _header_fields(header: bytes) -> dict[bytes, bytes]:
+    """Return the fields of a record's or a connection's header by name."""
+    fields: dict[bytes, bytes] = {}
+    place = 0
+    for _ in range(_MOST_FIELDS):
+        if place + 4 > len(header):
+            break
+        end = place + 4 + int.from_bytes(header[place : place + 4], "little")
+        name, _, value = header[place + 4 : end].partition(b"=")
+        fields[name] = value
+        place = end
+    return fields
+
+
+def _message_index(index: bytes) -> tuple[Ints, Ints]:
+    """Return where in its records the messages of a chunk begin (n,), and their connections (n,); none if damaged."""
+    places, connections, at = [_NONE], [_NONE], 0
+    while at + 8 <= len(index):
+        content = at + 8 + int.from_bytes(index[at : at + 4], "little")
+        length = int.from_bytes(index[content - 4 : content], "little")
+        entries = index[content : content + length]
+        fields = _header_fields(index[at + 4 : content - 4])
+        if len(entries) < length or fields.get(b"op") != bytes([_INDEX_DATA]):
+            return _NONE, _NONE
+        places.append(np.frombuffer(entries[: length // 12 * 12], "<u4")[2::3].astype(np.int64))
+        connections.append(np.full(len(places[-1]), int.from_bytes(fields.get(b"conn", b"")[:4], "little")))
+        at = content + length
+    return np.concatenate(places), np.concatenate(connections)
+
+
 class Ros1Bag(ChunkedFile):
     """One ROS 1 bag.
 
@@ -61,75 +91,50 @@ class Ros1Bag(ChunkedFile):
         Not a bag of version 2.0, or encrypted.
     """
 
+    _scan = staticmethod(scan_bag)
+    _message_index = staticmethod(_message_index)
+
     def __init__(self, path: Path, source: Source | None = None) -> None:
-        super().__init__(path, source)
+        super().__init__(path, source=source)
         self._connections: dict[int, Channel] = {}
-        self._stored: bool | None = None
         try:
             self._check_start()
             self._chunks: list[Chunk] | None = self._read_index()
             if self._chunks is None:
-                self.problems.add(f"has no index (not closed, or {CUT_OFF}); read from start to end")
+                self.report(f"has no index (not closed, or {CUT_OFF}); read from start to end")
                 self._learn_all()
         except BaseException:
             self.close()
             raise
         self.channels = list(self._connections.values())
 
-    def _span(self, chunk: Chunk, wanted: frozenset[int]) -> tuple[int, int]:
-        partly = chunk.channels is not None and not chunk.channels <= wanted
-        if partly and self._stored is None:
-            # One compression for all, as recorders write; where a chunk has another, that is found when it is read.
-            first = self._record(chunk.at)
-            self._stored = first is not None and _chunk_of(first).compression in STORED
-        return chunk.at, chunk.at + (0 if partly and self._stored else chunk.index_length)
-
-    def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Chunk:
-        held, partly = None, chunk.channels is not None and not chunk.channels <= wanted
-        if self._source.distant and chunk.index_length <= 2 * LARGEST_CHUNK_BYTES:
-            in_part = partly and self._stored
-            held = self._source.hold(
-                chunk.at, min(_HEADER_BYTES, chunk.index_length) if in_part else chunk.index_length
-            )
+    def _described(self, chunk: Chunk) -> Chunk:
+        if self._remote is not None and chunk.is_stored:
+            self._remote.hold(chunk.at, _HEADER_BYTES)
         record = self._record(chunk.at)
         if record is None or record.op != _CHUNK:
-            return chunk._replace(size=-1)
-        found, end = _chunk_of(record), record.at + record.length
-        stored = found.compression in STORED
-        index_length = min(max(chunk.at + chunk.index_length - end, 0), LARGEST_CHUNK_BYTES)
-        if held is not None and partly:
-            self._mixed |= not stored
-            held = self._source.hold(*((end, index_length) if stored else (chunk.at, chunk.index_length)))
-        index = self._bytes(end, index_length)
-        places, connections = _message_index(index)
-        found = found._replace(messages=places, held=held)
-        if held is None or not partly or not stored or places is None or not 0 < found.size == record.length:
-            return found
-        ends = np.append(places[1:], found.size)
-        rows = np.isin(connections, list(wanted))
-        if not rows.any() or (ends <= places).any() or places[0] < 0:
-            return found
-        sizes = (ends - places)[rows]
-        records = self._source.gather(found.at, np.stack([places[rows], ends[rows]]))
-        return found._replace(messages=np.cumsum(sizes) - sizes, records=records)
+            return Chunk(chunk.at, size=-1)
+        found = _chunk_of(record)
+        index_length = max(chunk.at + chunk.index_length - found.at - found.length, 0)
+        return found._replace(channels=chunk.channels, index_length=index_length)
 
     def _check_start(self) -> None:
-        start = self._bytes(0, len(MAGIC))
+        start = self._source.read_at(0, len(MAGIC))
         if start[:9] == MAGIC[:9] and start != MAGIC:
             raise LogError(
-                self._path, "a bag of another version", "only 2.0 can be read; `rosbag fix` converts older ones"
+                self.path, "a bag of another version", "only 2.0 can be read; `rosbag fix` converts older ones"
             )
         if start != MAGIC:
-            raise LogError(self._path, "not a ROS 1 bag", "its first bytes are not a bag's")
+            raise LogError(self.path, "not a ROS 1 bag", "its first bytes are not a bag's")
 
     def _record(self, at: int) -> _Record | None:
         """Return the record at a file offset with its header fields; None where there is no complete header."""
         if not 0 <= at < self._size:
             return None
-        header_length = int.from_bytes(self._bytes(at, 4), "little")
+        header_length = int.from_bytes(self._source.read_at(at, 4), "little")
         if header_length > min(_LARGEST_HEADER_BYTES, self._size - at - 8):
             return None
-        header = self._bytes(at + 4, header_length + 4)
+        header = self._source.read_at(at + 4, header_length + 4)
         length = int.from_bytes(header[header_length:], "little")
         return _Record(_header_fields(header[:header_length]), at + header_length + 8, length)
 
@@ -139,7 +144,7 @@ class Ros1Bag(ChunkedFile):
         if first is None or first.op != _BAG_HEADER:
             return None
         if first.text(b"encryptor"):
-            raise LogError(self._path, "an encrypted bag", "decrypt it first")
+            raise LogError(self.path, "an encrypted bag", "decrypt it first")
         at = first.number(b"index_pos", 8)
         if at <= 0:
             return None
@@ -149,7 +154,7 @@ class Ros1Bag(ChunkedFile):
             record = self._record(at)
             if record is None or record.length > min(_LARGEST_CONTENT_BYTES, self._size - record.at):
                 return None
-            content = self._bytes(record.at, record.length)
+            content = self._source.read_at(record.at, record.length)
             if record.op == BAG_CONNECTION:
                 self._connect(record.number(b"conn"), record.text(b"topic"), content)
             elif record.op == _CHUNK_INFO:
@@ -167,7 +172,13 @@ class Ros1Bag(ChunkedFile):
         self._connections = {n: replace(c, count=counts.get(n, 0)) for n, c in self._connections.items()}
         ordered = sorted(chunks.values(), key=lambda chunk: chunk.at)
         ends = [*(chunk.at for chunk in ordered), first.number(b"index_pos", 8)][1:]
-        return [chunk._replace(index_length=end - chunk.at) for chunk, end in zip(ordered, ends, strict=False)]
+        # One compression for all, as recorders write; where a chunk has another, that is found when it is read.
+        record = self._record(ordered[0].at) if ordered else None
+        kind = record.text(b"compression") if record is not None else "unknown"
+        return [
+            chunk._replace(index_length=end - chunk.at, compression=kind)
+            for chunk, end in zip(ordered, ends, strict=False)
+        ]
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
         at = len(MAGIC)
@@ -177,31 +188,28 @@ class Ros1Bag(ChunkedFile):
                 break
             cut = record.length > self._size - record.at
             if record.op == _CHUNK:
-                yield from self._read_chunk(_chunk_of(record), self._next_spaces(), learn=learn, cut=cut)
+                yield from self._read_chunk(Part(_chunk_of(record)), self._next_spaces(), learn=learn, cut=cut)
             if cut:
                 break
             if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
-                content = self._bytes(record.at, record.length)
+                content = self._source.read_at(record.at, record.length)
                 self._connect(record.number(b"conn"), record.text(b"topic"), content)
             at = record.at + record.length
         if at < self._size:
-            self.problems.add(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
+            self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
-    def _read_chunk(self, chunk: Chunk, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        if chunk.size < 0:
-            self.problems.add(f"no chunk at byte {chunk.at}, where the index lists one")
+    def _read_chunk(self, part: Part, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
+        if part.chunk.size < 0:
+            self.report(f"no chunk at byte {part.chunk.at}, where the index lists one")
         else:
-            yield from super()._read_chunk(chunk, spaces, learn=learn, cut=cut)
+            yield from super()._read_chunk(part, spaces, learn=learn, cut=cut)
 
-    def _packed(self, chunk: Chunk, space: Space, *, cut: bool = False) -> Packed:
+    def _packed(self, part: Part, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:  # noqa: ARG002 - all of it
+        chunk = part.chunk
         if chunk.size < 0:
             raise DecompressionError("no chunk")
-        return Packed(
-            self._content(chunk.at, chunk.length, space, chunk.held), chunk.compression, chunk.size, partial=cut
-        )
-
-    def _scan(self, data: Bytes, begin: int, hint: Ints | None = None) -> Records:
-        return scan_bag(data, begin, hint)
+        content = self._content(chunk.at, chunk.length, space, part.held)
+        return Packed(content, chunk.compression, chunk.size, partial=cut)
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         _, at, start, end = record
@@ -223,46 +231,9 @@ class Ros1Bag(ChunkedFile):
 
 
 def _chunk_of(record: _Record) -> Chunk:
-    return Chunk(record.at, record.length, size=record.number(b"size"), compression=record.text(b"compression"))
-
-
-def _message_index(index: bytes) -> tuple[Ints | None, Ints]:
-    """Return where in its records the messages of a chunk begin (n,), ascending, and their connections (n,).
-
-    None where that is not known.
-    """
-    keys, at = [], 0
-    while at + 8 <= len(index):
-        content = at + 8 + int.from_bytes(index[at : at + 4], "little")
-        length = int.from_bytes(index[content - 4 : content], "little")
-        entries = index[content : content + length]
-        fields = _header_fields(index[at + 4 : content - 4])
-        if len(entries) < length or fields.get(b"op") != bytes([_INDEX_DATA]):
-            return None, NO_PLACES
-        places = np.frombuffer(entries[: length // 12 * 12], "<u4")[2::3]
-        # Sorted together, as one number.
-        keys.append(
-            (places.astype(np.uint64) << np.uint64(32)) | int.from_bytes(fields.get(b"conn", b"")[:4], "little")
-        )
-        at = content + length
-    if not keys:
-        return None, NO_PLACES
-    joined = np.sort(np.concatenate(keys), kind="stable")
-    return (joined >> np.uint64(32)).astype(np.int64), (joined & np.uint64(0xFFFFFFFF)).astype(np.int64)
-
-
-def _header_fields(header: bytes) -> dict[bytes, bytes]:
-    """Return the fields of a record's or a connection's header by name."""
-    fields: dict[bytes, bytes] = {}
-    place = 0
-    for _ in range(_MOST_FIELDS):
-        if place + 4 > len(header):
-            break
-        end = place + 4 + int.from_bytes(header[place : place + 4], "little")
-        name, _, value = header[place + 4 : end].partition(b"=")
-        fields[name] = value
-        place = end
-    return fields
+    compression = record.text(b"compression")
+    size = record.length if compression in STORED else record.number(b"size")
+    return Chunk(record.at, record.length, size=size, compression=compression)
 
 
 def is_ros1_bag(stream: BinaryIO) -> bool:

@@ -8,10 +8,9 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from threading import Event
 from typing import BinaryIO
 from urllib.parse import quote
 
@@ -24,14 +23,12 @@ from icrtool.logs.containers.channel import (
     Block,
     Channel,
     Cut,
-    Problems,
     made_ahead,
     ros_type_name,
     with_possible_times,
 )
-from icrtool.logs.containers.decompress import ZSTD_MAGIC, unpack_messages
-from icrtool.logs.containers.split_files import inputs_of
-from icrtool.records.samples import InputFile
+from icrtool.logs.containers.container import Container
+from icrtool.logs.containers.decompress import ZSTD_MAGIC
 from icrtool.records.text import LogText
 
 MAGIC = b"SQLite format 3\0"
@@ -53,7 +50,7 @@ _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """The errors of sqlite3; the latter where its message contains a damaged name."""
 
 
-class SqliteBag:
+class SqliteBag(Container):
     """One ``.db3`` file.
 
     Parameters
@@ -67,8 +64,8 @@ class SqliteBag:
     """
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
-        self._path = path
-        self.problems = Problems(path.name)
+        super().__init__(path, message_compression)
+        self._file = path
         self._advice = f"`sqlite3 {path.name} .recover | sqlite3 recovered.db3` may bring back more"
         self._made_beside: Path | None = None
         self._last_row = 0
@@ -79,7 +76,7 @@ class SqliteBag:
             try:
                 self._restrict()
                 self.channels = self._read_topics()
-                self._message_compression = message_compression or self._found_compression()
+                self.message_compression = message_compression or self._found_compression()
                 self._rows = self._count_rows()
             except BaseException:
                 self.close()
@@ -91,14 +88,6 @@ class SqliteBag:
             found = "; ".join([str(err), *self.problems, *([self._advice] if is_damaged else [])])
             raise LogError(path, "not a readable rosbag2 database", found) from err
 
-    def inputs(self, ended: Event) -> tuple[InputFile, ...]:
-        """Return the file with its SHA-256."""
-        return inputs_of([self._path], ended)
-
-    def transfer(self) -> str:
-        """Return nothing: it is on disk."""
-        return ""
-
     def share_read(self) -> float:
         """Return the last row read as a share of all rows."""
         return self._last_row / max(self._rows, 1)
@@ -108,6 +97,7 @@ class SqliteBag:
         self._database.close()
         if self._made_beside is not None:
             self._made_beside.unlink(missing_ok=True)
+        super().close()
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return the times of the first and the last message, None where they cannot be read."""
@@ -121,21 +111,17 @@ class SqliteBag:
             return None
         return (first, last) if isinstance(first, int) and isinstance(last, int) else None
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages of the wanted topics in the order they were stored."""
-        if not wanted:
-            return
         self._interruption = None
-        blocks: Iterator[Block] = made_ahead(self._stored(wanted, cut), self._end_query)
+        blocks: Iterator[Block] = made_ahead(self._in_order(wanted, cut), self._end_query)
         if lost := self._cut_inside_page():
             blocks = _without_last(blocks, lost)
-        if self._message_compression:
-            blocks = unpack_messages(blocks, wanted, self._message_compression, self.problems.add)
         yield from blocks
 
     def _connect(self) -> sqlite3.Connection:
         """Open the database to read, with the write-ahead log that a recorder leaves when it is killed."""
-        log, index = (self._path.with_name(self._path.name + end) for end in ("-wal", "-shm"))
+        log, index = (self._file.with_name(self._file.name + end) for end in ("-wal", "-shm"))
         if log.exists() and log.stat().st_size:
             self._made_beside = None if os.path.lexists(index) else index
             database = self._open("mode=ro")
@@ -143,7 +129,7 @@ class SqliteBag:
                 database.execute("SELECT name FROM sqlite_master")
             except _DAMAGE as err:
                 database.close()
-                self.problems.add(f"its write-ahead log cannot be read ({err}); the last messages may be missing")
+                self.report(f"its write-ahead log cannot be read ({err}); the last messages may be missing")
             else:
                 return database
         # Without `immutable` SQLite writes files beside a log that was recorded in WAL mode.
@@ -156,7 +142,7 @@ class SqliteBag:
         return database
 
     def _open(self, mode: str) -> sqlite3.Connection:
-        name = quote(os.fsencode(self._path.resolve()))
+        name = quote(os.fsencode(self._file.resolve()))
         database = sqlite3.connect(f"file:{name}?{mode}", uri=True, check_same_thread=False)
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * _BLOCK_BYTES)
         database.text_factory = lambda text: text.decode("utf-8", "replace")
@@ -196,7 +182,7 @@ class SqliteBag:
 
     def _query(self, query: str, parameters: tuple[int, ...] = ()) -> sqlite3.Cursor:
         """Run a query, with its own limit of steps."""
-        self._steps_left = _LEAST_STEPS + _STEPS_PER_BYTE * self._path.stat().st_size
+        self._steps_left = _LEAST_STEPS + _STEPS_PER_BYTE * self._file.stat().st_size
         return self._database.execute(query, parameters)
 
     def _read_topics(self) -> list[Channel]:
@@ -229,7 +215,7 @@ class SqliteBag:
         try:
             return {name: (encoding, str(text)) for name, encoding, text in self._query(query).fetchmany(_MOST_TOPICS)}
         except _DAMAGE as err:
-            self.problems.add(f"its message definitions cannot be read ({err})")
+            self.report(f"its message definitions cannot be read ({err})")
             return {}
 
     def _found_compression(self) -> str:
@@ -262,7 +248,7 @@ class SqliteBag:
             return 0, self._rows
         return (first - 1, last) if first is not None else (0, 0)
 
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+    def _in_order(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages in the order they were stored, up to the first row that SQLite cannot read.
 
         Notes
@@ -296,7 +282,7 @@ class SqliteBag:
                 if self._interruption is not None:
                     raise self._interruption from None
                 if count == 1:
-                    self.problems.add(f"damaged ({err}); what SQLite reads before was read; {self._advice}")
+                    self.report(f"damaged ({err}); what SQLite reads before was read; {self._advice}")
                     return
                 count //= 2  # those before the damage; or together they are too long
                 continue
@@ -304,26 +290,26 @@ class SqliteBag:
                 return
             self._last_row = after = max(after + 1, last)
             if without:
-                self.problems.add(
+                self.report(
                     f"rows without a time, or without a message of up to {_LARGEST_MESSAGE_BYTES} bytes, left out"
                 )
             if content is None:
                 continue
             block = _unpacked(texts, content)
-            yield with_possible_times(block, self.problems)
+            yield with_possible_times(block, self.report)
             by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
             count = max(1, min(4 * count, _MOST_ROWS, by_size))
 
     def _cut_inside_page(self) -> int:
         """Return the bytes of a page where the file ends inside one, else 0; and report an end that is missing."""
-        size = self._path.stat().st_size
-        with self._path.open("rb") as stream:
+        size = self._file.stat().st_size
+        with self._file.open("rb") as stream:
             head = stream.read(32)
         # The field has two bytes, and 1 stands for 65536.
         page_bytes = int.from_bytes(head[16:18], "big")
         page_bytes = page_bytes if page_bytes > 1 else 1 << 16
         if size % page_bytes or size < page_bytes * int.from_bytes(head[28:32], "big"):
-            self.problems.add(f"{CUT_OFF}; what SQLite reads of it was read; {self._advice}")
+            self.report(f"{CUT_OFF}; what SQLite reads of it was read; {self._advice}")
         return page_bytes if size % page_bytes else 0
 
 

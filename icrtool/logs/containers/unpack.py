@@ -22,7 +22,7 @@ from typing import NamedTuple
 from icrtool.errors import LogError
 from icrtool.logs.containers.channel import CUT_OFF, some_of
 from icrtool.logs.containers.decompress import DECODERS, LARGEST_CHUNK_BYTES, LARGEST_RATIO, Readable, decoding_errors
-from icrtool.logs.containers.one_recording import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
+from icrtool.logs.containers.recording_files import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
 from icrtool.records import process_resources
 from icrtool.records.regular_file import open_regular
 

@@ -9,7 +9,7 @@ import pytest
 
 from icrtool.config import load_config
 from icrtool.fleet.recordings import find_recordings, logs_among
-from icrtool.logs.containers.split_files import numbered_file, split_files, split_path
+from icrtool.logs.containers.recording_files import numbered_file, split_files, split_path
 from icrtool.logs.read_log import read_log
 from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.containers.recording_files import log_name
 
 
 @pytest.mark.parametrize(

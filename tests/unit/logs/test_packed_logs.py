@@ -31,7 +31,7 @@ from icrtool.fleet.recordings import find_recordings
 from icrtool.logs import table_file
 from icrtool.logs.containers import unpack
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.containers.recording_files import log_name
 from icrtool.logs.read_log import read_log
 
 SAMPLES = Path(__file__).parents[3] / "sample_logs"

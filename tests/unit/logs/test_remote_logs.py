@@ -29,8 +29,8 @@ from icrtool.fleet.roll_up import _content
 from icrtool.logs.containers import address
 from icrtool.logs.containers.channel import Block
 from icrtool.logs.containers.open_log import open_log
-from icrtool.logs.containers.remote_file import find
-from icrtool.logs.containers.split_files import log_name
+from icrtool.logs.containers.recording_files import log_name
+from icrtool.logs.containers.source import find
 from icrtool.logs.read_log import read_log
 from icrtool.records.fleet_document import FleetFile
 from icrtool.records.urls import UrlPath, place_of, without_secrets
