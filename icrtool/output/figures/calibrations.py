@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.patches import Circle
@@ -34,9 +34,8 @@ def forecast_figure(
         answer = f"Within {budgets_m[0]:g} m (95 %) for {reached[0]:.1f} m, {answer}"
     by = "wheels alone" if gyro is None else "wheels alone, and with gyro"
     subtitle = f"{title}: forecast error without GNSS from the start: {by}, by the calibration"
-    figure = style.new_figure(
-        answer, subtitle, width_in=9.0, height_in=4.2, margins_in=(0.7, 0.25, 0.75, 0.95), wspace=0.28
-    )  # fmt: skip
+    margins_in = (0.7, 0.25, 0.75, 0.95)
+    figure = style.new_figure(answer, subtitle, width_in=9.0, height_in=4.2, margins_in=margins_in, wspace=0.28)
     grown, path = figure.subplots(1, 2)
     for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
         if one is not None:
@@ -66,7 +65,7 @@ def forecast_figure(
 SHOWN_PERCENT = 97.0
 """The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
 
-BEFORE: dict[str, Any] = {
+BEFORE: style.Look = {
     "label": "before: as configured, ICR separation estimated",
     "marker": "s",
     "color": "0.62",
@@ -74,7 +73,7 @@ BEFORE: dict[str, Any] = {
     "linestyle": "none",
     "markeredgewidth": 0.0,
 }
-AFTER: dict[str, Any] = BEFORE | {
+AFTER: style.Look = BEFORE | {
     "label": "after: calibrated",
     "marker": "o",
     "color": style.ICR.color,
@@ -86,11 +85,11 @@ AFTER: dict[str, Any] = BEFORE | {
 def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     """Return residuals of displacements and of heading changes over windows, before and after."""
     first, last = (float(np.median(np.hypot(*part))) for part in (residuals.before, residuals.after))
+    answer = f"Windows of the drive are off by {last:.3f} m calibrated, {first:.3f} m before"
     windows = f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals"
     figure = style.new_figure(
-        f"Windows of the drive are off by {last:.3f} m calibrated, {first:.3f} m before", f"{name}: {windows}",
-        height_in=4.2, margins_in=(0.75, 0.2, 0.7, 1.0), wspace=0.32,
-    )  # fmt: skip
+        answer, f"{name}: {windows}", height_in=4.2, margins_in=(0.75, 0.2, 0.7, 1.0), wspace=0.32
+    )
     place, turn = figure.subplots(1, 2)
     turns = (residuals.turn_before, residuals.turn_after)
     for part, turned, look in zip((residuals.before, residuals.after), turns, (BEFORE, AFTER), strict=True):
@@ -128,10 +127,10 @@ def transfer(found: GroupComparison) -> Figure:
     """Return the figure: p95 after 10 m, calibrated on row and tested on column; costs with 95 % intervals."""
     names, rows = list(found.groups), [one for one in found.costs if one.p95_m is not None]
     subtitle = f"{' · '.join(names)}: on the diagonal each trial is predicted by a fit that does not contain it"
+    height_in, margins_in = 2.95 + 0.45 * len(names) + 0.12 * len(rows), (1.3, 0.2, 1.35, 0.75)
     figure = style.new_figure(
-        _answer(found), subtitle, width_in=9.6, height_in=2.95 + 0.45 * len(names) + 0.12 * len(rows),
-        margins_in=(1.3, 0.2, 1.35, 0.75), wspace=1.15,
-    )  # fmt: skip
+        _answer(found), subtitle, width_in=9.6, height_in=height_in, margins_in=margins_in, wspace=1.15
+    )
     matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
     _draw_matrix(matrix, found, names)
     labels = []

@@ -63,10 +63,9 @@ def icr_estimates(run: Run) -> Figure:
     """
     spans = _spans_s(run)
     learning = "; left: learning, right: after it" if len(spans) > 1 else ""
-    figure = style.new_figure(
-        _answer(run), f"{run_title(run.document)}: estimates of the filter{learning}",
-        height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3,
-    )  # fmt: skip
+    title, subtitle = _answer(run), f"{run_title(run.document)}: estimates of the filter{learning}"
+    margins_in = (0.75, 0.2, 0.8, 0.9)
+    figure = style.new_figure(title, subtitle, height_in=5.8, margins_in=margins_in, wspace=0.22, hspace=0.3)
     panels = figure.subplots(
         3, len(spans), squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 3)[: len(spans)]}
     )
@@ -90,11 +89,9 @@ def icr_clusters(run: Run) -> Figure:
     mean, std = run.document.icr.mean, run.document.icr.std
     spread = (f"{ICR_WORDS[column]} ±{std[column]:.3f} m" for column in ICR_COLUMNS if mean[column] is not None)
     known = any(mean[column] is not None for column in ICR_COLUMNS)
-    figure = style.new_figure(
-        f"The ICRs scatter by {', '.join(spread)}" if known else "No ICR is shown",
-        f"{run_title(run.document)}: estimates from {settled:.1f} s on",
-        height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.9),
-    )  # fmt: skip
+    title = f"The ICRs scatter by {', '.join(spread)}" if known else "No ICR is shown"
+    subtitle = f"{run_title(run.document)}: estimates from {settled:.1f} s on"
+    figure = style.new_figure(title, subtitle, height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.9))
     panels = figure.subplots(1, 3, sharey=True)
     weight = np.append(np.diff(run.table.t_s), 0.0)[after]
     columns: tuple[IcrColumn, ...] = ("y_icr_left_m", "x_icr_m", "y_icr_right_m")
@@ -156,10 +153,8 @@ def _mark_clipped(axes: Axes, t: Floats, value: Floats) -> None:
     low, high = axes.get_ylim()
     for row, edge, arrow in ((int(value.argmin()), low, "↓"), (int(value.argmax()), high, "↑")):
         if not low <= value[row] <= high:
-            axes.annotate(
-                f"{arrow} {signed(value[row])}", (t[row], edge), ha="left", va="top" if edge == high else "bottom",
-                fontsize=7.5, color=style.BAD_FIX_COLOR, bbox=style.LABEL_BOX,
-            )  # fmt: skip
+            text, va = f"{arrow} {signed(value[row])}", "top" if edge == high else "bottom"
+            style.write_beside(axes, text, (t[row], edge), va=va, fontsize=7.5, color=style.BAD_FIX_COLOR)
 
 
 def _draw_convergence(axes: Axes, run: Run, column: IcrColumn, unit_s: float) -> list[float]:
@@ -240,10 +235,9 @@ def gnss_difference(run: Run) -> Figure:
     mean, most = facts.mean_difference_m, facts.max_difference_m
     of, word = facts.used + facts.rejected, position_word(run.document)
     apart = f"{error_text(mean)} from the {word} on average, " if mean is not None else ""
-    figure = style.new_figure(
-        f"Filter {apart}{100 * facts.rejected / max(of, 1):.0f} % rejected",
-        f"{run_title(run.document)}: distance between filter and {word}, {of:,} of them", height_in=3.9,
-    )  # fmt: skip
+    title = f"Filter {apart}{100 * facts.rejected / max(of, 1):.0f} % rejected"
+    subtitle = f"{run_title(run.document)}: distance between filter and {word}, {of:,} of them"
+    figure = style.new_figure(title, subtitle, height_in=3.9)
     axes = figure.subplots()
     unit, seconds = style.time_unit(float(run.table.t_s[-1]))
     t, difference = run.gnss.t_s / seconds, run.gnss.difference

@@ -53,10 +53,8 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
         for side in ("right", "left")
     }
     answer = ", ".join(f"y {side} {' to '.join(ends)} m" for side, ends in ranges.items()).replace("-", "−")
-    figure = style.new_figure(
-        f"ICRs: {answer}", f"{fleet.title}: of each log, ±σ", height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95),
-        hspace=0.12,
-    )  # fmt: skip
+    title, subtitle = f"ICRs: {answer}", f"{fleet.title}: of each log, ±σ"
+    figure = style.new_figure(title, subtitle, height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12)
     panels = figure.subplots(2, 1, sharex=True)
     for axes, side in zip(panels, ("right", "left"), strict=True):
         for number, robot in enumerate(dict.fromkeys(point.robot for point in fleet.points)):
@@ -66,8 +64,7 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
             axes.errorbar(
                 when, [_icr(point, side) for point in mine],
                 [point.icr.get(f"std_y_icr_{side}_m") or 0.0 for point in mine],
-                linestyle="none", marker=MARKERS[number % len(MARKERS)], color=COLORS[number % len(COLORS)],
-                markersize=4.5, capsize=2.0, linewidth=1.0, label=key,
+                markersize=4.5, capsize=2.0, linewidth=1.0, label=key, **_look(number),
             )  # fmt: skip
         axes.set_ylabel(f"ICR y {side} [m]")
     first, last = panels[-1].get_xlim()
@@ -81,6 +78,12 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
     panels[-1].set_xlabel(f"Date, UTC, {' to '.join(dict.fromkeys((years[0], years[-1])))}")
     style.add_legend(figure, ncols=4)
     return figure
+
+
+def _look(number: int) -> style.Look:
+    """Return how the robot or group of a number is drawn."""
+    color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
+    return {"linestyle": "none", "marker": marker, "color": color}
 
 
 def _icr(point: FleetLog, side: str) -> float:
@@ -101,27 +104,21 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
     cut = f", the {MOST_ROWS} largest" if len(errors) > MOST_ROWS else ""
     median = error_text(float(np.median([error for *_, error in errors])))
     labels = [style.drawable(log, LONGEST_LOG) for _, log, _ in shown]
-    figure = style.new_figure(
-        f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}",
-        f"{fleet.title}: 95 % error after 10 m without GNSS, {fleet.model}{cut}", height_in=1.9 + ROW_IN * len(shown),
-        margins_in=(2.9, 0.7, 0.65, 1.05),
-    )  # fmt: skip
+    title = f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}"
+    subtitle = f"{fleet.title}: 95 % error after 10 m without GNSS, {fleet.model}{cut}"
+    height_in = 1.9 + ROW_IN * len(shown)
+    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=(2.9, 0.7, 0.65, 1.05))
     axes = figure.subplots()
     axes.set_yticks(range(len(labels)), labels, parse_math=False)
     axes.set_ylim(len(labels) - 0.4, -0.6)
     for number, (group, logs) in enumerate(fleet.errors_m.items()):
         rows = [row for row, one in enumerate(shown) if one[0] == group]
         middle = error_text(float(np.median(list(logs.values()))))
-        axes.plot(
-            [shown[row][2] for row in rows], rows, linestyle="none", marker=MARKERS[number % len(MARKERS)],
-            color=COLORS[number % len(COLORS)], markersize=5.5,
-            label=f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}",
-        )  # fmt: skip
+        label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
+        axes.plot([shown[row][2] for row in rows], rows, markersize=5.5, label=label, **_look(number))
     for row, (*_, error) in enumerate(shown):
-        axes.annotate(
-            error_text(error), (error, row), xytext=(6, 0), textcoords="offset points", va="center", fontsize=8.0,
-            annotation_clip=False,
-        )  # fmt: skip
+        look: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False, "bbox": None}
+        style.write_beside(axes, error_text(error), (error, row), (6.0, 0.0), **look)
     style.logarithmic_errors(axes)
     style.add_legend(figure, ncols=2)
     return figure

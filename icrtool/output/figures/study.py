@@ -34,7 +34,7 @@ BEYOND = 1.6
 FATE_COLORS = np.array([(0.57, 0.77, 0.93), (0.50, 0.0, 0.10), (0.90, 0.90, 0.90)])
 """Red, green, blue by `FATES`, mixed by the share of the runs."""
 
-LOOKS: tuple[dict[str, Any], ...] = (
+LOOKS: tuple[style.Look, ...] = (
     *({key: value for key, value in look.items() if key != "label"} for look in style.ICR_LOOKS.values()),
     {"color": "#1b7837", "linestyle": "-", "marker": "D", "markersize": 3.5},
 )
@@ -43,7 +43,8 @@ LOOKS: tuple[dict[str, Any], ...] = (
 OPEN_LOOP = {"label": "open loop, final ICRs", **LOOKS[3]}
 OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP.keywords()}
 PATH_COLORS = ("#2166ac", "#e08214", "#1b7837", "#b2182b")
-TRUTH: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (4, 2))}
+WIDE: style.Look = {"linewidth": 1.5}
+TRUTH: style.Look = {"linewidth": 0.9, "linestyle": (0, (4, 2))}
 
 Draw = Callable[["Axes", StudyResult, list[Level]], None]
 """Draws the levels of one series."""
@@ -56,10 +57,9 @@ def study_figure(result: StudyResult) -> Figure:
     names = dict.fromkeys(level.setting.series for level in result.levels)
     of_series = [[level for level in result.levels if level.setting.series == name] for name in names]
     columns = [list(result.levels)] if result.request.name in TOGETHER else of_series
-    figure = style.new_figure(
-        study_title(result), study_subtitle(result), height_in=1.7 + PANEL_IN * len(rows),
-        margins_in=(0.85, 0.2, 0.75, 1.2), wspace=0.12, hspace=0.5,
-    )  # fmt: skip
+    title, subtitle, height_in = study_title(result), study_subtitle(result), 1.7 + PANEL_IN * len(rows)
+    margins_in = (0.85, 0.2, 0.75, 1.2)
+    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, wspace=0.12, hspace=0.5)
     panels = figure.subplots(len(rows), len(columns), squeeze=False, sharey="row")
     for column, levels in enumerate(columns):
         name = levels[0].setting.series
@@ -73,7 +73,7 @@ def study_figure(result: StudyResult) -> Figure:
 
 
 def over(
-    axes: Axes, result: StudyResult, levels: Sequence[Level], columns: dict[str, dict[str, Any]], *, log: str = ""
+    axes: Axes, result: StudyResult, levels: Sequence[Level], columns: dict[str, style.Look], *, log: str = ""
 ) -> None:
     """Draw columns over what varies: medians, and bars from the 5th to the 95th percentile.
 
@@ -96,15 +96,14 @@ def over(
         axes.set_yscale("log")
 
 
-def _points(axes: Axes, values: Sequence[Any], found: Sequence[Any], look: dict[str, Any], shift: float) -> None:
+def _points(axes: Axes, values: Sequence[Any], found: Sequence[Any], look: style.Look, shift: float) -> None:
     """Draw (low, middle, high) over numbers; over names beside one another."""
     x: Any = values
     if isinstance(values[0], str):
         axes.set_xticks(range(len(values)), [str(value).replace("_", " ") for value in values])
         x, look = np.arange(len(values)) + shift, look | {"linestyle": "none"}
     low, middle, high = np.array(found).T
-    look = {"linewidth": 1.5} | look
-    axes.errorbar(x, middle, [middle - low, high - middle], elinewidth=0.8, capsize=2.0, **look)
+    axes.errorbar(x, middle, [middle - low, high - middle], elinewidth=0.8, capsize=2.0, **WIDE | look)
 
 
 def errors(axes: Axes, result: StudyResult, levels: Sequence[Level], *, log: str = "") -> None:
@@ -118,7 +117,7 @@ def errors(axes: Axes, result: StudyResult, levels: Sequence[Level], *, log: str
     axes.set_ylim(min(finite) - reach, max(finite) + reach)
 
 
-def _by_icr(column: str) -> dict[str, dict[str, Any]]:
+def _by_icr(column: str) -> dict[str, style.Look]:
     return {column.format(icr=icr): look for icr, look in style.ICR_LOOKS.items()}
 
 
@@ -129,7 +128,7 @@ def inversions(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None
     axes.set(ylim=(-4, 104), xlabel=capital(result.study.varies))
 
 
-def along(axes: Axes, t: Floats, values: Floats, look: dict[str, Any]) -> None:
+def along(axes: Axes, t: Floats, values: Floats, look: style.Look) -> None:
     """Draw median and 5 to 95 % of values (runs, k) along time t (k,) [s]."""
     low, middle, high = np.nanpercentile(values, [5, 50, 95], axis=0)
     if len(values) > 1:
@@ -200,7 +199,7 @@ def shares(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     for number, level in enumerate(levels):
         times = np.sort(level.found["settle_s"])
         settled = np.maximum(times[np.isfinite(times)], 0.01)
-        look: dict[str, Any] = {"color": PATH_COLORS[number % 4], "linestyle": ("-", "--", ":", "-.")[number % 4]}
+        look: style.Look = {"color": PATH_COLORS[number % 4], "linestyle": ("-", "--", ":", "-.")[number % 4]}
         share = 100 * np.arange(len(settled) + 1) / len(times)
         axes.step([*settled[:1], *settled], share[: 2 * len(settled)], where="post", label=level.setting.value, **look)
     axes.axvspan(5.0, 15.0, color="0.92", zorder=0, label="the paper's driven robots")

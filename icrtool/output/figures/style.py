@@ -42,6 +42,9 @@ WEIGHTS = ("regular", "bold")
 MISSING = "\u25a1"
 """Drawn for a character that the font lacks."""
 
+Look = dict[str, Any]
+"""Keywords of what matplotlib draws: colour, line, marker."""
+
 RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
@@ -93,7 +96,7 @@ class Pen:
     dash: str | tuple[float, tuple[float, ...]] = "-"
     width: float = 1.3
 
-    def keywords(self) -> dict[str, Any]:
+    def keywords(self) -> Look:
         """Return the keywords `Axes.plot` takes."""
         return {"color": self.color, "linestyle": self.dash, "linewidth": self.width}
 
@@ -120,7 +123,7 @@ OTHER_PENS = (Pen("#8c510a", (0, (3, 1.2)), 1.4), Pen("#01665e", (0, (6, 1.5, 2,
 FORCED = Pen(BAD_FIX_COLOR, width=1.8)
 REAL = Pen("black", (0, (2.0, 1.2)), 1.8)
 
-ICR_LOOKS: dict[str, dict[str, Any]] = {
+ICR_LOOKS: dict[str, Look] = {
     "y_icr_right": {"label": "y right", "color": "#2166ac", "linestyle": "-", "marker": "o", "markersize": 3.5},
     "y_icr_left": {"label": "y left", "color": "#b2182b", "linestyle": (0, (6, 2)), "marker": "s", "markersize": 3.5},
     "x_icr": {"label": "x", "color": "0.25", "linestyle": (0, (1.5, 1.5)), "marker": "^", "markersize": 3.5},
@@ -128,7 +131,7 @@ ICR_LOOKS: dict[str, dict[str, Any]] = {
 """Of the three ICRs where they share a panel, by `icrtool.simulation.study_measures.ICR_NAMES`."""
 
 
-LABEL_BOX: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
+LABEL_BOX: Look = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
 """Behind text that lies on lines."""
 
 
@@ -181,7 +184,7 @@ def new_figure(
     )
     edge = 0.09 / width_in
     most = int(TITLE_CHARACTERS_PER_INCH * width_in)
-    at: dict[str, Any] = {"va": "top", "ha": "left", "parse_math": False}
+    at: Look = {"va": "top", "ha": "left", "parse_math": False}
     figure.text(edge, 1 - 0.09 / height_in, drawable(title, most), fontsize=10.5, fontweight="bold", **at)
     most = int(SUBTITLE_CHARACTERS_PER_INCH * width_in)
     figure.text(edge, 1 - 0.30 / height_in, drawable(subtitle, most), fontsize=8.5, color="0.3", **at)
@@ -200,9 +203,16 @@ def add_legend(figure: Figure, **layout: Any) -> None:
             text.set_parse_math(False)
 
 
-def spot(fill: str, size: float = 5.5) -> dict[str, Any]:
+def spot(fill: str, size: float = 5.5, marker: str = "o", color: str = "black") -> Look:
     """Return the look of a place: white where something begins, black where it ends."""
-    return {"linestyle": "none", "marker": "o", "color": "black", "markerfacecolor": fill, "markersize": size}
+    return {"linestyle": "none", "marker": marker, "color": color, "markerfacecolor": fill, "markersize": size}
+
+
+def write_beside(
+    axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[float, float] = (0.0, 0.0), **look: Any
+) -> None:
+    """Write a text so many points from a place, on a box of its own that hides the lines below it."""
+    axes.annotate(text, place, xytext=offset_pt, textcoords="offset points", **{"bbox": LABEL_BOX} | look)
 
 
 def drawable(text: str, longest: int = LONGEST_MESSAGE) -> str:

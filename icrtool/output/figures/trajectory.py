@@ -41,18 +41,15 @@ TIME_CLEARANCE = 0.06
 Corners = tuple[Floats, Floats]
 """Least and greatest (north, east) [m]."""
 
-_DOT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": style.FIX_COLOR}
-FIX_LOOKS: dict[int, dict[str, Any]] = {
+_DOT: style.Look = {"marker": "o", "markersize": 3.6, "markeredgewidth": 0, "color": style.FIX_COLOR}
+FIX_LOOKS: dict[int, style.Look] = {
     REFERENCE: _DOT,
     FIXED_FIX: _DOT,
     FLOAT_FIX: {"marker": "^", "markersize": 3.4, "markeredgewidth": 0, "color": style.FLOAT_COLOR},
     OTHER_FIX: {"marker": "+", "markersize": 4.0, "color": "0.45"},
 }
-SLIP_LOOK: dict[str, Any] = {
-    "marker": "D", "markersize": 6.5, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": style.FLOAT_COLOR,
-    "linestyle": "none", "zorder": 4.6,
-}  # fmt: skip
-REJECTED_LOOK: dict[str, Any] = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
+SLIP_LOOK: style.Look = style.spot("none", 6.5, "D", style.FLOAT_COLOR) | {"markeredgewidth": 1.6, "zorder": 4.6}
+REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
 """Markers by class: shape and luminance distinguish them."""
 
 ODOMETRIES = {"icr": (style.ICR, "ICR odometry", 3), "no_slip": (style.NO_SLIP, "no-slip odometry", 2)}
@@ -70,10 +67,10 @@ def trajectory(run: Run) -> Figure:
     norths, easts = np.column_stack([lowest, highest])
     width_in = style.WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
-    figure = style.new_figure(
-        _end_errors_text(run.document.odometry), f"{run_title(run.document)}: {driven_text(run.document.drive)}",
-        height_in=box_in + MARGINS_IN[2] + MARGINS_IN[3], margins_in=MARGINS_IN,
-    )  # fmt: skip
+    title = _end_errors_text(run.document.odometry)
+    subtitle = f"{run_title(run.document)}: {driven_text(run.document.drive)}"
+    height_in = box_in + MARGINS_IN[2] + MARGINS_IN[3]
+    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=MARGINS_IN)
     axes = figure.subplots()
     cell = look_down(axes, norths, easts, width_in / box_in, margin=0.04, ticks=9)
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
@@ -179,10 +176,8 @@ def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
             written.append(place)
             text = f"{time:.0f} s" if every < 60 else f"{time / 60:.0f} min" if every < 3600 else f"{time / 3600:.0f} h"
             axes.plot(*place, marker="|", color="black", markersize=7.0, zorder=4.7)
-            axes.annotate(
-                text, (float(place[0]), float(place[1])), xytext=(3, 3), textcoords="offset points", fontsize=7.0,
-                color="0.25", zorder=4.9, bbox=style.LABEL_BOX, annotation_clip=True,
-            )  # fmt: skip
+            look: style.Look = {"fontsize": 7.0, "color": "0.25", "zorder": 4.9, "annotation_clip": True}
+            style.write_beside(axes, text, (float(place[0]), float(place[1])), (3.0, 3.0), **look)
 
 
 BOX_HEIGHT_IN = (2.4, 5.4)
@@ -194,10 +189,7 @@ CELLS = 1500.0
 """Points closer than this fraction of the view are one point: about a pixel."""
 
 
-JUMP_LOOK: dict[str, Any] = {
-    "marker": "s", "markersize": 6.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "color": style.BAD_FIX_COLOR,
-    "linestyle": "none", "zorder": 4.4,
-}  # fmt: skip
+JUMP_LOOK: style.Look = style.spot("none", 6.0, "s", style.BAD_FIX_COLOR) | {"zorder": 4.4}
 """Where the position reference jumps."""
 
 
