@@ -34,9 +34,8 @@ if TYPE_CHECKING:
     from icrtool.calibration.pooled import calibrate
     from icrtool.calibration.record import Calibration
     from icrtool.config import Config, load_config
-    from icrtool.dropout_analysis.dropout_report import dropout_report
+    from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
     from icrtool.dropout_analysis.report import DropoutReport
-    from icrtool.dropout_analysis.trials import dropout
     from icrtool.errors import IcrToolError
     from icrtool.logs.read_log import read_log
     from icrtool.output.files.documents import open_calibration
@@ -77,7 +76,7 @@ _HOMES = {
     "Run": "icrtool.records.run",
     "WarmStart": "icrtool.records.run",
     "calibrate": "icrtool.calibration.pooled",
-    "dropout": "icrtool.dropout_analysis.trials",
+    "dropout": "icrtool.dropout_analysis.dropout_report",
     "dropout_report": "icrtool.dropout_analysis.dropout_report",
     "fit": "icrtool.calibration.fit",
     "load_config": "icrtool.config",

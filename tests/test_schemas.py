@@ -11,20 +11,17 @@ from typing import Any
 
 import msgspec
 import pytest
-from msgspec.structs import astuple
 
 from icrtool.calibration.forecast import forecast_drive
 from icrtool.calibration.pooled import calibrate
 from icrtool.calibration.run_recording import recording_of
 from icrtool.calibration.transfer import compare_groups
-from icrtool.dropout_analysis.acceptance_limits import parse_gate
+from icrtool.dropout_analysis.acceptance_limits import parse_gate, verdict_on
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.estimation.fit import fit
 from icrtool.fleet.fleet_files import fleet_document
-from icrtool.output.dropout_directory import report_document
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.tables.calibration import forecast_document
-from icrtool.records.dropout import CheckedGate
 from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.text import LogText
 from support.barn import configured, simulate
@@ -55,7 +52,7 @@ def documents() -> dict[str, Any]:
         run, horizons_m=(1.0, 5.0), outage_s=(4.0,), gates=("icr.p95@5m <= 0.001",), calibrations=[calibration],
         without_events=True,
     )  # fmt: skip
-    gate = CheckedGate(*astuple(parse_gate("icr.p95@5m <= 1")), passed=True, value_m=0.5, margin_m=0.5)
+    gate = verdict_on(parse_gate("icr.p95@5m <= 1"), "a", passed=True, value_m=0.5, margin_m=0.5)
     row = FleetLog(
         "a.bag", "runs/a", "done", verdicts=(fleet_verdict(gate, "a"),), inputs=(FleetFile("a.bag", 1, 2, "ab"),),
         icr={"x_icr_m": None},
@@ -63,7 +60,7 @@ def documents() -> dict[str, Any]:
     pooled = FleetCalibration("jackal", "grass", ("a.bag",), ())
     found = {
         "run": run.summary,
-        "dropout": report_document(report),
+        "dropout": report.document,
         "calibration": calibration.summary(),
         "compare": compare_groups({LogText("one"): [run], LogText("two"): [other]}),
         "forecast": forecast_document(forecast_drive(calibration, recording_of(run)), calibration, (0.5,)),

@@ -27,8 +27,11 @@ from icrtool.records.run import Run, width_or_usual_m
 
 FILTER_LABELS = {"icr": "ICR, momentary", "icr_final": "ICR, final"}
 
-FITTED_TO = {"icr": "before", "icr_final": "all", NO_SLIP: "never"}
-"""What a row's numbers were learned from; those of the others from the rest of the drive."""
+FITTED_TO = {"icr": "up to the start", "icr_final": "in sample", NO_SLIP: "not fitted"}
+"""What a row's numbers were learned from; those of the others are held out."""
+
+REST_OF_DRIVE = "the rest of the drive"
+"""What the numbers of a row that is held out were learned from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +63,16 @@ class ComparedRow(NamedTuple):
 
     Attributes
     ----------
-    errors_of : its errors in trials; path : its path from one state to another, None where it has none
+    errors_of : its errors in trials, NaN where it has none; path : its path from one state to another, None where it
+        has none
+    knows : what its numbers were learned from
     """
 
     name: str
     label: str
     errors_of: ErrorsOf
     path: Callable[[int, int], OpenLoopPath | None] | None = None
+    knows: str = REST_OF_DRIVE
 
 
 class ComparedModels(NamedTuple):

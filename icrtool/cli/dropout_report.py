@@ -102,7 +102,6 @@ def command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.dropout_directory import report_document
     from icrtool.output.exports.acceptance import format_outcomes, suite_of
     from icrtool.output.files.documents import open_calibration
 
@@ -119,11 +118,11 @@ def command(
         with inputs.each(source) as document:
             reports[str(source)] = found = _report_one(source, places.get(source), request)
             if printer.as_json:
-                document["report"] = report_document(found)
+                document["report"] = found.document
     printer.json("dropout-report", {"reports": inputs.documents})
     outcomes = [(str(source), (inputs.errors | reports)[str(source)]) for source in sources]
     exports.write("dropout-report", lambda: [suite_of(*one) for one in outcomes], lambda: format_outcomes(outcomes))
-    verdicts = [verdict for one in reports.values() for verdict in one.verdicts]
+    verdicts = [verdict for one in reports.values() for verdict in one.document.gates]
     options.check_compared(verdicts)
     inputs.leave("runs and logs", gate_failed=not all(one.passed for one in verdicts))
 
@@ -165,7 +164,7 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
     where = Section("", [Facts([(label, escaped(str(directory / name)))])])
     printer.show([*dropout_blocks(report), where])
     if not printer.shows:
-        for verdict in report.verdicts:
+        for verdict in report.document.gates:
             if not verdict.passed:
                 click.echo(verdict.verdict, err=True)
     return report

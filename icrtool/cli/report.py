@@ -77,7 +77,6 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> str:
     """Return the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
-    from icrtool.output.dropout_directory import report_document
     from icrtool.output.page.run_page import draw_pictures, pictures_of_run, read_report, run_page
     from icrtool.output.run_directory import open_run
 
@@ -87,7 +86,7 @@ def _page_of_run(directory: Path, *, coordinates: bool) -> str:
     if report is None:
         from icrtool.dropout_analysis.dropout_report import dropout_report
 
-        return run_page(run, report_document(dropout_report(run)), pictures, coordinates=coordinates)
+        return run_page(run, dropout_report(run).document, pictures, coordinates=coordinates)
     with _as_written(directory / "dropout", "make it again with icrtool dropout-report"):
         return run_page(run, report, pictures, coordinates=coordinates)
 

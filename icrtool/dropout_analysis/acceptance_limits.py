@@ -8,14 +8,15 @@ import re
 from collections.abc import Callable
 
 import numpy as np
-from msgspec.structs import asdict, astuple
+from msgspec.structs import astuple, replace
 
-from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
+from icrtool.dropout_analysis.report import BaselineReport, OpenLoopErrors
 from icrtool.errors import ConfigError
 from icrtool.kernels.error_statistics import BlockSums, difference_half_width, within_budget
 from icrtool.motion.models import FAMILY
-from icrtool.records.dropout import METRICS, BudgetDistance, CheckedGate, Gate, ModelResult, Verdict
-from icrtool.records.plain_data import known
+from icrtool.records.dropout import METRICS, BudgetDistance, Gate, Verdict
+from icrtool.records.dropout_document import ModelResult, column_of
+from icrtool.records.plain_data import plain
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(
@@ -32,7 +33,7 @@ FORMER_ROWS = {"multiplier", "window", "extended", *FAMILY} - {"no_slip", "contr
 """Rows that reports of earlier versions had."""
 
 
-def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDistance, ...]:
+def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDistance, ...]:
     """Return how far the 95th percentile of each model stays within a budget [m]; models without trials are left out.
 
     Raises
@@ -44,16 +45,15 @@ def budget_distances(report: DropoutReport, budget_m: float) -> tuple[BudgetDist
         raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
     found = []
     for result in report.results:
-        reached = within_budget(report.horizons_m, result.summary.p95, budget_m)
+        reached = within_budget(report.horizons_m, result.column("p95_m"), budget_m)
         if reached is not None:
             ends = (
-                within_budget(report.horizons_m, p95, budget_m)
-                for p95 in (result.intervals.p95_high, result.intervals.p95_low)
+                within_budget(report.horizons_m, result.column(name), budget_m) for name in ("p95_high_m", "p95_low_m")
             )
             # An end that stays within the budget as far as there are intervals has no such distance.
             low, high = (None if end is None or end[1] else end[0] for end in ends)
-            quiet = None if result.without_events is None else result.without_events.p95
-            free = None if quiet is None else within_budget(report.horizons_m, quiet, budget_m)
+            quiet = column_of(result.without_events, "p95_m")
+            free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
             without = (None, False) if free is None else free[:2]
             found.append(BudgetDistance(result.name, result.label, budget_m, *reached, low, high, *without))
     return tuple(found)
@@ -84,7 +84,7 @@ def parse_gate(text: str) -> Gate:
 
 
 def check_gate(
-    gate: Gate, report: DropoutReport, baseline: BaselineReport | None = None, *, strict: bool = False
+    gate: Gate, report: OpenLoopErrors, baseline: BaselineReport | None = None, *, strict: bool = False
 ) -> Verdict:
     """Compare a report with an acceptance limit.
 
@@ -100,38 +100,44 @@ def check_gate(
     """
     result = _result(gate, report)
     if gate.budget_m is not None:
-        reached = within_budget(report.horizons_m, result.summary.p95, gate.budget_m)
+        reached = within_budget(report.horizons_m, result.column("p95_m"), gate.budget_m)
         value, sums = (math.nan if reached is None else reached[0]), None
     else:
         h = _place(gate, report)
-        value, sums = float(getattr(result.summary, METRICS[gate.metric][0])[h]), result.block_sums[h]
+        value, sums = float(result.column(METRICS[gate.metric])[h]), result.block_sums[h]
     if gate.baseline_factor and baseline is None:
         why = "this log is not in the baseline"
-        return verdict_on(CheckedGate(*astuple(gate), value_m=known(value), passed=True, not_checked=why), report.name)
+        return verdict_on(gate, report.run.log, value_m=value, passed=True, not_checked=why)
     half_width, before = math.nan, math.nan
     if gate.baseline_factor and baseline is not None:
         before, old = _before(gate, baseline)
         half_width = difference_half_width(
-            sums, old, gate.metric, gate.baseline_factor, paired=baseline.is_of(report.run_document)
+            sums, old, gate.metric, gate.baseline_factor, paired=baseline.is_of(report.run)
         )
     bound = gate.bound_m + (gate.baseline_factor * before if gate.baseline_factor else 0.0)
     margin = bound - value if gate.relation.startswith("<") else value - bound
     passed = _RELATIONS[gate.relation](value, bound)
     if not strict and not passed and margin + half_width >= 0.0:
         passed = True
-    checked = CheckedGate(
-        *astuple(gate), passed=passed, value_m=known(value), value_bound_m=known(bound), baseline_m=known(before),
-        margin_m=known(margin), margin_low_m=known(margin - half_width), margin_high_m=known(margin + half_width),
+    return verdict_on(
+        gate, report.run.log, passed=passed, value_m=value, value_bound_m=bound, baseline_m=before, margin_m=margin,
+        margin_low_m=margin - half_width, margin_high_m=margin + half_width,
     )  # fmt: skip
-    return verdict_on(checked, report.name)
 
 
-def verdict_on(checked: CheckedGate, log: str) -> Verdict:
-    """Return a limit that was checked with the line about it, which names the log."""
-    return Verdict(**asdict(checked), verdict=checked.line(log))
+def verdict_on(gate: Gate, log: str, *, passed: bool, **found: float | str | None) -> Verdict:
+    """Return a limit that was checked, with the line about it, which names the log.
+
+    Parameters
+    ----------
+    found : further fields of `Verdict`; a number that is not finite is not known
+    """
+    fields = {"value_m": None} | {name: plain(value) for name, value in found.items()}
+    checked = Verdict(*astuple(gate), passed=passed, verdict="", **fields)
+    return replace(checked, verdict=checked.line(log))
 
 
-def _place(gate: Gate, report: DropoutReport) -> int:
+def _place(gate: Gate, report: OpenLoopErrors) -> int:
     """Return the place of a gate's horizon among those of the report."""
     places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m or math.nan))
     if not len(places):
@@ -150,7 +156,7 @@ def _before(gate: Gate, baseline: BaselineReport) -> tuple[float, BlockSums | No
     return (math.nan if reached is None else reached[0]), None
 
 
-def _result(gate: Gate, report: DropoutReport) -> ModelResult:
+def _result(gate: Gate, report: OpenLoopErrors) -> ModelResult:
     """Return the result of the model that a gate names."""
     result = report.result(gate.model)
     if result is not None:

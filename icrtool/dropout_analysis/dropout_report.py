@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
 import msgspec
+import numpy as np
 from msgspec import UNSET
 from msgspec.structs import astuple
 
-from icrtool.calibration.model_comparison import ComparedModels, compare_models
+from icrtool import __version__
+from icrtool.calibration.model_comparison import (
+    FITTED_TO,
+    ComparedModels,
+    ComparedRow,
+    ModelComparison,
+    compare_models,
+)
 from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import turning_recording_of
@@ -19,16 +27,95 @@ from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_g
 from icrtool.dropout_analysis.example_trials import example_trials, split_by_turning, worst_trials
 from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
 from icrtool.dropout_analysis.reference import with_smoothed_reference
-from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport, OpenLoopErrors
 from icrtool.dropout_analysis.starts import Starts
-from icrtool.dropout_analysis.trials import ConstantModel, ErrorSink, dropout
+from icrtool.dropout_analysis.trials import ErrorSink, Model, measure_errors
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
-from icrtool.kernels.track import TrialCounts
+from icrtool.kernels.arrays import Ints
+from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
+from icrtool.kernels.open_loop import TOLERANCE_M
+from icrtool.kernels.track import Track
+from icrtool.motion.models import FittedModel
 from icrtool.records.calibration_document import CalibrationFile
-from icrtool.records.dropout import DEFAULT_SEED, CheckedGate, EventCost, Gate, Outage, UsedCalibration
+from icrtool.records.dropout import DEFAULT_SEED, BudgetDistance, Gate, TurningSplit, UsedCalibration, Verdict
+from icrtool.records.dropout_document import (
+    DROPOUT_SCHEMA,
+    CountDocument,
+    DropoutDocument,
+    ErrorRow,
+    EventCostDocument,
+    ExampleTrial,
+    FitDocument,
+    IntervalsDocument,
+    LadderDocument,
+    Outage,
+    RunOfReport,
+    ScoreDocument,
+)
+from icrtool.records.plain_data import plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type
+from icrtool.records.text import distance_text
+
+ERRORS = len(ErrorRow.__struct_fields__)
+
+
+def dropout(
+    run: Run,
+    horizons_m: Sequence[float] | None = None,
+    *,
+    starts: Starts = "moving",
+    models: Sequence[Model] | None = None,
+    further: Sequence[ComparedRow] = (),
+    starts_of_further: Ints | None = None,
+    seed: int = DEFAULT_SEED,
+    sink: ErrorSink | None = None,
+    track: Track | None = None,
+) -> DropoutReport:
+    """Return how far the predicted position is off after distances without GNSS (Pentzer 2014, Section 6.4).
+
+    Parameters
+    ----------
+    run : of `icrtool.fit` or `icrtool.open_run`
+    horizons_m : distances without GNSS, in any order; default those of the run's configuration
+    starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
+    models : what to predict with; default `models_of` of the run
+    further : models that are not the filter's, in addition
+    starts_of_further : states from which theirs, and all heading errors, are measured: nearer ones are copies
+    seed : of what the reference's own error is drawn from
+    sink : receives every single error (for ``--trials``)
+    track : `icrtool.records.run.track_of` the run, where it is at hand: of a long log it is large
+
+    Returns
+    -------
+    DropoutReport
+        Mean, median, 95th percentile and largest error [m] by model and horizon, with intervals; no file is touched.
+
+    Raises
+    ------
+    DataError
+        The run has fewer than two states.
+    ConfigError
+        A horizon that is no distance.
+    ValueError
+        Two models of one name.
+
+    Notes
+    -----
+    A trial starts at a recorded state and keeps its ICRs; wheel speeds alone predict the path. The error is the
+    horizontal distance to the filter's estimate at the first state that is the horizon further along the path. A
+    start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
+    where it ends in a real GNSS outage. Of a standstill only the last state starts trials: the others would be copies,
+    and a parked robot would set the result. Overlapping trials are not independent: the
+    intervals come from blocks of path of at least four horizons (`icrtool.kernels.error_statistics`).
+    """
+    check_type(run, Run, MAKE_RUN)
+    errors = measure_errors(
+        run, horizons_m if horizons_m is not None else run.config.dropout.horizons_m, starts=starts, seed=seed,
+        models=models, further=further, starts_of_further=starts_of_further, sink=sink, track=track,
+    )  # fmt: skip
+    return _report(run, errors, starts=starts, seed=seed)
 
 
 def dropout_report(
@@ -97,39 +184,160 @@ def dropout_report(
     found, why = _compare(compared, run) if comparison and not unusable else (None, unusable)
     give_back_freed()
     rows = found.rows if found is not None else ()
-    further = [*(ConstantModel(row.name, row.label, row.errors_of) for row in rows), *further]
     horizons = _horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m, limits)
-    report = dropout(
-        compared, horizons, further=further, starts=starts, seed=seed, sink=sink,
+    errors = measure_errors(
+        compared, horizons, further=[*rows, *further], starts=starts, seed=seed, sink=sink,
         starts_of_further=None if found is None else found.trials.starts, track=None if found is None else found.track,
     )  # fmt: skip
     give_back_freed()
-    counts, cost = report.counts, None
+    cost = None
     if without_events:
-        counts, cost = _event_cost(report, replace(compared, in_gap=whole.in_gap), starts=starts, seed=seed)
-    return replace(
-        report,
-        counts=counts,
-        event_cost=cost,
+        crossed = replace(compared, in_gap=whole.in_gap)
+        cost = measure_errors(crossed, horizons, starts=starts, seed=seed)
+    return _report(
+        compared, errors, starts=starts, seed=seed,
+        with_events=cost,
         comparison=found.table if found is not None else None,
+        no_comparison=why,
         calibrations=used,
         smoothed=reference == "smoothed",
         with_jumps=with_jumps,
         examples=example_trials(compared),
         worst=worst_trials(compared, found, starts=starts),
         outages=(*forced, *real_outages(compared)),
-        budgets=() if unusable else tuple(one for budget in budgets_m for one in budget_distances(report, budget)),
-        verdicts=tuple(
-            verdict_on(CheckedGate(*astuple(gate), value_m=None, passed=False, unusable=unusable), run.name)
+        budgets=() if unusable else tuple(one for budget in budgets_m for one in budget_distances(errors, budget)),
+        gates=tuple(
+            verdict_on(gate, run.name, passed=False, unusable=unusable)
             if unusable
-            else check_gate(gate, report, baseline, strict=strict)
+            else check_gate(gate, errors, baseline, strict=strict)
             for gate in limits
         ),
         usable=not unusable,
         baseline=baseline,
         by_turning=split_by_turning(compared, starts),
-        no_comparison=why,
+    )  # fmt: skip
+
+
+def _report(
+    run: Run, errors: OpenLoopErrors, *, starts: Starts, seed: int, smoothed: bool = False, with_jumps: bool = False,
+    with_events: OpenLoopErrors | None = None, calibrations: tuple[UsedCalibration, ...] = (),
+    budgets: tuple[BudgetDistance, ...] = (), gates: tuple[Verdict, ...] = (),
+    by_turning: tuple[TurningSplit, ...] = (), comparison: ModelComparison | None = None, no_comparison: str = "",
+    worst: tuple[ExampleTrial, ...] = (), examples: tuple[ExampleTrial, ...] = (), outages: tuple[Outage, ...] = (),
+    baseline: BaselineReport | None = None, usable: bool = True,
+) -> DropoutReport:  # fmt: skip
+    """Return the report of a run.
+
+    Parameters
+    ----------
+    errors : of its models
+    with_events : errors of all trials, where those of `errors` cross no slip event
+    """
+    made = None if comparison is None else comparison.calibration
+    document = DropoutDocument(
+        schema=DROPOUT_SCHEMA,
+        tool_version=__version__,
+        run=RunOfReport(*(getattr(run.document, key) for key in RunOfReport.__struct_fields__)),
+        usable=run.usable,
+        unusable_because=run.document.unusable_because,
+        reference=f"the {'smoother' if smoothed else 'filter'}'s estimate at the end of the trial",
+        smoothed=smoothed,
+        starts=errors.states,
+        starts_counted=starts,
+        starts_standing=errors.standing,
+        with_jumps=with_jumps,
+        without_events=None if with_events is None else _event_cost(run, with_events),
+        tolerance_m=TOLERANCE_M,
+        # the key and its parts keep their names; nothing is resampled
+        bootstrap=IntervalsDocument(
+            method="Student's t over blocks of path",
+            block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",
+            resamples=0,
+            level=LEVEL,
+            seed=seed,
+        ),
+        models=tuple(one.document for one in errors.results),
+        trials=tuple(_counts(errors, with_events)),
+        reference_error=errors.reference,
+        by_learning=errors.by_learning,
+        calibrations=calibrations,
+        # Without when it was made: the same run, the same file.
+        recommended=None if made is None else msgspec.structs.replace(made, created=UNSET),
+        budgets=budgets,
+        by_turning=by_turning,
+        ladder=_ladder(errors, calibrations, comparison, no_comparison),
+        gates=gates,
+        passed=all(one.passed for one in gates),
+        baseline=None if baseline is None else baseline.compared_with(run.document),
+        outages=tuple(one.document for one in outages),
+        worst=tuple(one.document for one in worst),
+        examples=tuple(one.document for one in examples),
     )
+    return DropoutReport(
+        document, errors, run.directory, run.table.north_m, run.table.east_m, usable=usable, worst=worst,
+        examples=examples, outages=outages, comparison=comparison, baseline=baseline,
+    )  # fmt: skip
+
+
+def _counts(errors: OpenLoopErrors, with_events: OpenLoopErrors | None) -> Iterator[CountDocument]:
+    """Yield how many starts were a trial at each horizon, and why the others were none."""
+    # starts at a gap, at an outage or at a standstill are counted as without the option
+    counts = (with_events or errors).counts
+    crossing = counts.trials - errors.counts.trials
+    driven = distance_text(errors.run.drive.distance_m)
+    reasons = {
+        "too_little_way_left": (f"less than that is left of the {driven} driven", counts.short),
+        "across_wheel_gap": ("the path crosses a gap in the wheel data", counts.gap),
+        "ends_in_gnss_outage": ("it ends in a GNSS outage", counts.outage),
+        "from_standstill": ("the robot stands", counts.standing),
+        "crosses_jump": ("the reference jumps on the path", counts.crosses_jump),
+        "across_slip_event": ("the path crosses a slip event", crossing),
+    }
+    for h, horizon_m in enumerate(errors.horizons_m.tolist()):
+        trials, starts = int(errors.counts.trials[h]), {key: int(found[h]) for key, (_, found) in reasons.items()}
+        why = ", ".join(f"{text} ({starts[key]:,} starts)" for key, (text, _) in reasons.items() if starts[key])
+        if starts["too_little_way_left"] == errors.states:
+            why = reasons["too_little_way_left"][0]
+        yield CountDocument(horizon_m, trials, starts, None if trials else why)
+
+
+def _event_cost(run: Run, errors: OpenLoopErrors) -> EventCostDocument:
+    """Return what slip events cost, from the errors of all trials."""
+    rows = {one.name: [ErrorRow(*astuple(row)[:ERRORS]) for row in one.document.by_horizon] for one in errors.results}
+    return EventCostDocument(len(run.sensors.events), rows)
+
+
+def _ladder(
+    errors: OpenLoopErrors, calibrations: Sequence[UsedCalibration], found: ModelComparison | None, why_none: str
+) -> LadderDocument:
+    """Return how the models were compared; why there is no comparison where it was left out."""
+    if found is None:
+        return LadderDocument(left_out=why_none)
+    given, turned = {one.name for one in calibrations}, f"_{found.heading}"
+    models = []
+    for one in errors.results:
+        if one.name not in given:
+            with_heading = bool(found.heading) and one.name.endswith(turned)
+            fitted = FITTED_TO.get(one.name.removesuffix(turned) if with_heading else one.name, "held out")
+            rows = [astuple(row)[1:ERRORS] for row in one.document.by_horizon]
+            heading = found.heading if with_heading else "wheels"
+            models.append(ScoreDocument(one.name, one.label, fitted, heading, *map(list, zip(*rows, strict=True))))
+    return LadderDocument(
+        horizons_m=errors.horizons_m.tolist(),
+        blocks=found.blocks,
+        starts=found.starts,
+        heading=found.heading or None,
+        notes=list(found.notes),
+        models=models,
+        width_m=found.width_m,
+        fits={name: _fit(fit) for name, fit in found.fits.items()},
+    )
+
+
+def _fit(fit: FittedModel) -> FitDocument:
+    """Return the parameters of a fit with one standard deviation."""
+    columns = (fit.parameters, np.sqrt(np.diag(fit.covariance)))
+    return FitDocument(*(plain(dict(zip(fit.model.terms, column, strict=True))) for column in columns))
 
 
 def forced_lengths_s(run: Run, outage_s: Sequence[float] | None) -> Sequence[float]:
@@ -157,7 +365,7 @@ def _horizons(horizons_m: Sequence[float], gates: Sequence[Gate]) -> list[float]
 
 def _calibration_rows(
     run: Run, calibrations: Sequence[Calibration]
-) -> tuple[tuple[UsedCalibration, ...], list[ConstantModel]]:
+) -> tuple[tuple[UsedCalibration, ...], list[ComparedRow]]:
     """Return what is known of each calibration, and the model of its row."""
     used, models = [], []
     recording = turning_recording_of(run) if calibrations else None
@@ -178,7 +386,8 @@ def _calibration_rows(
         if one.gyro is not None and recording.track.gyro is not None:
             rows.append((f"{name}_gyro", f"{label} + gyro", one.gyro.model, True))
         for name, label, model, with_gyro in rows:
-            models.append(ConstantModel(name, label, predictor(one, recording, with_gyro=with_gyro)))
+            errors_of = predictor(one, recording, with_gyro=with_gyro)
+            models.append(ComparedRow(name, label, errors_of, knows=fitted))
             used.append(UsedCalibration(name, label, model, len(one.logs), seen, created, with_gyro, kept, fitted))
     return tuple(used), models
 
@@ -194,21 +403,3 @@ def _compare(compared: Run, run: Run) -> tuple[ComparedModels | None, str]:
 def leave_out_events(run: Run) -> Run:
     """Return the run with a gap in place of each slip event: no trial, window or forced outage crosses a gap."""
     return replace(run, in_gap=run.in_gap | run.slipping)
-
-
-def _event_cost(report: DropoutReport, run: Run, *, starts: Starts, seed: int) -> tuple[TrialCounts, EventCost]:
-    """Return the counts of the report of `leave_out_events`, and what the slip events cost.
-
-    Parameters
-    ----------
-    run : with its slip events
-    """
-    horizons: Sequence[float] = report.horizons_m.tolist()
-    whole = dropout(run, horizons, starts=starts, seed=seed)
-    cost = EventCost(
-        events=len(run.sensors.events),
-        trials=whole.counts.trials - report.counts.trials,
-        with_events={result.name: result.summary for result in whole.results},
-    )
-    # starts at a gap, at an outage or at a standstill are counted as without the option
-    return whole.counts._replace(trials=report.counts.trials), cost

@@ -16,7 +16,9 @@ from icrtool.kernels.open_loop import open_loop_errors, open_loop_path
 from icrtool.kernels.track import OpenLoopPath, Track, trial_ends
 from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Trials
-from icrtool.records.dropout import ExampleTrial, TurningSplit
+from icrtool.records.dropout import TurningSplit
+from icrtool.records.dropout_document import ExampleTrial, TrialDocument
+from icrtool.records.plain_data import known
 from icrtool.records.run import Run, track_of
 
 WORST_COUNT = 10
@@ -106,7 +108,7 @@ def _example(
     horizon_m: float,
 ) -> ExampleTrial:  # fmt: skip
     paths: dict[str, OpenLoopPath] = {}
-    errors: dict[str, float] = {}
+    errors: dict[str, float | None] = {}
     for model in models:
         if model.name in PICTURED:
             right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
@@ -115,25 +117,19 @@ def _example(
         if row.name in PICTURED and row.path is not None and (path := row.path(start, end)) is not None:
             paths[row.name] = path
     for name, path in paths.items():
-        errors[name] = float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end]))
+        errors[name] = known(float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end])))
     table = run.table
     duration = float(table.t_s[end] - table.t_s[start])
-    return ExampleTrial(
-        model=by,
-        start=start,
-        end=end,
-        stamp_ns=int(table.stamp_ns[start]),
-        t_s=float(table.t_s[start]),
-        north_m=float(table.north_m[start]),
-        east_m=float(table.east_m[start]),
-        horizon_m=horizon_m,
-        heading_change_rad=float(table.heading_rad[end] - table.heading_rad[start]),
-        speed_mean_mps=float(table.distance_m[end] - table.distance_m[start]) / duration if duration > 0 else 0.0,
-        reference_north_m=table.north_m[start : end + 1],
-        reference_east_m=table.east_m[start : end + 1],
-        paths=paths,
+    turned = float(table.heading_rad[end] - table.heading_rad[start])
+    driven = float(table.distance_m[end] - table.distance_m[start])
+    document = TrialDocument(
+        model=by, stamp_ns=int(table.stamp_ns[start]), t_s=float(table.t_s[start]),
+        north_m=float(table.north_m[start]), east_m=float(table.east_m[start]), horizon_m=horizon_m,
+        heading_change_deg=float(np.degrees(turned)), speed_mean_mps=driven / duration if duration > 0 else 0.0,
         errors_m=errors,
-    )
+    )  # fmt: skip
+    shown = slice(start, end + 1)
+    return ExampleTrial(document, start, end, table.north_m[shown], table.east_m[shown], paths)
 
 
 SPLIT_HORIZON_M = 5.0

@@ -14,7 +14,8 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.open_loop import open_loop_path
 from icrtool.kernels.track import OpenLoopPath
-from icrtool.records.dropout import Outage
+from icrtool.records.dropout_document import Outage, OutageDocument
+from icrtool.records.plain_data import known
 from icrtool.records.run import Run, track_of
 
 LONGEST_SHARE = 0.5
@@ -95,18 +96,11 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
                 f"{(end - begin) / 1e9:g} s from {(begin - origin) / 1e9:g} s on hold fewer than two states",
                 "the filter must have begun, and the outage last longer than a wheel sample",
             )
-        outages.append(
-            Outage(
-                kind="forced",
-                begin_s=(begin - origin) / 1e9,
-                end_s=(end - origin) / 1e9,
-                distance_m=float(np.ptp(distance[inside])),
-                end_error_m=float(away[inside][-1]),
-                max_error_m=float(away[inside].max()),
-                north_m=north[inside],
-                east_m=east[inside],
-            )
-        )
+        document = OutageDocument(
+            "forced", (begin - origin) / 1e9, (end - origin) / 1e9, float(np.ptp(distance[inside])),
+            known(float(away[inside][-1])), known(float(away[inside].max())),
+        )  # fmt: skip
+        outages.append(Outage(document, north[inside], east[inside]))
     return tuple(outages)
 
 
@@ -169,20 +163,12 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         gaps = np.flatnonzero(run.in_gap[last:after])
         after = last + int(gaps[0]) if len(gaps) else min(after, len(table) - 1)
         path = open_loop_path(track, *table.icrs_at(first), first, after)
-        error = _end_error_m(run, path, table.stamp_ns[first : after + 1], int(end))
+        error = known(_end_error_m(run, path, table.stamp_ns[first : after + 1], int(end)))
         inside = slice(last - first + 1)
-        outages.append(
-            Outage(
-                kind="real",
-                begin_s=(int(begin) - origin) / 1e9,
-                end_s=(int(end) - origin) / 1e9,
-                distance_m=float(table.distance_m[last] - table.distance_m[first]),
-                end_error_m=error,
-                max_error_m=error,
-                north_m=path.north[inside],
-                east_m=path.east[inside],
-            )
-        )
+        driven_m = float(table.distance_m[last] - table.distance_m[first])
+        begin_s, end_s = ((int(one) - origin) / 1e9 for one in (begin, end))
+        document = OutageDocument("real", begin_s, end_s, driven_m, error, error)
+        outages.append(Outage(document, path.north[inside], path.east[inside]))
     return tuple(outages)
 
 

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import RunError
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import Track
-from icrtool.records.dropout import ReferenceErrors
+from icrtool.records.dropout_document import ReferenceRow
+from icrtool.records.plain_data import known
 from icrtool.records.run import Run
 
 DRAWS = 20_000
@@ -19,13 +21,16 @@ GNSS_NIS, HEADING_NIS = 2.0, 1.0
 """Mean normalised innovation squared where the noise is right: the number of measured components."""
 
 
-def reference_error(run: Run, track: Track, ends: NDArray[np.int32], seed: int) -> ReferenceErrors:
+def reference_error(
+    run: Run, track: Track, horizons_m: Floats, ends: NDArray[np.int32], seed: int
+) -> tuple[ReferenceRow, ...]:
     """Return the error that the reference puts into the trials of each horizon.
 
     Parameters
     ----------
     run : its standard deviations are those of the reference
     track : its states
+    horizons_m : (h,)
     ends : (h, n), the state at which the trial from each start ends, negative where there is none
     seed : of the draws
 
@@ -45,11 +50,12 @@ def reference_error(run: Run, track: Track, ends: NDArray[np.int32], seed: int) 
     """
     position, heading = _spread(run)
     table = run.table
-    result = np.full((3, len(ends)), np.nan)
+    rows = []
     rng = np.random.default_rng(seed)
-    for h, column in enumerate(ends):
+    for horizon_m, column in zip(horizons_m.tolist(), ends, strict=True):
         start = np.flatnonzero(column >= 0)
         if not len(start):
+            rows.append(ReferenceRow(horizon_m, None, None, None))
             continue
         start = start[np.linspace(0, len(start) - 1, DRAWS).astype(np.int64)]
         end = column[start]
@@ -64,8 +70,9 @@ def reference_error(run: Run, track: Track, ends: NDArray[np.int32], seed: int) 
         error = np.hypot(off_north, off_east)
         square = sum(std**2 for std in (*north_std, *east_std))
         square = square + std_heading**2 * (north**2 + east**2)
-        result[:, h] = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
-    return ReferenceErrors(*result)
+        of_error = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
+        rows.append(ReferenceRow(horizon_m, *(known(float(one)) for one in of_error)))
+    return tuple(rows)
 
 
 def _spread(run: Run) -> tuple[float, float]:

@@ -11,31 +11,29 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from icrtool import __version__
 from icrtool.errors import ConfigError
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import BlockSums
 from icrtool.kernels.track import TrialCounts
-from icrtool.records.dropout import (
-    METRICS,
-    BudgetDistance,
-    EventCost,
+from icrtool.records.dropout import METRICS, Gate
+from icrtool.records.dropout_document import (
+    BaselineDocument,
+    BlocksDocument,
+    DropoutDocument,
+    EarlierReport,
     ExampleTrial,
-    Gate,
-    LearnedSplit,
+    LearnedDocument,
     ModelResult,
     Outage,
-    ReferenceErrors,
-    TurningSplit,
-    UsedCalibration,
-    Verdict,
-    error_columns,
+    ReferenceRow,
+    SummaryRow,
+    column_of,
 )
-from icrtool.records.dropout_document import BlocksDocument, EarlierReport
 from icrtool.records.run import FigureSet, call_output
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import escaped, listed
@@ -47,6 +45,36 @@ if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenLoopErrors:
+    """Errors of open-loop trials by model and horizon.
+
+    Attributes
+    ----------
+    run : document of the run
+    horizons_m : (h,) ascending
+    results : one per model
+    counts : trials, and starts without a trial, by horizon; the same for every model
+    states : recorded states
+    standing : states in which the robot stood: their trials are nearly copies of one another
+    reference : what a perfect model would show, by horizon
+    by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
+    """
+
+    run: RunDocument
+    horizons_m: Floats
+    results: tuple[ModelResult, ...]
+    counts: TrialCounts
+    states: int
+    standing: int
+    reference: tuple[ReferenceRow, ...]
+    by_learning: LearnedDocument | None
+
+    def result(self, model: str) -> ModelResult | None:
+        """Return the result of a model, None when it was not computed."""
+        return next((result for result in self.results if result.name == model), None)
+
+
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
 class DropoutReport:
     """Open-loop errors by model and horizon, and what else was asked for.
@@ -55,61 +83,47 @@ class DropoutReport:
 
     Attributes
     ----------
-    horizons_m : (h,) ascending
-    results : one per model
-    counts : trials, and starts without a trial, by horizon; the same for every model
-    states : recorded states
-    standing : states in which the robot stood: their trials are nearly copies of one another
-    seed : of what the reference's own error is drawn from
-    run_document : of the run, equal to its run.json
+    document : what report.json holds
+    errors : the errors with their histograms
     run_directory : where the run was read from, None for one just made
-    starts : ``moving``: each standstill is one start; ``all``: every state is one
-    reference_error : what a perfect model would show
-    by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
     reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
-    with_jumps : trials across jumps of the reference count, where the run has any
-    smoothed : the reference is the smoother's trajectory, not the filter's
-    budgets : by budget and model
-    verdicts : of the acceptance limits
-    worst : trials with the largest error first
-    examples : a trial of about half a turn and a straight one; empty where no trial is that long
-    outages : forced ones, then real ones
-    by_turning : straight and turning trials apart
-    comparison : the models on distance they were not fitted to; None where left out, `no_comparison` holds the reason
     usable : distances and numbers may be used, or were asked for all the same
-    calibrations : those with a row of their own
+    worst, examples, outages : those of `document`, with their paths
+    comparison : the models on distance they were not fitted to; None where left out
     baseline : an earlier report that this one is compared with
-    event_cost : how much slip events change the errors, where trials that cross one are left out; None where they count
     """
 
-    name: str
-    horizons_m: Floats
-    results: tuple[ModelResult, ...]
-    counts: TrialCounts
-    states: int
-    standing: int
-    seed: int
-    run_document: RunDocument
+    document: DropoutDocument
+    errors: OpenLoopErrors
     run_directory: Path | None
     reference_north_m: Floats
     reference_east_m: Floats
-    starts: Literal["moving", "all"] = "moving"
-    reference_error: ReferenceErrors | None = None
-    by_learning: LearnedSplit | None = None
-    smoothed: bool = False
-    with_jumps: bool = False
-    budgets: tuple[BudgetDistance, ...] = ()
-    verdicts: tuple[Verdict, ...] = ()
+    usable: bool = True
     worst: tuple[ExampleTrial, ...] = ()
     examples: tuple[ExampleTrial, ...] = ()
     outages: tuple[Outage, ...] = ()
-    by_turning: tuple[TurningSplit, ...] = ()
     comparison: ModelComparison | None = None
-    no_comparison: str = ""
-    usable: bool = True
-    calibrations: tuple[UsedCalibration, ...] = ()
     baseline: BaselineReport | None = None
-    event_cost: EventCost | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the log."""
+        return self.document.run.log
+
+    @property
+    def run_document(self) -> RunDocument:
+        """What run.json of the run holds."""
+        return self.errors.run
+
+    @property
+    def horizons_m(self) -> Floats:
+        """Distances without GNSS (h,), ascending."""
+        return self.errors.horizons_m
+
+    @property
+    def results(self) -> tuple[ModelResult, ...]:
+        """The errors of each model."""
+        return self.errors.results
 
     @property
     def calibration(self) -> Calibration | None:
@@ -119,39 +133,22 @@ class DropoutReport:
     @property
     def passed(self) -> bool:
         """Whether every acceptance limit is met."""
-        return all(verdict.passed for verdict in self.verdicts)
+        return self.document.passed
 
     def result(self, model: str) -> ModelResult | None:
         """Return the result of a model, None when it was not computed."""
-        return next((result for result in self.results if result.name == model), None)
-
-    @property
-    def best(self) -> str:
-        """Name of the model that the report is about: `recommended`, else the filter's momentary ICRs."""
-        return "recommended" if self.result("recommended") is not None else "icr"
+        return self.errors.result(model)
 
     @property
     def summary(self) -> pd.DataFrame:
         """The rows of summary.csv as a DataFrame."""
         import pandas as pd
 
-        return pd.DataFrame(self.summary_columns())
-
-    def summary_columns(self) -> dict[str, list[str] | Floats | Ints]:
-        """Return the columns of summary.csv: a row per model and horizon."""
-        h = self.horizons_m
-        parts = [
-            error_columns(one.summary)
-            | {"expected_pct": 100.0 * one.summary.expected / h, "p95_pct": 100.0 * one.summary.p95 / h}
-            | {f"{name}_m": values for name, values in one.intervals._asdict().items()}
-            | {f"heading_{name}": values for name, values in one.heading._asdict().items()}
-            for one in self.results
-        ]
-        return {
-            "model": [one.name for one in self.results for _ in h],
-            "horizon_m": np.tile(h, len(parts)),
-            **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]},
-        }
+        h, models = len(self.horizons_m), self.document.models
+        rows = [row for one in models for row in one.by_horizon]
+        columns = {name: column_of(rows, name) for name in SummaryRow.__struct_fields__}
+        columns["trials"] = columns["trials"].astype(np.int64)
+        return pd.DataFrame({"model": [one.name for one in models for _ in range(h)], **columns})
 
     def write(
         self, path: str | Path | None = None, *, plots: tuple[str, ...] = ("png",), figures: FigureSet = "default"
@@ -176,10 +173,11 @@ class DropoutReport:
         call_output("dropout_directory", "write_report", lambda _: self, Path(path), plots=plots, figures=figures)
 
     def __repr__(self) -> str:
-        icr, last = self.result("icr"), len(self.horizons_m) - 1
-        error = f", ICR 95 % {icr.summary.p95[last]:.3g} m after {self.horizons_m[last]:g} m" if icr is not None else ""
-        limits = f", acceptance limits {'met' if self.passed else 'NOT MET'}" if self.verdicts else ""
-        return f"<DropoutReport {self.name!r}: {len(self.results)} models from {self.states:,} states{error}{limits}>"
+        icr, h = self.result("icr"), self.horizons_m
+        error = f", ICR 95 % {icr.column('p95_m')[-1]:.3g} m after {h[-1]:g} m" if icr is not None else ""
+        limits = f", acceptance limits {'met' if self.passed else 'NOT MET'}" if self.document.gates else ""
+        states = self.document.starts
+        return f"<DropoutReport {self.name!r}: {len(self.results)} models from {states:,} states{error}{limits}>"
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(call_output('tables.dropout', 'format_dropout', self))}</pre>"
@@ -258,6 +256,11 @@ class BaselineReport:
             found.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
         return tuple(found)
 
+    def compared_with(self, run_document: RunDocument) -> BaselineDocument:
+        """Return what a report of a run holds of this one."""
+        same, changes = self.is_of(run_document), self.changes(run_document)
+        return BaselineDocument(self.path, self.log, self.tool_version, same, changes)
+
     def is_of(self, run_document: RunDocument) -> bool:
         """Return whether the report was made of the same recording as a run."""
         return bool(self.sha256) and self.sha256 == run_document.content
@@ -269,7 +272,7 @@ def baseline_report(document: EarlierReport, path: str, log: str) -> BaselineRep
     for model in document.models:
         sums = {one.horizon_m: _sums(one) for one in model.blocks}
         for row in model.by_horizon:
-            values = {metric: _number(getattr(row, column)) for metric, (_, column) in METRICS.items()}
+            values = {metric: _number(getattr(row, column)) for metric, column in METRICS.items()}
             rows[model.name, row.horizon_m] = BaselineRow(values, sums.get(row.horizon_m))
     return BaselineReport(log, path, document, rows)
 

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.calibration.model_comparison import REST_OF_DRIVE, ComparedRow
 from icrtool.dropout_analysis.reference import reference_error
-from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.report import OpenLoopErrors
 from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.error_statistics import (
     Blocks,
-    Intervals,
-    Summary,
+    BlockSums,
+    Histogram,
     block_sums,
     cut_blocks,
     error_intervals,
@@ -31,10 +32,19 @@ from icrtool.kernels.error_statistics import (
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop import open_loop_errors
 from icrtool.kernels.track import FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
-from icrtool.motion.recording import MOST_TRIALS, ErrorsOf, Trials
-from icrtool.records.dropout import DEFAULT_SEED, HeadingErrors, LearnedSplit, ModelResult, ReferenceErrors
+from icrtool.motion.recording import MOST_TRIALS, Trials
+from icrtool.records.dropout_document import (
+    BlocksDocument,
+    ErrorRow,
+    LearnedDocument,
+    ModelDocument,
+    ModelResult,
+    ReferenceRow,
+    SummaryRow,
+)
+from icrtool.records.plain_data import known, plain
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.run import MAKE_RUN, Run, check_type, no_slip_icrs, track_of
+from icrtool.records.run import Run, no_slip_icrs, track_of
 
 LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
@@ -57,80 +67,41 @@ THREADS = 2
 
 
 class Model(NamedTuple):
-    """What predicts motion from wheel speeds: ICRs per start, or one triple."""
+    """What predicts motion from wheel speeds: ICRs per start, or one triple.
+
+    Attributes
+    ----------
+    knows : what its ICRs were learned from
+    """
 
     name: str
     label: str
     icrs: FrozenIcrs
-
-
-class ConstantModel(NamedTuple):
-    """A model of constant parameters, by the errors that it has in trials; NaN where it has none."""
-
-    name: str
-    label: str
-    errors_of: ErrorsOf
+    knows: str = REST_OF_DRIVE
 
 
 ErrorSink = Callable[[str, Floats, Floats], None]
 """Called with a model's name, horizons (h,) [m] and errors (n, h) [m], NaN where there is no trial."""
 
 
-def dropout(
+def measure_errors(
     run: Run,
-    horizons_m: Sequence[float] | None = None,
+    horizons_m: Iterable[float],
     *,
-    starts: Starts = "moving",
+    starts: Starts,
+    seed: int,
     models: Sequence[Model] | None = None,
-    further: Sequence[ConstantModel] = (),
+    further: Sequence[ComparedRow] = (),
     starts_of_further: Ints | None = None,
-    seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
     track: Track | None = None,
-) -> DropoutReport:
-    """Return how far the predicted position is off after distances without GNSS (Pentzer 2014, Section 6.4).
-
-    Parameters
-    ----------
-    run : of `icrtool.fit` or `icrtool.open_run`
-    horizons_m : distances without GNSS, in any order; default those of the run's configuration
-    starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
-    models : what to predict with; default `models_of` of the run
-    further : models of constant parameters, in addition
-    starts_of_further : states from which theirs, and all heading errors, are measured: nearer ones are copies
-    seed : of what the reference's own error is drawn from
-    sink : receives every single error (for ``--trials``)
-    track : `icrtool.records.run.track_of` the run, where it is at hand: of a long log it is large
-
-    Returns
-    -------
-    DropoutReport
-        Mean, median, 95th percentile and largest error [m] by model and horizon, with intervals; no file is touched.
-
-    Raises
-    ------
-    DataError
-        The run has fewer than two states.
-    ConfigError
-        A horizon that is no distance.
-    ValueError
-        Two models of one name.
-
-    Notes
-    -----
-    A trial starts at a recorded state and keeps its ICRs; wheel speeds alone predict the path. The error is the
-    horizontal distance to the filter's estimate at the first state that is the horizon further along the path. A
-    start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
-    where it ends in a real GNSS outage. Of a standstill only the last state starts trials: the others would be copies,
-    and a parked robot would set the result. Overlapping trials are not independent: the
-    intervals come from blocks of path of at least four horizons (`icrtool.kernels.error_statistics`).
-    """
-    check_type(run, Run, MAKE_RUN)
+) -> OpenLoopErrors:
+    """Return the errors of all models; parameters and errors are those of `icrtool.dropout`."""
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
-    horizons = check_horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
+    horizons = check_horizons(horizons_m)
     track = track if track is not None else track_of(run)
-    predictors: list[Model | ConstantModel] = [*(models if models is not None else models_of(run)), *further]
+    predictors: list[Model | ComparedRow] = [*(models if models is not None else models_of(run)), *further]
     standing, learned = standing_states(track), first_learned(run)
     left_out = standing if starts == "moving" else np.zeros_like(standing)
     if len({model.name for model in predictors}) < len(predictors):
@@ -139,22 +110,20 @@ def dropout(
     asked = _Asked(run, track, predictors, left_out, learned, seed, sink, sparse)
     with ThreadPoolExecutor(THREADS) as pool:
         parts = [_part(asked, horizons[group], pool) for group in _groups(len(horizons), len(run.table))]
-    splits = [part.by_learning for part in parts if part.by_learning is not None]
-    return DropoutReport(
-        name=run.name,
+    split = None
+    if sides := [part.by_learning for part in parts if part.by_learning is not None]:
+        at, driven = (None if learned is None else float(one[learned]) for one in (run.table.t_s, run.table.distance_m))
+        before, after = ([row for rows in part for row in rows] for part in zip(*sides, strict=True))
+        split = LearnedDocument("icr", at, driven, before, after)
+    return OpenLoopErrors(
+        run=run.document,
         horizons_m=horizons,
-        results=tuple(_joined(of_model) for of_model in zip(*(part.results for part in parts), strict=True)),
-        counts=TrialCounts(*_columns(part.counts for part in parts)),
+        results=tuple(map(_result, predictors, zip(*(part.results for part in parts), strict=True))),
+        counts=TrialCounts(*(np.concatenate(column) for column in zip(*(part.counts for part in parts), strict=True))),
         states=len(run.table),
         standing=int(np.count_nonzero(standing)),
-        starts=starts,
-        reference_error=ReferenceErrors(*_columns(part.reference for part in parts)),
-        by_learning=_learned_split(run, learned, splits) if splits else None,
-        seed=seed,
-        run_document=run.document,
-        run_directory=run.directory,
-        reference_north_m=run.table.north_m,
-        reference_east_m=run.table.east_m,
+        reference=tuple(row for part in parts for row in part.reference),
+        by_learning=split,
     )
 
 
@@ -169,7 +138,7 @@ class _Asked(NamedTuple):
 
     run: Run
     track: Track
-    predictors: Sequence[Model | ConstantModel]
+    predictors: Sequence[Model | ComparedRow]
     left_out: Bools
     learned: int | None
     seed: int
@@ -177,13 +146,22 @@ class _Asked(NamedTuple):
     sparse: Ints
 
 
+class _AtHorizon(NamedTuple):
+    """The errors of one model at one horizon; `free`: of the trials that touch no slip event."""
+
+    row: SummaryRow
+    bins: Histogram
+    sums: BlockSums | None
+    free: ErrorRow | None
+
+
 class _Part(NamedTuple):
     """The trials of some horizons; `by_learning`: before and after the ICRs were learned, of the momentary ICRs."""
 
     counts: TrialCounts
-    reference: ReferenceErrors
-    results: list[ModelResult]
-    by_learning: tuple[Summary, Summary] | None
+    reference: tuple[ReferenceRow, ...]
+    results: list[list[_AtHorizon]]
+    by_learning: tuple[list[ErrorRow], list[ErrorRow]] | None
 
 
 def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
@@ -196,7 +174,7 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
     results = []
     for model in asked.predictors:
         give_back_freed()
-        if isinstance(model, ConstantModel):
+        if isinstance(model, ComparedRow):
             errors, turned = model.errors_of(sparse)
             tested = _blocks(track.distance[sparse.starts], horizons, np.isfinite(errors.T) - 1, pool)
         else:
@@ -205,12 +183,12 @@ def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
         if asked.sink is not None:
             asked.sink(model.name, horizons, errors if len(errors) == len(track.distance) else _spread(errors, asked))
         touching = slipping if slipping is None or len(errors) == len(slipping) else slipping[asked.sparse]
-        results.append(_result_of(model, errors, turned, tested, touching, pool))
+        results.append(_at_horizons(horizons, errors, turned, tested, touching, pool))
         if model.name == "icr":
             first = len(errors) if learned is None else learned
-            by_learning = error_summary(errors[:first]), error_summary(errors[first:])
+            by_learning = _rows(horizons, errors[:first]), _rows(horizons, errors[first:])
         del errors  # before those of the next model are made
-    return _Part(counts, reference_error(asked.run, track, ends, asked.seed), results, by_learning)
+    return _Part(counts, reference_error(asked.run, track, horizons, ends, asked.seed), results, by_learning)
 
 
 def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> Bools | None:
@@ -286,12 +264,12 @@ def load_kernels() -> None:
 def models_of(run: Run) -> tuple[Model, ...]:
     """Return the filter's models: momentary ICRs, no slip where b is known, the run's final ICRs."""
     table = run.table
-    models = [Model("icr", "ICR, momentary", FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m))]
-    width = run.track_width_m
-    if width is not None:
-        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(*no_slip_icrs(width))))
-    models.append(Model("icr_final", "ICR, final", FrozenIcrs.constant(*table.icrs_at(-1))))
-    return tuple(models)
+    momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
+    models = [Model("icr", "ICR, momentary", momentary, "the distance up to each start")]
+    if (width := run.track_width_m) is not None:
+        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(*no_slip_icrs(width)), "the track width"))
+    final = FrozenIcrs.constant(*table.icrs_at(-1))
+    return (*models, Model("icr_final", "ICR, final", final, "all of the drive, the trial too"))
 
 
 def sparse_starts(track: Track) -> Ints:
@@ -322,21 +300,10 @@ def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tu
     return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
 
 
-def _columns(parts: Iterable[tuple[NDArray[np.generic], ...]]) -> Iterator[Any]:
-    """Join the columns of records that hold some horizons each."""
-    return (np.concatenate(column) for column in zip(*parts, strict=True))
-
-
-def _learned_split(run: Run, learned: int | None, splits: Sequence[tuple[Summary, Summary]]) -> LearnedSplit:
-    """Return the trials before and after the state at which the ICRs were learned."""
-    table = run.table
-    before, after = (Summary(*_columns(part)) for part in zip(*splits, strict=True))
-    return LearnedSplit(
-        learned_s=float(table.t_s[learned]) if learned is not None else None,
-        distance_m=float(table.distance_m[learned]) if learned is not None else None,
-        before=before,
-        after=after,
-    )
+def _rows(horizons: Floats, errors: Floats) -> list[ErrorRow]:
+    """Return errors (n, h) [m] in numbers, a row a horizon."""
+    found = error_summary(errors)
+    return list(map(ErrorRow, *plain([horizons, found.trials, found.expected, found.p50, found.p95, found.largest])))
 
 
 def _blocks(path_m: Floats, horizons: Floats, ends: NDArray[np.signedinteger], pool: Executor) -> list[Blocks | None]:
@@ -360,30 +327,43 @@ def _errors(track: Track, model: Model, ends: NDArray[np.int32], pool: Executor)
     return errors.T
 
 
-def _result_of(
-    model: Model | ConstantModel, errors: Floats, turned: Floats, blocks: Sequence[Blocks | None],
-    slipping: Bools | None, pool: Executor,
-) -> ModelResult:  # fmt: skip
+def _at_horizons(
+    horizons: Floats, errors: Floats, turned: Floats, blocks: Sequence[Blocks | None], slipping: Bools | None,
+    pool: Executor,
+) -> list[_AtHorizon]:  # fmt: skip
     """Return the errors of one model in numbers, horizon by horizon; `turned` are those of its turns [rad].
 
     `slipping` (n, h) marks the trials that touch a slip event.
     """
 
-    def at_horizon(h: int) -> ModelResult:
-        column = errors[:, h : h + 1]
+    def at_horizon(h: int) -> _AtHorizon:
+        column, metres = errors[:, h : h + 1], float(horizons[h])
         ordered = sort_trials(column[:, 0])
-        summary = summary_of_sorted([ordered])
-        bins = histogram_sorted(ordered, _bin_width(float(summary.p95[0]), float(summary.largest[0])))
-        p50, p95 = float(summary.p50[0]), float(summary.p95[0])
+        trials, *found = (one[0] for one in summary_of_sorted([ordered]))
+        expected, p50, p95, largest = map(float, found)
+        bins = histogram_sorted(ordered, _bin_width(p95, largest))
         sums = block_sums(column[:, 0], blocks[h], ordered, p50, p95)
-        found = error_intervals(column[:, 0], blocks[h], sums, p95)
-        intervals = Intervals(*(np.array([end]) for end in found))
+        intervals = error_intervals(column[:, 0], blocks[h], sums, p95)
         of_turns = error_summary(np.degrees(turned[:, h : h + 1]))
-        heading = HeadingErrors(of_turns.expected, of_turns.p95)
-        free = None if slipping is None else error_summary(column[~slipping[:, h]])
-        return ModelResult(model.name, model.label, summary, intervals, (bins,), (sums,), heading, free)
+        shares = 100.0 * expected / metres, 100.0 * p95 / metres
+        turns = float(of_turns.expected[0]), float(of_turns.p95[0])
+        row = SummaryRow(metres, int(trials), *map(known, (expected, p50, p95, largest, *shares, *intervals, *turns)))
+        free = None if slipping is None else _rows(horizons[h : h + 1], column[~slipping[:, h]])[0]
+        return _AtHorizon(row, bins, sums, free)
 
-    return _joined(list(pool.map(at_horizon, range(len(blocks)))))
+    return list(pool.map(at_horizon, range(len(blocks))))
+
+
+def _result(model: Model | ComparedRow, parts: Iterable[list[_AtHorizon]]) -> ModelResult:
+    """Return the errors of one model from those of groups of horizons."""
+    found = [one for part in parts for one in part]
+    rows, bins, sums, free = zip(*found, strict=True)
+    blocks = [
+        BlocksDocument(row.horizon_m, **plain(one._asdict() | {"errors_m": [float(f"{e:.6g}") for e in one.errors_m]}))
+        for row, one in zip(rows, sums, strict=True) if one is not None
+    ]  # fmt: skip
+    document = ModelDocument(model.name, model.label, model.knows, list(rows), blocks)
+    return ModelResult(document, bins, sums, tuple(row for row in free if row is not None))
 
 
 def _bin_width(p95_m: float, largest_m: float) -> float:
@@ -391,17 +371,3 @@ def _bin_width(p95_m: float, largest_m: float) -> float:
     if math.isnan(largest_m):
         return round_bin_width(0.0)
     return round_bin_width(max(min(largest_m, BULK_IN_P95 * p95_m), largest_m / MOST_BULKS))
-
-
-def _joined(parts: Sequence[ModelResult]) -> ModelResult:
-    """Join what several horizons, or groups of them, gave for one model."""
-    return ModelResult(
-        parts[0].name,
-        parts[0].label,
-        Summary(*_columns(part.summary for part in parts)),
-        Intervals(*_columns(part.intervals for part in parts)),
-        tuple(one for part in parts for one in part.histograms),
-        tuple(one for part in parts for one in part.block_sums),
-        HeadingErrors(*_columns(part.heading for part in parts)),
-        Summary(*_columns(free)) if (free := [one.without_events for one in parts if one.without_events]) else None,
-    )

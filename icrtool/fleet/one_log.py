@@ -370,11 +370,11 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
         multiplier=None if controller is None else controller.multiplier,
         multiplier_std=None if controller is None else controller.multiplier_std,
         errors=_errors(report),
-        bounds=tuple(_within_name(one) for one in report.budgets if one.beyond),
+        bounds=tuple(_within_name(one) for one in report.document.budgets if one.beyond),
         events=len(summary.events),
         outages=len(report.outages),
         warnings=len(summary.warnings),
-        verdicts=tuple(fleet_verdict(one, request.known.log) for one in report.verdicts),
+        verdicts=tuple(fleet_verdict(one, request.known.log) for one in report.document.gates),
         baseline=_baseline_numbers(report),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
         inputs=files_of(path_of(request.path), summary.inputs),
@@ -383,12 +383,12 @@ def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutR
 
 def _errors(report: DropoutReport) -> dict[str, float | None]:
     errors: dict[str, float | None] = {}
-    for result in report.results:
-        for h, horizon_m in enumerate(report.horizons_m.tolist()):
-            if horizon_m in HORIZONS_M:
-                errors[f"{result.name}_p95_{horizon_m:g}m_m"] = plain(result.summary.p95[h])
-                errors[f"{result.name}_expected_{horizon_m:g}m_m"] = plain(result.summary.expected[h])
-    for budget in report.budgets:
+    for model in report.document.models:
+        for row in model.by_horizon:
+            if row.horizon_m in HORIZONS_M:
+                errors[f"{model.name}_p95_{row.horizon_m:g}m_m"] = row.p95_m
+                errors[f"{model.name}_expected_{row.horizon_m:g}m_m"] = row.expected_error_m
+    for budget in report.document.budgets:
         errors[_within_name(budget)] = plain(budget.distance_m)
     return errors
 

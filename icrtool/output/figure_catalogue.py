@@ -34,7 +34,7 @@ def _where(content: Callable[[Any], object]) -> Callable[[Any], Parts]:
 
 
 def _histogram_horizons_m(report: DropoutReport) -> tuple[float, ...]:
-    trials = dict(zip(report.horizons_m.tolist(), report.counts.trials.tolist(), strict=True))
+    trials = {row.horizon_m: row.trials for row in report.document.trials}
     return tuple(metres for metres in HISTOGRAM_HORIZONS_M if trials.get(metres))
 
 
@@ -100,7 +100,7 @@ FIGURES = {
         "report", "Two trials of {} m",
         "One of half a turn, and the straightest. The closer a coloured end is to the black one, the better its model.",
         "dropout_paths.dropout_examples",
-        lambda report: {f"{one.horizon_m:02.0f}m": () for one in report.examples[:1]},
+        lambda report: {f"{one.horizon_m:02.0f}m": () for one in report.document.examples[:1]},
         with_place=True, further=True,
     ),
     "worst": Entry(
@@ -125,7 +125,7 @@ FIGURES = {
     "summary": Entry(
         "report", "Error over distance",
         "The lower a curve, the better the model. Where it crosses the budget line, the budget is used up.",
-        "dropout_errors.dropout_summary", _where(lambda report: report.counts.trials.any()),
+        "dropout_errors.dropout_summary", _where(lambda report: any(row.trials for row in report.document.trials)),
     ),
     "icrs": Entry(
         "fleet", "Final ICRs of every log",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.samples import ROLE_WORDS, Role
-from icrtool.records.text import counted
+from icrtool.records.text import counted, distance_text
 
 if TYPE_CHECKING:
     from icrtool.motion.models import FittedModel
@@ -29,9 +29,6 @@ MODEL_WORDS = {"recommended": "whole model", "controller": "controller numbers",
 
 MOST_LINES = 50
 """Jumps of the reference that are printed, the largest decided ones first."""
-
-FITTED = {"never": "not fitted", "before": "up to the start", "all": "in sample", "others": "held out"}
-"""What the numbers of a row were fitted to, by the values of `icrtool.calibration.model_comparison.FITTED_TO`."""
 
 
 def run_title(summary: RunDocument) -> str:
@@ -95,11 +92,6 @@ def xml_text(text: str) -> str:
 def signed(metres: float) -> str:
     """Return a number with its sign, to the millimetre, as print has it (a minus, not a hyphen)."""
     return f"{metres:+.3f}".replace("-", "−") if round(metres, 3) else "0.000"
-
-
-def distance_text(metres: float) -> str:
-    """Return a distance as ``398.5 m`` or ``36.00 km``."""
-    return f"{metres:.1f} m" if metres < 10_000 else f"{metres / 1000:.2f} km"
 
 
 def duration_text(seconds: float) -> str:

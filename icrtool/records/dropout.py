@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
-from icrtool.kernels.arrays import Floats, Ints
-from icrtool.kernels.error_statistics import BlockSums, Histogram, Intervals, Summary
-from icrtool.kernels.track import OpenLoopPath
+from icrtool.kernels.arrays import Floats
 from icrtool.records.calibration_document import CalibrationDocument
 from icrtool.records.plain_data import Record
 
@@ -24,138 +22,8 @@ CHOICE_HORIZON_M = 10.0
 """The distance that headlines, tables of calibrations and the worst trials are about."""
 
 
-METRICS = {
-    "expected": ("expected", "expected_error_m"), "p50": ("p50", "p50_m"), "p95": ("p95", "p95_m"),
-    "max": ("largest", "max_m"),
-}  # fmt: skip
-"""By its name in an acceptance limit: an error's field of `Summary`, and its name in files."""
-
-
-def error_columns(summary: Summary) -> dict[str, Floats | Ints]:
-    """Return the errors by horizon under their names in files."""
-    return {"trials": summary.trials} | {column: getattr(summary, field) for field, column in METRICS.values()}
-
-
-class HeadingErrors(NamedTuple):
-    """Mean and 95th percentile of the errors of the turn over trials, by horizon; (h,) [deg], NaN without trials."""
-
-    expected_deg: Floats
-    p95_deg: Floats
-
-
-class ModelResult(NamedTuple):
-    """The errors of one model's trials, by horizon.
-
-    Attributes
-    ----------
-    block_sums : None where there is too little path
-    without_events : of the trials among them that touch no slip event; None where the run has none
-    """
-
-    name: str
-    label: str
-    summary: Summary
-    intervals: Intervals
-    histograms: tuple[Histogram, ...]
-    block_sums: tuple[BlockSums | None, ...]
-    heading: HeadingErrors
-    without_events: Summary | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ExampleTrial:
-    """One open-loop trial: from state `start` to state `end`, the reference's path and each model's.
-
-    Attributes
-    ----------
-    model : by whose error it was chosen
-    reference_north_m, reference_east_m : (m,)
-    paths : by model name
-    errors_m : by model name, at the end
-    """
-
-    model: str
-    start: int
-    end: int
-    stamp_ns: int
-    t_s: float
-    north_m: float
-    east_m: float
-    horizon_m: float
-    heading_change_rad: float
-    speed_mean_mps: float
-    reference_north_m: Floats
-    reference_east_m: Floats
-    paths: dict[str, OpenLoopPath]
-    errors_m: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Outage:
-    """One outage.
-
-    Attributes
-    ----------
-    begin_s, end_s : seconds since the first recorded state
-    distance_m : path driven through it
-    end_error_m, max_error_m : forced: against the undisturbed estimate; real: against the fixes that ended it (both
-        the same)
-    north_m, east_m : (m,) the path without GNSS, for a picture
-    """
-
-    kind: OutageKind
-    begin_s: float
-    end_s: float
-    distance_m: float
-    end_error_m: float
-    max_error_m: float
-    north_m: Floats
-    east_m: Floats
-
-
-class ReferenceErrors(NamedTuple):
-    """The error that the reference itself puts into trials, by horizon; (h,) [m] each, NaN where there is no trial.
-
-    Attributes
-    ----------
-    std : root mean square
-    expected, p95 : mean and 95th percentile: what a perfect motion model would show
-    """
-
-    std: Floats
-    expected: Floats
-    p95: Floats
-
-
-class EventCost(NamedTuple):
-    """What slip events cost: trials that cross one were left out, and the errors are those with them.
-
-    Attributes
-    ----------
-    events : number of slip events
-    trials : (h,) left out
-    with_events : by model of the filter, the errors of all trials
-    """
-
-    events: int
-    trials: Ints
-    with_events: dict[str, Summary]
-
-
-class LearnedSplit(NamedTuple):
-    """Trials of the momentary ICRs that start before and after the ICRs were first learned.
-
-    Attributes
-    ----------
-    learned_s, distance_m : when and where they were learned, seconds and metres since the first recorded state; None
-        where they never were: all trials are before
-    before, after : by horizon
-    """
-
-    learned_s: float | None
-    distance_m: float | None
-    before: Summary
-    after: Summary
+METRICS = {"expected": "expected_error_m", "p50": "p50_m", "p95": "p95_m", "max": "max_m"}
+"""By its name in an acceptance limit: an error's name in files."""
 
 
 class UsedCalibration(Record, frozen=True):
@@ -278,7 +146,7 @@ class Gate(Record, frozen=True):
         return bool(self.baseline_factor)
 
 
-class CheckedGate(Gate, frozen=True, kw_only=True):
+class Verdict(Gate, frozen=True, kw_only=True):
     """Whether an acceptance limit was kept; numbers are None where there is none.
 
     Attributes
@@ -291,6 +159,7 @@ class CheckedGate(Gate, frozen=True, kw_only=True):
     value_bound_m : the bound, with the baseline's share
     not_checked : why the limit was not checked; None where it was
     unusable : why the run must not be used, which fails every limit; None where it can be
+    verdict : the line about it that is printed
     """
 
     value_m: float | None
@@ -302,6 +171,7 @@ class CheckedGate(Gate, frozen=True, kw_only=True):
     value_bound_m: float | None = None
     not_checked: str | None = None
     unusable: str | None = None
+    verdict: str
 
     def line(self, log: str) -> str:
         """Return the verdict in one line, which names the log."""
@@ -326,12 +196,6 @@ class CheckedGate(Gate, frozen=True, kw_only=True):
         if self.margin_low_m is not None:
             interval = f" (95 %: {self.margin_low_m:+.4g} to {self.margin_high_m:+.4g} m)"
         return f", bound {bound_m:.4g} m (baseline {baseline_m:.4g} m){margin}{interval}"
-
-
-class Verdict(CheckedGate, frozen=True, kw_only=True):
-    """A limit that was checked, and the line about it that is printed."""
-
-    verdict: str
 
 
 class TurningSplit(Record, frozen=True):

@@ -1,12 +1,19 @@
-"""report.json: what a dropout report holds; numbers that are not known are null."""
+"""report.json: what a dropout report holds; numbers that are not known are null. And what pictures need beside it."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from icrtool.config import Config
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.error_statistics import BlockSums, Histogram
+from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.calibration_document import CalibrationDocument
 from icrtool.records.dropout import BudgetDistance, OutageKind, TurningSplit, UsedCalibration, Verdict
 from icrtool.records.plain_data import Record
@@ -22,6 +29,11 @@ LARGEST_M = 1e12
 Number = Annotated[float, Meta(ge=-LARGEST_M, le=LARGEST_M)] | None
 Numbers = list[Number]
 Count = Annotated[int, Meta(ge=0, le=10**12)]
+
+
+def column_of(rows: Sequence[Record], name: str) -> Floats:
+    """Return a number of each row, NaN where there is none."""
+    return np.array([math.nan if (value := getattr(row, name)) is None else value for row in rows], np.float64)
 
 
 class RunOfReport(Record, frozen=True):
@@ -86,6 +98,10 @@ class ModelDocument(Record, frozen=True):
     by_horizon: list[SummaryRow]
     blocks: list[BlocksDocument]
 
+    def column(self, name: str) -> Floats:
+        """Return a number at each horizon (h,), NaN where there is none."""
+        return column_of(self.by_horizon, name)
+
 
 class CountDocument(Record, frozen=True):
     """How many starts were a trial at a horizon, and why the others were none."""
@@ -106,7 +122,13 @@ class ReferenceRow(Record, frozen=True):
 
 
 class LearnedDocument(Record, frozen=True):
-    """The trials before and after the ICRs were first learned."""
+    """The trials of a model that start before and after the ICRs were first learned.
+
+    Attributes
+    ----------
+    learned_s, learned_at_distance_m : when and where they were learned, seconds and metres since the first recorded
+        state; None where they never were: all trials are before
+    """
 
     model: str
     learned_s: Number
@@ -116,7 +138,13 @@ class LearnedDocument(Record, frozen=True):
 
 
 class EventCostDocument(Record, frozen=True):
-    """What slip events cost: trials that cross one are left out; `with_events`: the errors with them, by model."""
+    """What slip events cost: trials that cross one are left out.
+
+    Attributes
+    ----------
+    events : number of slip events
+    with_events : by model of the filter, the errors of all trials
+    """
 
     events: int
     with_events: dict[str, list[ErrorRow]]
@@ -168,7 +196,15 @@ class BaselineDocument(Record, frozen=True):
 
 
 class OutageDocument(Record, frozen=True):
-    """An outage."""
+    """An outage.
+
+    Attributes
+    ----------
+    begin_s, end_s : seconds since the first recorded state
+    distance_m : path driven through it
+    end_error_m, max_error_m : forced: against the undisturbed estimate; real: against the fixes that ended it (both
+        the same)
+    """
 
     kind: OutageKind
     begin_s: float
@@ -190,6 +226,70 @@ class TrialDocument(Record, frozen=True):
     heading_change_deg: float
     speed_mean_mps: float
     errors_m: dict[str, Number]
+
+
+class ModelResult(NamedTuple):
+    """The errors of one model's trials.
+
+    Attributes
+    ----------
+    document : as report.json holds them
+    histograms : by horizon
+    block_sums : by horizon, to all digits; None where there is too little path
+    without_events : by horizon, of the trials that touch no slip event; empty where the run has none
+    """
+
+    document: ModelDocument
+    histograms: tuple[Histogram, ...]
+    block_sums: tuple[BlockSums | None, ...]
+    without_events: tuple[ErrorRow, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+        return self.document.name
+
+    @property
+    def label(self) -> str:
+        """Its label in tables and pictures."""
+        return self.document.label
+
+    def column(self, name: str) -> Floats:
+        """Return a number at each horizon (h,), NaN where there is none."""
+        return self.document.column(name)
+
+
+@dataclass(frozen=True, slots=True)
+class Outage:
+    """An outage with the path without GNSS, for a picture.
+
+    Attributes
+    ----------
+    north_m, east_m : (m,)
+    """
+
+    document: OutageDocument
+    north_m: Floats
+    east_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class ExampleTrial:
+    """A trial with the reference's path and each model's, for a picture.
+
+    Attributes
+    ----------
+    start, end : its first and last state
+    reference_north_m, reference_east_m : (m,)
+    paths : by model name
+    """
+
+    document: TrialDocument
+    start: int
+    end: int
+    reference_north_m: Floats
+    reference_east_m: Floats
+    paths: dict[str, OpenLoopPath]
 
 
 class IntervalsDocument(Record, frozen=True):

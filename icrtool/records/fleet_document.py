@@ -6,7 +6,7 @@ from typing import Literal
 
 from msgspec import UNSET, UnsetType, field
 
-from icrtool.records.dropout import CheckedGate
+from icrtool.records.dropout import Verdict
 from icrtool.records.plain_data import Record
 
 FLEET_SCHEMA: Literal["icrtool/fleet/1"] = "icrtool/fleet/1"
@@ -47,7 +47,7 @@ class FleetVerdict(Record, frozen=True, kw_only=True):
     not_checked: str
 
 
-def fleet_verdict(one: CheckedGate, log: str) -> FleetVerdict:
+def fleet_verdict(one: Verdict, log: str) -> FleetVerdict:
     """Return an acceptance limit under the keys of fleet.json, with the line about it, which names the log."""
     return FleetVerdict(
         gate=one.text, value_m=one.value_m, margin_m=one.margin_m, passed=one.passed, line=one.line(log),

@@ -160,3 +160,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     near = get_close_matches(given, choices, n=1, cutoff=LEAST_LIKENESS)
     near = near or [choice for choice in choices if len(given) >= LEAST_LETTERS and given in choice][:1]
     return f"did you mean {choices[near[0]]}? " if near else ""
+
+
+def distance_text(metres: float) -> str:
+    """Return a distance as ``398.5 m`` or ``36.00 km``."""
+    return f"{metres:.1f} m" if metres < 10_000 else f"{metres / 1000:.2f} km"

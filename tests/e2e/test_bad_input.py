@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
 from icrtool.config import load_config
-from icrtool.dropout_analysis.trials import dropout
+from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
 from icrtool.logs.read_log import read_log

@@ -24,7 +24,6 @@ from icrtool.kernels.track import trial_ends
 from icrtool.motion.fit import own_constants
 from icrtool.motion.models import controller_model
 from icrtool.motion.recording import Trials, cut_windows, predicted_path
-from icrtool.output.dropout_directory import report_document
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.page import drive_data
 from icrtool.output.page.group_pages import comparison_page, fleet_page
@@ -65,7 +64,7 @@ def file(run: Run, report: DropoutReport, tmp_path_factory: pytest.TempPathFacto
     pixel = base64.b64decode(
         "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
     )
-    page = run_page(run, report_document(report), pictures_of([("trajectory", pixel), ("ladder", pixel)]))
+    page = run_page(run, report.document, pictures_of([("trajectory", pixel), ("ladder", pixel)]))
     file = tmp_path_factory.mktemp("page") / "report.html"
     file.write_text(page, encoding="utf-8")
     return file
@@ -210,7 +209,7 @@ def test_paths_of_joined_samples_are_close_to_those_of_the_library(
 ) -> None:
     monkeypatch.setattr(drive_data, "MOST_STEPS", 1000)
     file = tmp_path / "joined.html"
-    file.write_text(run_page(run, report_document(report), {}), encoding="utf-8")
+    file.write_text(run_page(run, report.document, {}), encoding="utf-8")
     page = chrome.page()
     page.open(file)
     joined = page.evaluate("icrtoolPage.data.steps.joined")
@@ -243,10 +242,10 @@ def test_paths_of_calibrations_with_and_without_the_gyro_end_where_those_of_the_
     calibration = calibrate(run)
     report = dropout_report(run, horizons_m=LENGTHS_M, calibrations=[calibration])
     names = {"calibration": False, "calibration_gyro": True}
-    assert {one.name: one.with_gyro for one in report.calibrations} == names
+    assert {one.name: one.with_gyro for one in report.document.calibrations} == names
     # Read back from JSON, as `icrtool report` does; so many paths that each has one point of three.
     monkeypatch.setattr(drive_data, "PATH_POINTS", 15_000)
-    document = msgspec.convert(json.loads(json_bytes(report_document(report))), DropoutDocument)
+    document = msgspec.convert(json.loads(json_bytes(report.document)), DropoutDocument)
     file = tmp_path / "calibrations.html"
     file.write_text(run_page(run, document, {}), encoding="utf-8")
     page = chrome.page()
@@ -316,7 +315,7 @@ def test_the_moment_follows_the_keyboard(page: Page) -> None:
 def test_hostile_names_stay_text(chrome: Browser, run: Run, report: DropoutReport, tmp_path: Path) -> None:
     streams = [{**one, "topic": HOSTILE, "why": HOSTILE} for one in run.summary["streams"]]
     hostile = with_summary(run, log=HOSTILE, warnings=[HOSTILE], streams=streams)
-    made = report_document(report)
+    made = report.document
     models = tuple(msgspec.structs.replace(one, label=HOSTILE) for one in made.models)
     document = msgspec.structs.replace(made, models=models)
     file = tmp_path / "hostile.html"

@@ -39,7 +39,7 @@ def test_the_learned_icrs_of_known_robots_are_where_they_should_be(shared_logs: 
     icr, no_slip = report.result("icr"), report.result("no_slip")
     assert icr is not None
     assert no_slip is not None
-    assert (icr.summary.expected < no_slip.summary.expected).all()
+    assert (icr.column("expected_error_m") < no_slip.column("expected_error_m")).all()
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def suite_of(name: str, outcome: Outcome) -> Suite:
     if isinstance(outcome, IcrToolError):
         return Suite(name, error=str(outcome))
     log = outcome.run_document.log
-    return Suite(run_title(outcome.run_document), [fleet_verdict(one, log) for one in outcome.verdicts])
+    return Suite(run_title(outcome.run_document), [fleet_verdict(one, log) for one in outcome.document.gates])
 
 
 def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-report") -> None:
@@ -72,7 +72,7 @@ def format_markdown(report: DropoutReport) -> str:
     # Not at import: a batch needs the verdicts alone.
     from icrtool.output.tables.dropout import format_dropout
 
-    title, verdicts = run_title(report.run_document), [one.verdict for one in report.verdicts]
+    title, verdicts = run_title(report.run_document), [one.verdict for one in report.document.gates]
     lines = [f"## {escaped_markdown(title)}", ""]
     if verdicts:
         word = "All acceptance limits are met." if report.passed else "**An acceptance limit is not met.**"

@@ -28,9 +28,10 @@ from icrtool.output.exports.paths import (
     utc_text,
 )
 from icrtool.output.series import places
-from icrtool.output.text_format import distance_text, driven_text, duration_text, run_title, xml_text
+from icrtool.output.text_format import driven_text, duration_text, run_title, xml_text
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.text import distance_text
 
 STATE_CELL_M = 0.2
 """A state becomes a point where the path enters another cell of a grid of this side."""

@@ -11,7 +11,8 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.text_format import MODEL_WORDS, error_text, run_title
-from icrtool.records.dropout import BudgetDistance, ModelResult
+from icrtool.records.dropout import BudgetDistance
+from icrtool.records.dropout_document import ModelResult, column_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,15 +53,15 @@ def dropout_summary(report: DropoutReport) -> Figure:
     comparison. Where there is no recommended model, the momentary ICRs.
     """
     models = [*_held_out(report), *(one for one in report.results if one.name == "no_slip")]
-    budgets_m = list(dict.fromkeys(one.budget_m for one in report.budgets))
-    reached = [one for one in report.budgets if one.model in {model.name for model in models}]
+    budgets_m = list(dict.fromkeys(one.budget_m for one in report.document.budgets))
+    reached = [one for one in report.document.budgets if one.model in {model.name for model in models}]
     best = next((one for one in reached if one.model == models[0].name), None)
     pens = _pens(report)
     title = (
         f"Within {best.budget_m:g} m (95 %) for {best.reach_text}" if best is not None else _largest(report, models[0])
     )
     # Beside the models: the mean of the first, budget, outages.
-    most = int(report.counts.trials.max())
+    most = max(row.trials for row in report.document.trials)
     keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
     figure = style.new_figure(
         title, f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals",
@@ -71,13 +72,13 @@ def dropout_summary(report: DropoutReport) -> Figure:
     first_m = min([report.horizons_m[0], *(one.distance_m for one in reached if one.model != "no_slip")])
     for one in models:
         _draw_model(axes, one, report.horizons_m, first_m, pens[one.name], first=one is models[0])
-    outages = [one for one in report.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
+    outages = [one for one in report.document.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
     if outages:
         axes.plot(
-            [one.distance_m for one in outages], [one.end_error_m for one in outages], linestyle="none", marker="X",
+            [one.distance_m for one in outages], column_of(outages, "end_error_m"), linestyle="none", marker="X",
             color="black", markersize=7, zorder=5, label="real outage",
         )  # fmt: skip
-    low, high = _shown_errors(models, [*budgets_m, *(one.end_error_m for one in outages)])
+    low, high = _shown_errors(models, [*budgets_m, *column_of(outages, "end_error_m")])
     axes.set(xlim=(0, report.horizons_m[-1] * 1.02), ylim=(low, high), xlabel="Distance without GNSS [m]")
     axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
     style.logarithmic_errors(axes, "y")
@@ -93,10 +94,10 @@ def dropout_summary(report: DropoutReport) -> Figure:
 
 def _largest(report: DropoutReport, model: ModelResult) -> str:
     """Return the error at the last horizon that has trials; of a run that is not usable no distance is stated."""
-    known = np.flatnonzero(np.isfinite(model.summary.p95))
-    if not len(known):
+    known = [row for row in model.document.by_horizon if row.p95_m is not None]
+    if not known:
         return "Error over distance: no trial was long enough"
-    error = f"{error_text(float(model.summary.p95[known[-1]]))} off (95 %) after {report.horizons_m[known[-1]]:g} m"
+    error = f"{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
     return error if report.usable else f"Do not use: {error}"
 
 
@@ -108,8 +109,8 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
         (one, [h for h in asked if len(one.histograms[h].left)]) for one in (*_held_out(report), *report.results)
     )
     model, places = next(found for found in of_models if found[1])
-    budgets_m = dict.fromkeys(one.budget_m for one in report.budgets)
-    errors = ", ".join(error_text(float(model.summary.p95[h])).removesuffix(" m") for h in places)
+    budgets_m = dict.fromkeys(one.budget_m for one in report.document.budgets)
+    errors = ", ".join(error_text(model.document.by_horizon[h].p95_m).removesuffix(" m") for h in places)
     distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
     figure = style.new_figure(
         f"95 % of the trials end within {errors} m after {distances} m",
@@ -117,10 +118,10 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
         height_in=1.55 + LOW_PANEL_IN * len(places), margins_in=(0.75, 0.25, 0.85, 0.9), hspace=0.38,
     )  # fmt: skip
     panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
-    p95 = model.summary.p95[places]
+    p95 = model.column("p95_m")[places]
     end = _histogram_end([np.nanmax(p95), *(budget for budget in budgets_m if budget < 2 * np.nanmax(p95))])
     for axes, h in zip(panels, places, strict=True):
-        heading = f"after {report.horizons_m[h]:g} m, {int(model.summary.trials[h]):,} trials"
+        heading = f"after {report.horizons_m[h]:g} m, {model.document.by_horizon[h].trials:,} trials"
         _draw_bins(axes, model, h, _pens(report)[model.name].color, end, heading)
         for budget in budgets_m:
             axes.axvline(budget, label=f"budget {budget:g} m", **style.BUDGET.keywords())
@@ -143,10 +144,10 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     found = [*of_the_filter, *(one for one in _held_out(report) if one.name != "icr")]
     # A model of constant parameters may have no trial of a length that others have.
     results = [result for result in found if len(result.histograms[h].left)]
-    p95 = [float(result.summary.p95[h]) for result in results]
+    p95 = [float(result.column("p95_m")[h]) for result in results]
     figure = style.new_figure(
         f"After {horizon_m:g} m 95 % of the trials end within {min(p95):.2f} to {max(p95):.2f} m, by model",
-        f"{run_title(report.run_document)}: open-loop error of {int(report.counts.trials[h]):,} trials",
+        f"{run_title(report.run_document)}: open-loop error of {report.document.trials[h].trials:,} trials",
         height_in=1.5 + PANEL_HEIGHT_IN * len(results), margins_in=(0.75, 0.2, 0.85, 0.9), hspace=0.45,
     )  # fmt: skip
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
@@ -167,7 +168,7 @@ def _held_out(report: DropoutReport) -> list[ModelResult]:
 def _pens(report: DropoutReport) -> dict[str, style.Pen]:
     """Return how the models are drawn that pictures show; final ICRs and rows with a gyro are in the tables alone."""
     own = ("icr_final", "icr_gyro", "icr_final_gyro", "no_slip_gyro", "recommended_gyro", "controller_gyro")
-    left_out = {*own, *(one.name for one in report.calibrations if one.with_gyro)}
+    left_out = {*own, *(one.name for one in report.document.calibrations if one.with_gyro)}
     return style.model_pens([one.name for one in report.results if one.name not in left_out])
 
 
@@ -186,7 +187,7 @@ def _draw_model(
     """
     label = MODEL_WORDS.get(result.name, result.label)
     x = np.linspace(first_m, horizons_m[-1], CURVE_POINTS)
-    known = np.isfinite(result.summary.p95)
+    known = np.isfinite(result.column("p95_m"))
     at = np.append(0.0, horizons_m[known])
 
     def between(errors: Floats) -> Floats:
@@ -195,17 +196,17 @@ def _draw_model(
 
     thin = result.name == "no_slip"
     look = pen.keywords() | ({"linewidth": THIN} if thin else {}) | {"zorder": 2.6 if first else 2.4}
-    axes.plot(x, between(result.summary.p95), label=f"{label}, 95 %", **look)
+    axes.plot(x, between(result.column("p95_m")), label=f"{label}, 95 %", **look)
     if not thin:
-        low, high = (between(values) for values in (result.intervals.p95_low, result.intervals.p95_high))
+        low, high = (between(values) for values in (result.column("p95_low_m"), result.column("p95_high_m")))
         axes.fill_between(x, low, high, color=pen.color, alpha=BAND_ALPHA, linewidth=0)
     if first:
-        axes.plot(x, between(result.summary.expected), label=f"{label}, mean", **look | {"linewidth": THIN})
+        axes.plot(x, between(result.column("expected_error_m")), label=f"{label}, mean", **look | {"linewidth": THIN})
 
 
 def _shown_errors(models: list[ModelResult], others_m: list[float]) -> tuple[float, float]:
     """Return the ends [m] of the scale: all that is drawn from the first horizon on, over at most `MOST_DECADES`."""
-    errors = np.concatenate([*(one.summary.p95 for one in models), models[0].summary.expected, others_m])
+    errors = np.concatenate([*(one.column("p95_m") for one in models), models[0].column("expected_error_m"), others_m])
     errors = errors[np.isfinite(errors) & (errors > 0)]
     if not len(errors):
         return 0.01, 1.0
@@ -242,15 +243,15 @@ def _histogram_end(marks_m: list[Any]) -> float:
 
 def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float, heading: str) -> None:
     """Draw the bins of one model at horizon number `h` up to `end_m`, and its expected value and 95 %."""
-    summary, bins = result.summary, result.histograms[h]
-    p95, expected, largest = float(summary.p95[h]), float(summary.expected[h]), float(summary.largest[h])
+    row, bins = result.document.by_horizon[h], result.histograms[h]
     width = float(bins.right[0] - bins.left[0])
     edges = np.append(bins.left, bins.right[-1])
     style.fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
-    axes.axvline(p95, label="95 % of the trials", **P95.keywords())
-    axes.axvline(expected, label="expected value", **style.MEAN.keywords())
+    axes.axvline(result.column("p95_m")[h], label="95 % of the trials", **P95.keywords())
+    axes.axvline(result.column("expected_error_m")[h], label="expected value", **style.MEAN.keywords())
     axes.set_title(heading, loc="left", pad=4.0, fontweight="bold")
-    facts = f"expected {error_text(expected)},  95 % within {error_text(p95)},  max {error_text(largest)}"
+    expected, p95, largest = map(error_text, (row.expected_error_m, row.p95_m, row.max_m))
+    facts = f"expected {expected},  95 % within {p95},  max {largest}"
     axes.set_title(facts, loc="right", pad=4.0)
     axes.set_xlim(0, end_m)
     axes.locator_params(axis="y", nbins=4)

@@ -23,7 +23,7 @@ from icrtool.output.figures.trajectory import (
 )
 from icrtool.output.series import places
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title, turn_text
-from icrtool.records.dropout import ExampleTrial, Outage
+from icrtool.records.dropout_document import ExampleTrial, Outage, OutageDocument, TrialDocument
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,18 +67,19 @@ def dropout_examples(report: DropoutReport) -> Figure:
         The report holds none; `icrtool.dropout_report` makes one that does.
     """
     examples = _needed(report, report.examples, "example trials")
-    errors = " and ".join(error_text(one.errors_m[one.model]) for one in examples)
+    trials = [one.document for one in examples]
+    errors = " and ".join(error_text(one.errors_m[one.model]) for one in trials)
     what = "about half a turn (left), as straight as the drive has it (right)"
     figure = style.new_figure(
-        f"Typical trials of {examples[0].horizon_m:g} m end {errors} off", f"{run_title(report.run_document)}: {what}",
+        f"Typical trials of {trials[0].horizon_m:g} m end {errors} off", f"{run_title(report.run_document)}: {what}",
         height_in=4.7, margins_in=(0.75, 0.2, 1.0, 0.9), wspace=0.34,
     )  # fmt: skip
     panels = figure.subplots(1, len(examples), squeeze=False)[0]
-    for axes, drive in zip(panels, examples, strict=True):
+    for axes, drive, trial in zip(panels, examples, trials, strict=True):
         _draw_drive(axes, report, drive, shape=3.0 / 2.75)
-        turn = turn_text(math.degrees(drive.heading_change_rad))
-        facts = f"at {drive.t_s:.0f} s, turns {turn} at {drive.speed_mean_mps:.2f} m/s"
-        errors = ",  ".join(f"{_word(report, name)} {error_text(error)}" for name, error in drive.errors_m.items())
+        turn = turn_text(trial.heading_change_deg)
+        facts = f"at {trial.t_s:.0f} s, turns {turn} at {trial.speed_mean_mps:.2f} m/s"
+        errors = ",  ".join(f"{_word(report, name)} {error_text(error)}" for name, error in trial.errors_m.items())
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
@@ -96,10 +97,11 @@ def dropout_worst(report: DropoutReport) -> Figure:
         The report holds none; `icrtool.dropout_report` makes one that does.
     """
     worst = _needed(report, report.worst, "worst trials")[: WORST_COLUMNS * WORST_ROWS - 1]
-    rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), worst[0].model
+    first = worst[0].document
+    rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), first.model
     which = f"{_word(report, model)}, the {len(worst)} worst trials, none overlapping"
     figure = style.new_figure(
-        f"The worst trial of {worst[0].horizon_m:g} m ends {error_text(worst[0].errors_m[model])} off",
+        f"The worst trial of {first.horizon_m:g} m ends {error_text(first.errors_m[model])} off",
         f"{run_title(report.run_document)}: {which}",
         width_in=WORST_WIDTH_IN, height_in=1.0 + rows * (WORST_CELL_IN + 0.5), margins_in=(0.15, 0.15, 0.98, 0.5),
         wspace=0.12, hspace=0.27,
@@ -108,13 +110,13 @@ def dropout_worst(report: DropoutReport) -> Figure:
     for axes in panels:
         axes.spines[["top", "right"]].set_visible(True)
         axes.spines[:].set_color(FRAME_COLOR)
-    _draw_overview(panels[0], worst, report.reference_north_m, report.reference_east_m)
+    _draw_overview(panels[0], [one.document for one in worst], report.reference_north_m, report.reference_east_m)
     for rank, (axes, drive) in enumerate(zip(panels[1:], worst, strict=False), start=1):
         _draw_drive(axes, report, drive, shape=1.0, ticks=0)
         _draw_scale(axes)
-        turn = turn_text(math.degrees(drive.heading_change_rad))
-        facts = f"at {duration_text(drive.t_s)}, {turn}, {drive.speed_mean_mps:.2f} m/s"
-        axes.set_title(f"{rank}:  {error_text(drive.errors_m[model])}\n{facts}", **CELL_TITLE)
+        trial = drive.document
+        facts = f"at {duration_text(trial.t_s)}, {turn_text(trial.heading_change_deg)}, {trial.speed_mean_mps:.2f} m/s"
+        axes.set_title(f"{rank}:  {error_text(trial.errors_m[model])}\n{facts}", **CELL_TITLE)
     for axes in panels[len(worst) + 1 :]:
         axes.set_axis_off()
     style.add_legend(figure)
@@ -126,21 +128,21 @@ def _word(report: DropoutReport, model: str) -> str:
     return MODEL_WORDS.get(model) or (result.label if result is not None else model)
 
 
-def _draw_overview(axes: Axes, worst: Sequence[ExampleTrial], north_m: Floats, east_m: Floats) -> None:
+def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, east_m: Floats) -> None:
     """Draw the whole path and, numbered, where the trials start; numbers that would touch stand in a row."""
     cell = look_down(axes, north_m, east_m, 1.0, ticks=0)
     draw_path(axes, north_m, east_m, cell, PATH, zorder=2)
     number_pt, line_pt = 1.1 * CHARACTER_PT, 0.8 * LINE_PT
     point_m = cell * CELLS / (72.0 * WORST_CELL_IN)
     together: list[tuple[float, float, list[int]]] = []
-    for rank, drive in enumerate(worst, start=1):
+    for rank, trial in enumerate(worst, start=1):
         for north, east, ranks in together:
             half_pt = number_pt * (len(ranks) + 1) + 2.0
-            if abs(drive.north_m - north) < line_pt * point_m and abs(drive.east_m - east) < half_pt * point_m:
+            if abs(trial.north_m - north) < line_pt * point_m and abs(trial.east_m - east) < half_pt * point_m:
                 ranks.append(rank)
                 break
         else:
-            together.append((drive.north_m, drive.east_m, [rank]))
+            together.append((trial.north_m, trial.east_m, [rank]))
     for north, east, ranks in together:
         axes.text(
             east, north, " ".join(map(str, ranks)), fontsize=8.0, fontweight="bold", ha="center", va="center",
@@ -188,12 +190,15 @@ def dropout_outages(report: DropoutReport) -> Figure:
     easts = np.concatenate([report.reference_east_m, *(one.east_m for one in outages)])
     width_in = style.WIDTH_IN - 0.95
     box_in = fitted_box_in(norths, easts, width_in)
-    figure = style.new_figure(_outages_text(outages), run_title(report.run_document), height_in=box_in + 1.65)
+    figure = style.new_figure(
+        _outages_text(report.document.outages), run_title(report.run_document), height_in=box_in + 1.65
+    )
     axes = figure.subplots()
     cell = look_down(axes, norths, easts, width_in / box_in, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
     for one in outages:
-        draw_path(axes, one.north_m, one.east_m, cell, OUTAGES[one.kind], zorder=3, label=f"{one.kind} outage")
+        kind = one.document.kind
+        draw_path(axes, one.north_m, one.east_m, cell, OUTAGES[kind], zorder=3, label=f"{kind} outage")
     for row, fill, label in ((0, "white", "its begin"), (-1, "black", "its end")):
         ends = [(one.east_m[row], one.north_m[row]) for one in outages]
         axes.plot(*zip(*ends, strict=True), zorder=4, label=label, **style.spot(fill))
@@ -214,13 +219,13 @@ def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> t
 
 def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: float, ticks: int = 5) -> None:
     """Draw one trial about its start in axes `shape` times as wide as high."""
-    pens = style.model_pens(list(drive.paths))
+    trial, pens = drive.document, style.model_pens(list(drive.paths))
     lines = [(drive.reference_north_m, drive.reference_east_m, style.FILTER, "filter")]
     lines += [
         (path.north, path.east, pens[name], _word(report, name))
-        for name, path in drive.paths.items() if name in (*PICTURED, drive.model)
+        for name, path in drive.paths.items() if name in (*PICTURED, trial.model)
     ]  # fmt: skip
-    lines = [(north - drive.north_m, east - drive.east_m, pen, label) for north, east, pen, label in lines]
+    lines = [(north - trial.north_m, east - trial.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
     cell = look_down(axes, norths, easts, shape, ticks=ticks)
     axes.plot([0.0], [0.0], zorder=6, label="start", **style.spot("white"))
@@ -231,25 +236,26 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
             east[-1:], north[-1:], linestyle="none", marker="D", color=pen.color, markersize=4.5, zorder=5,
             label="where each ends",
         )  # fmt: skip
-    end_s = drive.t_s + drive.horizon_m / max(drive.speed_mean_mps, SLOWEST_MPS)
+    end_s = trial.t_s + trial.horizon_m / max(trial.speed_mean_mps, SLOWEST_MPS)
     for one in report.outages:
-        if one.kind == "real" and drive.t_s <= one.end_s and one.begin_s <= end_s:
-            axes.plot(one.east_m - drive.east_m, one.north_m - drive.north_m, label="real outage", **LOST_LOOK)
-    jumps = [one for one in report.run_document.reference_jumps if drive.t_s <= one.end_s and one.begin_s <= end_s]
+        span = one.document
+        if span.kind == "real" and trial.t_s <= span.end_s and span.begin_s <= end_s:
+            axes.plot(one.east_m - trial.east_m, one.north_m - trial.north_m, label="real outage", **LOST_LOOK)
+    jumps = [one for one in report.run_document.reference_jumps if trial.t_s <= one.end_s and one.begin_s <= end_s]
     if jumps:
         axes.plot(
-            [one.east_m - drive.east_m for one in jumps], [one.north_m - drive.north_m for one in jumps],
+            [one.east_m - trial.east_m for one in jumps], [one.north_m - trial.north_m for one in jumps],
             label="step of the reference", **JUMP_LOOK,
         )  # fmt: skip
 
 
-def _outages_text(outages: Sequence[Outage]) -> str:
+def _outages_text(outages: Sequence[OutageDocument]) -> str:
     """Return how many outages of each kind there are, and the largest end error of each."""
     parts = []
     for kind in ("forced", "real"):
         ours = [one for one in outages if one.kind == kind]
         if ours:
-            worst = max(one.end_error_m for one in ours)
+            worst = max(one.end_error_m or 0.0 for one in ours)
             lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
             span = duration_text(lengths[0])
             span += f" to {duration_text(lengths[-1])}" if len(lengths) > 1 else ""
@@ -267,7 +273,7 @@ def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
         _spot_box(path[row], point_px) for path in paths for row in places(path[:, 1], path[:, 0], LINE_PT * point_px)
     ]
     for number, (one, path) in enumerate(zip(outages, paths, strict=True), start=1):
-        text = f"{number}: {error_text(one.end_error_m)}"
+        text = f"{number}: {error_text(one.document.end_error_m)}"
         boxes = _label_boxes(path[-1], CHARACTER_PT * len(text), point_px)
         found = _free_box(boxes, [*taken, *crossed], axes.bbox) or _free_box(boxes, taken, axes.bbox)
         if found is None:

@@ -11,11 +11,12 @@ from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icr
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.series import places
-from icrtool.output.text_format import distance_text, driven_text, error_text, position_word, run_title
+from icrtool.output.text_format import driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run
 from icrtool.records.run_document import OdometryDocument
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
+from icrtool.records.text import distance_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,12 +16,12 @@ from icrtool.output.page.render import drawn_pictures, pictures_in, render
 from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.tables.calibration import transfer_blocks
 from icrtool.output.text_blocks import Block, Cell, Figure, Section, Table, Title
-from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text, signed
+from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, signed
 from icrtool.records.calibration_document import GroupComparison, TransferCell
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
 from icrtool.records.regular_file import is_regular
 from icrtool.records.run import ICR_WORDS
-from icrtool.records.text import counted
+from icrtool.records.text import counted, distance_text
 
 PLOTS = "plots"
 

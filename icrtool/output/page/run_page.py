@@ -15,7 +15,7 @@ import msgspec
 from icrtool.dropout_analysis.reference import with_smoothed_reference
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import RunError
-from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, report_document
+from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
 from icrtool.output.files.own_files import is_page
@@ -70,7 +70,7 @@ def write_page(
     """
     check_type(run, Run, "icrtool.open_run(directory) reads one")
     pictures = pictures_of_run(plots if plots is not None else run.directory)
-    page = run_page(run, report_document(report), pictures, coordinates=coordinates)
+    page = run_page(run, report.document, pictures, coordinates=coordinates)
     write_file(Path(path), page, inside, ours=is_page if inside is not None else None)
 
 

@@ -33,7 +33,7 @@ from icrtool.output.text_blocks import (
     Title,
     printed,
 )
-from icrtool.output.text_format import distance_text, model_text
+from icrtool.output.text_format import model_text
 from icrtool.records.calibration_document import (
     ComparedPair,
     ErrorsAt,
@@ -49,7 +49,7 @@ from icrtool.records.calibration_document import (
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS
-from icrtool.records.text import counted, with_interval, with_std
+from icrtool.records.text import counted, distance_text, with_interval, with_std
 
 BUDGET_M = 0.5
 """Error within which a distance counts."""

@@ -30,19 +30,12 @@ from icrtool.output.text_blocks import (
     Title,
     printed,
 )
-from icrtool.output.text_format import (
-    controller_error_text,
-    distance_text,
-    duration_text,
-    error_text,
-    run_title,
-    turn_text,
-)
+from icrtool.output.text_format import controller_error_text, duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.run_document import RunDocument
-from icrtool.records.text import counted, shortened
+from icrtool.records.text import counted, distance_text, shortened
 
 REACH_ROWS = ("controller", "recommended", "recommended_gyro", "recommended_heading", "icr", "no_slip")
 """Models whose distance is stated first, as far as they are there; the momentary ICRs where nothing is held out."""
@@ -63,9 +56,7 @@ def format_dropout(report: DropoutReport) -> Text:
 
 def dropout_blocks(report: DropoutReport) -> list[Block]:
     """Return what `icrtool dropout-report` prints, with the differences to a baseline where there is one."""
-    from icrtool.output.dropout_directory import report_document
-
-    *blocks, verdicts = report_blocks(report.run_document, report_document(report))
+    *blocks, verdicts = report_blocks(report.run_document, report.document)
     return [*blocks, *baseline_sections(report), verdicts]
 
 

@@ -11,11 +11,11 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import difference_half_width
 from icrtool.output.text_blocks import VERBOSE, Block, Cell, Figure, Items, Section, Table
-from icrtool.output.text_format import MODEL_WORDS, distance_text, duration_text, error_text
+from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.dropout_document import DropoutDocument, ErrorRow, ModelDocument
 from icrtool.records.run_document import RunDocument
-from icrtool.records.text import counted, shortened
+from icrtool.records.text import counted, distance_text, shortened
 
 LONGEST_LABEL = 26
 """Characters of a model's name that are printed."""
@@ -272,7 +272,7 @@ def baseline_sections(report: DropoutReport) -> Iterator[Section]:
     shown, same, rows = shown_horizons(report.horizons_m), baseline.is_of(report.run_document), []
     for result in report.results:
         for label, metric, column in (
-            ("95 %", "p95", result.summary.p95), ("expected", "expected", result.summary.expected),
+            ("95 %", "p95", result.column("p95_m")), ("expected", "expected", result.column("expected_error_m")),
         ):  # fmt: skip
             cells = []
             for h in shown:

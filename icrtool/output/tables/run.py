@@ -28,7 +28,6 @@ from icrtool.output.text_blocks import (
     printed,
 )
 from icrtool.output.text_format import (
-    distance_text,
     duration_text,
     error_text,
     event_kinds,
@@ -42,7 +41,7 @@ from icrtool.output.text_format import (
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.run_document import ControllerNumbers, RunDocument
-from icrtool.records.text import counted, shortened
+from icrtool.records.text import counted, distance_text, shortened
 
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
 """A delay that receivers have, to show what it does; at lower speeds than this it does little."""

@@ -110,7 +110,7 @@ def test_the_path_of_a_row_ends_where_its_trial_does(run: Run) -> None:
 
 def test_the_whole_model_predicts_better_than_the_momentary_icrs(run: Run) -> None:
     report = icrtool.dropout_report(run)
-    p95 = {one.name: float(one.summary.p95[9]) for one in report.results}
+    p95 = {one.name: float(one.column("p95_m")[9]) for one in report.results}
     # of a robot whose ICRs are constant, momentary ones are as good once they are learned
     assert p95["recommended"] < 1.1 * p95["icr"] < p95["no_slip"]
 
@@ -140,6 +140,8 @@ def test_the_whole_model_beats_momentary_icrs_on_the_shared_logs(shared_logs) ->
     for name, robot in robots.items():
         config = icrtool.load_config(robot=robot)
         run = icrtool.fit(icrtool.read_log(shared_logs / "simulated" / name, config), config)
-        p95 = {one.name: float(one.summary.p95[0]) for one in icrtool.dropout_report(run, horizons_m=[10.0]).results}
+        p95 = {
+            one.name: float(one.column("p95_m")[0]) for one in icrtool.dropout_report(run, horizons_m=[10.0]).results
+        }
         ratios.append(p95["icr"] / p95["recommended"])
     assert np.median(ratios) > 1.5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,15 +13,15 @@ from icrtool.dropout_analysis.acceptance_limits import (
     check_gate,
     parse_gate,
 )
-from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import ConfigError
 from icrtool.kernels.error_statistics import never_falling, within_budget
 from icrtool.records.run import Run
 from support.documents import with_summary
+from support.reports import with_models, with_numbers
 
-METRICS = {"p50": "p50", "p95": "p95", "expected": "expected", "max": "largest"}
+METRICS = {"p50": "p50_m", "p95": "p95_m", "expected": "expected_error_m", "max": "max_m"}
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +37,10 @@ def test_a_gate_holds_its_number_against_its_bound(
 ) -> None:
     result = report.result(model)
     assert result is not None
-    value = float(getattr(result.summary, METRICS[metric])[1])
+    value = float(result.column(METRICS[metric])[1])
     above, below = value + 0.25, value - 0.25
     for bound in (above, below):
-        verdict = check_gate(parse_gate(f"{model}.{metric}@2.5m {relation} {bound}"), report)
+        verdict = check_gate(parse_gate(f"{model}.{metric}@2.5m {relation} {bound}"), report.errors)
         assert verdict.value_m == value
         assert verdict.passed == ((bound == above) == (relation[0] == "<"))
         assert verdict.margin_m == pytest.approx(0.25 if verdict.passed else -0.25)
@@ -51,8 +50,8 @@ def test_a_gate_holds_its_number_against_its_bound(
 def test_a_number_on_its_bound_passes_only_where_equality_is_allowed(
     report: DropoutReport, relation: str, passes: bool
 ) -> None:
-    value = float(report.results[0].summary.p95[0])
-    verdict = check_gate(parse_gate(f"icr.p95@1m{relation}{value!r}"), report)
+    value = float(report.results[0].column("p95_m")[0])
+    verdict = check_gate(parse_gate(f"icr.p95@1m{relation}{value!r}"), report.errors)
     assert verdict.passed is passes
     assert verdict.margin_m == 0.0
 
@@ -92,32 +91,30 @@ def test_text_that_is_no_gate_is_refused_with_an_example(text: str) -> None:
 
 def test_an_unknown_model_or_horizon_is_an_error_that_names_what_there_is(report: DropoutReport) -> None:
     with pytest.raises(ConfigError, match="no model calibrated; this run has icr, no_slip, icr_final"):
-        check_gate(parse_gate("calibrated.p95@1m <= 1"), report)
+        check_gate(parse_gate("calibrated.p95@1m <= 1"), report.errors)
     with pytest.raises(ConfigError, match="no horizon of 7 m"):
-        check_gate(parse_gate("icr.p95@7m <= 1"), report)
+        check_gate(parse_gate("icr.p95@7m <= 1"), report.errors)
 
 
 def test_a_gate_without_trials_fails_and_says_so(run: Run) -> None:
     report = dropout(run, [900.0])
     for relation in ("<=", ">="):
-        verdict = check_gate(parse_gate(f"icr.p95@900m {relation} 1"), report)
+        verdict = check_gate(parse_gate(f"icr.p95@900m {relation} 1"), report.errors)
         assert not verdict.passed
         assert verdict.value_m is None
         assert verdict.verdict.startswith(f"FAIL  icr.p95@900m {relation} 1: no trial of 900 m in this log")
 
 
 def test_the_verdict_names_number_bound_and_margin(report: DropoutReport) -> None:
-    value = float(report.results[0].summary.p95[0])
-    line = check_gate(parse_gate("icr.p95@1m <= 3"), report).verdict
+    value = float(report.results[0].column("p95_m")[0])
+    line = check_gate(parse_gate("icr.p95@1m <= 3"), report.errors).verdict
     assert line.startswith(f"pass  icr.p95@1m <= 3: {value:.4g} m, margin {3 - value:+.4g} m")
     assert report.name in line
 
 
 def with_p95(report: DropoutReport, *p95: float) -> DropoutReport:
     """The report of one model with these p95 at 1, 2.5 and 10 m."""
-    result = report.results[0]
-    summary = result.summary._replace(p95=np.array(p95))
-    return replace(report, results=(result._replace(summary=summary),))
+    return with_models(report, with_numbers(report.results[0], p95_m=p95))
 
 
 @pytest.mark.parametrize(
@@ -137,16 +134,16 @@ def with_p95(report: DropoutReport, *p95: float) -> DropoutReport:
 def test_a_budget_is_interpolated_between_horizons_from_zero(
     report: DropoutReport, budget: float, p95: tuple[float, ...], distance: float, beyond: bool
 ) -> None:
-    (found,) = budget_distances(with_p95(report, *p95), budget)
+    (found,) = budget_distances(with_p95(report, *p95).errors, budget)
     assert found.distance_m == pytest.approx(distance)
     assert (found.model, found.budget_m, found.beyond) == ("icr", budget, beyond)
 
 
 def test_a_budget_without_trials_is_left_out_and_no_length_is_refused(report: DropoutReport) -> None:
-    assert budget_distances(with_p95(report, math.nan, math.nan, math.nan), 1.0) == ()
+    assert budget_distances(with_p95(report, math.nan, math.nan, math.nan).errors, 1.0) == ()
     for budget in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ConfigError, match="budget"):
-            budget_distances(report, budget)
+            budget_distances(report.errors, budget)
 
 
 @pytest.mark.parametrize(
@@ -161,8 +158,8 @@ def test_an_interval_of_a_budget_ends_where_its_knowledge_ends(
     report: DropoutReport, high: tuple[float, ...], low: tuple[float, ...], text: str
 ) -> None:
     one = with_p95(report, 0.1, 0.4, 2.0)
-    intervals = one.results[0].intervals._replace(p95_low=np.array(low), p95_high=np.array(high))
-    (found,) = budget_distances(replace(one, results=(one.results[0]._replace(intervals=intervals),)), 0.3)
+    between = with_numbers(one.results[0], p95_low_m=low, p95_high_m=high)
+    (found,) = budget_distances(with_models(one, between).errors, 0.3)
     assert found.distance_m == pytest.approx(1.0 + 1.5 * 0.2 / 0.3)
     assert found.interval_text == text
 
@@ -185,12 +182,12 @@ def test_a_short_distance_that_is_worse_than_a_longer_one_does_not_end_the_reach
 
 
 def test_a_limit_on_the_distance_within_a_budget(report: DropoutReport) -> None:
-    reached = next(one for one in budget_distances(report, 0.2) if one.model == "icr")
+    reached = next(one for one in budget_distances(report.errors, 0.2) if one.model == "icr")
     for bound, passed in ((reached.distance_m - 0.01, True), (reached.distance_m + 0.01, False)):
-        verdict = check_gate(parse_gate(f"icr.within@0.2m >= {bound}"), report)
+        verdict = check_gate(parse_gate(f"icr.within@0.2m >= {bound}"), report.errors)
         assert (verdict.passed, verdict.value_m) == (passed, pytest.approx(reached.distance_m))
-    wide = check_gate(parse_gate("icr.within@99 >= 1"), report)
-    assert wide.value_m == report.horizons_m[np.isfinite(report.results[0].summary.p95)][-1]
+    wide = check_gate(parse_gate("icr.within@99 >= 1"), report.errors)
+    assert wide.value_m == report.horizons_m[np.isfinite(report.results[0].column("p95_m"))][-1]
 
 
 def test_every_limit_fails_on_a_run_that_is_not_usable(run: Run) -> None:
@@ -198,9 +195,9 @@ def test_every_limit_fails_on_a_run_that_is_not_usable(run: Run) -> None:
     gates = ["icr.p95@5m <= 100", "recommended.within@0.5m >= 0.1"]
     report = dropout_report(bad, horizons_m=[5.0], gates=gates)
     assert [result.name for result in report.results] == ["icr", "no_slip", "icr_final"]
-    assert (report.budgets, report.calibration) == ((), None)
-    assert [verdict.passed for verdict in report.verdicts] == [False, False]
-    assert all("the robot did not move" in verdict.verdict for verdict in report.verdicts)
+    assert (report.document.budgets, report.calibration) == ((), None)
+    assert [verdict.passed for verdict in report.document.gates] == [False, False]
+    assert all("the robot did not move" in verdict.verdict for verdict in report.document.gates)
     allowed = dropout_report(bad, horizons_m=[5.0], gates=gates, allow_unusable=True)
     assert allowed.result("recommended") is not None
-    assert allowed.verdicts[0].passed
+    assert allowed.document.gates[0].passed

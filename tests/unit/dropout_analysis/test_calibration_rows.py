@@ -60,9 +60,9 @@ def test_a_calibration_is_tested_in_the_trials_of_the_other_rows(
     for name in ("calibration:own", "calibration:last.season"):
         result = report.result(name)
         assert result is not None
-        np.testing.assert_array_equal(result.summary.trials, (trials.ends >= 0).sum(axis=0))
-        np.testing.assert_allclose(result.summary.p95, expected.p95, rtol=1e-6)
-        assert np.all(result.intervals.p95_low[:1] < result.summary.p95[:1])
+        np.testing.assert_array_equal(result.column("trials"), (trials.ends >= 0).sum(axis=0))
+        np.testing.assert_allclose(result.column("p95_m"), expected.p95, rtol=1e-6)
+        assert np.all(result.column("p95_low_m")[:1] < result.column("p95_m")[:1])
 
 
 def test_ranges_of_starts_without_a_trial_have_no_errors(
@@ -77,12 +77,12 @@ def test_ranges_of_starts_without_a_trial_have_no_errors(
         ours, theirs = pieces.result(name), report.result(known)
         assert ours is not None
         assert theirs is not None
-        np.testing.assert_array_equal(ours.summary.trials, theirs.summary.trials)
-        np.testing.assert_allclose(ours.summary.p95, theirs.summary.p95, rtol=1e-6)
+        np.testing.assert_array_equal(ours.column("trials"), theirs.column("trials"))
+        np.testing.assert_allclose(ours.column("p95_m"), theirs.column("p95_m"), rtol=1e-6)
 
 
 def test_the_report_states_whether_the_log_was_fitted_to(report: DropoutReport) -> None:
-    assert [one.fitted_to_this for one in report.calibrations] == [True, False]
+    assert [one.fitted_to_this for one in report.document.calibrations] == [True, False]
     text = format_dropout(report)
     assert "own: " in text
     assert "not fitted to this log" in text
@@ -92,9 +92,9 @@ def test_what_is_recommended_is_not_better_than_what_knew_the_drive(report: Drop
     held_out, in_sample = report.result("recommended"), report.result("calibration:own")
     assert held_out is not None
     assert in_sample is not None
-    assert np.all(held_out.summary.expected != in_sample.summary.expected)
-    assert held_out.summary.expected[0] < 2.0 * in_sample.summary.expected[0]
-    np.testing.assert_array_equal(held_out.summary.trials, in_sample.summary.trials)
+    assert np.all(held_out.column("expected_error_m") != in_sample.column("expected_error_m"))
+    assert held_out.column("expected_error_m")[0] < 2.0 * in_sample.column("expected_error_m")[0]
+    np.testing.assert_array_equal(held_out.column("trials"), in_sample.column("trials"))
 
 
 def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, report: DropoutReport) -> None:
@@ -110,7 +110,7 @@ def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, rep
     # the controller's model is tested in the same trials as the whole one
     for key, row in (("full_p95_m", "recommended"), ("p95_m", "controller")):
         assert (result := report.result(row)) is not None
-        assert exported[key] == pytest.approx(result.summary.p95[1], rel=1e-9)
+        assert exported[key] == pytest.approx(result.column("p95_m")[1], rel=1e-9)
     assert exported["p95_m"] != exported["full_p95_m"]
     pooled = {(one.model, one.horizon_m): one.p95_m for one in own.held_out_pooled}
     assert pooled["recommended", 10.0] == exported["full_p95_m"]
@@ -119,9 +119,9 @@ def test_calibrate_report_and_export_give_the_same_numbers(own: Calibration, rep
 
 
 def test_gates_and_budgets_know_every_row(report: DropoutReport) -> None:
-    assert [verdict.passed for verdict in report.verdicts] == [True, False, True]
-    assert {one.model for one in report.budgets} <= {one.name for one in report.results}
-    known = [one for one in report.budgets if one.low_m is not None]
+    assert [verdict.passed for verdict in report.document.gates] == [True, False, True]
+    assert {one.model for one in report.document.budgets} <= {one.name for one in report.results}
+    known = [one for one in report.document.budgets if one.low_m is not None]
     assert all(one.low_m <= one.distance_m <= (one.high_m or np.inf) for one in known)
 
 

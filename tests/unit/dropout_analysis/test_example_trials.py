@@ -35,7 +35,8 @@ def test_the_worst_trials_are_the_largest_that_do_not_overlap(run: Run) -> None:
     worst = worst_trials(run, horizon_m=3.0, count=6)
     assert [(drive.start, drive.end) for drive in worst] == expected[:6]
     assert len(worst) == 6
-    assert [drive.errors_m["icr"] for drive in worst] == sorted((d.errors_m["icr"] for d in worst), reverse=True)
+    of_icr = [drive.document.errors_m["icr"] for drive in worst]
+    assert of_icr == sorted(of_icr, reverse=True)
 
 
 def test_the_worst_trials_are_those_of_the_recommended_model(make_run: Callable[..., Run]) -> None:
@@ -45,9 +46,9 @@ def test_the_worst_trials_are_those_of_the_recommended_model(make_run: Callable[
     ends = trial_ends(track_of(run), np.array([5.0]))[compared.trials.starts]
     errors = row.errors_of(Trials(compared.trials.starts, ends)).position[:, 0]
     worst = worst_trials(run, compared, 5.0, count=3)
-    assert {one.model for one in worst} == {"recommended"}
+    assert {one.document.model for one in worst} == {"recommended"}
     assert worst[0].start == compared.trials.starts[np.nanargmax(errors)]
-    assert worst[0].errors_m["recommended"] == pytest.approx(np.nanmax(errors), abs=1e-4)
+    assert worst[0].document.errors_m["recommended"] == pytest.approx(np.nanmax(errors), abs=1e-4)
     assert set(worst[0].paths) == {"icr", "no_slip", "recommended", "controller"}
 
 
@@ -61,24 +62,24 @@ def test_fewer_drives_fit_than_are_asked_for(run: Run) -> None:
 def test_a_drive_tells_time_place_turn_speed_and_paths(run: Run) -> None:
     drive, table = worst_trials(run, horizon_m=3.0)[0], run.table
     k, j = drive.start, drive.end
-    assert (drive.stamp_ns, drive.t_s) == (table.stamp_ns[k], table.t_s[k])
-    assert (drive.north_m, drive.east_m) == (table.north_m[k], table.east_m[k])
-    assert drive.heading_change_rad == table.heading_rad[j] - table.heading_rad[k]
-    assert drive.speed_mean_mps == pytest.approx(3.0 / (table.t_s[j] - table.t_s[k]), rel=0.02)
+    assert (drive.document.stamp_ns, drive.document.t_s) == (table.stamp_ns[k], table.t_s[k])
+    assert (drive.document.north_m, drive.document.east_m) == (table.north_m[k], table.east_m[k])
+    assert drive.document.heading_change_deg == np.degrees(table.heading_rad[j] - table.heading_rad[k])
+    assert drive.document.speed_mean_mps == pytest.approx(3.0 / (table.t_s[j] - table.t_s[k]), rel=0.02)
     assert drive.reference_north_m.tolist() == table.north_m[k : j + 1].tolist()
     for number, name in enumerate(("icr", "no_slip")):
         path, (errors, _) = drive.paths[name], errors_of(run, 3.0, number)
         assert len(path.north) == j - k + 1
-        assert (path.north[0], path.east[0]) == (drive.north_m, drive.east_m)
-        assert drive.errors_m[name] == pytest.approx(errors[k], abs=EQUAL_M)
+        assert (path.north[0], path.east[0]) == (drive.document.north_m, drive.document.east_m)
+        assert drive.document.errors_m[name] == pytest.approx(errors[k], abs=EQUAL_M)
 
 
 def test_examples_are_a_turning_and_a_straight_drive_with_ordinary_errors(run: Run) -> None:
     cornering, straight = example_trials(run, 5.0)
     errors, ends = errors_of(run, 5.0)
     turned = np.abs(run.table.heading_rad[np.maximum(ends, 0)] - run.table.heading_rad)[ends >= 0]
-    assert abs(cornering.heading_change_rad) >= turned.max() - np.radians(10.5)
-    assert abs(straight.heading_change_rad) < np.median(turned)
+    assert abs(cornering.document.heading_change_deg) >= np.degrees(turned.max()) - 10.5
+    assert abs(straight.document.heading_change_deg) < np.degrees(np.median(turned))
     for drive in (cornering, straight):
         assert errors[drive.start] < np.nanmax(errors)
 

@@ -135,23 +135,23 @@ def test_a_forced_outage_is_driven_open_loop_with_the_icrs_of_its_begin(clean: R
     np.testing.assert_allclose(outage.north_m, north, rtol=0, atol=1e-9)
     np.testing.assert_allclose(outage.east_m, east, rtol=0, atol=1e-9)
     away = np.hypot(north - table.north_m[first:last], east - table.east_m[first:last])
-    assert outage.end_error_m == pytest.approx(away[-1], abs=1e-9)
-    assert outage.max_error_m == pytest.approx(away.max(), abs=1e-9)
-    assert (outage.kind, outage.begin_s, outage.end_s) == ("forced", 20.0, 28.0)
-    assert outage.distance_m == pytest.approx(table.distance_m[last - 1] - table.distance_m[first])
+    assert outage.document.end_error_m == pytest.approx(away[-1], abs=1e-9)
+    assert outage.document.max_error_m == pytest.approx(away.max(), abs=1e-9)
+    assert (outage.document.kind, outage.document.begin_s, outage.document.end_s) == ("forced", 20.0, 28.0)
+    assert outage.document.distance_m == pytest.approx(table.distance_m[last - 1] - table.distance_m[first])
 
 
 def test_the_filter_learns_on_after_a_forced_outage(clean: Run) -> None:
     alone = force_outages(clean, plan_outages(clean, 5.0, (40.0,)))[0]
     after_another = force_outages(clean, plan_outages(clean, 5.0, (20.0, 40.0)))[1]
-    assert after_another.end_error_m == pytest.approx(alone.end_error_m, abs=0.05)
+    assert after_another.document.end_error_m == pytest.approx(alone.document.end_error_m, abs=0.05)
 
 
 def test_an_outage_is_never_better_than_none_and_none_costs_nothing(clean: Run) -> None:
     short, long = (force_outages(clean, plan_outages(clean, length, (20.0,)))[0] for length in (0.1, 15.0))
-    assert 0 <= short.max_error_m < 0.03 < long.max_error_m
+    assert 0 <= short.document.max_error_m < 0.03 < long.document.max_error_m
     for outage in (short, long):
-        assert outage.end_error_m <= outage.max_error_m
+        assert outage.document.end_error_m <= outage.document.max_error_m
 
 
 def test_a_warm_started_run_is_made_again_from_its_own_start(clean: Run) -> None:
@@ -159,7 +159,7 @@ def test_a_warm_started_run_is_made_again_from_its_own_start(clean: Run) -> None
         simulate(troubles=False), clean.config, warm_start=WarmStart(np.array([0.9, -0.4, 0.2]), 1e-4 * np.eye(3))
     )
     (cold_outage,), (outage,) = (force_outages(run, plan_outages(run, 5.0, (2.0,))) for run in (clean, warm))
-    assert outage.end_error_m != pytest.approx(cold_outage.end_error_m, rel=0.01)
+    assert outage.document.end_error_m != pytest.approx(cold_outage.document.end_error_m, rel=0.01)
     cold = with_summary(warm, filter={"warm_start": None})
     with pytest.raises(DataError, match="cannot be made again"):
         force_outages(cold, plan_outages(warm, 5.0, (20.0,)))
@@ -173,14 +173,15 @@ def test_a_run_with_terrain_changes_is_made_again_with_them(clean: Run) -> None:
 def test_a_real_outage_is_compared_with_the_fixes_that_ended_it(run: Run) -> None:
     (outage,), table = real_outages(run), run.table
     (begin, end), origin = run.outages_ns[0], table.stamp_ns[0]
-    assert (outage.kind, outage.begin_s, outage.end_s) == ("real", (begin - origin) / 1e9, (end - origin) / 1e9)
+    one = outage.document
+    assert (one.kind, one.begin_s, one.end_s) == ("real", (begin - origin) / 1e9, (end - origin) / 1e9)
     first, last = np.searchsorted(table.stamp_ns, [begin, end])
-    assert outage.distance_m == pytest.approx(table.distance_m[last] - table.distance_m[first])
+    assert outage.document.distance_m == pytest.approx(table.distance_m[last] - table.distance_m[first])
     fix = int(np.flatnonzero(run.gnss.stamp_ns == end)[0])
     fixes = run.sensors.fixes
     error = np.hypot(outage.north_m[-1] - fixes.north_m[fix], outage.east_m[-1] - fixes.east_m[fix])
     # several fixes of 0.01 m are compared, and the path drifts on for a second
-    assert outage.end_error_m == outage.max_error_m == pytest.approx(error, abs=0.05)
+    assert outage.document.end_error_m == outage.document.max_error_m == pytest.approx(error, abs=0.05)
     assert 0 < error < 1.0
     assert len(outage.north_m) == last - first + 1
 
@@ -206,8 +207,8 @@ def test_an_outage_lasts_until_a_fix_is_used_again_and_its_error_is_that_of_the_
     assert (code[inside] == GATED).all()
     assert inside.any()
     assert code[stamps == end] == RECOVERED
-    (outage,) = (one for one in real_outages(moved) if one.begin_s == (begin - origin) / 1e9)
-    assert outage.end_error_m == pytest.approx(3.0, abs=0.15)
+    (outage,) = (one for one in real_outages(moved) if one.document.begin_s == (begin - origin) / 1e9)
+    assert outage.document.end_error_m == pytest.approx(3.0, abs=0.15)
     # No trial ends where the filter was without fixes; from the outage's end on it is where the fixes are.
     drive = track_of(moved)
     assert drive.in_outage[np.searchsorted(moved.table.stamp_ns, stamps[inside])].all()
@@ -220,14 +221,14 @@ def test_the_end_error_of_a_real_outage_is_near_the_truth(shared_logs: Path) -> 
     log = shared_logs / "simulated" / "tracked_trouble"
     config = load_config(robot="jackal")
     run = fit(read_log(log, config), config)
-    outage = max(real_outages(run), key=lambda one: one.end_s - one.begin_s)
+    outage = max(real_outages(run), key=lambda one: one.document.end_s - one.document.begin_s)
     truth = np.load(log.with_name(f"{log.name}.truth.npz"))
     # Fixes and truth have the same axes; the datum is where they differ, and fixes wander by 0.2 m about it.
     fixes, seconds = run.sensors.fixes, (run.sensors.fixes.stamp_ns - run.table.stamp_ns[0]) / 1e9
-    before = (run.gnss.code == USED) & (seconds < outage.begin_s)
+    before = (run.gnss.code == USED) & (seconds < outage.document.begin_s)
     off = []
     for name, measured, path in (("z_north", fixes.north_m, outage.north_m), ("z_east", fixes.east_m, outage.east_m)):
         datum = np.median(measured[before] - np.interp(seconds[before], truth["t"], truth[name]))
-        off.append(path[-1] - datum - np.interp(outage.end_s, truth["t"], truth[name]))
+        off.append(path[-1] - datum - np.interp(outage.document.end_s, truth["t"], truth[name]))
     assert np.hypot(*off) > 0.5
-    assert outage.end_error_m == pytest.approx(np.hypot(*off), abs=0.2)
+    assert outage.document.end_error_m == pytest.approx(np.hypot(*off), abs=0.2)

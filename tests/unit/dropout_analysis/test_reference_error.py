@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.dropout_analysis.trials import Model, dropout
+from icrtool.dropout_analysis.dropout_report import dropout
+from icrtool.dropout_analysis.trials import Model
 from icrtool.kernels.track import FrozenIcrs
+from icrtool.records.dropout_document import column_of
 from icrtool.records.run import Run
 from support.barn import ICRS_M, RATE_HZ
 from support.documents import with_summary
@@ -54,31 +56,28 @@ def test_a_perfect_model_shows_the_references_error_and_nothing_else(
     clean: Run, stds: tuple[float, float, float], factor: float
 ) -> None:
     report = dropout(with_noise(clean, stds, factor), HORIZONS_M, models=PERFECT)
-    shown, own = report.results[0].summary, report.reference_error
-    assert own is not None
-    np.testing.assert_allclose(shown.expected, own.expected, rtol=0.06)
-    np.testing.assert_allclose(shown.p95, own.p95, rtol=0.06)
-    assert (own.expected < own.std).all()
-    assert (own.std < own.p95).all()
+    shown = report.results[0]
+    std, expected, p95 = (column_of(report.document.reference_error, name) for name in ("std_m", "expected_m", "p95_m"))
+    np.testing.assert_allclose(shown.column("expected_error_m"), expected, rtol=0.06)
+    np.testing.assert_allclose(shown.column("p95_m"), p95, rtol=0.06)
+    assert (expected < std).all()
+    assert (std < p95).all()
 
 
 def test_a_worse_model_shows_more(clean: Run) -> None:
     noisy = with_noise(clean, STDS[0])
     wrong = [Model("icr", "wrong ICRs", FrozenIcrs.constant(0.6, -0.6, 0.0))]
     report = dropout(noisy, [20.0], models=wrong)
-    assert report.reference_error is not None
-    assert report.results[0].summary.p95[0] > 2 * report.reference_error.p95[0]
+    assert report.results[0].column("p95_m")[0] > 2 * report.document.reference_error[0].p95_m
 
 
 def test_the_filters_own_states_hold_what_their_standard_deviations_promise(clean: Run) -> None:
     report = dropout(clean, HORIZONS_M, models=PERFECT)
-    assert report.reference_error is not None
-    ratio = report.results[0].summary.p95 / report.reference_error.p95
+    ratio = report.results[0].column("p95_m") / column_of(report.document.reference_error, "p95_m")
     assert (ratio < 1.2).all(), ratio
     assert (ratio > 0.1).all(), ratio
 
 
 def test_horizons_without_trials_have_none(clean: Run) -> None:
-    own = dropout(clean, [1.0, 900.0]).reference_error
-    assert own is not None
-    assert np.isfinite(own.p95).tolist() == [True, False]
+    own = dropout(clean, [1.0, 900.0]).document.reference_error
+    assert [row.p95_m is not None for row in own] == [True, False]

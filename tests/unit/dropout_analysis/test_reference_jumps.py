@@ -11,13 +11,11 @@ import pytest
 from icrtool.calibration.fit import fit
 from icrtool.calibration.run_recording import recording_of
 from icrtool.config import load_config
-from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import dropout
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import JUMP, trial_ends
 from icrtool.motion.recording import cut_trials, cut_windows
-from icrtool.output.dropout_directory import report_document
 from icrtool.output.run_directory import open_run
 from icrtool.records.run import Run, track_of
 from icrtool.records.samples import GyroSamples, HeadingSamples
@@ -70,29 +68,32 @@ def test_no_trial_of_any_row_crosses_it(jumping: Run, report: DropoutReport) -> 
     assert not ((first < begin) & (last > end)).any()
     assert {one.name for one in report.results} >= {"icr", "no_slip", "icr_final", "recommended"}
     for one in report.results:
-        assert (one.summary.largest < JUMP_M / 2).all() or one.name == "no_slip"
+        assert (one.column("max_m") < JUMP_M / 2).all() or one.name == "no_slip"
 
 
 def test_left_out_trials_are_counted_and_all_starts_add_up(report: DropoutReport) -> None:
-    assert (report.counts.crosses_jump > 0).all()
-    assert (np.sum(report.counts, axis=0) == report.states).all()
-    for row, count in zip(report_document(report).trials, report.counts.crosses_jump, strict=True):
+    assert (report.errors.counts.crosses_jump > 0).all()
+    assert (np.sum(report.errors.counts, axis=0) == report.errors.states).all()
+    for row, count in zip(report.document.trials, report.errors.counts.crosses_jump, strict=True):
         assert row.no_trial["crosses_jump"] == count
 
 
 def test_with_jumps_brings_them_back_and_shows_their_size(jumping: Run, report: DropoutReport) -> None:
     whole = dropout_report(jumping, horizons_m=HORIZONS_M, comparison=False, with_jumps=True)
-    assert not whole.counts.crosses_jump.any()
-    assert (whole.counts.trials >= report.counts.trials + report.counts.crosses_jump - whole.counts.standing).all()
+    assert not whole.errors.counts.crosses_jump.any()
+    assert (
+        whole.errors.counts.trials
+        >= report.errors.counts.trials + report.errors.counts.crosses_jump - whole.errors.counts.standing
+    ).all()
     icr = whole.result("icr")
     assert icr is not None
-    assert icr.summary.largest[-1] > 0.8 * JUMP_M
+    assert icr.column("max_m")[-1] > 0.8 * JUMP_M
 
 
 def test_preset_paper_leaves_nothing_out() -> None:
     run = fitted(step, [*FIELD, "filter.preset=paper"])
     assert run.summary["reference_jumps"] == []
-    assert not dropout(run, HORIZONS_M).counts.crosses_jump.any()
+    assert not dropout(run, HORIZONS_M).errors.counts.crosses_jump.any()
 
 
 def test_a_run_read_back_has_its_jumps(jumping: Run, tmp_path) -> None:
@@ -105,10 +106,10 @@ def test_a_slide_without_a_gyro_stays_in_the_headline(speed_mps: float) -> None:
     run = fitted(lambda t: speed_mps * np.clip(t - AT_S, 0.0, 2.0))
     assert all(jump["undecided"] for jump in run.summary["reference_jumps"])
     found = dropout(run, HORIZONS_M)
-    assert not found.counts.crosses_jump.any()
+    assert not found.errors.counts.crosses_jump.any()
     whole = dropout(replace(run, sensors=replace(run.sensors, jumps=())), HORIZONS_M)
     for one, other in zip(found.results, whole.results, strict=True):
-        np.testing.assert_array_equal(one.summary.p95, other.summary.p95)
+        np.testing.assert_array_equal(one.column("p95_m"), other.column("p95_m"))
 
 
 def relocated(gyro_deg: float | None) -> Run:

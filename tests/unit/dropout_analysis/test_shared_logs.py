@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.dropout_analysis.trials import dropout, models_of
+from icrtool.dropout_analysis.dropout_report import dropout
+from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import SHORT, trial_ends
 from icrtool.records.run import track_of
@@ -68,8 +69,8 @@ def test_lidar_poses_that_jump_by_metres_are_not_charged_to_the_robot(shared_log
     for name in ("icr", "icr_final"):
         result = report.result(name)
         assert result is not None
-        assert result.summary.p95[0] < WITHIN_M
-    assert report.counts.trials[0] > report.counts.crosses_jump[0]
+        assert result.column("p95_m")[0] < WITHIN_M
+    assert report.errors.counts.trials[0] > report.errors.counts.crosses_jump[0]
 
 
 @pytest.mark.parametrize("name", CLEAN)

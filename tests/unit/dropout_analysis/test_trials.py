@@ -13,11 +13,13 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis import trials as module
+from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.starts import first_learned
-from icrtool.dropout_analysis.trials import Model, dropout, models_of
+from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import FrozenIcrs, trial_ends
+from icrtool.records.dropout_document import ErrorRow, ModelResult, SummaryRow, column_of
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 from support.contract import SUMMARY_COLUMNS
 from support.documents import with_summary
@@ -73,14 +75,18 @@ def test_the_summary_is_that_of_the_single_errors(run: Run) -> None:
             assert row[column] == pytest.approx(value, rel=1e-12)
 
 
+def numbers(result: ModelResult, row: type[ErrorRow] = ErrorRow) -> np.ndarray:
+    return np.array([result.column(name) for name in row.__struct_fields__])
+
+
 def test_the_contracts_columns_come_first(run: Run) -> None:
     assert list(icrtool.dropout(run, [1.0]).summary.columns)[:9] == SUMMARY_COLUMNS
 
 
 def test_starts_that_are_no_trial_are_counted_by_kind(run: Run) -> None:
     report = dropout(run, HORIZONS_M)
-    table, counts = run.table, report.counts
-    assert report.states == len(table)
+    table, counts = run.table, report.errors.counts
+    assert report.errors.states == len(table)
     distance, stamps = table.distance_m, table.stamp_ns
     (outage,) = run.outages_ns
     for h, horizon in enumerate(HORIZONS_M):
@@ -112,8 +118,8 @@ def test_a_model_is_data(run: Run) -> None:
     mine, known = dropout(run, [5.0], models=models).result("mine"), dropout(run, [5.0]).result("no_slip")
     assert mine is not None
     assert known is not None
-    np.testing.assert_allclose(np.array(mine.summary), np.array(known.summary), rtol=1e-12)
-    assert dropout(run, [5.0], models=models).counts.trials == known.summary.trials
+    np.testing.assert_allclose(numbers(mine), numbers(known), rtol=1e-12)
+    assert dropout(run, [5.0], models=models).errors.counts.trials == known.column("trials")
 
 
 def test_rotating_and_shifting_the_world_changes_no_error(run: Run) -> None:
@@ -133,8 +139,8 @@ def test_neither_order_nor_company_of_horizons_matters(run: Run) -> None:
     assert reverse.horizons_m.tolist() == [0.5, 1.0, 3.0, 7.0, 10.0]
     for key, error in errors.items():
         np.testing.assert_allclose(others[key], error, rtol=0, atol=EQUAL_M)
-    alone, together = dropout(run, [3.0]).results[0].intervals, report.results[0].intervals
-    assert alone.p95_low[0] == pytest.approx(together.p95_low[2], abs=EQUAL_M)
+    alone, together = dropout(run, [3.0]).results[0], report.results[0]
+    assert alone.column("p95_low_m")[0] == pytest.approx(together.column("p95_low_m")[2], abs=EQUAL_M)
 
 
 def test_small_tables_and_small_ranges_give_the_same(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,27 +148,26 @@ def test_small_tables_and_small_ranges_give_the_same(run: Run, monkeypatch: pyte
     monkeypatch.setattr(module, "LARGEST_TABLE_BYTES", 1)
     monkeypatch.setattr(module, "STARTS_AT_ONCE", 333)
     pieces = dropout(run, HORIZONS_M)
-    np.testing.assert_array_equal(np.array(pieces.counts), np.array(report.counts))
+    np.testing.assert_array_equal(np.array(pieces.errors.counts), np.array(report.errors.counts))
     for ours, theirs in zip(pieces.results, report.results, strict=True):
-        np.testing.assert_allclose(np.array(ours.summary), np.array(theirs.summary), rtol=0, atol=EQUAL_M)
-        np.testing.assert_allclose(np.array(ours.intervals), np.array(theirs.intervals), rtol=0, atol=EQUAL_M)
+        np.testing.assert_allclose(numbers(ours, SummaryRow), numbers(theirs, SummaryRow), rtol=0, atol=EQUAL_M)
 
 
 def test_intervals_hold_the_estimate_and_depend_on_no_seed(run: Run) -> None:
     reports = [dropout(run, [2.0], seed=seed) for seed in (1, 2)]
-    spans = [(r.results[0].intervals.p95_low[0], r.results[0].intervals.p95_high[0]) for r in reports]
+    spans = [(r.results[0].column("p95_low_m")[0], r.results[0].column("p95_high_m")[0]) for r in reports]
     assert spans[0] == spans[1]
-    assert spans[0][0] < reports[0].results[0].summary.p95[0] < spans[0][1]
-    assert [r.seed for r in reports] == [1, 2]
+    assert spans[0][0] < reports[0].results[0].column("p95_m")[0] < spans[0][1]
+    assert [r.document.bootstrap.seed for r in reports] == [1, 2]
 
 
 def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: Run) -> None:
     for result in dropout(run, HORIZONS_M).results:
         for h, bins in enumerate(result.histograms):
             assert bins.percent.sum() == pytest.approx(100.0)
-            assert bins.right[-1] >= result.summary.largest[h]
+            assert bins.right[-1] >= result.column("max_m")[h]
             assert len(bins.left) <= 600
-            assert np.count_nonzero(bins.left < result.summary.p95[h]) >= 6
+            assert np.count_nonzero(bins.left < result.column("p95_m")[h]) >= 6
 
 
 def test_horizons_default_to_the_configured_ones(run: Run) -> None:
@@ -184,8 +189,8 @@ def test_a_run_of_one_state_is_refused(run: Run) -> None:
 
 def test_a_drive_shorter_than_every_horizon_has_no_numbers(make_run: Callable[..., Run]) -> None:
     report = dropout(make_run(duration_s=12.0, troubles=False), [500.0])
-    assert report.counts.trials.tolist() == [0]
-    assert np.isnan(report.results[0].summary.p95).all()
+    assert report.errors.counts.trials.tolist() == [0]
+    assert np.isnan(report.results[0].column("p95_m")).all()
     assert np.isnan(report.summary.p95_pct).all()
 
 
@@ -210,32 +215,33 @@ def stopping(run: Run) -> Run:
 def test_a_standstill_counts_once_whatever_its_length(run: Run, stopping: Run) -> None:
     without, moving = dropout(run, HORIZONS_M), dropout(stopping, HORIZONS_M)
     every = dropout(stopping, HORIZONS_M, starts="all")
-    np.testing.assert_array_equal(moving.counts.trials, without.counts.trials)
-    np.testing.assert_array_equal(moving.counts.standing, 440)
-    np.testing.assert_array_equal(every.counts.trials, without.counts.trials + 440)
+    np.testing.assert_array_equal(moving.errors.counts.trials, without.errors.counts.trials)
+    np.testing.assert_array_equal(moving.errors.counts.standing, 440)
+    np.testing.assert_array_equal(every.errors.counts.trials, without.errors.counts.trials + 440)
     for ours, theirs in zip(moving.results, without.results, strict=True):
-        np.testing.assert_allclose(np.array(ours.summary), np.array(theirs.summary), rtol=0, atol=EQUAL_M)
+        np.testing.assert_allclose(numbers(ours), numbers(theirs), rtol=0, atol=EQUAL_M)
     for report in (moving, every):
-        assert sum(int(column[0]) for column in report.counts) == report.states == len(stopping.table)
-        assert report.standing == 440
-    assert not np.allclose(every.results[0].summary.p95, moving.results[0].summary.p95, rtol=1e-3)
+        assert sum(int(column[0]) for column in report.errors.counts) == report.errors.states == len(stopping.table)
+        assert report.errors.standing == 440
+    assert not np.allclose(every.results[0].column("p95_m"), moving.results[0].column("p95_m"), rtol=1e-3)
 
 
 def test_trials_before_and_after_the_icrs_were_learned_are_all_trials(run: Run) -> None:
     report, errors = gathered(run)
-    split, icr, table = report.by_learning, report.result("icr"), run.table
+    split, icr, table = report.document.by_learning, report.result("icr"), run.table
     assert split is not None
     assert icr is not None
     assert split.learned_s is not None
-    np.testing.assert_array_equal(split.before.trials + split.after.trials, icr.summary.trials)
+    sides = [column_of(side, "trials") for side in (split.before, split.after)]
+    np.testing.assert_array_equal(sum(sides), icr.column("trials"))
     early = table.t_s < split.learned_s
     for h, horizon in enumerate(HORIZONS_M):
         for part, rows in ((split.before, early), (split.after, ~early)):
             tried = errors["icr", horizon][rows]
             tried = tried[~np.isnan(tried)]
-            assert part.trials[h] == len(tried)
-            assert part.p95[h] == pytest.approx(np.percentile(tried, 95))
-            assert part.expected[h] == pytest.approx(tried.mean())
+            assert part[h].trials == len(tried)
+            assert part[h].p95_m == pytest.approx(np.percentile(tried, 95))
+            assert part[h].expected_error_m == pytest.approx(tried.mean())
 
 
 def test_icrs_are_learned_when_their_standard_deviations_have_fallen(run: Run, make_run: Callable[..., Run]) -> None:
@@ -257,9 +263,9 @@ def test_icrs_are_learned_when_their_standard_deviations_have_fallen(run: Run, m
 
 
 def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
-    assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).standing == 0
+    assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).errors.standing == 0
     parked = make_run(duration_s=20.0, **PARKED)
-    assert dropout(parked, [1.0]).standing == len(parked.table) - 1
+    assert dropout(parked, [1.0]).errors.standing == len(parked.table) - 1
 
 
 def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:

@@ -12,8 +12,8 @@ from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.estimation.fit import fit
 from icrtool.kernels.track import trial_ends
-from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
+from icrtool.records.dropout_document import column_of
 from icrtool.records.measurements import SlipEvent
 from icrtool.records.run import Run, track_of
 from support.drives import make_log
@@ -35,7 +35,7 @@ def run() -> Run:
 def test_only_trials_across_an_event_are_left_out(run: Run) -> None:
     whole = dropout_report(run, horizons_m=HORIZONS_M, comparison=False)
     report = dropout_report(run, horizons_m=HORIZONS_M, comparison=False, without_events=True)
-    cost = report.event_cost
+    cost = report.document.without_events
     assert cost is not None
     assert cost.events == 1
     t = run.table.t_s
@@ -43,16 +43,18 @@ def test_only_trials_across_an_event_are_left_out(run: Run) -> None:
     for h, horizon in enumerate(HORIZONS_M):
         last = t[np.maximum(ends[:, h], 0)]
         crossing = (ends[:, h] >= 0) & (t < EVENT_S[1]) & (last > EVENT_S[0])
-        assert cost.trials[h] == np.count_nonzero(crossing)
-        assert report.counts.trials[h] == whole.counts.trials[h] - cost.trials[h]
+        left_out = report.document.trials[h].no_trial["across_slip_event"]
+        assert left_out == np.count_nonzero(crossing)
+        assert report.errors.counts.trials[h] == whole.errors.counts.trials[h] - left_out
         errors = errors_from_states(run, horizon)["icr"]
         icr = report.result("icr")
         assert icr is not None
         kept = errors[np.isfinite(errors) & ~crossing]
-        assert icr.summary.p95[h] == pytest.approx(np.percentile(kept, 95.0))
-        assert cost.with_events["icr"].p95[h] == pytest.approx(np.nanpercentile(errors, 95.0))
-        assert icr.summary.expected[h] < cost.with_events["icr"].expected[h]
-    assert sum(int(column[0]) for column in report.counts) + int(cost.trials[0]) == report.states
+        assert icr.column("p95_m")[h] == pytest.approx(np.percentile(kept, 95.0))
+        assert cost.with_events["icr"][h].p95_m == pytest.approx(np.nanpercentile(errors, 95.0))
+        assert icr.column("expected_error_m")[h] < cost.with_events["icr"][h].expected_error_m
+    (row, *_) = report.document.trials
+    assert row.trials + sum(row.no_trial.values()) == report.document.starts
 
 
 def test_the_distance_within_a_budget_is_given_with_and_without_events_from_the_same_trials(run: Run) -> None:
@@ -61,20 +63,21 @@ def test_the_distance_within_a_budget_is_given_with_and_without_events_from_the_
     quiet = dropout_report(
         replace(run, sensors=replace(run.sensors, events=())), horizons_m=HORIZONS_M, comparison=False, budgets_m=(0.4,)
     )
-    for one, free, unknown in zip(whole.budgets, without.budgets, quiet.budgets, strict=True):
+    for one, free, unknown in zip(
+        whole.document.budgets, without.document.budgets, quiet.document.budgets, strict=True
+    ):
         # blocks of other starts sum their steps in another order
         assert one.without_events_m == pytest.approx(free.distance_m, abs=1e-9)
         assert one.beyond_without_events == free.beyond
         assert one.distance_m == unknown.distance_m <= one.without_events_m
         assert unknown.without_events_m is None
-    icr = next(one for one in whole.budgets if one.model == "icr")
+    icr = next(one for one in whole.document.budgets if one.model == "icr")
     assert icr.distance_m < icr.without_events_m
-    rows = {row.model: row for row in report_document(whole).budgets}
+    rows = {row.model: row for row in whole.document.budgets}
     assert rows["icr"].without_events_m == icr.without_events_m
     for result, free in zip(whole.results, without.results, strict=True):
-        assert result.without_events is not None
-        np.testing.assert_allclose(result.without_events.p95, free.summary.p95, rtol=1e-9)
-        np.testing.assert_array_equal(result.without_events.trials, free.summary.trials)
+        np.testing.assert_allclose(column_of(result.without_events, "p95_m"), free.column("p95_m"), rtol=1e-9)
+        np.testing.assert_array_equal(column_of(result.without_events, "trials"), free.column("trials"))
 
 
 def test_the_cost_is_printed_and_a_log_without_events_says_so(run: Run) -> None:
@@ -83,6 +86,6 @@ def test_the_cost_is_printed_and_a_log_without_events_says_so(run: Run) -> None:
     assert "across a slip event" in text
     quiet = replace(run, sensors=replace(run.sensors, events=()))
     report = dropout_report(quiet, horizons_m=HORIZONS_M, comparison=False, without_events=True)
-    assert report.event_cost is not None
-    assert not report.event_cost.trials.any()
+    assert report.document.without_events is not None
+    assert not any(row.no_trial["across_slip_event"] for row in report.document.trials)
     assert "none in this log" in format_dropout(report)

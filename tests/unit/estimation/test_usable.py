@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from icrtool.config import load_config
-from icrtool.dropout_analysis.trials import dropout
+from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.estimation.filter_setup import FIELD_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS
 from icrtool.estimation.observability import Excitation
 from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
 from icrtool.kernels.filter_records import GATED, UNSEEN, USED
-from icrtool.output.dropout_directory import report_document
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
 from icrtool.records.run import MeasurementOutcome, Run
@@ -51,7 +50,7 @@ def test_a_run_that_rejected_a_third_of_a_stream_is_not_usable(stream: str) -> N
     assert any(f"of the {stream} were rejected" in warning for warning in run.warnings)
     report = dropout(run, [5.0])
     assert format_dropout(report).startswith("Do not use: ")
-    document = report_document(report)
+    document = report.document
     assert document.usable is False
     assert document.unusable_because == run.summary["unusable_because"]
 

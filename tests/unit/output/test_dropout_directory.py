@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -14,16 +13,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate
-from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
-from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
+from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError
 from icrtool.output.dropout_directory import (
     TRIALS_FILE,
     is_dropout_directory,
-    report_document,
     write_report,
     write_tables,
 )
@@ -39,14 +34,8 @@ GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001", "icr.max@900m <= 1")
 
 
 def content_of(run: Run, horizons_m: list[float] | None = None, gates: tuple[str, ...] = GATES) -> DropoutReport:
-    report = dropout(run, horizons_m or HORIZONS_M)
-    return replace(
-        report,
-        budgets=budget_distances(report, 0.5),
-        verdicts=tuple(check_gate(parse_gate(gate), report) for gate in gates),
-        worst=worst_trials(run),
-        examples=example_trials(run),
-        outages=(*force_outages(run, plan_outages(run, 4.0, (15.0,))), *real_outages(run)),
+    return dropout_report(
+        run, horizons_m=horizons_m or HORIZONS_M, gates=gates, outage_s=(4.0,), outage_at_s=(15.0,), comparison=False
     )
 
 
@@ -103,16 +92,16 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
         "from_standstill",
     }
     assert [row["why_none"] is None for row in document["trials"]] == [row["trials"] > 0 for row in document["trials"]]
-    own, split = content.reference_error, content.by_learning
+    own, split = content.document.reference_error, content.document.by_learning
     assert own is not None
     assert split is not None
-    assert [row["p95_m"] for row in document["reference_error"]] == [None if np.isnan(p) else p for p in own.p95]
+    assert [row["p95_m"] for row in document["reference_error"]] == [row.p95_m for row in own]
     assert document["by_learning"]["learned_s"] == split.learned_s
     for part, summary in (("before", split.before), ("after", split.after)):
         rows = document["by_learning"][part]
-        assert [row["trials"] for row in rows] == summary.trials.tolist()
-        assert [row["p95_m"] for row in rows] == [None if np.isnan(p95) else p95 for p95 in summary.p95]
-    assert document["bootstrap"]["seed"] == content.seed
+        assert [row["trials"] for row in rows] == [row.trials for row in summary]
+        assert [row["p95_m"] for row in rows] == [row.p95_m for row in summary]
+    assert document["bootstrap"]["seed"] == content.document.bootstrap.seed
     assert {"method", "level", "block"} <= document["bootstrap"].keys()
     assert document["tolerance_m"] <= 1e-9
     assert document["run"]["inputs"] == json.loads(json_bytes({"x": run.summary["inputs"]}))["x"]
@@ -138,9 +127,9 @@ def test_worst_csv_has_a_row_a_drive(written: Path, content: DropoutReport) -> N
     read = pd.read_csv(written / "worst.csv")
     assert {"rank", "stamp_ns", "t_s", "north_m", "east_m", "heading_change_deg", "speed_mean_mps"} <= set(read.columns)
     assert read["rank"].tolist() == list(range(1, len(content.worst) + 1))
-    assert read.icr_error_m.tolist() == [drive.errors_m["icr"] for drive in content.worst]
-    assert read.no_slip_error_m.tolist() == [drive.errors_m["no_slip"] for drive in content.worst]
-    assert read.stamp_ns.tolist() == [drive.stamp_ns for drive in content.worst]
+    assert read.icr_error_m.tolist() == [drive.errors_m["icr"] for drive in content.document.worst]
+    assert read.no_slip_error_m.tolist() == [drive.errors_m["no_slip"] for drive in content.document.worst]
+    assert read.stamp_ns.tolist() == [drive.stamp_ns for drive in content.document.worst]
 
 
 def test_without_track_width_the_no_slip_column_is_empty(make_run: Callable[..., Run], tmp_path: Path) -> None:
@@ -155,7 +144,7 @@ def test_the_document_is_json_without_nan_and_is_read_back_equal(
 ) -> None:
     parked = content_of(make_run(duration_s=20.0), gates=())
     for report in (content, parked):
-        document = report_document(report)
+        document = report.document
         stored = json.loads(json_bytes(document), parse_constant=pytest.fail)
         assert msgspec.convert(stored, DropoutDocument) == document
 

@@ -8,22 +8,25 @@ from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from icrtool.dropout_analysis.acceptance_limits import budget_distances
+from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import dropout, models_of
+from icrtool.dropout_analysis.trials import models_of
 from icrtool.output.figure_catalogue import draw_figures
 from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_histograms, dropout_summary
 from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
 from icrtool.output.figures.style import style
-from icrtool.records.dropout import ModelResult, Outage
+from icrtool.records.dropout_document import ModelResult, Outage
 from icrtool.records.run import Run
+from support.reports import with_content, with_models, with_numbers, with_outages
 
 HORIZONS_M = [1.0, 2.0, 5.0, 10.0]
 
@@ -95,32 +98,32 @@ def test_axes_have_units_and_no_text_lies_on_another(
 
 
 def test_the_summary_draws_the_numbers_of_both_models(report: DropoutReport, outages: tuple[Outage, ...]) -> None:
-    (axes,) = drawn(lambda: dropout_summary(replace(report, outages=outages))).axes
+    (axes,) = drawn(lambda: dropout_summary(with_outages(report, outages))).axes
     found = {str(line.get_label()): line.get_xydata().T for line in axes.lines}
     for name, label in (("icr", "ICR"), ("no_slip", "no slip")):
         result = report.result(name)
         assert result is not None
-        for metric, values in (("95 %", result.summary.p95), ("mean", result.summary.expected)):
+        for metric, values in (("95 %", result.column("p95_m")), ("mean", result.column("expected_error_m"))):
             if (name, metric) != ("no_slip", "mean"):
                 assert np.allclose(np.interp(HORIZONS_M, *found[f"{label}, {metric}"]), values, rtol=0.02)
-    assert found["real outage"][1].tolist() == [outages[-1].end_error_m]
+    assert found["real outage"][1].tolist() == [outages[-1].document.end_error_m]
     low, high = axes.get_ylim()
-    assert low < min(outages[-1].end_error_m, float(report.results[0].summary.expected[0]))
-    assert high > float(np.nanmax(report.results[1].summary.p95))
+    assert low < min(outages[-1].document.end_error_m, float(report.results[0].column("expected_error_m")[0]))
+    assert high > float(np.nanmax(report.results[1].column("p95_m")))
 
 
 def named(one: ModelResult, name: str, factor: float) -> ModelResult:
-    summary, intervals = (
-        part._replace(
-            **{
-                key: factor * value
-                for key, value in part._asdict().items()
-                if "low" in key or "high" in key or key in ("p50", "p95", "expected", "largest")
-            }
-        )
-        for part in (one.summary, one.intervals)
+    keys = (
+        "expected_error_m",
+        "p50_m",
+        "p95_m",
+        "max_m",
+        "expected_low_m",
+        "expected_high_m",
+        "p95_low_m",
+        "p95_high_m",
     )
-    return one._replace(name=name, label=name, summary=summary, intervals=intervals)
+    return with_numbers(one, name, **{key: factor * one.column(key) for key in keys})
 
 
 def with_rows(report: DropoutReport) -> DropoutReport:
@@ -128,13 +131,13 @@ def with_rows(report: DropoutReport) -> DropoutReport:
     icr = report.results[0]
     rows = {"recommended": 0.6, "controller": 0.9, "recommended_gyro": 0.3, "calibration:season": 0.7}
     further = [named(icr, name, factor) for name, factor in rows.items()]
-    whole = replace(report, results=(*report.results, *further))
-    return replace(whole, budgets=budget_distances(whole, 0.1))
+    whole = with_models(report, *report.results, *further)
+    return with_content(whole, budgets=budget_distances(whole.errors, 0.1))
 
 
 def test_the_summary_marks_the_distances_that_the_report_states(report: DropoutReport) -> None:
     whole = with_rows(report)
-    reaches = {one.model: one for one in whole.budgets}
+    reaches = {one.model: one for one in whole.document.budgets}
     figure = drawn(lambda: dropout_summary(whole))
     written = [text.get_text() for text in figure.axes[0].texts]
     shown = ("recommended", "controller", "calibration:season")
@@ -147,19 +150,19 @@ def test_the_summary_marks_the_distances_that_the_report_states(report: DropoutR
 def test_the_summary_has_a_handful_of_entries_and_none_of_the_tables_alone(
     report: DropoutReport, outages: tuple[Outage, ...]
 ) -> None:
-    entries = texts_of(drawn(lambda: dropout_summary(replace(with_rows(report), outages=outages))))
+    entries = texts_of(drawn(lambda: dropout_summary(with_outages(with_rows(report), outages))))
     entries = [text for text in entries if text]
     assert len(entries) <= 7
     assert not any(text.startswith(("ICR", "icr", "recommended_gyro", "final")) for text in entries)
 
 
 def test_a_run_that_is_not_usable_is_named_so_in_the_title(report: DropoutReport) -> None:
-    title = dropout_summary(replace(report, usable=False, budgets=())).texts[0].get_text()
+    title = dropout_summary(with_content(replace(report, usable=False), budgets=())).texts[0].get_text()
     assert re.fullmatch(r"Do not use: [\d.]+ m off \(95 %\) after \d+ m", title)
 
 
 def test_a_distance_beyond_all_trials_is_not_marked(report: DropoutReport) -> None:
-    far = replace(report, budgets=budget_distances(report, 1000.0))
+    far = with_content(report, budgets=budget_distances(report.errors, 1000.0))
     figure = drawn(lambda: dropout_summary(far))
     assert [text.get_text() for text in figure.axes[0].texts] == []
     assert "more than 10 m" in figure.texts[0].get_text()
@@ -173,7 +176,7 @@ def test_the_histogram_shows_the_recommended_model_at_three_distances_with_the_b
     assert len(figure.axes) == 3
     for axes, h in zip(figure.axes, (1, 2, 3), strict=True):
         places = {float(line.get_xdata()[0]) for line in axes.lines}
-        assert places == {float(model.summary.p95[h]), float(model.summary.expected[h]), 0.1}
+        assert places == {float(model.column("p95_m")[h]), float(model.column("expected_error_m")[h]), 0.1}
 
 
 def test_a_histogram_marks_expected_value_and_95_percent_in_lines_and_words(report: DropoutReport) -> None:
@@ -182,7 +185,7 @@ def test_a_histogram_marks_expected_value_and_95_percent_in_lines_and_words(repo
         result = report.result(name)
         assert result is not None
         places = {float(line.get_xdata()[0]) for line in axes.lines}
-        assert places == {float(result.summary.p95[2]), float(result.summary.expected[2])}
+        assert places == {float(result.column("p95_m")[2]), float(result.column("expected_error_m")[2])}
         assert "95 % within" in axes.get_title("right")
         assert "expected" in axes.get_title("right")
 
@@ -203,7 +206,9 @@ def test_pictures_stand_without_the_no_slip_model(make_run: Callable[..., Run]) 
 def test_a_report_draws_what_it_holds(
     run: Run, report: DropoutReport, outages: tuple[Outage, ...], tmp_path: Path
 ) -> None:
-    whole = replace(report, examples=example_trials(run, 15.0), worst=worst_trials(run), outages=outages)
+    examples = example_trials(run, 15.0)
+    whole = with_content(report, examples=tuple(one.document for one in examples))
+    whole = with_outages(replace(whole, examples=examples, worst=worst_trials(run)), outages)
     draw_figures("report", whole, tmp_path, ("png", "svg"))
     names = {path.stem for path in tmp_path.iterdir()}
     assert names == {"summary", "histogram", "worst", "outages"}
@@ -223,9 +228,12 @@ def test_an_outage_within_a_worst_trial_is_marked_there(
     run: Run, report: DropoutReport, outages: tuple[Outage, ...]
 ) -> None:
     worst = worst_trials(run, horizon_m=2.0)
-    (real,) = (one for one in outages if one.kind == "real")
-    meanwhile = replace(real, begin_s=worst[0].t_s, end_s=worst[0].t_s + 0.1)
-    before = replace(real, begin_s=-2.0, end_s=-1.0)
+    (real,) = (one for one in outages if one.document.kind == "real")
+    t_s = worst[0].document.t_s
+    meanwhile, before = (
+        replace(real, document=msgspec.structs.replace(real.document, begin_s=begin, end_s=end))
+        for begin, end in ((t_s, t_s + 0.1), (-2.0, -1.0))
+    )
     for outage, marked in ((meanwhile, True), (before, False)):
-        figure = drawn(lambda shown=outage: dropout_worst(replace(report, outages=(shown,), worst=worst)))
+        figure = drawn(lambda shown=outage: dropout_worst(replace(with_outages(report, (shown,)), worst=worst)))
         assert ("real outage" in {line.get_label() for line in figure.axes[1].lines}) is marked

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -11,33 +10,25 @@ import msgspec
 import pytest
 
 from icrtool.config import Config
-from icrtool.dropout_analysis.acceptance_limits import BudgetDistance, budget_distances, check_gate, parse_gate
-from icrtool.dropout_analysis.example_trials import worst_trials
-from icrtool.dropout_analysis.outages import real_outages
+from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import dropout
 from icrtool.errors import OutputError, RunError
-from icrtool.output.dropout_directory import report_document
 from icrtool.output.exports.acceptance import format_markdown, format_outcomes, suite_of, write_junit
 from icrtool.output.files.own_files import check_place
 from icrtool.output.tables.dropout import format_dropout, p95_at, reach_rows
 from icrtool.output.tables.errors import shown_horizons
 from icrtool.output.text_format import error_text
+from icrtool.records.dropout import BudgetDistance
 from icrtool.records.run import Run
+from support.reports import with_content, with_run
 
 HORIZONS_M = [0.5, 1.0, 5.0, 9.0, 30.0]
 GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001")
 
 
 def content_of(run: Run, horizons_m: list[float], gates: tuple[str, ...] = ()) -> DropoutReport:
-    report = dropout(run, horizons_m)
-    return replace(
-        report,
-        budgets=budget_distances(report, 0.05) + budget_distances(report, 50.0),
-        verdicts=tuple(check_gate(parse_gate(gate), report) for gate in gates),
-        worst=worst_trials(run),
-        examples=(),
-        outages=real_outages(run),
+    return dropout_report(
+        run, horizons_m=horizons_m, gates=gates, budgets_m=(0.05, 50.0), outage_s=(), comparison=False
     )
 
 
@@ -61,9 +52,9 @@ def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: 
     icr, no_slip = content.result("icr"), content.result("no_slip")
     assert icr is not None
     assert no_slip is not None
-    p95 = float(icr.summary.p95[1])
+    p95 = float(icr.column("p95_m")[1])
     assert row_of(text, "ICR, momentary  95 %")[:4] == [f"{p95:.3f}", "m", f"{100 * p95:.1f}", "%"]
-    ratio = float(no_slip.summary.p95[1]) / p95
+    ratio = float(no_slip.column("p95_m")[1]) / p95
     assert row_of(text, "no slip / ICR   95 %")[:2] == [f"{ratio:.1f}", "x"]
     assert "ICR, final" in text
     assert max(len(line) for line in text.splitlines()) <= 100
@@ -71,7 +62,7 @@ def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: 
 
 
 def test_the_table_counts_trials_and_the_kinds_of_none(content: DropoutReport) -> None:
-    text, counts = format_dropout(content), content.counts
+    text, counts = format_dropout(content), content.errors.counts
     assert row_of(text, "trials")[0] == f"{counts.trials[1]:,}"
     assert row_of(text, "not counted: log ends")[0] == f"{counts.short[1]:,}"
     assert row_of(text, "  across a wheel gap")[0] == f"{counts.gap[1]:,}"
@@ -83,25 +74,29 @@ def test_horizons_beyond_the_log_are_printed_with_the_reason(run: Run) -> None:
     text = " ".join(format_dropout(report).split())
     driven = f"{run.summary['drive']['distance_m']:.1f} m"
     assert f"no trial of 500, 700 m: less than that is left of the {driven} driven" in text
-    assert report_document(report).trials[0].why_none is None
+    assert report.document.trials[0].why_none is None
     assert "no trial of" not in format_dropout(dropout(run, [1.0]))
 
 
 def test_the_reference_and_the_run_up_stand_in_the_table(content: DropoutReport) -> None:
-    text, own, split = format_dropout(content), content.reference_error, content.by_learning
+    text, own, split = format_dropout(content), content.document.reference_error, content.document.by_learning
     assert own is not None
     assert split is not None
-    assert row_of(text, "reference alone 95 %")[0] == f"{own.p95[1]:.3f}"
-    assert row_of(text, "  before")[:3] == [f"{split.before.p95[1]:.3f}", "/", f"{split.before.expected[1]:.3f}"]
-    assert row_of(text, "  after")[0] == f"{split.after.p95[1]:.3f}"
+    assert row_of(text, "reference alone 95 %")[0] == f"{own[1].p95_m:.3f}"
+    assert row_of(text, "  before")[:3] == [
+        f"{split.before[1].p95_m:.3f}",
+        "/",
+        f"{split.before[1].expected_error_m:.3f}",
+    ]
+    assert row_of(text, "  after")[0] == f"{split.after[1].p95_m:.3f}"
 
 
 def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutReport) -> None:
-    (outage,), icr = content.outages, content.result("icr")
+    (outage,), icr = content.document.outages, content.result("icr")
     assert icr is not None
-    document = report_document(content)
+    document = content.document
     usual = p95_at(document, "icr", outage.distance_m)
-    assert usual == icr.summary.p95[2]
+    assert usual == icr.column("p95_m")[2]
     assert p95_at(document, "icr", 31.0) is None
     line = next(line for line in format_dropout(content).splitlines() if line.startswith("1 real"))
     assert f"{outage.end_error_m:.3f} m" in line
@@ -111,9 +106,9 @@ def test_outages_stand_beside_the_usual_error_over_as_much_way(content: DropoutR
 
 def test_verdicts_are_lines_of_the_table(content: DropoutReport) -> None:
     lines = format_dropout(content).splitlines()
-    assert [verdict.verdict for verdict in content.verdicts] == lines[-2:]
+    assert [verdict.verdict for verdict in content.document.gates] == lines[-2:]
     assert not content.passed
-    assert replace(content, verdicts=content.verdicts[:1]).passed
+    assert content.document.gates[0].passed
 
 
 def test_a_budget_is_a_table_a_field_engineer_can_act_on(content: DropoutReport) -> None:
@@ -122,7 +117,7 @@ def test_a_budget_is_a_table_a_field_engineer_can_act_on(content: DropoutReport)
         BudgetDistance("no_slip", "no slip", 0.5, 2.1, beyond=False, between_m=(1.0, 20.0)),
         BudgetDistance("icr_final", "ICR, final", 0.5, 20.0, beyond=True, between_m=(20.0, 20.0)),
     )
-    report = msgspec.structs.replace(report_document(content), budgets=budgets)
+    report = msgspec.structs.replace(content.document, budgets=budgets)
     assert reach_rows(report, 0.5, 0) == (
         [("ICR, momentary", "7.3 m", ""), ("no slip", "about 2 m", "between 1 and 20 m")],
         [("ICR, final", "more than 20 m", "")],
@@ -147,7 +142,7 @@ def test_a_run_without_trials_or_track_width_is_told_plainly(make_run: Callable[
 
 def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutReport, tmp_path: Path) -> None:
     strange = msgspec.structs.replace(content.run_document, log='a <b> & "c" \x01', config=Config())
-    odd = replace(content, run_document=strange, verdicts=content.verdicts[1:])
+    odd = with_content(with_run(content, strange), gates=content.document.gates[1:])
     error = RunError("runs/x", "edited", "fit <again> & again")
     write_junit(tmp_path / "j.xml", [suite_of(*one) for one in [("barn", content), ("odd", odd), ("runs/x", error)]])
     root = ET.parse(tmp_path / "j.xml").getroot()
@@ -163,7 +158,7 @@ def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutReport, tmp_p
     assert passed.find("failure") is None
     failure = failed.find("failure")
     assert failure is not None
-    assert failure.get("message") == content.verdicts[1].verdict
+    assert failure.get("message") == content.document.gates[1].verdict
     assert second.get("name") == 'a <b> & "c" ?'
     told = third.find("testcase/error")
     assert told is not None
@@ -180,7 +175,9 @@ def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutReport) ->
     tables = [part for part in text.split("\n\n") if part.startswith("|")]
     assert len(tables) > 1
     assert all(len({line.count("|") for line in part.splitlines()}) == 1 for part in tables)
-    assert "All acceptance limits are met" in format_markdown(replace(content, verdicts=content.verdicts[:1]))
+    assert "All acceptance limits are met" in format_markdown(
+        with_content(content, gates=content.document.gates[:1], passed=True)
+    )
 
 
 def test_exports_replace_a_file_whole_or_refuse_in_one_line(content: DropoutReport, tmp_path: Path) -> None:

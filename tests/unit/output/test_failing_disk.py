@@ -34,6 +34,7 @@ from icrtool.records.fleet_document import FleetLog
 from icrtool.records.run import Run
 from icrtool.simulation.study_records import Level
 from support.documents import with_summary
+from support.reports import with_run
 from support.studies import small_study
 
 Writer = Callable[[Path, str], object]
@@ -69,7 +70,7 @@ def writers(run: Run, calibration: Calibration) -> dict[str, Writer]:
         return with_summary(run, log=text)
 
     def dropout(place: Path, text: str) -> None:
-        replace(report, name=text, run_document=named(text).document).write(place, plots=())
+        with_run(report, named(text).document).write(place, plots=())
 
     def log(place: Path, text: str, *, directory: bool = False) -> None:
         with log_and_truth(place, force=True) as (fresh, truth):

@@ -8,7 +8,7 @@ import pytest
 
 import icrtool
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.output.dropout_directory import COMPARISON_COLUMNS, comparison_document, comparison_rows
+from icrtool.output.dropout_directory import COMPARISON_COLUMNS, comparison_rows
 from icrtool.output.files.formats import json_bytes
 
 
@@ -18,8 +18,7 @@ def report(make_run) -> DropoutReport:
 
 
 def test_rows_are_those_of_the_summary(report: DropoutReport) -> None:
-    assert report.comparison is not None
-    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in comparison_rows(report, report.comparison)]
+    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in comparison_rows(report.document)]
     summary = report.summary
     assert [row["model"] for row in rows] == list(summary["model"])
     for name in ("horizon_m", "trials", "p95_m", "expected_error_m", "expected_pct"):
@@ -29,6 +28,6 @@ def test_rows_are_those_of_the_summary(report: DropoutReport) -> None:
 
 
 def test_the_document_is_json(report: DropoutReport) -> None:
-    document = json.loads(json_bytes(comparison_document(report)))
+    document = json.loads(json_bytes(report.document.ladder))
     assert [model["name"] for model in document["models"]] == [one.name for one in report.results]
     assert set(document["fits"]) >= {"no_slip", "five", "recommended", "recommended_gyro"}

@@ -16,7 +16,6 @@ import icrtool
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import RunError
 from icrtool.estimation.fit import fit
-from icrtool.output.dropout_directory import report_document
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.style import picture_bytes
 from icrtool.output.files.formats import file_b2sum, json_bytes
@@ -117,11 +116,11 @@ def test_a_run_read_back_reports_the_same(reference: Any, whole: Run, stored: Ru
         )
         for one in (whole, stored)
     )
-    assert json_bytes(report_document(read)) == json_bytes(report_document(fresh))
+    assert json_bytes(read.document) == json_bytes(fresh.document)
     assert format_dropout(read) == format_dropout(fresh)
-    assert {outage.kind for outage in read.outages} == {"forced", "real"}
+    assert {outage.kind for outage in read.document.outages} == {"forced", "real"}
     assert read.comparison is not None
-    assert {verdict.horizon_m for verdict in read.verdicts} <= set(read.horizons_m)
+    assert {verdict.horizon_m for verdict in read.document.gates} <= set(read.horizons_m)
 
 
 def test_the_library_gives_what_the_command_gives(stored: Run, tmp_path: Path) -> None:

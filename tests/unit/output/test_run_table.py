@@ -6,8 +6,9 @@ import pytest
 
 from icrtool.output.tables.run import format_run, run_checks
 from icrtool.output.text_blocks import TEXT_WIDTH
-from icrtool.output.text_format import distance_text, duration_text, error_text, signed
+from icrtool.output.text_format import duration_text, error_text, signed
 from icrtool.records.run import Run
+from icrtool.records.text import distance_text
 from support.documents import with_summary
 
 

@@ -19,7 +19,6 @@ import pytest
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
-from icrtool.output.dropout_directory import report_document
 from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.page.drive_data import packed, packed_levels, packed_sums
 from icrtool.output.page.render import pictures_of
@@ -80,63 +79,62 @@ def numbers(column: dict[str, Any]) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def page(run: Run, report: DropoutReport) -> str:
-    return run_page(run, report_document(report), pictures_of([("worst", b"\x89PNG")]))
+    return run_page(run, report.document, pictures_of([("worst", b"\x89PNG")]))
 
 
 def test_the_answer_is_that_of_the_report(page: str, run: Run, report: DropoutReport) -> None:
     text = " ".join("".join(Elements(page).text).split())
-    reached = next(one for one in report.budgets if one.model == "recommended")
+    reached = next(one for one in report.document.budgets if one.model == "recommended")
     assert f"{reached.distance_m:.1f} m" in text or f"more than {reached.distance_m:g} m" in text
     assert report.calibration is not None
     assert f"{report.calibration.controller.multiplier:.3f}" in text
     assert "No: an acceptance limit" in text
-    assert f"{report.worst[0].errors_m['recommended']:.3f} m" in text
+    assert f"{report.document.worst[0].errors_m['recommended']:.3f} m" in text
 
 
 def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutReport) -> None:
     quiet = {"without_events_m": 20.0, "beyond_without_events": True}
-    budgets = tuple(msgspec.structs.replace(one, **quiet) for one in report.budgets)
+    budgets = tuple(msgspec.structs.replace(one, **quiet) for one in report.document.budgets)
     event = EventDocument("skid", 1.0, 2.0, 10**9, 2 * 10**9, 0.0, 0.0, 0.1, 0.5, 1.0)
     document = msgspec.structs.replace(run.document, events=(event, event))
-    slipped = replace(report, budgets=budgets, run_document=document)
-    stated = report_document(slipped)
+    stated = msgspec.structs.replace(report.document, budgets=budgets)
     brief = str(printed(report_blocks(document, stated), verbose=False))
     text = "".join("".join(Elements(run_page(replace(run, document=document), stated, {})).text).split())
-    rows, _ = reach_rows(stated, report.budgets[0].budget_m, 2)
+    rows, _ = reach_rows(stated, report.document.budgets[0].budget_m, 2)
     assert rows[-1][:2] == ("without its 2 slip events", "more than 20 m")
     lines = brief[brief.index("How far") :].splitlines()[1 : 1 + len(rows)]
     assert [[word for word in row if word] for row in rows] == [
         [word for word in re.split("  +", line.strip()) if word] for line in lines
     ]
     assert all("".join(f"{label}:{distance}".split()) in text for label, distance, _ in rows)
-    assert "without its" not in str(printed(report_blocks(run.document, report_document(report)), verbose=False))
+    assert "without its" not in str(printed(report_blocks(run.document, report.document), verbose=False))
 
 
 def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> None:
     warned = with_summary(run, warnings=["the left wheel sings", "so does the right one"])
-    text = "".join(Elements(run_page(warned, report_document(report), {})).text)
+    text = "".join(Elements(run_page(warned, report.document, {})).text)
     assert "the left wheel sings" in text
     assert "2 warnings" in text
 
 
 def test_a_worst_trial_in_which_the_reference_jumped_is_marked(run: Run, report: DropoutReport) -> None:
-    at = report.worst[0].stamp_ns + 10**9
+    at = report.document.worst[0].stamp_ns + 10**9
     jump = ReferenceJump("position", at, at + 10**8, 0.0, 0.0, 7.25, 0.0, 7.25, 0.0, "", undecided=True)
     jumping = with_summary(run, reference_jumps=[msgspec.structs.asdict(jump) | {"begin_s": 0.0, "end_s": 0.1}])
-    found = [run_page(one, report_document(report), {}) for one in (run, jumping)]
+    found = [run_page(one, report.document, {}) for one in (run, jumping)]
     texts = [" ".join("".join(Elements(page).text).split()) for page in found]
     assert ["steps by 7.25 m" in text for text in texts] == [False, True]
 
 
 def test_a_run_that_is_not_usable_begins_with_that(hostile_run: Run, report: DropoutReport) -> None:
-    page = run_page(hostile_run, report_document(report), {})
+    page = run_page(hostile_run, report.document, {})
     assert page.index("Do not use") < page.index("How far without GNSS")
 
 
 def test_a_run_with_too_few_turns_states_what_to_drive(run: Run, report: DropoutReport) -> None:
     excitation = run.summary["excitation"] | {"turned_right_deg": 0.0, "turned_left_deg": 9.0}
     straight = with_summary(run, usable=False, unusable_because="it turns too little", excitation=excitation)
-    page = run_page(straight, report_document(report), {})
+    page = run_page(straight, report.document, {})
     assert "hardly any turns" in page[page.index("Do not use") : page.index("How far without GNSS")]
 
 
@@ -167,7 +165,7 @@ def test_a_report_on_the_smoothed_trajectory_is_drawn_along_it() -> None:
     smoothed = fit(simulate(), configured(), smooth=True)
     assert smoothed.smoothed is not None
     found = dropout_report(smoothed, reference="smoothed", comparison=False)
-    data = data_of(run_page(smoothed, report_document(found), {}))
+    data = data_of(run_page(smoothed, found.document, {}))
     north = numbers(data["steps"]["north"]) + data["origin"][0]
     np.testing.assert_allclose(north, smoothed.smoothed.north_m, atol=1e-5)
 
@@ -208,7 +206,7 @@ def test_the_page_may_load_nothing_and_run_only_its_own_scripts(page: str) -> No
 
 
 def test_text_of_a_log_stays_text(hostile_run: Run, report: DropoutReport) -> None:
-    page = run_page(hostile_run, report_document(report), {})
+    page = run_page(hostile_run, report.document, {})
     elements = Elements(page)
     assert HOSTILE_PART in "".join(elements.text)
     assert not [one for one in elements.named("img") if one.get("src") == "x"]
@@ -218,7 +216,7 @@ def test_text_of_a_log_stays_text(hostile_run: Run, report: DropoutReport) -> No
 
 
 def test_json_in_a_page_cannot_end_its_element(page: str, run: Run, report: DropoutReport) -> None:
-    made = report_document(report)
+    made = report.document
     models = tuple(msgspec.structs.replace(one, label="</script><b>&") for one in made.models)
     document = msgspec.structs.replace(made, models=models)
     found = run_page(run, document, {})
@@ -237,7 +235,7 @@ def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutRe
     )
     table = replace(run.table, north_m=run.table.north_m + 4_440_123.0, east_m=run.table.east_m + 612_345.0)
     there = replace(placed, table=table)
-    made = report_document(report)
+    made = report.document
     worst = tuple(
         msgspec.structs.replace(one, north_m=one.north_m + 4_440_123.0, east_m=one.east_m + 612_345.0)
         for one in made.worst
@@ -255,14 +253,14 @@ def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutRe
 def test_a_picture_whose_axes_show_a_map_grid_is_left_out_without_coordinates(run: Run, report: DropoutReport) -> None:
     metric = with_summary(run, gnss={"datum": None})
     pictures = pictures_of([("worst", b"place"), ("summary", b"models")])
-    page = run_page(metric, report_document(report), pictures, coordinates=False)
+    page = run_page(metric, report.document, pictures, coordinates=False)
     assert base64.b64encode(b"models").decode() in page
     assert base64.b64encode(b"place").decode() not in page
 
 
 def test_a_run_without_track_width_and_a_short_one_have_pages(make_run: Any) -> None:
     narrow = make_run(track_width_m=None)
-    page = run_page(narrow, report_document(dropout_report(narrow)), {})
+    page = run_page(narrow, dropout_report(narrow).document, {})
     assert "robot.track_width_m is not known" in unescape(page)
 
 
