@@ -115,6 +115,9 @@ DRIVE_DEFAULTS: dict[str, object] = {
 }  # fmt: skip
 """Of `simulate`, by field; a study has its own."""
 
+MANY = object()
+"""In place of a default: an option that may be given more than once."""
+
 RECORDED = (
     ("--start-heading start_heading_rad", "DEG", degrees(), "Heading at the start, clockwise from north.", 30.0),
     ("--wheels", None, click.Choice(["encoder", "commanded"]),
@@ -122,7 +125,7 @@ RECORDED = (
     ("--wheel-messages", None, click.Choice(WHEEL_MESSAGES), "Message type of the wheels.", "joint_states"),
     ("--wheel-rate wheel_rate_hz", "HZ", POSITIVE, "Wheel messages a second; default 100, commanded 10.", None),
     ("--motor-lag motor_lag_s", "S", NOT_NEGATIVE, "Time constant with which the tracks follow their commands.", 0.0),
-    ("--outage outages_s", "BEGIN:END", span_text, "No fixes between these seconds; repeatable.", ()),
+    ("--outage outages_s", "BEGIN:END", span_text, "No fixes between these seconds; repeatable.", MANY),
     ("--antenna", "FORWARD,RIGHT", place_text, "Position of the antenna, from the body origin [m].", "0,0"),
     ("--gnss-delay gnss_delay_s", "S", float, "The stamps of the fixes lag by this.", 0.0),
     ("--heading convention", None, click.Choice(["enu", "ned"]), "Convention of the Imu: REP-103, or REP-145's NED.",
@@ -147,7 +150,13 @@ def drive_options(**defaults: object) -> Option:
 
 def recorded_options(command: Command) -> Command:
     """Add `RECORDED` to a command."""
-    return add_options(command, *(option(*row, default=default, multiple=default == ()) for *row, default in RECORDED))
+    return add_options(
+        command,
+        *(
+            option(*row, default=None if default is MANY else default, multiple=default is MANY)
+            for *row, default in RECORDED
+        ),
+    )
 
 
 def given_fields(record: type, given: Mapping[str, Any]) -> dict[str, Any]:

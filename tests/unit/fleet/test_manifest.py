@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -66,10 +67,13 @@ def test_what_is_no_manifest_is_one_line(logs: Path, name: str, content: str, wh
     assert "\n" not in str(error.value)
 
 
+RECURSES = pytest.mark.skipif(sys.version_info >= (3, 14), reason="pathlib matches it since Python 3.14")
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("a.csv", "log\n" + "**/" * 2000 + "*\n"),
+        pytest.param("a.csv", "log\n" + "**/" * 2000 + "*\n", marks=RECURSES),
         ("a.csv", "log\n" + "x" * 5000 + "\n"),
         ("a.csv", "log\n" + "x" * 11_000_000),
         ("a.toml", ".".join(["a"] * 20_000) + " = 1"),
