@@ -13,10 +13,10 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from icrtool.calibration.pooled import calibrated
@@ -31,6 +31,7 @@ from icrtool.motion.recording import Recording, cut_windows, predicted_path
 from icrtool.output.series import breaks_after, extremes, scale_end_m
 from icrtool.output.tables.errors import in_order, main_rows
 from icrtool.records.dropout_document import DropoutDocument, FitDocument
+from icrtool.records.plain_data import Record
 from icrtool.records.run import MeasurementOutcome, Run, track_of, width_or_usual_m
 
 MOST_STEPS = 150_000
@@ -61,7 +62,7 @@ class PageSteps(NamedTuple):
     joined: int
 
 
-def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[str, Any]:
+def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[str, object]:
     """Return plain data for the page of a run.
 
     Parameters
@@ -91,7 +92,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
     }
 
 
-def errors_data(report: DropoutDocument) -> dict[str, Any]:
+def errors_data(report: DropoutDocument) -> dict[str, object]:
     """Return the errors over distance by model, and those of the reference alone."""
     models, main = in_order(report.models), main_rows(report)
     reference = report.reference_error
@@ -106,7 +107,7 @@ def errors_data(report: DropoutDocument) -> dict[str, Any]:
     }
 
 
-def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict[str, Any]:
+def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict[str, object]:
     """Return what the wheels did and where the reference was, at every step."""
     track, rows = track_of(run), steps.rows
     columns = {
@@ -124,7 +125,7 @@ def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict
     } | {name: packed_sums(column) for name, column in columns.items()}
 
 
-def _series_data(run: Run, steps: PageSteps) -> dict[str, Any]:
+def _series_data(run: Run, steps: PageSteps) -> dict[str, Column]:
     """Return the states that the time series show; each is a step too."""
     table, icrs = run.table, {"y_right": "y_icr_right_m", "y_left": "y_icr_left_m", "x": "x_icr_m"}
     values = {name: getattr(table, column)[steps.rows] for name, column in icrs.items()}
@@ -141,10 +142,10 @@ def _series_data(run: Run, steps: PageSteps) -> dict[str, Any]:
     }
 
 
-def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
+def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
     """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
     fixes, difference = run.sensors.fixes, run.gnss.difference
-    found: dict[str, Any] = {"top_m": scale_end_m(difference[run.gnss.used])}
+    found: dict[str, object] = {"top_m": scale_end_m(difference[run.gnss.used])}
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
         rows = _extreme_rows(difference, chosen)
         found[name] = _differences(run.gnss, chosen, rows, difference) | {
@@ -153,13 +154,13 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, Any]:
     return found
 
 
-def _headings_data(run: Run) -> dict[str, Any]:
+def _headings_data(run: Run) -> dict[str, object]:
     """Return how far the headings that the filter used were from its own [deg]."""
     rows = _extreme_rows(run.heading.difference, run.heading.used)
     return _differences(run.heading, run.heading.used, rows, np.degrees(run.heading.difference))
 
 
-def _differences(outcome: MeasurementOutcome, chosen: Bools, rows: Ints, difference: Floats) -> dict[str, Any]:
+def _differences(outcome: MeasurementOutcome, chosen: Bools, rows: Ints, difference: Floats) -> dict[str, object]:
     """Return differences at rows of the chosen measurements, and moments at which a line through them breaks."""
     t = outcome.t_s[chosen]
     after = breaks_after(t)
@@ -177,7 +178,7 @@ Paths = Iterator[tuple[str, tuple[Floats, Complexes]]]
 """Name of a model; heading [rad] and place [m] of the robot along its path, at the steps of the page alone."""
 
 
-def _models_data(run: Run, report: DropoutDocument, steps: PageSteps, origin: tuple[float, float]) -> dict[str, Any]:
+def _models_data(run: Run, report: DropoutDocument, steps: PageSteps, origin: tuple[float, float]) -> dict[str, object]:
     """Return the models of the report, and where each of constant parameters leads from the begin of the drive."""
     labels = {one.name: one.label for one in report.models}
     recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(run.track_width_m)))
@@ -252,7 +253,7 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
                 yield one.name, predicted_path(recording, *model)(recording.track.t[rows])
 
 
-def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, Any]]:
+def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, object]]:
     return [
         {"kind": one.kind, "begin_s": one.begin_s, "end_s": one.end_s, "severity": one.severity,
          "north": one.north_m - origin[0], "east": one.east_m - origin[1]}
@@ -273,23 +274,39 @@ SMALLEST_UNIT = 1e-7
 """Metres or radians: finer steps mean nothing."""
 
 
-def packed(column: Floats) -> dict[str, Any]:
+class Column(Record, frozen=True, kw_only=True):
+    """Numbers (n,) for a page.
+
+    Attributes
+    ----------
+    type : ``f32``: as they are; ``levels``: in multiples of a unit; ``sums``: their steps, in multiples of a unit
+    data : base64 of little-endian float32 or int16
+    first : number that the steps begin at
+    """
+
+    type: Literal["f32", "levels", "sums"]
+    data: str
+    unit: float | UnsetType = UNSET
+    first: float | UnsetType = UNSET
+
+
+def packed(column: Floats) -> Column:
     """Return a column (n,) for a page.
 
     Notes
     -----
     ``f32`` has seven digits: enough for metres within some kilometres of the origin, and for seconds of a day (8 ms).
     """
-    return {"type": "f32", "data": _base64(column, "<f4")}
+    return Column(type="f32", data=_base64(column, "<f4"))
 
 
-def packed_levels(column: Floats) -> dict[str, Any]:
+def packed_levels(column: Floats) -> Column:
     """Return a column (n,) without NaN for a page, in 16 bits each: in steps of the greatest value / `LARGEST_STEP`."""
     unit = max(float(np.abs(column).max(initial=0.0)) / LARGEST_STEP, SMALLEST_UNIT)
-    return {"type": "levels", "unit": unit, "data": _base64(np.rint(column / unit), "<i2")}
+    return Column(type="levels", data=_base64(np.rint(column / unit), "<i2"), unit=unit)
 
 
-def packed_sums(column: Floats | Ints, unit: float | None = None) -> dict[str, Any]:
+def packed_sums(column: Floats | Ints, unit: float | None = None) -> Column:
     """Return a running sum (n,) for a page: where it begins, and its steps of 16 bits each, in multiples of `unit`.
 
     Notes
@@ -300,7 +317,7 @@ def packed_sums(column: Floats | Ints, unit: float | None = None) -> dict[str, A
     sums = column - column[0]
     unit = unit or max(float(np.abs(np.diff(sums)).max(initial=0.0)) / LARGEST_STEP, SMALLEST_UNIT)
     steps = np.diff(np.rint(sums / unit))
-    return {"type": "sums", "first": float(column[0]), "unit": unit, "data": _base64(steps, "<i2")}
+    return Column(type="sums", data=_base64(steps, "<i2"), unit=unit, first=float(column[0]))
 
 
 def _base64(column: NDArray[Any], kind: str) -> str:

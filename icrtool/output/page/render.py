@@ -10,7 +10,7 @@ from functools import cache
 from hashlib import blake2b, sha256
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from icrtool import __version__
 from icrtool.errors import RunError
@@ -46,7 +46,7 @@ IN_SCRIPT = {ord("<"): "\\u003c", ord(">"): "\\u003e", ord("&"): "\\u0026"}
 
 
 def render(
-    scripts: Sequence[str], data: Mapping[str, Any] | None, *, title: str, kind: str, blocks: Sequence[Block],
+    scripts: Sequence[str], data: Mapping[str, object] | None, *, title: str, kind: str, blocks: Sequence[Block],
     **content: object,
 ) -> str:  # fmt: skip
     """Return a page as HTML; text in it is escaped, twice: for a reader, and for HTML.
@@ -113,7 +113,7 @@ def _grouped(rows: Sequence[tuple[str, str]]) -> list[tuple[str, list[str]]]:
     return found
 
 
-def script_json(data: Mapping[str, Any]) -> str:
+def script_json(data: Mapping[str, object]) -> str:
     """Return JSON that can stand in a script element, whatever text it holds."""
     return json.dumps(plain(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
 

@@ -26,6 +26,7 @@ from icrtool.output.page.run_page import draw_pictures, run_page, write_page
 from icrtool.output.tables.dropout import reach_rows, report_blocks
 from icrtool.output.text_blocks import printed
 from icrtool.records.measurements import ReferenceJump
+from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
 from icrtool.records.run_document import EventDocument
 from support.barn import configured, simulate
@@ -173,18 +174,18 @@ def test_a_report_on_the_smoothed_trajectory_is_drawn_along_it() -> None:
 def test_running_sums_do_not_gather_errors() -> None:
     rng = np.random.default_rng(16)
     column = np.cumsum(rng.normal(0.02, 0.01, 200_000))
-    found = numbers(packed_sums(column))
-    unit = packed_sums(column)["unit"]
+    packed_column = plain(packed_sums(column))
+    found, unit = numbers(packed_column), packed_column["unit"]
     assert np.abs(found - column).max() <= 0.5001 * unit
     assert unit < 3e-6
 
 
 def test_columns_survive_their_packing() -> None:
     column = np.random.default_rng(16).normal(size=100)
-    np.testing.assert_allclose(numbers(packed(column)), column, rtol=1e-7)
+    np.testing.assert_allclose(numbers(plain(packed(column))), column, rtol=1e-7)
     # Half of a 32,000th of the greatest.
-    np.testing.assert_allclose(numbers(packed_levels(column)), column, atol=0.51 / 32_000 * np.abs(column).max())
-    np.testing.assert_array_equal(numbers(packed_sums(np.array([3, 4, 9]), unit=1)), [3, 4, 9])
+    np.testing.assert_allclose(numbers(plain(packed_levels(column))), column, atol=0.51 / 32_000 * np.abs(column).max())
+    np.testing.assert_array_equal(numbers(plain(packed_sums(np.array([3, 4, 9]), unit=1))), [3, 4, 9])
 
 
 def test_the_page_may_load_nothing_and_run_only_its_own_scripts(page: str) -> None:
