@@ -2,14 +2,13 @@
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
 tens of seconds: treated as independent they would mislead the filter. Some drivers still state a centimetre: such fixes
-are found by their noise beside a jump, or between a jump and its return.
+are found by their noise, best beside a jump.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -87,9 +86,9 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
     """Return the classes of the fixes, and the noise of each.
 
     The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
-    fixes move against the wheels: a stretch that is noisier than the rest, or lies between two jumps that take each
-    other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
-    number of samples that err alike. Preset ``paper`` takes every fix as it is.
+    fixes move against the wheels: a stretch that is noisier than the rest is no fixed solution. Where fixed is the
+    norm, the others get the variance of their class, times the number of samples that err alike. Preset ``paper`` takes
+    every fix as it is.
 
     Parameters
     ----------
@@ -132,7 +131,7 @@ def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Boo
         return np.full(len(stated), REFERENCE, np.uint8), none
     stated_kind = _stated_class(gnss.stated_class, stated)
     flagged = none if gnss.stated_class is None else gnss.stated_class == FIXED_FIX
-    misreported = find_misreported(gnss.stamp_ns, steps, stated_kind == FIXED_FIX, flagged)
+    misreported = find_misreported(steps, stated_kind == FIXED_FIX, flagged)
     return np.where(misreported, FLOAT_FIX, stated_kind).astype(np.uint8), misreported
 
 
@@ -250,24 +249,20 @@ BESIDE_JUMP = 5
 SIDES_VARIANCE = 1.7
 """Beside a jump, the side whose noise over this many stretches has this many times the other's variance is float."""
 
-LONGEST_EXCURSION_S = 60.0
-TAKEN_BACK = 0.25
-"""A jump that another takes back, up to this part, within this time: the fixes between were off."""
-
 MOST_JUMPS = 500
 """With more of them the position reference is something else than RTK that is lost now and then."""
 
 
-def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
+def find_misreported(steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
     """Return the fixes (m,) among the `claimed` ones that move like RTK float.
 
     Parameters
     ----------
     claimed : bool (m,), reported as fixed; flagged : bool (m,), by a flag of the message itself and not by its variance
 
-    A jump alone does not show which of its sides is wrong: noise does, or a return. Else the class stays.
+    A jump alone does not show which of its sides is wrong: noise does. Else the class stays.
     """
-    misreported = np.zeros(len(stamps), np.bool_)
+    misreported = np.zeros(len(claimed), np.bool_)
     level, moves = steps.stretch_levels(claimed), steps.stretch_moves()
     known, moving = level[np.isfinite(level)], level[np.isfinite(level) & moves]
     if len(known) < 2:
@@ -277,19 +272,10 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
         noisy = level > STRETCH_VARIANCE * usual
     noisy &= ~flagged[1 : 1 + len(level) * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).any(axis=1)
     jumps = np.flatnonzero(claimed[steps.jump_row] & claimed[np.maximum(steps.jump_row - 1, 0)])
-    undecided, beside, nearby = [], _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
-    for jump in jumps.tolist() if len(jumps) <= MOST_JUMPS else ():
-        decided, stretches = _noisy_side(beside, nearby, moves, (int(steps.jump_row[jump]) - 1) // FEWEST_STEPS)
-        noisy[stretches] = True
-        if not decided:
-            undecided.append(jump)
+    beside, nearby = _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
+    for row in steps.jump_row[jumps].tolist() if len(jumps) <= MOST_JUMPS else ():
+        noisy[_noisy_side(beside, nearby, moves, (row - 1) // FEWEST_STEPS)] = True
     misreported[1 : 1 + len(level) * FEWEST_STEPS] = np.repeat(noisy, FEWEST_STEPS)
-    for jump, back in pairwise(undecided):
-        first, last = steps.jump_row[jump], steps.jump_row[back]
-        away, home = steps.jump[jump], steps.jump[back]
-        short = back == jump + 1 and stamps[last] - stamps[first] < LONGEST_EXCURSION_S * 1e9
-        if short and abs(away + home) < TAKEN_BACK * min(abs(away), abs(home)):
-            misreported[first:last] = True
     return misreported & claimed
 
 
@@ -303,22 +289,22 @@ def _moving_mean(level: Floats, width: int) -> Floats:
     return mean
 
 
-def _noisy_side(beside: Floats, nearby: Floats, moves: Bools, at: int) -> tuple[bool, slice]:
-    """Return whether noise distinguishes the sides of a jump in stretch `at`, and the stretches that are float then."""
+def _noisy_side(beside: Floats, nearby: Floats, moves: Bools, at: int) -> slice:
+    """Return the stretches that are float beside a jump in stretch `at`; none where noise does not show its side."""
     before, after = at - 1 - BESIDE_JUMP // 2, at + 1 + BESIDE_JUMP // 2
     if before < 0 or after >= len(beside) or not np.isfinite(beside[[before, after]]).all():
-        return False, slice(0, 0)
+        return slice(0, 0)
     half = BESIDE_JUMP // 2
     if moves[before - half : before + half + 1].any() != moves[after - half : after + half + 1].any():
-        return False, slice(0, 0)  # where the robot parks the fixes are quieter, whatever they are
+        return slice(0, 0)  # where the robot parks the fixes are quieter, whatever they are
     left, right = max(float(beside[before]), USUAL_M2), max(float(beside[after]), USUAL_M2)
     if max(left, right) < SIDES_VARIANCE * min(left, right):
-        return False, slice(0, 0)
+        return slice(0, 0)
     bound = (left * right) ** 0.5
     with np.errstate(invalid="ignore"):
         quiet = np.flatnonzero(~(nearby >= bound))
     if left > right:
         ends = quiet[quiet < at - 1]
-        return True, slice(int(ends[-1]) + 1 if len(ends) else 0, at + 1)
+        return slice(int(ends[-1]) + 1 if len(ends) else 0, at + 1)
     ends = quiet[quiet > at + 1]
-    return True, slice(at, int(ends[0]) if len(ends) else len(nearby))
+    return slice(at, int(ends[0]) if len(ends) else len(nearby))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -42,8 +43,7 @@ WHEEL_HOLE_S = 1.0
 """... and the path is not known between wheel samples this far apart."""
 
 
-@dataclass(frozen=True, slots=True)
-class FixSteps:
+class FixSteps(NamedTuple):
     """Steps between neighbouring fixes, north + j east, without what wheels and heading explain.
 
     Attributes
@@ -52,14 +52,13 @@ class FixSteps:
     product : (m - 2,) minus the product of neighbouring steps [m^2], NaN at gaps and wild steps: white noise of
         variance s^2 an axis makes it 2 s^2 on average; what the wheels get wrong for longer makes it less
     moves : bool (m - 1,), whether the wheels went on
-    jump_row : (j,) rows of the first fix after a jump; jump : complex (j,) [m]
+    jump_row : (j,) rows of the first fix after a jump
     """
 
     step: Complexes
     product: Floats
     moves: Bools
     jump_row: Ints
-    jump: Complexes
 
     def white_std_m(self, rows: Bools) -> float:
         """Return the white noise of the fixes `rows` (m,), an axis [m]; NaN where there are too few steps."""
@@ -96,7 +95,7 @@ def measure_steps(t: Floats, place: Complexes, expected: Complexes) -> FixSteps:
     step, dt = np.diff(place - expected), np.diff(t)
     if len(step) < 2:
         unknown = np.full(max(len(step) - 1, 0), np.nan)
-        return FixSteps(step, unknown, np.zeros(len(step), np.bool_), np.empty(0, np.int64), np.empty(0, np.complex128))
+        return FixSteps(step, unknown, np.zeros(len(step), np.bool_), np.empty(0, np.int64))
     usual = float(np.median(dt))
     step[is_hole(dt)] = np.nan
     moves = np.abs(np.diff(expected)) > MOVES_MPS * dt
@@ -105,8 +104,9 @@ def measure_steps(t: Floats, place: Complexes, expected: Complexes) -> FixSteps:
     with np.errstate(invalid="ignore"):
         usual_step = np.where(np.abs(step) <= CLIP_SIGMAS * scale, step, np.nan)
     product = -(usual_step[1:] * np.conj(usual_step[:-1])).real
-    rows, jumps = _jumps(step, scale, max(3, round(PERSISTS_S / usual)) if usual > 0 else 3)
-    return FixSteps(step, product, moves, rows, jumps)
+    return FixSteps(
+        step, product, moves, _jump_rows(step, scale, max(3, round(PERSISTS_S / usual)) if usual > 0 else 3)
+    )
 
 
 def bend_std_m(gnss: PositionFixes | Fixes) -> float:
@@ -128,14 +128,14 @@ def _scale(step: Complexes) -> float:
     return max(float(np.median(size)) / MEDIAN_OF_RAYLEIGH, 1e-6) if len(size) else 1e-6
 
 
-def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:
-    """Return the first row after each jump, and the jumps [m]."""
+def _jump_rows(step: Complexes, scale: float, span: int) -> Ints:
+    """Return the first row after each jump."""
     count = len(step)
     with np.errstate(invalid="ignore"):
         found = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, JUMP_SIGMAS * scale))
     found = found[(found >= span) & (found + span < count)]
     if not len(found):
-        return np.empty(0, np.int64), np.empty(0, np.complex128)
+        return np.empty(0, np.int64)
     level = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step))])
     around = sliding_window_view(level, span)
     # level[k] is fix k's; the step k leads from fix k to fix k + 1.
@@ -143,8 +143,7 @@ def _jumps(step: Complexes, scale: float, span: int) -> tuple[Ints, Complexes]:
     change = np.median(after.real, axis=1) - np.median(before.real, axis=1)
     shift = change + 1j * (np.median(after.imag, axis=1) - np.median(before.imag, axis=1))
     stays = np.abs(shift - step[found]) < PERSISTS_SHARE * np.abs(step[found])
-    rows: Ints = (found[stays] + 1).astype(np.int64)
-    return rows, step[found[stays]]
+    return np.asarray(found[stays] + 1, np.int64)
 
 
 def is_hole(interval_s: Floats, least_s: float = 1e-6) -> Bools:

@@ -9,7 +9,6 @@ shows stays undecided, and is the robot's.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,20 +28,8 @@ STAMP_STD_S = 0.1
 """Stamps of poses jitter: by 0.1 s rms, and three times as much now and then, on recorded lidar poses."""
 
 
-class Steps(NamedTuple):
-    """Neighbouring knots between which the reference may jump.
-
-    Attributes
-    ----------
-    first, last : (s,) rows of the knots before and after
-    """
-
-    first: Ints
-    last: Ints
-
-
-def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Steps]:
-    """Return the knots without single outliers, and the steps that may be jumps: holes, which no window spans."""
+def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Ints]:
+    """Return the knots without single outliers, and the rows before steps that may be jumps, which no window spans."""
     row = np.arange(len(knots.t))
     step, over = _beyond(knots, row[:-1], row[1:], width_m), _beyond(knots, row[:-2], row[2:], width_m)
     kept = np.ones(len(row), np.bool_)
@@ -51,7 +38,7 @@ def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Steps]:
     row = row[: len(knots.t)]
     first = np.flatnonzero(_beyond(knots, row[:-1], row[1:], width_m))
     holes = np.searchsorted(first, row - 1, side="right")
-    return knots._replace(holes=knots.holes + holes), Steps(first, first + 1)
+    return knots._replace(holes=knots.holes + holes), first
 
 
 def _beyond(knots: Knots, first: Ints, last: Ints, width_m: float) -> Bools:
@@ -67,25 +54,26 @@ def _beyond(knots: Knots, first: Ints, last: Ints, width_m: float) -> Bools:
     return np.asarray(moved | (turned > JUMP_SIGMAS * turn_noise + by_robot))
 
 
-def decide_jumps(knots: Knots, motion: Motion, steps: Steps) -> tuple[ReferenceJump, ...]:
+def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJump, ...]:
     """Return the jumps of the reference among the steps that may be one.
 
     Parameters
     ----------
-    knots, steps : of `without_jumps`
+    knots, first : of `without_jumps`
     motion : that the wheels make
     """
-    windows = compare(knots, motion, steps.first, steps.last, 0.0)
-    duration = knots.t[steps.last] - knots.t[steps.first]
+    last = first + 1
+    windows = compare(knots, motion, first, last, 0.0)
+    duration = knots.t[last] - knots.t[first]
     slide = (SLIDE_MPS + _fastest_mps(knots, motion)) * duration
     along, turns = motion.scale * knots.track.distance, motion.lever_m * motion.turn
-    jitter, spin = (_by_jitter(knots, one, steps) for one in (along, turns))
+    jitter, spin = (_by_jitter(knots, one, first) for one in (along, turns))
     noise = JUMP_SIGMAS * np.sqrt(windows.sensor)
     ahead = np.maximum(np.abs(windows.ahead) - jitter, 0.0)
     moved = np.hypot(ahead, windows.aside) - noise[:, :2].max(axis=1)
     turned = np.maximum(np.abs(windows.turned) - spin, 0.0) - noise[:, 2]
     turned = np.where(knots.turn_follows_place, 0.0, turned)
-    restated = knots.fix_class[steps.first] != knots.fix_class[steps.last]
+    restated = knots.fix_class[first] != knots.fix_class[last]
     shown = (moved > JUMP_MPS * duration) | (turned > JUMP_MPS * duration)
     alone = (turned > JUMP_MPS * duration) & _turn_with_wheels(knots, motion, windows, duration)
     return tuple(
@@ -114,16 +102,16 @@ def _fastest_mps(knots: Knots, motion: Motion) -> float:
     return motion.scale * float(np.quantile(np.diff(knots.track.distance) / np.diff(knots.t), 0.99))
 
 
-def _by_jitter(knots: Knots, along: Floats, steps: Steps) -> Floats:
+def _by_jitter(knots: Knots, along: Floats, first: Ints) -> Floats:
     """Return the motion of the wheels (s,) in the time by which stamps are wrong, before and after each step.
 
     Parameters
     ----------
     along : (m,) the wheels' motion until each knot
     """
-    off = 3 * STAMP_STD_S
-    reach = np.interp(knots.t[steps.last] + off, knots.t, along) - np.interp(knots.t[steps.first] - off, knots.t, along)
-    return np.abs(np.asarray(reach - (along[steps.last] - along[steps.first])))
+    off, last = 3 * STAMP_STD_S, first + 1
+    reach = np.interp(knots.t[last] + off, knots.t, along) - np.interp(knots.t[first] - off, knots.t, along)
+    return np.abs(np.asarray(reach - (along[last] - along[first])))
 
 
 def _cause(*, far: bool, turn: bool, stated: bool, alone: bool) -> str:
