@@ -33,7 +33,7 @@ from icrtool.alignment.log_track import (
     cut_chords,
 )
 from icrtool.kernels.arrays import Floats, trapezoids
-from icrtool.kernels.robust import RobustFit, mad_std, robust_least_squares, sandwich_covariance, soft_l1_loss
+from icrtool.kernels.robust import RobustFit, mad_std, robust_regression, sandwich_covariance, soft_l1_loss
 from icrtool.kernels.track import Track
 from icrtool.motion.turns import fit_gyro_line
 from icrtool.records.tables import RobotLog
@@ -206,12 +206,8 @@ def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:
     return {hand: soft_l1_loss(one.residuals / scale) / STARTS_A_WINDOW for hand, one in shown.items()}
 
 
-def _linear(design: Floats, target: Floats) -> RobustFit:
-    zero = np.zeros(design.shape[1])
-    prior_std = np.full(len(zero), PRIOR_STD)
-    return robust_least_squares(
-        lambda x: (design @ x - target, design), zero, zero, prior_std, overlap=float(STARTS_A_WINDOW)
-    )
+def _linear(columns: Floats, target: Floats) -> RobustFit:
+    return robust_regression(columns, target, np.full(columns.shape[1], PRIOR_STD), float(STARTS_A_WINDOW))
 
 
 def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:

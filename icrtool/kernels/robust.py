@@ -68,12 +68,6 @@ def soft_l1_weights(z: Floats) -> Floats:
     return weights
 
 
-def huber_weights(z: Floats) -> Floats:
-    """Return Huber's weights (m,) of squared residuals; `z` (m,) in standard deviations (Huber 1964)."""
-    weights: Floats = 1.0 / np.maximum(np.abs(z) / LOSS_SIGMAS, 1.0)
-    return weights
-
-
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
     """A robust least squares problem about its minimum, to first order: what covariances are made of.
@@ -202,6 +196,15 @@ def robust_least_squares(
         residuals=residuals, jacobian=jacobian, scale=scale, prior=prior, overlap=overlap, x=x, own_prior=own_prior,
         own_pull=own_pull, gain=found.gain,
     )  # fmt: skip
+
+
+def robust_regression(
+    columns: Floats, target: Floats, prior_std: Floats | None = None, overlap: float = 1.0
+) -> RobustFit:
+    """Return the robust fit of a target (m,) by columns (m, k), with a prior about zero (k,); default none."""
+    zero = np.zeros(columns.shape[1])
+    std = np.full(len(zero), np.inf) if prior_std is None else prior_std
+    return robust_least_squares(lambda x: (columns @ x - target, columns), zero, zero, std, overlap=overlap)
 
 
 def scale_by_kind(residuals: Floats, kind: Ints | None = None) -> Floats:

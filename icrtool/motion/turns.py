@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints, rows_at_steps
-from icrtool.kernels.robust import huber_weights, mad_std, robust_least_squares
+from icrtool.kernels.robust import robust_least_squares, robust_regression, sandwich_covariance
 from icrtool.kernels.track import Track
 
 STEP_S, FEWEST_STEPS = 1.0, 10
@@ -56,8 +56,8 @@ def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: 
     return GyroLine(*robust_least_squares(evaluate, zero, zero, PRIOR_STD, overlap=10.0).x.tolist())
 
 
-STARTS_A_WINDOW, FEWEST_SPANS, ROUNDS = 4, 6, 5
-"""Windows of turns start so often in one, and so many whole ones are needed; rounds of the robust regression."""
+STARTS_A_WINDOW, FEWEST_SPANS = 4, 6
+"""Windows of turns start so often in one, and so many whole ones are needed."""
 
 
 class Turns(NamedTuple):
@@ -97,21 +97,13 @@ def compare_turns(track: Track, width_m: float, delay_s: float, window_s: float)
     kept = whole & moved
     if np.count_nonzero(kept) < STARTS_A_WINDOW * FEWEST_SPANS:
         return None
-    return _regress(by_wheels[kept], by_heading[kept], np.arange(len(begin))[kept] // STARTS_A_WINDOW)
+    return _ratio(by_wheels[kept], by_heading[kept], np.arange(len(begin))[kept] // STARTS_A_WINDOW)
 
 
-def _regress(wheels: Floats, heading: Floats, group: Ints) -> Turns | None:
-    """Return the ratio of two turns (w,) by robust regression, its deviation from groups of windows."""
-    weight, information = np.ones(len(wheels)), float(wheels @ wheels)
-    if information <= 0.0:
+def _ratio(wheels: Floats, heading: Floats, group: Ints) -> Turns | None:
+    """Return the ratio of two turns (w,), its deviation from groups of windows."""
+    if not wheels.any():
         return None
-    ratio = float(wheels @ heading) / information
-    for _ in range(ROUNDS):
-        left = heading - ratio * wheels
-        weight = huber_weights(left / max(mad_std(left, 0.0), 1e-6))
-        information = float(weight @ wheels**2)
-        ratio = float(weight @ (wheels * heading)) / information
-    left = heading - ratio * wheels
-    pull = np.bincount(group - group.min(), weight * wheels * left)
-    turn = math.sqrt(float(np.mean(heading**2)))
-    return Turns(ratio, math.sqrt(float(pull @ pull)) / information, mad_std(left, 0.0), turn)
+    fit = robust_regression(wheels[:, None], heading)
+    std, turn = math.sqrt(float(sandwich_covariance(fit, group)[0, 0])), math.sqrt(float(np.mean(heading**2)))
+    return Turns(float(fit.x[0]), std, float(fit.scale[0]), turn)

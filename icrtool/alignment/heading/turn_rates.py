@@ -21,7 +21,7 @@ import numpy as np
 
 from icrtool.alignment.sensors.sensor_noise import is_hole
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
-from icrtool.kernels.robust import huber_weights, mad_std
+from icrtool.kernels.robust import mad_std, robust_regression
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.samples import GyroAxes
@@ -37,8 +37,8 @@ FEWEST_FIXES = 5
 """Windows share no fix, so that their errors are independent; with fewer fixes, most of the distance would be lost."""
 
 SPIKE_SIGMAS = 8.0
-MIDDLE_NOISE = 0.01
-"""Turns that change the sides' speeds by less than this show no middle."""
+MIDDLE_STD = 0.2
+"""The antenna's speed grows by about so much of half the difference of the sides."""
 
 LONGEST_STRETCH_S = 60.0
 """Displacements that take longer, or are further apart, are not compared without a turn rate."""
@@ -186,15 +186,8 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
 
 def fit_middle(courses: Courses, guess: Guess) -> float:
     """Return `Guess.middle` by the lengths of the courses: robust regression on the difference of the sides."""
-    x, y = courses.of_middle, courses.length
-    slope, weights = 0.0, np.ones(len(x))
-    for _ in range(3):
-        mean_x, mean_y = np.average(x, weights=weights), np.average(y, weights=weights)
-        spread = float((weights * (x - mean_x) ** 2).sum())
-        slope = float((weights * (x - mean_x) * (y - mean_y)).sum()) / (spread + len(x) * MIDDLE_NOISE**2)
-        left = y - mean_y - slope * (x - mean_x)
-        weights = huber_weights(left / max(mad_std(left, 0.0), 1e-6))
-    return guess.middle + slope
+    columns = np.column_stack([courses.of_middle, np.ones(len(courses.length))])
+    return guess.middle + float(robust_regression(columns, courses.length, np.array([MIDDLE_STD, math.inf])).x[0])
 
 
 def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
@@ -260,6 +253,9 @@ LARGEST_CHANGE_RAD = 2.5
 SHORTEST_HOLE_S = 0.1
 """Shorter ones are none in a turn rate."""
 
+AXIS_PRIOR_STD = np.array([0.3, 0.3, 0.3, math.radians(1.0)])
+"""A drive on level ground shows little of the axes across the vertical; the last is of the gyro's bias [rad/s]."""
+
 LEAST_AXIS = 0.3
 """A gyro that shows less than this share of the changes of the course over ground shows no axis."""
 
@@ -305,14 +301,7 @@ def _vertical_axis(turned: Floats, seconds: Floats, change: Floats) -> tuple[Flo
     columns, y = np.column_stack([turned, seconds])[small], change[small]
     if len(y) < 6:
         return up, "z up"
-    noise = max(mad_std(_wrapped(y - columns[:, :3] @ up)), math.radians(0.1))
-    prior = noise**2 * np.diag([1.0, 1.0, 1.0, 1.0 / math.radians(1.0) ** 2])
-    found, weights = np.zeros(4), np.ones(len(y))
-    for _ in range(5):
-        weighted = columns * weights[:, None]
-        found = np.linalg.solve(columns.T @ weighted + prior, weighted.T @ y)
-        left = _wrapped(y - columns @ found)
-        weights = huber_weights(left / max(mad_std(left, 0.0), 1e-6))
+    found = robust_regression(columns, y, AXIS_PRIOR_STD).x
     bias = found[3] * columns[:, 3]
     size = float(np.linalg.norm(found[:3]))
     if size <= LEAST_AXIS:

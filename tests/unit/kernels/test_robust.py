@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from icrtool.kernels.robust import (
     LOSS_SIGMAS,
     Linearised,
     RobustFit,
-    huber_weights,
     long_run_factor,
     mad_std,
     robust_least_squares,
@@ -63,10 +61,9 @@ def test_mad_std_is_the_standard_deviation_of_normal_values_and_ignores_outliers
     assert np.isnan(mad_std(np.empty(0)))
 
 
-@pytest.mark.parametrize("weights", [soft_l1_weights, huber_weights])
-def test_weights_are_one_at_zero_and_fall_as_one_over_the_residual(weights: Callable[[Floats], Floats]) -> None:
+def test_weights_are_one_at_zero_and_fall_as_one_over_the_residual() -> None:
     z = np.array([0.0, 1e6, -1e6])
-    np.testing.assert_allclose(weights(z), [1.0, LOSS_SIGMAS / 1e6, LOSS_SIGMAS / 1e6], rtol=1e-9)
+    np.testing.assert_allclose(soft_l1_weights(z), [1.0, LOSS_SIGMAS / 1e6, LOSS_SIGMAS / 1e6], rtol=1e-9)
 
 
 def test_the_minimum_is_that_of_scipy() -> None:
