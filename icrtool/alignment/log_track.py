@@ -269,44 +269,36 @@ def check_streams(log: RobotLog) -> None:
         number. Logs that were read hold no such rows (`icrtool.read_log` sorts, and leaves out), tables made by a
         program may.
     """
-    needed = {"wheel": log.wheels.stamp_ns, "position": log.gnss.stamp_ns, "heading": log.heading.stamp_ns}
-    if not len(log.heading.stamp_ns):
+    wheels, gnss, heading = log.wheels, log.gnss, log.heading
+    if not len(heading.stamp_ns):
         raise DataError(log.name, "no orientation in it", "use preset field, which estimates the heading")
-    for what, stamps in needed.items():
+    for what, stamps, values, variances in (
+        ("wheel", wheels.stamp_ns, (wheels.v_left_mps, wheels.v_right_mps), ()),
+        ("position", gnss.stamp_ns, (gnss.north_m, gnss.east_m), (gnss.var_north_m2, gnss.var_east_m2)),
+        ("heading", heading.stamp_ns, (heading.heading_rad,), (heading.var_rad2,)),
+    ):
         if len(stamps) < 2:
             raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
-        back = np.diff(stamps) < 0
+        back = stamps < np.append(stamps[:1], stamps[:-1])
         if back.any():
-            raise DataError(
-                log.name, f"the {what} stamps go back at row {int(back.argmax()) + 1}", "sort the rows by stamp"
-            )
-    columns = {
-        "wheel": (log.wheels.v_left_mps, log.wheels.v_right_mps),
-        "position": (log.gnss.north_m, log.gnss.east_m),
-        "heading": (log.heading.heading_rad,),
-    }
-    for what, values in columns.items():
+            raise DataError(log.name, f"the {what} stamps go back at row {back.argmax()}", "sort the rows by stamp")
         bad = ~np.logical_and.reduce(np.isfinite(values))
         if bad.any():
-            raise DataError(
-                log.name,
-                f"{np.count_nonzero(bad)} {what} samples are not finite numbers, the first at row {int(bad.argmax())}",
-                "leave those rows out",
-            )
-    variances = {"position": (log.gnss.var_north_m2, log.gnss.var_east_m2), "heading": (log.heading.var_rad2,)}
-    for what, stated in variances.items():
-        negative = np.logical_or.reduce([variance < 0 for variance in stated])
+            count = np.count_nonzero(bad)
+            text = f"{count} {what} samples are not finite numbers, the first at row {bad.argmax()}"
+            raise DataError(log.name, text, "leave those rows out")
+        negative = np.logical_or.reduce([np.zeros(len(stamps), np.bool_), *(one < 0 for one in variances)])
         if negative.any():
-            why = f"a {what} variance is negative, the first at row {int(negative.argmax())}"
-            raise DataError(log.name, why, "NaN stands for unknown")
-    fastest = float(np.abs(columns["wheel"]).max())
+            text = f"a {what} variance is negative, the first at row {negative.argmax()}"
+            raise DataError(log.name, text, "NaN stands for unknown")
+    fastest, farthest = (
+        float(np.abs(pair).max()) for pair in ((wheels.left, wheels.right), (gnss.north_m, gnss.east_m))
+    )
     if fastest >= IMPOSSIBLE_MPS:
         raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")
-    farthest = float(np.abs(columns["position"]).max())
     if farthest >= IMPOSSIBLE_M:
         raise DataError(log.name, f"a position {farthest:.2g} m from the origin", "is it in its unit?")
-    begin = max(int(stamps[0]) for stamps in needed.values())
-    end = min(int(stamps[-1]) for stamps in needed.values())
-    if begin >= end:
-        spans = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in needed.items())
-        raise DataError(log.name, "wheels, position and heading do not overlap in time", spans)
+    spans = {"wheel": wheels.stamp_ns, "position": gnss.stamp_ns, "heading": heading.stamp_ns}
+    if max(int(s[0]) for s in spans.values()) >= min(int(s[-1]) for s in spans.values()):
+        found = ", ".join(f"{what} {int(s[0]) / 1e9:.1f}-{int(s[-1]) / 1e9:.1f} s" for what, s in spans.items())
+        raise DataError(log.name, "wheels, position and heading do not overlap in time", found)

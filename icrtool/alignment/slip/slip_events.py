@@ -155,7 +155,7 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
     ----------
     quiet : (m,) knots that the model's error is taken from
     """
-    begin, end, distance2, excess, stuck, doubled = ([] for _ in range(6))
+    shown: list[tuple[ComparedWindows, Floats]] = []
     error = np.full(3, LEAST_MODEL_ERROR)
     for duration in reversed(_durations(knots)):
         first, last = spans_of(knots, duration)
@@ -169,23 +169,20 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
         drives = np.abs(windows.model_ahead) > np.abs(windows.model_turned)
         least = np.where(_of_one_side(windows) & drives, LEAST_OF_SIDE, LEAST_SHARE)
         shows = (square > LEAST_DISTANCE2) & (missed > least * windows.path_m)
-        windows, square = windows.rows(shows), square[shows]
-        begin.append(windows.begin)
-        end.append(windows.end)
-        distance2.append(square)
-        excess.append(_exceeds(windows))
-        stuck.append(windows.made < STUCK_SHARE * windows.path_m)
-        doubled.append(_from_doubled(windows) < STUCK_SHARE * windows.path_m)
-    first, last = np.concatenate(begin), np.concatenate(end)
-    square, beyond, still, twice = (np.concatenate(parts) for parts in (distance2, excess, stuck, doubled))
+        shown.append((windows.rows(shows), square[shows]))
+    windows = ComparedWindows._make(map(np.concatenate, zip(*(one for one, _ in shown), strict=True)))
+    square, beyond = np.concatenate([one for _, one in shown]), _exceeds(windows)
+    still, twice = (far < STUCK_SHARE * windows.path_m for far in (windows.made, _from_doubled(windows)))
 
     def clearest(kind: Bools) -> Floats:
-        return _clearest_of_runs(first[kind], last[kind], square[kind])
+        return _clearest_of_runs(windows.begin[kind], windows.end[kind], square[kind])
 
     # what stands still is rarer than any slip, and so is its opposite
     of_stuck = _false_rate(square, clearest(still), clearest(twice))
     of_others = _false_rate(square, clearest(~beyond & ~still), clearest(beyond))
-    return _Evidence(first, last, square, np.where(still, of_stuck, np.where(beyond, np.inf, of_others))), error
+    return _Evidence(
+        windows.begin, windows.end, square, np.where(still, of_stuck, np.where(beyond, np.inf, of_others))
+    ), error
 
 
 def _durations(knots: Knots) -> list[float]:
@@ -224,19 +221,19 @@ def _exceeds(windows: ComparedWindows) -> Bools:
     A side without grip turns the robot more than both sides would; a robot in a rut drags the slower side along.
     """
     least = LEAST_SHARE * windows.path_m
-    ahead, turned = (windows.model_ahead, windows.ahead), (windows.model_turned, windows.turned)
-    left, right = ([one + sign * other for one, other in zip(ahead, turned, strict=True)] for sign in (1.0, -1.0))
 
     def beyond(model: Floats, residual: Floats) -> Bools:
         missed = -np.sign(model) * residual
         return np.asarray((missed < -least) | (missed > np.abs(model) + least))
 
-    return (beyond(*left) | beyond(*right)) & (beyond(*ahead) | beyond(*turned)) & ~_of_one_side(windows)
+    of_side = beyond(windows.model_sides, windows.of_sides).any(axis=0)
+    of_all = beyond(windows.model_ahead, windows.ahead) | beyond(windows.model_turned, windows.turned)
+    return of_side & of_all & ~_of_one_side(windows)
 
 
 def _of_one_side(windows: ComparedWindows) -> Bools:
     """Return in which windows one side keeps to its wheels: the other has no grip, and may be dragged along."""
-    sides = np.abs([windows.ahead + windows.turned, windows.ahead - windows.turned])
+    sides = np.abs(windows.of_sides)
     return np.asarray(sides.min(axis=0) < KEEPING_SHARE * sides.max(axis=0))
 
 
@@ -295,9 +292,8 @@ def _keeps_one_side(steps: ComparedWindows, extent: Extent) -> bool:
     No error of a position or of a heading does that, except that of a stamp while the robot turns about a side: it is
     short, or comes and goes.
     """
-    rows = slice(extent.first, extent.last)
-    sides = np.array([steps.ahead[rows] + steps.turned[rows], steps.ahead[rows] - steps.turned[rows]])
-    noise2 = steps.sensor[rows, 0] + steps.sensor[rows, 2]
+    steps = steps.rows(slice(extent.first, extent.last))
+    sides, noise2 = steps.of_sides, steps.sensor[:, 0] + steps.sensor[:, 2]
     total, each = np.abs(sides.sum(axis=1)), np.sqrt(np.maximum(sides**2 - noise2, 0.0)).sum(axis=1)
     keeping, missing = np.argsort(total)
     steady = total[missing] > STEADY_SHARE * each[missing] and total[keeping] < KEEPING_SHARE * total[missing]

@@ -67,16 +67,16 @@ def find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools,
     core : rows of the steps of the window
     """
     span = core
-    shares = missed_shares(steps, core)
+    shares = missed_shares(steps.rows(core))
     for _ in range(2):
-        first, last = _best_part(np.where(usable[core], _evidence(steps, error, shares, core), -MOST_EVIDENCE))
+        first, last = _best_part(np.where(usable[core], _evidence(steps.rows(core), error, shares), -MOST_EVIDENCE))
         if first == last:
             return None
         first, last = core.start + first, core.start + last
         last += _growth(steps, error, shares, usable, range(last, len(usable)))
         first -= _growth(steps, error, shares, usable, range(first - 1, -1, -1))
         span = slice(first, last)
-        shares = missed_shares(steps, span)
+        shares = missed_shares(steps.rows(span))
 
     def time_in(row: int, *, inside: bool) -> float:
         if not 0 <= row < len(usable) or not usable[row]:
@@ -87,29 +87,28 @@ def find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools,
     end_s = float(t[span.stop - 1]) + time_in(span.stop - 1, inside=True) + time_in(span.stop, inside=False)
     if end_s - begin_s < SHORTEST_EVENT_S or span.stop - span.start < FEWEST_STEPS:
         return None
-    return _measured(steps, span, shares, begin_s, end_s)
+    return _measured(steps.rows(span), span, shares, begin_s, end_s)
 
 
-def missed_shares(steps: ComparedWindows, rows: slice) -> Floats:
+def missed_shares(steps: ComparedWindows) -> Floats:
     """Return the shares that the left and the right side miss of their motion, and that the robot moves aside (3,).
 
     Sums, and no least squares over steps: the noise of the fixes cancels except that of the first and the last.
     """
-    left, right = _sides(steps, rows)
-    ahead, aside, turned = steps.ahead[rows], steps.aside[rows], steps.turned[rows]
-    noise = float(steps.sensor[rows].sum(axis=1).mean())
+    (left, right), (of_left, of_right) = steps.model_sides, steps.of_sides
+    noise = float(steps.sensor.sum(axis=1).mean())
 
     def share(moved: Floats, missed: Floats) -> float:
         size = float(np.abs(moved).sum())
         return float(np.sign(moved) @ missed) * size / (size**2 + noise)
 
-    return np.array([share(left, -ahead - turned), share(right, turned - ahead), share(steps.path_m[rows], -aside)])
+    return np.array([share(left, -of_left), share(right, -of_right), share(steps.path_m, -steps.aside)])
 
 
 def _measured(steps: ComparedWindows, span: slice, shares: Floats, begin_s: float, end_s: float) -> Extent:
-    left, right = _sides(steps, span)
+    left, right = steps.model_sides
     miss_left, miss_right = shares[0] * left, shares[1] * right
-    path = float(steps.path_m[span].sum())
+    path = float(steps.path_m.sum())
     aside = abs(float(shares[2])) * path
     missed: dict[SlipKind, float] = {
         "slip": float(np.abs(miss_left + miss_right).sum()) / 2,
@@ -125,23 +124,18 @@ def _measured(steps: ComparedWindows, span: slice, shares: Floats, begin_s: floa
     )  # fmt: skip
 
 
-def _sides(steps: ComparedWindows, rows: slice) -> tuple[Floats, Floats]:
-    """Return the motion of the left and of the right side by the model [m]."""
-    return steps.model_ahead[rows] + steps.model_turned[rows], steps.model_ahead[rows] - steps.model_turned[rows]
-
-
-def _expected(steps: ComparedWindows, shares: Floats, rows: slice) -> Floats:
+def _expected(steps: ComparedWindows, shares: Floats) -> Floats:
     """Return the residual of steps that miss these shares (k, 3) [m]."""
-    left, right = (share * side for share, side in zip(shares[:2], _sides(steps, rows), strict=True))
-    return -np.column_stack([(left + right) / 2, shares[2] * steps.path_m[rows], (left - right) / 2])
+    left, right = shares[:2, None] * steps.model_sides
+    return -np.column_stack([(left + right) / 2, shares[2] * steps.path_m, (left - right) / 2])
 
 
-def _evidence(steps: ComparedWindows, error: Floats, shares: Floats, rows: slice) -> Floats:
+def _evidence(steps: ComparedWindows, error: Floats, shares: Floats) -> Floats:
     """Return the log likelihood ratio of steps (k,): missing these shares over missing none; bounded."""
-    seen = steps.residual_of(rows)
+    seen = steps.residual
     # while the robot parks, sensors without noise leave no variance, and nothing is expected
-    variance = np.maximum(steps.sensor[rows] + (error * steps.path_m[rows, None]) ** 2, np.finfo(np.float64).tiny)
-    ratio = ((seen**2 - (seen - _expected(steps, shares, rows)) ** 2) / (2 * variance)).sum(axis=1)
+    variance = np.maximum(steps.sensor + (error * steps.path_m[:, None]) ** 2, np.finfo(np.float64).tiny)
+    ratio = ((seen**2 - (seen - _expected(steps, shares)) ** 2) / (2 * variance)).sum(axis=1)
     return np.asarray(np.clip(ratio, -MOST_EVIDENCE, MOST_EVIDENCE))
 
 
@@ -163,7 +157,7 @@ def _growth(steps: ComparedWindows, error: Floats, shares: Floats, usable: Bools
     while done < len(rows):
         chunk = rows[done : done + CHUNK]
         low, high = min(chunk), max(chunk) + 1
-        values = _evidence(steps, error, shares, slice(low, high))[:: rows.step]
+        values = _evidence(steps.rows(slice(low, high)), error, shares)[:: rows.step]
         for value, fine in zip(values, usable[low:high][:: rows.step], strict=True):
             total, done = total + float(value), done + 1
             if not fine or total < best - LOST_EVIDENCE:
@@ -175,8 +169,8 @@ def _growth(steps: ComparedWindows, error: Floats, shares: Floats, usable: Bools
 
 def _part(steps: ComparedWindows, error: Floats, shares: Floats, row: int, *, default: float) -> float:
     """Return the part of a step that lies in the event, or a default where the fixes are too noisy to show it."""
-    one = slice(row, row + 1)
-    deviation = np.sqrt(steps.sensor[row] + (error * steps.path_m[row]) ** 2)
-    expected, seen = _expected(steps, shares, one)[0] / deviation, steps.residual_of(one)[0] / deviation
+    one = steps.rows(slice(row, row + 1))
+    deviation = np.sqrt(one.sensor + (error * one.path_m) ** 2)[0]
+    expected, seen = _expected(one, shares)[0] / deviation, one.residual[0] / deviation
     size2 = float(expected @ expected)
     return float(np.clip(expected @ seen / size2, 0.0, 1.0)) if size2 > CLEAR_STEP**2 else default

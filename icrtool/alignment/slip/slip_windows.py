@@ -127,15 +127,21 @@ class ComparedWindows(NamedTuple):
     @property
     def residual(self) -> Floats:
         """Reference minus model (w, 3): ahead, aside, turned [m]."""
-        return self.residual_of(slice(None))
+        return np.column_stack([self.ahead, self.aside, self.turned])
 
-    def rows(self, kept: Bools) -> ComparedWindows:
-        """Return the windows marked in `kept` (w,)."""
+    @property
+    def of_sides(self) -> Floats:
+        """Reference minus model of the left and of the right side (2, w) [m]."""
+        return np.stack([self.ahead + self.turned, self.ahead - self.turned])
+
+    @property
+    def model_sides(self) -> Floats:
+        """Motion of the left and of the right side by the model (2, w) [m]."""
+        return np.stack([self.model_ahead + self.model_turned, self.model_ahead - self.model_turned])
+
+    def rows(self, kept: Bools | slice) -> ComparedWindows:
+        """Return some of the windows."""
         return ComparedWindows._make(column[kept] for column in self)
-
-    def residual_of(self, rows: slice) -> Floats:
-        """Return the residual of some windows (k, 3) [m]."""
-        return np.column_stack([self.ahead[rows], self.aside[rows], self.turned[rows]])
 
 
 def lay_knots(sensors: SensorData) -> Knots | None:
