@@ -79,7 +79,7 @@ INSTEAD = re.compile(
 
 
 SHORT_IN_NAMES = ("course",)
-"""What prose writes in full (course over ground), a name may shorten (``CourseAngles``)."""
+"""What prose writes in full (course over ground), a name may shorten (``CourseComparison``)."""
 
 
 def found_in_text(text: str) -> list[str]:
@@ -163,7 +163,7 @@ def test_a_word_not_to_use_is_found(source: str, word: str) -> None:
     [
         "y = 1  # course over ground",
         "course_over_ground = 1",
-        "class CourseAngles: pass",
+        "class CourseComparison: pass",
         "for n in ast.walk(x): pass",
         "always = 'latest'",
     ],

@@ -259,7 +259,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     else:
         if free:
             refuse_stuck(log)
-            if course.is_of_course:
+            if course.turns_about:
                 why = (
                     "the heading turns about where the robot drives backwards: it is a course over ground, and left out"
                 )

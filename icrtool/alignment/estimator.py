@@ -143,20 +143,15 @@ class AlignmentFit(NamedTuple):
     @property
     def heading_scatter(self) -> float:
         """Robust scatter of the heading [rad] beyond the fixes' noise, across windows or within a second."""
-        return max(self.across_scatter, float(self.fit.scale[-1]) / math.sqrt(2.0))
+        return max(self.scatter[1], float(self.fit.scale[-1]) / math.sqrt(2.0))
 
     @property
-    def across_scatter(self) -> float:
-        """Robust scatter of the displacements across the heading beyond the fixes' noise, over the length [rad]."""
-        return self._beyond_noise(float(self.fit.scale[len(self.windows.begin)]))
-
-    @property
-    def slip_std(self) -> float:
-        """Robust scatter of the displacements along the path beyond the fixes' noise, over the window's length."""
-        return self._beyond_noise(float(self.fit.scale[0]))
-
-    def _beyond_noise(self, scatter_m: float) -> float:
-        return math.sqrt(max(scatter_m**2 - 2.0 * self.windows.track.place_std_m**2, 0.0)) / self.windows.length_m
+    def scatter(self) -> tuple[float, float]:
+        """Robust scatter of the displacements along and across the heading beyond the fixes' noise, over the length."""
+        noise2 = 2.0 * self.windows.track.place_std_m**2
+        beyond = np.maximum(self.fit.scale[[0, len(self.windows.begin)]] ** 2 - noise2, 0.0)
+        along, across = (np.sqrt(beyond) / self.windows.length_m).tolist()
+        return along, across
 
     @property
     def turn_wander_rad(self) -> float:
@@ -174,7 +169,7 @@ class AlignmentFit(NamedTuple):
     @property
     def slips(self) -> bool:
         """Whether the wheels slip too much to show a scale or a delay."""
-        return self.slip_std > SLIPPING or self.turn_slip > TURNS_SLIPPING
+        return self.scatter[0] > SLIPPING or self.turn_slip > TURNS_SLIPPING
 
     def expected_motion(self) -> tuple[Complexes, Floats]:
         """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,), by this estimate."""
@@ -359,21 +354,18 @@ class _Model:
             np.cumsum((speed * step)[:-1], out=integral[1:])
             return np.asarray(np.interp(t, track.t, integral), np.complex128)
 
-        def between(at: Complexes) -> Complexes:
-            return np.asarray(at[1] - at[0], np.complex128)
-
         jacobian = np.zeros((len(self.seen), len(x)), np.complex128)
         for name, speed in ((A, v), (M, u), (N, drag), (C, rate), (L, v * rate)):
-            jacobian[:, name] = between(laid(speed))
+            jacobian[:, name] = np.diff(laid(speed), axis=0)
         jacobian[:, [C, L]] *= 1j
         predicted = sum((x[name] * jacobian[:, name] for name in (A, M, C, L, N)), np.zeros(1))
         jacobian[:, D] = 1j * predicted
         np.cumsum((self._velocity(x, rate) * step)[:-1], out=integral[1:])
         after, before = (np.interp(t + shift, track.t, integral) for shift in (STEP_S, -STEP_S))
-        jacobian[:, TP] = -between((after - before) / (2 * STEP_S))
+        jacobian[:, TP] = -np.diff(after - before, axis=0) / (2 * STEP_S)
         sideways = np.interp(t, self.middle_t, x[C] + x[L] * v) * self._smooth_turn(t, x)
         turning = 1j * laid(rate * (x[A] * v + x[M] * u + x[N] * drag))
-        jacobian[:, TH] = jacobian[:, TP] + between(turning + sideways)
+        jacobian[:, TH] = jacobian[:, TP] + np.diff(turning + sideways, axis=0)
         level = self.level * np.exp(-1j * x[D])
         return (predicted - self.seen) * level, jacobian * level[:, None]
 

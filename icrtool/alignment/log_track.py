@@ -193,13 +193,15 @@ def cut_windows(track: Track, length_m: float | None = None) -> DriveWindows:
     """
     length = window_length(track, WINDOW_M) if length_m is None else length_m
     begin, end, _ = cut(track, [length], length / STARTS_A_WINDOW)
-    first, last = _common_span(track)
+    covers = [track.t, track.heading_t] if len(track.heading_t) else [track.t]
+    first, last = max(t[0] for t in covers), min(t[-1] for t in covers)
     t, at = track.place_t, track.distance
     whole = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_WINDOW_S)
     whole &= at[end] - at[begin] < 2.0 * length
     begin, end = begin[whole], end[whole]
     turn_begin, turn_end = _turn_windows(track, first, last)
-    size = _group_length(float(track.travel[-1]), length)
+    # what counts as one independent observation: 10 windows, where there are 40 of them
+    size = min(max(float(track.travel[-1]) / 40.0, 2.0 * length), 10.0 * length)
     turn_travel = np.interp(turn_begin, track.t, track.travel)
     return DriveWindows(
         track, begin, end, length, turn_begin, turn_end,
@@ -219,20 +221,6 @@ def _value_length(track: Track) -> float:
     moving = np.diff(track.travel) > 0
     changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
     return float(track.travel[-1]) / max(sum(changes) / 2, 1.0)
-
-
-def _group_length(total: float, length: float) -> float:
-    """Return the distance that counts as one independent observation: 10 windows, where there are 40 of them."""
-    return min(max(total / 40.0, 2.0 * length), 10.0 * length)
-
-
-def _common_span(track: Track) -> tuple[float, float]:
-    """Return begin and end of what wheels and heading both cover [s]."""
-    starts, ends = [track.t[0]], [track.t[-1]]
-    if len(track.heading_t):
-        starts.append(track.heading_t[0])
-        ends.append(track.heading_t[-1])
-    return float(max(starts)), float(min(ends))
 
 
 def _turn_windows(track: Track, first: float, last: float) -> tuple[Floats, Floats]:

@@ -72,6 +72,10 @@ NOISES_OF_A_SOURCE = {
 """White noise in the stated one; growth [rad/sqrt(s)] and standard deviation [rad] of the error that wanders."""
 
 
+WANDERS = "0 size"
+"""Of these, the standard deviation of the wandering error of the first absolute heading."""
+
+
 class AbsoluteHeading(NamedTuple):
     """Headings with an offset, thinned to independent ones.
 
@@ -294,7 +298,11 @@ class _Problem:
 
         events, model = self.events(noises), self.model(noises)
         passes = filter_headings(events, model)
-        alike = self._alike(passes)
+        # by how much courses of windows that follow one another err alike, by slip that the model lacks
+        course = self.kind == COURSE
+        z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
+        # the first ones find the states
+        alike = float(long_run_factor(z[len(z) // 20 + 2 :, None])[0])
         if alike > 1.0:
             events = self.events(noises, alike)
             passes = filter_headings(events, model)
@@ -307,13 +315,6 @@ class _Problem:
         P[np.ix_(fixed, fixed)] = covariances[-1][np.ix_(fixed, fixed)]
         causal = filter_headings(events, model._replace(x=x, P=P, fixed=fixed))
         return self._at_rate_samples(causal, states, covariances, noises)
-
-    def _alike(self, passes: HeadingPasses) -> float:
-        """Return by how much courses of windows that follow one another err alike, by slip that the model lacks."""
-        course = self.kind == COURSE
-        z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
-        # the first ones find the states
-        return float(long_run_factor(z[len(z) // 20 + 2 :, None])[0])
 
     def usual(self) -> dict[str, float]:
         """Return noises to start from."""
@@ -359,7 +360,9 @@ class _Problem:
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
         scale = 1 + constants[SCALE]
         smoothed = scale * G[rows] + np.interp(s, t, states[:, PSI] - scale * self.at)
-        stamp = turn.stamp_std()[rows] ** 2
+        # a rate may be the mean over the interval before its stamp, or after it
+        delay_s = float(np.median(np.diff(turn.t))) / 2.0 if turn.delay_std_s is None else turn.delay_std_s
+        stamp = (turn.rate[rows] * delay_s) ** 2
         smoothed_std = np.sqrt(np.interp(s, t, covariances[:, PSI, PSI]) + stamp)
         return HeadingEstimate(
             s, carried, np.sqrt(np.maximum(variance, 0.0) + stamp), smoothed, smoothed_std,

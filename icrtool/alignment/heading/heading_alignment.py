@@ -15,7 +15,7 @@ from icrtool.alignment.log_track import FEWEST_WINDOWS, STARTS_A_WINDOW, DriveWi
 from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import Floats
 from icrtool.records.measurements import HeadingFacts
 from icrtool.records.plain_data import known
 from icrtool.records.samples import Datum
@@ -112,7 +112,7 @@ SMALLEST_OFFSET_RAD = math.radians(1.0)
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
 
 EXPLAINED = 0.8
-"""Mean resultant length of heading minus course over ground above which they are one direction."""
+"""Mean resultant length of angles above which they are one direction; share of those that turn about."""
 
 UNEXPLAINED_RAD = math.radians(40.0)
 """A heading that scatters by more about the motion of wheels and fixes is refused: noise with half of that is used."""
@@ -126,59 +126,48 @@ TURN_M, TURN_SHARE = 1.0, 0.1
 so on a straight row."""
 
 
-class CourseAngles(NamedTuple):
-    """Windows of distance: displacement by the fixes, and by the wheels laid along the heading.
+class CourseComparison(NamedTuple):
+    """Heading and course over ground in windows of distance.
 
     Attributes
     ----------
-    angle : (w,) heading minus course over ground [rad], in (-pi, pi]
-    mirrored : (w,) the same for a heading of the other handedness
-    backwards : (w,) whether the wheels ran backwards
+    windows : how many
+    agreement : mean resultant length of heading minus course over ground: 1 where they agree, about 0 at random, NaN
+        without windows; mirrored_agreement : the same for a heading of the other handedness
+    turns_about : the heading turns about where the robot drives backwards: it is itself a course over ground
     duration_s : median duration of a window
     """
 
-    angle: Floats
-    mirrored: Floats
-    backwards: Bools
+    windows: int
+    agreement: float
+    mirrored_agreement: float
+    turns_about: bool
     duration_s: float
 
-    @property
-    def agreement(self) -> float:
-        """Mean resultant length of `angle`: 1 where heading and course over ground agree, about 0 at random."""
-        return _resultant_length(self.angle)
 
-    @property
-    def mirrored_agreement(self) -> float:
-        """The same of `mirrored`."""
-        return _resultant_length(self.mirrored)
-
-    @property
-    def is_of_course(self) -> bool:
-        """Whether the heading turns about where the robot drives backwards: it is itself a course over ground."""
-        ahead, back = self.angle[~self.backwards], self.angle[self.backwards]
-        if min(len(ahead), len(back)) < FEWEST_WINDOWS:
-            return False
-        about = np.cos(back - np.angle(np.exp(1j * ahead).mean())) < 0.0
-        return _resultant_length(ahead) > EXPLAINED and float(about.mean()) > EXPLAINED
+NO_COURSE = CourseComparison(0, math.nan, math.nan, False, 0.0)
 
 
-NO_COURSE = CourseAngles(np.empty(0), np.empty(0), np.empty(0, np.bool_), 0.0)
-
-
-def compare_with_course(windows: DriveWindows) -> CourseAngles:
+def compare_with_course(windows: DriveWindows) -> CourseComparison:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
     track, (begin, end) = windows.track, (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
     v, nose = track.mean_speed, track.nose
     seen = track.place[end] - track.place[begin]
-    along, mirrored = track.at_places(v * nose), track.at_places(v * np.conj(nose))
-    laid, other = (at[end] - at[begin] for at in (along, mirrored))
+    laid, other = (at[end] - at[begin] for at in (track.at_places(v * one) for one in (nose, nose.conj())))
     travel = track.at_places(v)
     moved = (np.abs(seen) > windows.length_m / 3) & (np.abs(laid) > windows.length_m / 3)
-    return CourseAngles(
-        np.angle(laid * np.conj(seen))[moved],
-        np.angle(other * np.conj(seen))[moved],
-        (travel[end] < travel[begin])[moved],
-        float(np.median((track.place_t[end] - track.place_t[begin])[moved])) if moved.any() else 0.0,
+    if not moved.any():
+        return NO_COURSE
+    angle, turned_over = (np.exp(1j * np.angle(one * np.conj(seen)))[moved] for one in (laid, other))
+    backwards = (travel[end] < travel[begin])[moved]
+    ahead, back = angle[~backwards], angle[backwards]
+    turns_about = False
+    if min(len(ahead), len(back)) >= FEWEST_WINDOWS:
+        about = (back * np.conj(ahead.mean())).real < 0.0
+        turns_about = abs(ahead.mean()) > EXPLAINED and float(about.mean()) > EXPLAINED
+    duration_s = float(np.median((track.place_t[end] - track.place_t[begin])[moved]))
+    return CourseComparison(
+        len(angle), float(abs(angle.mean())), float(abs(turned_over.mean())), bool(turns_about), duration_s
     )
 
 
@@ -197,7 +186,7 @@ class HeadingAlignment(NamedTuple):
 
 
 def align_heading(
-    log: RobotLog, config: Config, stated: tuple[AlignmentFit | None, CourseAngles, Convention] | None,
+    log: RobotLog, config: Config, stated: tuple[AlignmentFit | None, CourseComparison, Convention] | None,
     derived: DerivedHeading | None,
 ) -> HeadingAlignment:  # fmt: skip
     """Return offset and noise of the heading, and what is applied.
@@ -217,7 +206,7 @@ def align_heading(
             applied = -math.radians(config.frames.heading_offset_deg)
         if fit is not None:
             turn, std = fit.estimate("offset")
-            offset, scatter = math.remainder(-turn, 2 * math.pi), fit.across_scatter
+            offset, scatter = math.remainder(-turn, 2 * math.pi), fit.scatter[1]
             applied, name, notes = _correction(log, config, fit, convention, (offset, std), applied)
     noisy = derived is None and corrects and scatter > NOISY_SCATTER_RAD
     if noisy:
@@ -238,7 +227,7 @@ def align_heading(
     facts = HeadingFacts(
         source=stated_source(log) if derived is None else derived.source,
         parts=None if derived is None else derived.why,
-        windows=len(course.angle),
+        windows=course.windows,
         applied_mirror=mirrored and corrects,
         offset_deg=known(math.degrees(offset)),
         offset_std_deg=known(math.degrees(std)),
@@ -349,7 +338,3 @@ def _clearly_ahead(ahead: Floats, gone: Floats) -> Floats:
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:
     advice = "choose another with topics.heading, or use this one with --set frames.heading_offset_deg=0"
     return DataError(log.name, " ".join(filter(None, ("the heading", log.topic("heading"), why))), f"{found}; {advice}")
-
-
-def _resultant_length(angle: Floats) -> float:
-    return float(abs(np.exp(1j * angle).mean())) if len(angle) else math.nan

@@ -9,7 +9,14 @@ from typing import Literal
 import numpy as np
 
 from icrtool.alignment.estimator import ATTITUDE_STD_RAD
-from icrtool.alignment.heading.gyro_heading import LAG, OFFSET, AbsoluteHeading, HeadingEstimate, estimate_heading
+from icrtool.alignment.heading.gyro_heading import (
+    LAG,
+    OFFSET,
+    WANDERS,
+    AbsoluteHeading,
+    HeadingEstimate,
+    estimate_heading,
+)
 from icrtool.alignment.heading.turn_rates import TurnRate, gyro_rate, wheel_rate
 from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensors.sensor_noise import is_hole
@@ -189,17 +196,12 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
     found = _with_gyro(log, track, log.heading)
     if found is None or not _is_alive(found.estimate):
         return None
-    return found if found.estimate.median_std <= math.hypot(attitude_error(found.estimate), ATTITUDE_STD_RAD) else None
+    return found if found.estimate.median_std <= math.hypot(found.estimate.noises[WANDERS], ATTITUDE_STD_RAD) else None
 
 
 def _is_alive(estimate: HeadingEstimate) -> bool:
     """Return whether the turn rate of an estimate turns with the robot."""
     return estimate.noises["angle"] < LARGEST_DRIFT
-
-
-def attitude_error(estimate: HeadingEstimate) -> float:
-    """Return the standard deviation of the wandering error of the first absolute heading [rad]."""
-    return estimate.noises["0 size"]
 
 
 def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> DerivedHeading | None:
@@ -248,7 +250,7 @@ def _derived(
     attitude, attitude_offset = None, None
     if stated is not None:
         source = "fused"
-        parts.insert(0, f"orientation (error {math.degrees(attitude_error(estimate)):.1f}°)")
+        parts.insert(0, f"orientation (error {math.degrees(estimate.noises[WANDERS]):.1f}°)")
         names.insert(0, log.topic("heading", "orientation"))
         offset = math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
         attitude_offset = offset, float(estimate.constants_std[OFFSET])

@@ -67,14 +67,6 @@ class TurnRate(NamedTuple):
         """Return the turn since the first sample (n,) [rad], by trapezoids."""
         return trapezoids(self.t, self.rate)
 
-    def stamp_std(self) -> Floats:
-        """Return what an error of its stamps turns the heading by (n,) [rad].
-
-        A rate may be the mean over the interval before its stamp, or after it.
-        """
-        delay = float(np.median(np.diff(self.t))) / 2.0 if self.delay_std_s is None else self.delay_std_s
-        return np.abs(self.rate) * delay
-
     def hole_variance(self, t: Floats) -> Floats:
         """Return the variance that its holes have added until times t (n,) [rad^2]."""
         total = np.zeros(len(t))
@@ -279,14 +271,10 @@ def gyro_rate(track: Track, gyro: GyroAxes, epoch_ns: int) -> tuple[TurnRate, st
     begin, end, change = begin[inside], end[inside], change[inside]
     if len(change) < 3:
         return None
-    turned = np.column_stack([_turn_between(t, gyro.rates_radps[:, axis], begin, end) for axis in range(3)])
+    angles = [trapezoids(t, rate) for rate in gyro.rates_radps.T]
+    turned = np.column_stack([np.interp(end, t, angle) - np.interp(begin, t, angle) for angle in angles])
     axis, name = _vertical_axis(turned, end - begin, change)
     return _bridged(t, gyro.rates_radps @ axis, track), name
-
-
-def _turn_between(t: Floats, rate: Floats, begin: Floats, end: Floats) -> Floats:
-    turned = trapezoids(t, rate)
-    return np.asarray(np.interp(end, t, turned) - np.interp(begin, t, turned), np.float64)
 
 
 def _vertical_axis(turned: Floats, seconds: Floats, change: Floats) -> tuple[Floats, str]:

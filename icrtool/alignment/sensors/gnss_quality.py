@@ -116,9 +116,11 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
         *_notes_of_classes(fixes, stated, given, changes=changes),
         *_notes_of_noise(fixes, stated, {name: white[name] for name in raised}),
     ]
+    known = {name: given[(kinds == code) & np.isfinite(given)] for code, name in CLASSES.items()}
+    std = {name: float(np.median(one)) if len(one) else math.nan for name, one in known.items()}
     return GnssQuality(
         fixes,
-        FixStatistics(_class_std(given, kinds), white),
+        FixStatistics(std, white),
         _losses(gnss.stamp_ns, fixed) if norm else np.empty((0, 2), np.int64),
         tuple(f"{log.name}: {note}" for note in notes),
     )
@@ -129,21 +131,12 @@ def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Boo
     gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
     if log.datum is None:
         return np.full(len(stated), REFERENCE, np.uint8), none
-    stated_kind = _stated_class(gnss.stated_class, stated)
-    flagged = none if gnss.stated_class is None else gnss.stated_class == FIXED_FIX
-    misreported = find_misreported(steps, stated_kind == FIXED_FIX, flagged)
-    return np.where(misreported, FLOAT_FIX, stated_kind).astype(np.uint8), misreported
-
-
-def _stated_class(stated_kind: Bytes | None, stated: Floats) -> Bytes:
-    """Return the class of each fix by what its message states: OTHER_FIX, FLOAT_FIX or FIXED_FIX."""
-    stated_kind = np.full(len(stated), NOT_STATED, np.uint8) if stated_kind is None else stated_kind
+    status = np.full(len(stated), NOT_STATED, np.uint8) if gnss.stated_class is None else gnss.stated_class
     rtk = np.where(stated > FIXED_STD_M, FLOAT_FIX, FIXED_FIX)
     silent = np.where(stated <= SURELY_FIXED_STD_M, FIXED_FIX, OTHER_FIX)
-    kinds: Bytes = np.select([stated_kind == RTK_FIX, stated_kind == NOT_STATED], [rtk, silent], stated_kind).astype(
-        np.uint8
-    )
-    return kinds
+    kinds = np.select([status == RTK_FIX, status == NOT_STATED], [rtk, silent], status)
+    misreported = find_misreported(steps, kinds == FIXED_FIX, status == FIXED_FIX)
+    return np.where(misreported, FLOAT_FIX, kinds).astype(np.uint8), misreported
 
 
 def _at_least_white(
@@ -217,12 +210,6 @@ def _notes_of_noise(fixes: Fixes, stated: Floats, raised: dict[str, float]) -> l
                 "the scatter is used"
             )
     return notes
-
-
-def _class_std(std: Floats, kinds: Bytes) -> dict[str, float]:
-    """Return the median of the standard deviations (m,) of the fixes of each class [m], by its name; NaN for none."""
-    given = {name: std[(kinds == code) & np.isfinite(std)] for code, name in CLASSES.items()}
-    return {name: float(np.median(one)) if len(one) else math.nan for name, one in given.items()}
 
 
 def _counted(rows: Bools) -> str:

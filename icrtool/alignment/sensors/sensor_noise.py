@@ -100,7 +100,8 @@ def measure_steps(t: Floats, place: Complexes, expected: Complexes) -> FixSteps:
     step[is_hole(dt)] = np.nan
     moves = np.abs(np.diff(expected)) > MOVES_MPS * dt
     moving = step[moves & np.isfinite(step)]
-    scale = _scale(moving if len(moving) >= FEWEST_STEPS else step)
+    size = np.abs(moving if len(moving) >= FEWEST_STEPS else step[np.isfinite(step)])
+    scale = max(float(np.median(size)) / MEDIAN_OF_RAYLEIGH, 1e-6) if len(size) else 1e-6
     with np.errstate(invalid="ignore"):
         usual_step = np.where(np.abs(step) <= CLIP_SIGMAS * scale, step, np.nan)
     product = -(usual_step[1:] * np.conj(usual_step[:-1])).real
@@ -120,12 +121,6 @@ def bend_std_m(gnss: PositionFixes | Fixes) -> float:
         return float("nan")
     bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
     return float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
-
-
-def _scale(step: Complexes) -> float:
-    """Return the robust standard deviation of steps, an axis [m]."""
-    size = np.abs(step[np.isfinite(step)])
-    return max(float(np.median(size)) / MEDIAN_OF_RAYLEIGH, 1e-6) if len(size) else 1e-6
 
 
 def _jump_rows(step: Complexes, scale: float, span: int) -> Ints:

@@ -19,7 +19,7 @@ from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, rows_at_steps
-from icrtool.motion.turns import Turns, compare_turns
+from icrtool.motion.turns import compare_turns
 from icrtool.records.measurements import WheelFacts
 from icrtool.records.plain_data import known
 from icrtool.records.samples import WheelSamples
@@ -232,7 +232,7 @@ def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tu
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     if fit.slips:
         slip = (
-            f"over {fit.windows.length_m:.0f} m their distance differs by {100 * fit.slip_std:.0f} % from the robot's"
+            f"over {fit.windows.length_m:.0f} m their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
         )
         turns = f"their turns by {100 * fit.turn_slip:.0f} %"
         return (1.0, 1.0), [f"the wheels slip: {slip}, {turns}; no scale and no delay is corrected"]
@@ -322,13 +322,9 @@ def find_filtering(fit: AlignmentFit) -> str:
     if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(SIGMAS * std, SMALLEST_CHANGE * long.ratio):
         ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {SHORT_S:g} s and {long.ratio:.2f} ± "
         return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of what they show"
-    at_middle, at_end = (_beyond(one, noise) for one in (middle, long))
+    at_middle, at_end = (math.sqrt(max(one.left_rad**2 - noise.left_rad**2, 0.0)) for one in (middle, long))
     least = max(LARGE_SHARE * short.turn_rad, LARGE_RAD)
     if fit.turn_slip > TURNS_SLIPPING and at_middle > least and at_end < BOUNDED * at_middle:
         angles = f"{math.degrees(at_middle):.0f}° over {MIDDLE_S:g} s and by no more than {math.degrees(at_end):.0f}°"
         return f"their turn differs from the robot's by {angles} over {long_s:.0f} s, which slip would add up"
     return ""
-
-
-def _beyond(turns: Turns, noise: Turns) -> float:
-    return math.sqrt(max(turns.left_rad**2 - noise.left_rad**2, 0.0))

@@ -65,7 +65,9 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     last = first + 1
     windows = compare(knots, motion, first, last, 0.0)
     duration = knots.t[last] - knots.t[first]
-    slide = (SLIDE_MPS + _fastest_mps(knots, motion)) * duration
+    speed = np.diff(knots.track.distance) / np.diff(knots.t)
+    # how fast the wheels drive the robot at most, but for single samples
+    slide = (SLIDE_MPS + motion.scale * float(np.quantile(speed, 0.99))) * duration
     along, turns = motion.scale * knots.track.distance, motion.lever_m * motion.turn
     jitter, spin = (_by_jitter(knots, one, first) for one in (along, turns))
     noise = JUMP_SIGMAS * np.sqrt(windows.sensor)
@@ -95,11 +97,6 @@ def _turn_with_wheels(knots: Knots, motion: Motion, windows: ComparedWindows, du
     by_gyro = motion.lever_m * (knots.gyro[windows.end] - knots.gyro[windows.begin])
     slipped = np.abs(by_gyro - windows.model_turned)
     return np.asarray(slipped < np.minimum(JUMP_MPS * duration, np.abs(windows.turned) / 2))
-
-
-def _fastest_mps(knots: Knots, motion: Motion) -> float:
-    """Return how fast the wheels drive the robot at most [m/s], but for single samples."""
-    return motion.scale * float(np.quantile(np.diff(knots.track.distance) / np.diff(knots.t), 0.99))
 
 
 def _by_jitter(knots: Knots, along: Floats, first: Ints) -> Floats:

@@ -172,14 +172,12 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
         shown.append((windows.rows(shows), square[shows]))
     windows = ComparedWindows._make(map(np.concatenate, zip(*(one for one, _ in shown), strict=True)))
     square, beyond = np.concatenate([one for _, one in shown]), _exceeds(windows)
-    still, twice = (far < STUCK_SHARE * windows.path_m for far in (windows.made, _from_doubled(windows)))
-
-    def clearest(kind: Bools) -> Floats:
-        return _clearest_of_runs(windows.begin[kind], windows.end[kind], square[kind])
-
-    # what stands still is rarer than any slip, and so is its opposite
-    of_stuck = _false_rate(square, clearest(still), clearest(twice))
-    of_others = _false_rate(square, clearest(~beyond & ~still), clearest(beyond))
+    # what stands still is rarer than any slip, and so is its opposite: twice the motion of the wheels
+    doubled = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
+    doubled = np.maximum(doubled, np.abs(windows.turned - windows.model_turned))
+    still, twice = (far < STUCK_SHARE * windows.path_m for far in (windows.made, doubled))
+    of_stuck = _false_rate(windows, square, still, twice)
+    of_others = _false_rate(windows, square, ~beyond & ~still, beyond)
     return _Evidence(
         windows.begin, windows.end, square, np.where(still, of_stuck, np.where(beyond, np.inf, of_others))
     ), error
@@ -237,25 +235,18 @@ def _of_one_side(windows: ComparedWindows) -> Bools:
     return np.asarray(sides.min(axis=0) < KEEPING_SHARE * sides.max(axis=0))
 
 
-def _from_doubled(windows: ComparedWindows) -> Floats:
-    """Return how far the robot is from twice the motion of its wheels (w,) [m]: the opposite of standing still."""
-    place = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
-    return np.maximum(place, np.abs(windows.turned - windows.model_turned))
+def _false_rate(windows: ComparedWindows, distance2: Floats, targets: Bools, decoys: Bools) -> Floats:
+    """Return, for each window, the decoys over the targets among those as clear as it or clearer (w,).
 
-
-def _clearest_of_runs(begin: Ints, end: Ints, distance2: Floats) -> Floats:
-    """Return the largest squared distance of each run of windows that overlap (r,), ascending."""
-    if not len(begin):
-        return np.empty(0)
-    order = np.argsort(begin, kind="stable")
-    begin, end, distance2 = begin[order], end[order], distance2[order]
-    apart = np.flatnonzero(begin[1:] >= np.maximum.accumulate(end)[:-1]) + 1
-    return np.sort(np.maximum.reduceat(distance2, np.concatenate([[0], apart])))
-
-
-def _false_rate(distance2: Floats, targets: Floats, decoys: Floats) -> Floats:
-    """Return, for each window, the decoys over the targets among those as clear as it or clearer (w,)."""
-    beyond = [len(values) - np.searchsorted(values, distance2) for values in (decoys, targets)]
+    Windows that overlap are one run, as clear as the clearest of them.
+    """
+    beyond = []
+    for kind in (decoys, targets):
+        order = np.flatnonzero(kind)[np.argsort(windows.begin[kind], kind="stable")]
+        apart = windows.begin[order][1:] >= np.maximum.accumulate(windows.end[order])[:-1]
+        runs = np.flatnonzero(np.append(True, apart)[: len(order)])
+        clearest = np.sort(np.maximum.reduceat(distance2[order], runs)) if len(order) else np.empty(0)
+        beyond.append(len(clearest) - np.searchsorted(clearest, distance2))
     return np.asarray(beyond[0] / np.maximum(beyond[1], 1))
 
 
