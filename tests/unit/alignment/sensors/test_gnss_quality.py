@@ -105,7 +105,8 @@ def test_rtk_losses_are_outages_with_a_miss_at_the_first_fixed_fix() -> None:
     spans = (run.outages_ns - run.table.stamp_ns[0]) / 1e9
     assert np.abs(spans - np.array(LOSSES_S)).max() < 0.11
     assert run.summary["rtk_losses_ns"] == run.summary["outages_ns"] == run.outages_ns.tolist()
-    missed = [outage for outage in real_outages(run) if outage.kind == "real"]
+    found = [outage.document for outage in real_outages(run)]
+    missed = [outage for outage in found if outage.kind == "real"]
     assert [outage.begin_s for outage in missed] == pytest.approx(list(spans[:, 0]))
     # Ten metres with known ICRs; the float fixes themselves were 0.3 to 1 m off.
     assert all(0.0 < outage.end_error_m < 0.03 * outage.distance_m for outage in missed)
