@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.errors import IcrToolError
     from icrtool.logs.read_log import read_log
-    from icrtool.output.files.documents import open_calibration
+    from icrtool.output.files.formats import open_calibration
     from icrtool.output.page.run_page import write_page
     from icrtool.output.run_directory import open_run
     from icrtool.records.run import Run, WarmStart
@@ -80,7 +80,7 @@ _HOMES = {
     "dropout_report": "icrtool.dropout_analysis.dropout_report",
     "fit": "icrtool.calibration.fit",
     "load_config": "icrtool.config",
-    "open_calibration": "icrtool.output.files.documents",
+    "open_calibration": "icrtool.output.files.formats",
     "open_run": "icrtool.output.run_directory",
     "read_log": "icrtool.logs.read_log",
     "write_page": "icrtool.output.page.run_page",

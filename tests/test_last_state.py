@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 
 import icrtool
-from icrtool.output.files.documents import logs_of_fleet
-from icrtool.output.files.formats import json_bytes
+from icrtool.output.files.formats import json_bytes, logs_of_fleet
 from icrtool.output.page.run_page import read_report, run_page
 
 DATA = Path(__file__).parent / "data"

@@ -204,7 +204,7 @@ class Calibration(CalibrationDocument, frozen=True, kw_only=True):
             Something that is not a calibration is there, or it cannot be written.
         """
         document = msgspec.structs.replace(self, name=UNSET)
-        file: Path = call_output("files.documents", "write_calibration", document, Path(path))
+        file: Path = call_output("files.formats", "write_calibration", document, Path(path))
         return file
 
     def __repr__(self) -> str:

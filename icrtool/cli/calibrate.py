@@ -51,7 +51,7 @@ def command(
       icrtool calibrate icrtool-runs -o calibration.json
     """  # noqa: D301 - click reads the escape
     from icrtool.errors import IcrToolError
-    from icrtool.output.files.documents import calibration_file, write_calibration
+    from icrtool.output.files.formats import calibration_file, write_calibration
 
     config = settings.load()
     sources = tuple(one for source in sources for one in runs_or_logs(source))

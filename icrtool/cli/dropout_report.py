@@ -103,7 +103,7 @@ def command(
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
     from icrtool.output.exports.acceptance import format_outcomes, suite_of
-    from icrtool.output.files.documents import open_calibration
+    from icrtool.output.files.formats import open_calibration
 
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)

@@ -54,7 +54,7 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
       icrtool export --for evo icrtool-runs/field -o trajectories
       icrtool export --for foxglove icrtool-runs/field -o field.mcap
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.files.own_files import check_place
+    from icrtool.output.files.atomic import check_place
 
     if target in TRAJECTORIES and output is not None and not _is_one_file(output):
         _write_trajectories(_run(source), cast("TrajectoryFormat", target), output)
@@ -101,8 +101,7 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
     from icrtool.output.exports.paths import SUFFIXES, format_trajectory, is_trajectory, paths_of
 
     directory.mkdir(parents=True, exist_ok=True)
-    from icrtool.output.files.atomic import write_file
-    from icrtool.output.files.own_files import check_place
+    from icrtool.output.files.atomic import check_place, write_file
 
     files = {directory / f"{path.name}{SUFFIXES[target]}": path for path in paths_of(run)}
     for file in files:
@@ -115,9 +114,8 @@ def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> 
 def _write_foxglove(run: Run, output: Path) -> None:
     """Write the MCAP file, and the layout beside it."""
     from icrtool.output.exports.foxglove import foxglove_layout, is_layout, write_foxglove
-    from icrtool.output.files.atomic import atomic_file, write_file
+    from icrtool.output.files.atomic import atomic_file, check_place, write_file
     from icrtool.output.files.formats import json_bytes
-    from icrtool.output.files.own_files import check_place
 
     layout = output.with_name(f"{output.stem}.layout.json")
     check_place(layout, layout.parent, is_layout)

@@ -121,7 +121,7 @@ def read_calibration(source: Path | None, *, force: bool = False, advice: str = 
     from icrtool.output.run_directory import newest_run, open_run
 
     if source is not None and source.is_file():
-        from icrtool.output.files.documents import open_calibration
+        from icrtool.output.files.formats import open_calibration
 
         return source.name, open_calibration(source)
     from icrtool.calibration.pooled import calibrate

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import wraps
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import click
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 Command = Callable[..., Any]
 Option = Callable[[Command], Command]
+Record = TypeVar("Record")
+Change = Callable[[Record], Record]
 
 POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
@@ -69,14 +72,29 @@ def together(name: str, home: str | Callable[..., object], *options: Option) -> 
     home : the record, or where it is: ``icrtool.config:ConfigSources``, imported when the command is called. Options
         that have the names of its fields become these, if they are given; the command gets the others as they are
     """
+    return _joined(name, home, lambda record, values: record(**values), options)
 
+
+def changes(name: str, home: str, *options: Option) -> Option:
+    """Return the same as `together`, but the argument changes a record, a dataclass, by the options that are given."""
+    return _joined(name, home, lambda _, values: lambda record: replace(record, **values), options)
+
+
+def _joined(
+    name: str,
+    home: str | Callable[..., object],
+    make: Callable[[Callable[..., object], dict[str, object]], object],
+    options: Sequence[Option],
+) -> Option:
     def add(command: Command) -> Command:
         @wraps(command)
         def call(**given: Any) -> object:
-            module, _, record = home.partition(":") if isinstance(home, str) else ("", "", "")
-            make = getattr(import_module(module), record) if isinstance(home, str) else home
-            values = {one: given.pop(one) for one in signature(make).parameters if one in given}
-            made = make(**{one: value for one, value in values.items() if value is not None})
+            record = home
+            if isinstance(record, str):
+                module, _, attribute = record.partition(":")
+                record = getattr(import_module(module), attribute)
+            values = {one: given.pop(one) for one in signature(record).parameters if one in given}
+            made = make(record, {one: value for one, value in values.items() if value is not None})
             return command(**{name: made}, **given)
 
         return add_options(call, *options)
@@ -134,7 +152,7 @@ class _File(click.Path):
 
 
 def _check_file(path: Path) -> None:
-    from icrtool.output.files.own_files import check_place
+    from icrtool.output.files.atomic import check_place
 
     check_place(path)
 

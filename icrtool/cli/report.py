@@ -32,8 +32,7 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
       icrtool report results/
     """  # noqa: D301 - click reads the escape
     from icrtool.errors import ConfigError
-    from icrtool.output.files.atomic import write_file
-    from icrtool.output.files.own_files import check_place, is_page
+    from icrtool.output.files.atomic import check_place, is_page, write_file
     from icrtool.output.run_directory import PAGE_FILE, newest_run
 
     sources = sources or (newest_run(RUNS),)
@@ -53,8 +52,7 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
 def _page_of(source: Path, *, coordinates: bool) -> str:
     """Return the page of a run, a fleet or a comparison."""
     from icrtool.errors import RunError
-    from icrtool.output.files.documents import read_fleet
-    from icrtool.output.files.formats import schema_of
+    from icrtool.output.files.formats import read_fleet, schema_of
     from icrtool.output.page.group_pages import comparison_in, comparison_page, fleet_page, read_comparison
     from icrtool.output.run_directory import is_run_directory
     from icrtool.records.fleet_document import FLEET_FAMILY, FLEET_FILE

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,9 +15,9 @@ from icrtool.cli.options import (
     FILE,
     NOT_NEGATIVE,
     POSITIVE,
-    Command,
+    Change,
     Option,
-    add_options,
+    changes,
     flag,
     numbers,
     option,
@@ -26,9 +26,9 @@ from icrtool.cli.printing import Printer
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
-    from icrtool.logs.writing.log import WriteOptions
+    from icrtool.logs.writing.messages import WheelMessages, WriteOptions
     from icrtool.records.tables import Icrs
-    from icrtool.simulation.drives import DrivePlan, Sensors
+    from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
     from icrtool.simulation.record import TruthTable
 
 PATHS = ("circle", "curved", "lawnmower", "figure-eight", "spins", "straight")
@@ -115,17 +115,13 @@ DRIVE_DEFAULTS: dict[str, object] = {
 }  # fmt: skip
 """Of `simulate`, by field; a study has its own."""
 
-MANY = object()
-"""In place of a default: an option that may be given more than once."""
-
 RECORDED = (
     ("--start-heading start_heading_rad", "DEG", degrees(), "Heading at the start, clockwise from north.", 30.0),
     ("--wheels", None, click.Choice(["encoder", "commanded"]),
      "Content of the wheel messages: counted travel, or the motor commands.", "encoder"),
     ("--wheel-messages", None, click.Choice(WHEEL_MESSAGES), "Message type of the wheels.", "joint_states"),
-    ("--wheel-rate wheel_rate_hz", "HZ", POSITIVE, "Wheel messages a second; default 100, commanded 10.", None),
+    ("--wheel-rate", "HZ", POSITIVE, "Wheel messages a second; default 100, commanded 10.", None),
     ("--motor-lag motor_lag_s", "S", NOT_NEGATIVE, "Time constant with which the tracks follow their commands.", 0.0),
-    ("--outage outages_s", "BEGIN:END", span_text, "No fixes between these seconds; repeatable.", MANY),
     ("--antenna", "FORWARD,RIGHT", place_text, "Position of the antenna, from the body origin [m].", "0,0"),
     ("--gnss-delay gnss_delay_s", "S", float, "The stamps of the fixes lag by this.", 0.0),
     ("--heading convention", None, click.Choice(["enu", "ned"]), "Convention of the Imu: REP-103, or REP-145's NED.",
@@ -137,32 +133,22 @@ RECORDED = (
     ("--heading-offset heading_offset_rad", "DEG", degrees(), "Added to every heading, clockwise.", 0.0),
     ("--heading-delay heading_delay_s", "S", float, "The stamps of the headings lag by this.", 0.0),
 )  # fmt: skip
-"""Further options of `simulate`, as in `DRIVE`, with their default; the one with an empty one is repeatable."""
+"""Further options of `simulate`, as in `DRIVE`, with their default."""
 
 
-def drive_options(**defaults: object) -> Option:
-    """Return what adds `DRIVE` and --change to a command; `defaults`: by field, none for the others."""
+def drive_options(*further: Option, **defaults: object) -> Option:
+    """Return what adds `DRIVE`, --change and further options, as what changes a path, a plan, and sensors.
+
+    Parameters
+    ----------
+    defaults : of `DRIVE`, by field, none for the others
+    """
     text = "The ICRs become these after T seconds; repeatable."
     change = option("--change changes", "T:YR,YL,X", change_text, text, multiple=True)
     of_drive = [option(*row, default=defaults.get(row[0].split()[-1])) for row in DRIVE]
-    return lambda command: add_options(command, *of_drive, change)
-
-
-def recorded_options(command: Command) -> Command:
-    """Add `RECORDED` to a command."""
-    return add_options(
-        command,
-        *(
-            option(*row, default=None if default is MANY else default, multiple=default is MANY)
-            for *row, default in RECORDED
-        ),
-    )
-
-
-def given_fields(record: type, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that set fields of a record, those that were given or have a default."""
-    names = (field.name for field in fields(record))
-    return {name: given[name] for name in names if given.get(name) not in (None, ())}
+    of_sensors = changes("sensors", "icrtool.simulation.drives:Sensors", *of_drive, change, *further)
+    of_plan = changes("plan", "icrtool.simulation.drives:DrivePlan", of_sensors)
+    return changes("path", "icrtool.simulation.drives:PathPlan", of_plan)
 
 
 @click.command("simulate")
@@ -170,11 +156,14 @@ def given_fields(record: type, given: Mapping[str, Any]) -> dict[str, Any]:
 @flag("--force", "Replace a log that is there.")
 @options.SEED
 @option("--speeds", "FILE.csv", FILE, "Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")
-@drive_options(**DRIVE_DEFAULTS)
-@recorded_options
+@drive_options(*(option(*row, default=default, multiple=default == ()) for *row, default in RECORDED), **DRIVE_DEFAULTS)
 @options.CONFIGURATION
 @options.printing(options.QUIET, options.VERBOSE)
-def command(log: Path, settings: ConfigSources, printer: Printer, **given: Any) -> None:
+def command(
+    log: Path, force: bool, seed: int, speeds: Path | None, path: Change[PathPlan], plan: Change[DrivePlan],
+    sensors: Change[Sensors], encoder_counts: float | None, wheel_rate: float | None, antenna: tuple[float, float],
+    wheel_messages: WheelMessages, convention: Literal["enu", "ned"], settings: ConfigSources, printer: Printer,
+) -> None:  # fmt: skip
     """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth beside it.
 
     The kinematics are the paper's (Eqs. 8-10), integrated without error; the sensors those of its Section 4. The robot
@@ -186,19 +175,30 @@ def command(log: Path, settings: ConfigSources, printer: Printer, **given: Any) 
       icrtool simulate -o drive.mcap --robot husky-a200 --path figure-eight
       icrtool fit drive.mcap --robot husky-a200
     """  # noqa: D301 - click reads the escape
-    config = simulated_robot(settings)
-    plan, sensors = _plan(config, given), _sensors(config, given)
-    writing = _write_options(log, config, sensors, given)
     from icrtool.logs.writing.log import write_log
-    from icrtool.output.files.truth_file import log_and_truth, truth_path, write_truth
+    from icrtool.output.simulation_files import log_and_truth, read_speeds, truth_path, write_truth
+    from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
     from icrtool.simulation.record import simulate
 
-    with log_and_truth(log, force=given["force"]) as (fresh_log, fresh_truth):
-        recorded, truth = simulate(plan, sensors, given["seed"])
+    config = simulated_robot(settings)
+    driven = path(PathPlan()) if speeds is None else read_speeds(speeds)
+    duration_s = 100.0 if isinstance(driven, PathPlan) else float(driven.t_s[-1])
+    drive = plan(DrivePlan(icrs_m=default_icrs(config), path=driven, duration_s=duration_s))
+    check_changes(drive.changes, drive.duration_s)
+    counts = encoder_counts or encoder_counts_of(config)
+    metres = 2 * math.pi * needed(config, "wheel_radius_m") / counts
+    sensed = sensors(Sensors(metres_per_count=metres, antenna_forward_m=antenna[0], antenna_right_m=antenna[1]))
+    rate = wheel_rate or (COMMAND_RATE_HZ if sensed.wheels == "commanded" else ENCODER_RATE_HZ)
+    sensed = replace(sensed, wheel_rate_hz=rate)
+    if sensed.wheels == "commanded":
+        drive = replace(drive, command_rate_hz=rate)
+    writing = _write_options(log, config, sensed, wheel_messages, convention, counts)
+    with log_and_truth(log, force=force) as (fresh_log, fresh_truth):
+        recorded, truth = simulate(drive, sensed, seed)
         write_log(fresh_log, recorded, writing)
         write_truth(truth, fresh_truth)
-    printer.text(f"{_summary(config, plan, truth, given)}\n\nwritten to {log}, truth to {truth_path(log)}")
-    printer.detail(f"sensors: {sensors}")
+    printer.text(f"{_summary(config, drive, truth, seed)}\n\nwritten to {log}, truth to {truth_path(log)}")
+    printer.detail(f"sensors: {sensed}")
 
 
 def simulated_robot(settings: ConfigSources) -> Config:
@@ -225,47 +225,16 @@ def needed(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> f
     return value
 
 
-def _plan(config: Config, given: dict[str, Any]) -> DrivePlan:
-    from icrtool.simulation.drives import DrivePlan
-    from icrtool.simulation.paths import PathPlan
-
-    path: Any = PathPlan(**given_fields(PathPlan, given))
-    duration = given["duration_s"]
-    if given["speeds"] is not None:
-        from icrtool.output.files.truth_file import read_speeds
-
-        path = read_speeds(given["speeds"])
-        duration = duration if duration is not None else float(path.t_s[-1])
-    duration = duration if duration is not None else 100.0
-    check_changes(given["changes"], duration)
-    commanded = given["wheels"] == "commanded"
-    return DrivePlan(**given_fields(DrivePlan, given) | {
-        "icrs_m": given["icrs_m"] or default_icrs(config), "path": path, "duration_s": duration,
-        "command_rate_hz": (given["wheel_rate_hz"] or COMMAND_RATE_HZ) if commanded else None,
-    })  # fmt: skip
+def encoder_counts_of(config: Config) -> float:
+    """Return the counts of a wheel revolution: the robot's, or the paper's."""
+    return config.robot.encoder_counts_per_rev or 8192.0
 
 
-def _sensors(config: Config, given: dict[str, Any]) -> Sensors:
-    from icrtool.simulation.drives import Sensors
-
-    default_rate = COMMAND_RATE_HZ if given["wheels"] == "commanded" else ENCODER_RATE_HZ
-    forward, right = given["antenna"]
-    return Sensors(**given_fields(Sensors, given) | {
-        "wheel_rate_hz": given["wheel_rate_hz"] or default_rate,
-        "metres_per_count": 2 * math.pi * needed(config, "wheel_radius_m") / encoder_counts(config, given),
-        "antenna_forward_m": forward, "antenna_right_m": right,
-    })  # fmt: skip
-
-
-def encoder_counts(config: Config, given: dict[str, Any]) -> float:
-    """Return the counts of a wheel revolution: as given, the robot's, or the paper's."""
-    counts: float = given["encoder_counts"] or config.robot.encoder_counts_per_rev or 8192.0
-    return counts
-
-
-def _write_options(log: Path, config: Config, sensors: Sensors, given: dict[str, Any]) -> WriteOptions:
+def _write_options(
+    log: Path, config: Config, sensors: Sensors, wheels: WheelMessages, heading: Literal["enu", "ned"], counts: float
+) -> WriteOptions:
     from icrtool.errors import ConfigError
-    from icrtool.logs.writing.log import WriteOptions
+    from icrtool.logs.writing.messages import WriteOptions
 
     if log.suffix not in ("", ".mcap", ".bag"):
         raise ConfigError(
@@ -275,23 +244,25 @@ def _write_options(log: Path, config: Config, sensors: Sensors, given: dict[str,
         )
     return WriteOptions(
         container="mcap" if log.suffix == ".mcap" else "bag" if log.suffix == ".bag" else "db3",
-        wheels=given["wheel_messages"],
-        heading=given["convention"],
+        wheels=wheels,
+        heading=heading,
         wheel_radius_m=needed(config, "wheel_radius_m"),
         track_width_m=needed(config, "track_width_m"),
-        counts_per_rev=encoder_counts(config, given),
+        counts_per_rev=counts,
         heading_std_deg=math.degrees(sensors.heading_std_rad),
     )
 
 
-def _summary(config: Config, plan: DrivePlan, truth: TruthTable, given: dict[str, Any]) -> str:
+def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> str:
     import numpy as np
 
+    from icrtool.simulation.drives import PathPlan
+
     distance_m = float(np.hypot(np.diff(truth["north_m"]), np.diff(truth["east_m"])).sum())
-    what = "track speeds as given" if given["speeds"] is not None else f"{given['kind']} path"
+    what = f"{plan.path.kind} path" if isinstance(plan.path, PathPlan) else "track speeds as given"
     lines = [
         f"robot  {config.robot.name or 'as configured'}, b = {needed(config, 'track_width_m'):g} m",
-        f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {given['seed']}",
+        f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {seed}",
         f"ICRs   y right {plan.icrs_m[0]:+.3f}, y left {plan.icrs_m[1]:+.3f}, x {plan.icrs_m[2]:+.3f} m",
     ]
     lines += [

@@ -15,9 +15,8 @@ from icrtool.errors import OutputError
 from icrtool.fleet.recordings import as_text
 from icrtool.fleet.roll_up import CALIBRATIONS, MOST_POOLED_S
 from icrtool.output.figure_catalogue import FIGURES
-from icrtool.output.files.atomic import atomic_file, make_folders, write_file
+from icrtool.output.files.atomic import atomic_file, check_place, is_page, make_folders, write_file
 from icrtool.output.files.formats import PLOT_FORMATS, csv_bytes, json_bytes, schema_of
-from icrtool.output.files.own_files import check_place, is_page
 from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records.fleet_document import (

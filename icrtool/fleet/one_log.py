@@ -172,7 +172,7 @@ def _warm_start(source: Path | None, config: Config, note: Callable[[str], None]
     if source is None:
         return None
     if source.is_file():
-        from icrtool.output.files.documents import open_calibration
+        from icrtool.output.files.formats import open_calibration
 
         start = open_calibration(source).warm_start()
     else:

@@ -15,7 +15,7 @@ from icrtool import __version__
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import unique_name
 from icrtool.output.files.atomic import make_folders
-from icrtool.output.files.documents import logs_of_fleet, read_fleet, write_calibration
+from icrtool.output.files.formats import logs_of_fleet, read_fleet, write_calibration
 from icrtool.records.fleet_document import BUDGET_M, FLEET_FILE, FleetCalibration, FleetFile, FleetLog
 from icrtool.records.regular_file import is_regular
 from icrtool.records.run import ICR_COLUMNS, Run

@@ -12,9 +12,8 @@ import msgspec
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.kernels.arrays import Ints
-from icrtool.output.files.atomic import atomic_directory
+from icrtool.output.files.atomic import atomic_directory, files_in
 from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, schema_of
-from icrtool.output.files.own_files import files_in
 from icrtool.output.files.states_file import trials_file
 from icrtool.output.run_directory import is_run_directory
 from icrtool.records.dropout_document import DropoutDocument, SummaryRow, TrialDocument
@@ -46,7 +45,7 @@ def write_report(
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     figures : ``all``: those of the paper too
     stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: they are not written
-    inside : as in `icrtool.output.files.own_files.check_directory`
+    inside : as in `icrtool.output.files.atomic.check_directory`
 
     Raises
     ------

@@ -15,7 +15,7 @@ import numpy as np
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, OutputError, RunError
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, numbered_file, split_path
-from icrtool.output.files.atomic import atomic_directory
+from icrtool.output.files.atomic import atomic_directory, check_directory, own_files
 from icrtool.output.files.formats import (
     CHECKSUM_FILE,
     PLOT_FORMATS,
@@ -29,7 +29,6 @@ from icrtool.output.files.formats import (
     write_sums,
 )
 from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of, write_measurements
-from icrtool.output.files.own_files import check_directory, own_files
 from icrtool.output.files.remote_place import fetched, lies_there
 from icrtool.output.files.states_file import StatesFileError, StatesFormat, read_states, write_states
 from icrtool.records.plain_data import Record

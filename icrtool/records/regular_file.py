@@ -49,9 +49,7 @@ def open_regular(path: Path, inside: Path | None = None) -> BufferedReader:
         It cannot be opened.
     """
     if inside is not None:
-        check_folders(path, inside)
-        if path.is_symlink():
-            raise NotRegularFileError(path, "a link, which is not followed")
+        check_links(path, inside)
     handle = os.open(path, _FILE if inside is None else _FILE | _NO_LINK)
     try:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
@@ -95,24 +93,18 @@ def is_regular(path: Path, inside: Path) -> bool:
     return True
 
 
-def check_folders(path: Path, inside: Path) -> None:
-    """Refuse a path below a directory that leads over a link to a directory, or that is one itself.
+def check_links(path: Path, inside: Path) -> None:
+    """Refuse a path, of a file or a folder below a directory, that is a link or leads over one.
 
     Raises
     ------
     NotRegularFileError
-        It does.
+        It does, or does not lie there.
     """
-    place = inside
-    for name in _parts(path, inside):
-        place = place / name
-        if place.is_symlink() and (place != path or place.is_dir()):
-            raise NotRegularFileError(place, f"{name} is a link, which is not followed")
-
-
-def _parts(path: Path, inside: Path) -> tuple[str, ...]:
-    """Return the names that lead from a directory to a path below it."""
-    parts = path.relative_to(inside).parts
-    if not parts or ".." in parts:
+    place, names = inside, path.relative_to(inside).parts
+    if ".." in names:
         raise NotRegularFileError(path, f"does not lie in {inside}")
-    return parts
+    for name in names:
+        place = place / name
+        if place.is_symlink():
+            raise NotRegularFileError(place, f"{name} is a link, which is not followed")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.records.samples import SensorColumns
+from icrtool.records.samples import HeadingSamples, PositionFixes, SensorColumns, WheelSamples
+from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, Readings, Sensors, Truth, check_drive, drive_plan, sense
 
 START_NS = 1_760_000_000_000_000_000
@@ -67,6 +68,26 @@ def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> Se
     )
 
 
+def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
+    """Return readings as a log, whose stamps begin at 0."""
+    fixes, headings = len(readings.gnss_t), len(readings.heading_t)
+    variance = np.full(fixes, sensors.gnss_std_m**2)
+    north, east = readings.gnss_m.T
+    return RobotLog(
+        name="study",
+        wheels=WheelSamples(stamps(readings.wheel_t, 0), readings.v_left_mps, readings.v_right_mps),
+        gnss=PositionFixes(stamps(readings.gnss_t, 0), north, east, variance, variance, np.zeros(fixes)),
+        heading=HeadingSamples(
+            stamps(readings.heading_t, 0), readings.heading_rad, np.full(headings, sensors.heading_std_rad**2)
+        ),
+        datum=None,
+        streams=(),
+        inputs=(),
+        rejected_fixes={},
+        warnings=(),
+    )
+
+
 def truth_table(truth: Truth, times: Floats) -> TruthTable:
     """Return the truth at times (n,) [s]: the body origin about `DATUM`, headings unwrapped, true track speeds."""
     row = truth.rows(times)
@@ -76,6 +97,6 @@ def truth_table(truth: Truth, times: Floats) -> TruthTable:
     return columns | {"v_left_mps": truth.v_left_mps[row], "v_right_mps": truth.v_right_mps[row]}
 
 
-def stamps(times: Floats) -> Ints:
+def stamps(times: Floats, start_ns: int = START_NS) -> Ints:
     """Return times [s] as stamps of the log's clock."""
-    return START_NS + np.rint(times * 1e9).astype(np.int64)
+    return start_ns + np.rint(times * 1e9).astype(np.int64)

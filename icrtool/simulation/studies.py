@@ -16,11 +16,11 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError
 from icrtool.kernels.filter_records import GUARDED, PRINTED, UNGUARDED
 from icrtool.records.tables import Icrs
-from icrtool.simulation import study_measures as measured
-from icrtool.simulation.drives import DrivePlan, Sensors, check_drive
-from icrtool.simulation.paths import PathPlan
-from icrtool.simulation.study_measures import FATES, consistency_of, trace
+from icrtool.simulation import study_runs as measured
+from icrtool.simulation.drives import DrivePlan, PathKind, PathPlan, check_drive
 from icrtool.simulation.study_records import (
+    IDEAL,
+    PLAN,
     Level,
     Number,
     Setting,
@@ -29,14 +29,12 @@ from icrtool.simulation.study_records import (
     StudyNumber,
     StudyRequest,
     StudyResult,
+    consistency_of,
 )
-from icrtool.simulation.study_runs import Progress, Scenario, run_scenarios
+from icrtool.simulation.study_runs import FATES, Progress, Scenario, run_scenarios, trace
 
 PAPER_TRACK_WIDTH_M = 0.51
 """Pentzer 2014, Section 5: the robot of the simulations."""
-
-STUDY_STEP_S = 0.005
-"""Track speeds of a path are held this long in a study: no longer than any wheel interval."""
 
 MOST_RUNS = 100_000
 """Runs of a setting."""
@@ -196,7 +194,7 @@ def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
     return numbers
 
 
-WINDING = {"path": PathPlan("curved", radius_m=2.0), "duration_s": 200.0}
+WINDING = replace(PLAN, path=PathPlan("curved", radius_m=2.0), duration_s=200.0)
 NOISES = tuple(round(0.05 * step, 2) for step in range(11))
 ERROR = "error_{icr}_m"
 
@@ -208,8 +206,9 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
         figures=figures,
         varies=f"input {word} [m/s]",
         varied=sensors_field,
-        request={"runs": 20, "values": NOISES},
-        drive=WINDING,
+        runs=20,
+        values=NOISES,
+        plan=WINDING,
         vary=by_preset(lambda base, value: sensing(base, **{sensors_field: value})),
         measures=(measured.measure_errors,),
         numbers=(Number("{series}: error of {icr} at {value:g} m/s", ERROR, "spread", "m", paper, largest),),
@@ -218,7 +217,7 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
     )
 
 
-PATHS = ("circle", "curved", "lawnmower", "spins")
+PATHS: tuple[PathKind, ...] = ("circle", "curved", "lawnmower", "spins")
 PATH_TIMES = {"circle": "2.9-12.8 s, driven (Figs. 15, 17)", "": "5-15 s, driven"}
 STARTS = only("proper start", "inverted start")
 START_FATES = {"no guard": "those with y_icr_right > 0 (Fig. 6)", "": "all (Fig. 7)"}
@@ -230,7 +229,9 @@ STUDIES: dict[StudyName, Study] = {
     "convergence": Study(
         about="convergence time of the ICRs, by kind of path",
         figures="4, 5",
-        request={"presets": ("paper",), "runs": 200, "paths": PATHS},
+        presets=("paper",),
+        runs=200,
+        paths=PATHS,
         vary=by_preset(lambda base, kind: driving(base, kind=kind)),
         measures=(measured.measure_times, measured.measure_errors, trace(end_s=SHOWN_S)),
         numbers=(Number("{value} ({series}): all three ICRs converged after", "settle_s", "spread", "s", PATH_TIMES),),
@@ -241,7 +242,9 @@ STUDIES: dict[StudyName, Study] = {
         about="which initial ICRs converge, without and with the sign guard",
         figures="6, 7",
         varies="initial y ICRs [m]",
-        request={"presets": ("paper",), "runs": 4, "values": tuple(2.0 - 0.5 * step for step in range(9))},
+        presets=("paper",),
+        runs=4,
+        values=tuple(2.0 - 0.5 * step for step in range(9)),
         vary=by_start,
         measures=(measured.measure_fate, trace()),
         numbers=(
@@ -255,8 +258,8 @@ STUDIES: dict[StudyName, Study] = {
     "icr-change": Study(
         about="time to follow a change of the ICRs, without and with covariance inflation",
         figures="8, 9",
-        request={"runs": 20},
-        drive={"path": PathPlan("figure-eight", speed_mps=0.5, radius_m=1.0), "duration_s": 525.0},
+        runs=20,
+        plan=replace(PLAN, path=PathPlan("figure-eight", speed_mps=0.5, radius_m=1.0), duration_s=525.0),
         changes_s=(175.0, 350.0),
         vary=by_preset(lambda base, name: replace(base, inflate=name == "inflated"), ("not inflated", "inflated")),
         measures=(measured.measure_changes, trace(), measured.zoom),
@@ -274,8 +277,8 @@ STUDIES: dict[StudyName, Study] = {
         figures="10",
         varies="turn radius [m]",
         varied="radius_m",
-        request={"values": tuple(0.25 * step for step in range(9))},
-        drive={"path": PathPlan("circle"), "duration_s": 60.0},
+        values=tuple(0.25 * step for step in range(9)),
+        plan=replace(PLAN, path=PathPlan("circle"), duration_s=60.0),
         changes_s=(20.0,),
         vary=by_preset(on_circle),
         measures=(measured.measure_one_change,),
@@ -293,8 +296,8 @@ STUDIES: dict[StudyName, Study] = {
     "input-source": Study(
         about="encoders against commanded speeds",
         figures="11",
-        drive={**WINDING, "command_rate_hz": 10.0, "motor_lag_s": 0.1},
-        sensors={"input_bias_mps": 0.03},
+        plan=replace(WINDING, command_rate_hz=10.0, motor_lag_s=0.1),
+        sensors=replace(IDEAL, input_bias_mps=0.03),
         vary=by_preset(from_source, ("encoder", "commanded")),
         measures=(measured.measure_errors, trace()),
         numbers=(Number("{series}: error of {icr}, {value} speeds", ERROR, "spread", "m"),),
@@ -306,8 +309,9 @@ STUDIES: dict[StudyName, Study] = {
         figures="35-37",
         varies="GNSS noise [m]",
         varied="gnss_std_m",
-        request={"runs": 20, "values": (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)},
-        drive={"path": PathPlan("lawnmower"), "duration_s": 300.0},
+        runs=20,
+        values=(0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
+        plan=replace(PLAN, path=PathPlan("lawnmower"), duration_s=300.0),
         vary=by_preset(lambda base, value: sensing(base, gnss_std_m=value)),
         measures=(measured.measure_errors, measured.measure_times, measured.measure_open_loop),
         numbers=(
@@ -324,8 +328,8 @@ STUDIES: dict[StudyName, Study] = {
         about="whether logs of any rate give the same ICRs",
         varies="rate of wheels and heading [Hz]",
         varied="rate",
-        request={"values": (10.0, 20.0, 50.0, 100.0, 200.0)},
-        sensors={"wheels": "encoder"},
+        values=(10.0, 20.0, 50.0, 100.0, 200.0),
+        sensors=replace(IDEAL, wheels="encoder"),
         vary=by_preset(at_rate),
         measures=(measured.measure_errors,),
         numbers=(
@@ -337,7 +341,7 @@ STUDIES: dict[StudyName, Study] = {
     ),
     "consistency": Study(
         about="whether the filter's covariance is right: NEES, NIS, coverage",
-        request={"runs": 200},
+        runs=200,
         vary=by_case,
         measures=(measured.measure_consistency,),
         numbers=consistency_numbers,
@@ -353,9 +357,7 @@ def default_request(name: StudyName, config: Config) -> StudyRequest:
     if config.robot.track_width_m is None:
         config = replace(config, robot=replace(config.robot, track_width_m=PAPER_TRACK_WIDTH_M))
     study = STUDIES[name]
-    plan = DrivePlan(step_s=STUDY_STEP_S, **study.drive)
-    sensors = Sensors(**{"wheels": "ideal", "heading_resolution_rad": 0.0, **study.sensors})
-    return StudyRequest(name, plan, sensors, config, **study.request)
+    return StudyRequest(name, study.plan, study.sensors, config, study.presets, study.runs, study.values, study.paths)
 
 
 def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyResult:

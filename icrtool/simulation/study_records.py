@@ -5,17 +5,15 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
 from icrtool.config import Config
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.simulation.drives import DrivePlan, Sensors
-from icrtool.simulation.paths import PathKind, PathPlan
-from icrtool.simulation.study_measures import ICR_NAMES, statistics
-from icrtool.simulation.study_runs import Measure, Scenario
+from icrtool.simulation.drives import DrivePlan, PathKind, PathPlan, Sensors
+from icrtool.simulation.study_runs import ICR_NAMES, STATES, Measure, Scenario
 
 StudyName = Literal[
     "convergence",
@@ -29,6 +27,11 @@ StudyName = Literal[
     "rate",
     "consistency",
 ]
+
+PLAN = DrivePlan(step_s=0.005)
+"""A study holds track speeds no longer than any wheel interval."""
+
+IDEAL = Sensors(wheels="ideal", heading_resolution_rad=0.0)
 
 Preset = Literal["paper", "field"]
 Column = Floats | Ints | list[float | str]
@@ -51,11 +54,11 @@ class StudyRequest:
     plan: DrivePlan
     sensors: Sensors
     config: Config
-    presets: tuple[Preset, ...] = ("paper", "field")
-    runs: int = 40
+    presets: tuple[Preset, ...]
+    runs: int
+    values: tuple[float, ...]
+    paths: tuple[PathKind, ...]
     seed: int = 0
-    values: tuple[float, ...] = ()
-    paths: tuple[PathKind, ...] = ()
 
     @property
     def path(self) -> PathPlan:
@@ -107,6 +110,45 @@ class Level(NamedTuple):
     def metrics(self) -> dict[str, dict[str, float]]:
         """Return the statistics of each number over the runs."""
         return {name: statistics(values) for name, values in self.numbers().items()}
+
+
+def chi2_band(degrees: int, runs: int) -> tuple[float, float]:
+    """Return the 95 % band of the mean of `runs` chi-squared values that together have `degrees` degrees of freedom."""
+    from scipy.stats import chi2
+
+    low, high = chi2.ppf([0.025, 0.975], degrees)
+    return float(low) / runs, float(high) / runs
+
+
+def consistency_of(found: Mapping[str, Floats]) -> dict[str, Any]:
+    """Return what `measure_consistency` shows of a case: means with their 95 % bands, coverage and rms by state."""
+    nees, ratio, runs = found["settled nees"], found["ratio"], len(found["nees"])
+    low, high = chi2_band(6 * runs, runs)
+    by_stop = nees.mean(axis=0)
+    in_band = 100 * float(((by_stop >= low) & (by_stop <= high)).mean())
+    case: dict[str, Any] = {
+        "nees": {"mean": float(nees.mean()), "expected": 6.0, "band": (low, high), "stops_in_band_pct": in_band}
+    }
+    for what, degrees in (("nis_gnss", 2), ("nis_heading", 1)):
+        finite = found[f"all {what}"][np.isfinite(found[f"all {what}"])]
+        band = chi2_band(degrees * len(finite), len(finite))
+        case[what] = {"mean": float(finite.mean()), "expected": float(degrees), "band": band}
+    return case | {
+        "states": list(STATES),
+        "by_run": {what: statistics(found[what]) for what in case},
+        "coverage_pct": (100 * (np.abs(ratio) <= 2).mean(axis=(0, 1))).tolist(),
+        "rms_error_over_std": np.sqrt((ratio**2).mean(axis=(0, 1))).tolist(),
+    }
+
+
+def statistics(values: Floats) -> dict[str, float]:
+    """Return count, mean, std, median, 5th and 95th percentile of values (runs,); NaN are ignored."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return {"count": 0, "mean": math.nan, "std": math.nan, "p5": math.nan, "p50": math.nan, "p95": math.nan}
+    low, middle, high = np.percentile(finite, [5, 50, 95]).tolist()
+    mean, std = float(finite.mean()), float(finite.std())
+    return {"count": len(finite), "mean": mean, "std": std, "p5": low, "p50": middle, "p95": high}
 
 
 How = Literal["spread", "median", "mean", "percent", "percent found", "range of means", "extreme medians", "first"]
@@ -191,7 +233,7 @@ class Study:
     varies : what its values are, with unit; empty where it takes none
     varied : the option of the command that they are values of
     changes_s : the ICRs change at these times, where no others are given
-    request, drive, sensors : settings of the request, the drive and the sensors that are not the usual ones
+    plan, sensors, presets, runs, values, paths : of the usual request
     summary : what study.json holds of a level beside the statistics of its numbers
     """
 
@@ -205,9 +247,12 @@ class Study:
     varies: str = ""
     varied: str = ""
     changes_s: tuple[float, ...] = ()
-    request: Mapping[str, Any] = field(default_factory=dict)
-    drive: Mapping[str, Any] = field(default_factory=dict)
-    sensors: Mapping[str, Any] = field(default_factory=dict)
+    plan: DrivePlan = PLAN
+    sensors: Sensors = IDEAL
+    presets: tuple[Preset, ...] = ("paper", "field")
+    runs: int = 40
+    values: tuple[float, ...] = ()
+    paths: tuple[PathKind, ...] = ()
     summary: Callable[[Mapping[str, Floats]], dict[str, Any]] = lambda _: {}
 
 

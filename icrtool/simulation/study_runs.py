@@ -1,4 +1,7 @@
-"""Filter many simulated runs on all cores; each is reduced at once to the numbers that a study needs of it."""
+"""Filter many simulated runs on all cores; each is reduced at once to the numbers that a study needs of it.
+
+What is measured of a run are named numbers, the columns of its CSV, and arrays for its picture.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import cast
 
 import numpy as np
@@ -16,16 +20,53 @@ from icrtool.estimation.filter_setup import configured_noise, process_variance, 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GUARDED
-from icrtool.kernels.kinematics import model_states
-from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
-from icrtool.records.tables import RobotLog
-from icrtool.simulation.drives import DrivePlan, Readings, Sensors, Truth, check_drive, drive_plan, sample_times, sense
-from icrtool.simulation.paths import PathPlan, plan_body, track_speeds
+from icrtool.kernels.kinematics import drive, model_states
+from icrtool.simulation.drives import (
+    DrivePlan,
+    PathPlan,
+    Readings,
+    Sensors,
+    Truth,
+    check_drive,
+    drive_plan,
+    plan_body,
+    sample_times,
+    sense,
+    track_speeds,
+)
+from icrtool.simulation.record import readings_log
 
 Progress = Callable[[float], None]
 
 STOP_EVERY_S = 5.0
 """The whole covariance is kept so often [s], and at the end."""
+
+
+ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")
+STATES = ("north", "east", "heading", *ICR_NAMES)
+FATES = ("converged", "inverted", "elsewhere")
+
+SETTLED_SHARE = 0.1
+SETTLED_M = 0.02
+"""An estimate has settled when its error stays below a tenth of its initial error, or below 2 cm."""
+
+CONVERGED_M = 0.1
+"""A run has converged where all three ICRs, averaged over its last tenth, are within this distance of the truth [m]."""
+
+LAST_SHARE = 10
+
+TRACE_POINTS = 400
+ZOOM_S = 10.0
+
+TRIAL_M = 10.0
+TRIAL_STARTS = 40
+"""Open-loop trials per run; their starts are evenly spaced."""
+
+SETTLED_S = 10.0
+"""Covariances count after this time: before, the initial values of the presets still have an effect."""
+
+LEAST_STD = 1e-12
+"""Avoids division by zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +119,8 @@ class StudyRun:
     heading_nis: Floats
 
 
-Measure = Callable[[StudyRun], dict[str, float | Floats]]
+Found = dict[str, float | Floats]
+Measure = Callable[[StudyRun], Found]
 """Reduces a run to numbers, or arrays as large in all runs of a scenario."""
 
 
@@ -101,7 +143,7 @@ def run_scenarios(
         check_drive(scenario.plan, scenario.sensors)
     jobs = [(scenario, run) for scenario in scenarios for run in range(runs)]
 
-    def work(job: tuple[Scenario, int]) -> dict[str, float | Floats]:
+    def work(job: tuple[Scenario, int]) -> Found:
         run = _filtered(*job, seed)
         return {name: value for measure in measures for name, value in measure(run).items()}
 
@@ -188,25 +230,176 @@ def _readings(
     )  # fmt: skip
 
 
-def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
-    """Return readings as a log."""
+def measure_errors(run: StudyRun) -> Found:
+    """Return, over the second half of a run, mean error and its rms, with the stated std, by ICR; and NIS."""
+    half = len(run.t_s) // 2
+    error = run.x[half:, 3:] - run.truth[half:, 3:]
+    numbers: Found = {"inverted": inverted(run)}
+    for place, name in enumerate(ICR_NAMES):
+        numbers[f"final_{name}_m"] = run.x[-1, 3 + place]
+        numbers[f"std_{name}_m"] = run.std[-1, 3 + place]
+        numbers[f"error_{name}_m"] = error[:, place].mean()
+        numbers[f"rms_{name}_m"] = np.sqrt((error[:, place] ** 2).mean())
+    return numbers | _mean_nis(run)
 
-    def stamps(times: Floats) -> Ints:
-        return np.rint(times * 1e9).astype(np.int64)
 
-    fixes, headings = len(readings.gnss_t), len(readings.heading_t)
-    variance = np.full(fixes, sensors.gnss_std_m**2)
-    north, east = readings.gnss_m.T
-    return RobotLog(
-        name="study",
-        wheels=WheelSamples(stamps(readings.wheel_t), readings.v_left_mps, readings.v_right_mps),
-        gnss=PositionFixes(stamps(readings.gnss_t), north, east, variance, variance, np.zeros(fixes)),
-        heading=HeadingSamples(
-            stamps(readings.heading_t), readings.heading_rad, np.full(headings, sensors.heading_std_rad**2)
-        ),
-        datum=None,
-        streams=(),
-        inputs=(),
-        rejected_fixes={},
-        warnings=(),
-    )
+def _mean_nis(run: StudyRun) -> Found:
+    return {"nis_gnss": float(np.nanmean(run.gnss_nis)), "nis_heading": float(np.nanmean(run.heading_nis))}
+
+
+def measure_times(run: StudyRun, since_s: float = 0.0, until_s: float = np.inf) -> Found:
+    """Return convergence and settling times [s] of every ICR after `since_s`; NaN: not before `until_s`."""
+    begin = max(int(np.searchsorted(run.t_s, since_s - 1e-9)) - 1, 0)
+    end = int(np.searchsorted(run.t_s, until_s - 1e-9))
+    t = run.t_s[begin:end] - max(since_s, run.t_s[0])
+    times: Found = {}
+    for place, name in enumerate(ICR_NAMES):
+        value, target = run.x[begin:end, 3 + place], float(run.truth[end - 1, 3 + place])
+        times[f"rise_{name}_s"] = convergence_time(t, value, target)
+        times[f"settle_{name}_s"] = settling_time(t, value, target)
+    return {**times, "settle_s": float(np.max([times[f"settle_{name}_s"] for name in ICR_NAMES]))}
+
+
+def measure_changes(run: StudyRun) -> Found:
+    """Return whether a run ended inverted, and its times after every change of the ICRs, until the next one."""
+    plan = run.scenario.plan
+    spans = enumerate(pairwise([*(time for time, _ in plan.changes), plan.duration_s]), start=1)
+    times = {f"change{n}_{name}": time for n, span in spans for name, time in measure_times(run, *span).items()}
+    return {"inverted": inverted(run), **times}
+
+
+def measure_one_change(run: StudyRun) -> Found:
+    """Return whether a run ended inverted, and its times after the first change of the ICRs."""
+    return {"inverted": inverted(run), **measure_times(run, run.scenario.plan.changes[0][0])}
+
+
+def convergence_time(t: Floats, value: Floats, target: float) -> float:
+    """Return the time [s] between the first samples past 10 % and past 90 % of the change to the target.
+
+    Parameters
+    ----------
+    t : (k,) [s]; value : (k,); target : the true ICR [m]
+
+    Returns
+    -------
+    NaN where the run does not reach 90 %. An estimate that jumps past the target has 0.
+
+    Notes
+    -----
+    Pentzer 2014, Section 5.2. `icrtool.estimation.summary.converge` computes another time, of a run without a known
+    truth: its target is the median of the run's second half, and from its end on the estimate must stay within 10 %
+    of the change for some seconds. `settling_time` is the time to stay near the truth.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (value - value[0]) / (target - value[0])
+    first = int(np.argmax(share >= 0.1))
+    last = first + int(np.argmax(share[first:] >= 0.9))
+    return float(t[last] - t[first]) if share[first] >= 0.1 and share[last] >= 0.9 else np.nan
+
+
+def settling_time(t: Floats, value: Floats, target: float) -> float:
+    """Return the time [s] from which on the value (k,) stays near the target (`SETTLED_SHARE`); NaN: it does not."""
+    near = max(SETTLED_SHARE * abs(target - float(value[0])), SETTLED_M)
+    away = np.flatnonzero(~(np.abs(value - target) <= near))
+    settled = int(away[-1]) + 1 if len(away) else 0
+    return max(float(t[settled]), 0.0) if settled < len(t) else np.nan
+
+
+def inverted(run: StudyRun) -> float:
+    """Return 1 where a run ended with y_icr_right <= y_icr_left, or with NaN; else 0."""
+    return float(not run.x[-1, 3] > run.x[-1, 4])
+
+
+def measure_fate(run: StudyRun) -> Found:
+    """Return which of `FATES` a run had, as 1 and 0, and the ICRs at its end."""
+    last = max(1, len(run.x) // LAST_SHARE)
+    error = np.abs(run.x[-last:, 3:] - run.truth[-last:, 3:]).mean(axis=0)
+    near, wrong = float((error < CONVERGED_M).all()), inverted(run)
+    fates = dict(zip(FATES, (near, wrong * (1 - near), (1 - wrong) * (1 - near)), strict=True))
+    return {**fates, **{f"final_{name}_m": run.x[-1, 3 + place] for place, name in enumerate(ICR_NAMES)}}
+
+
+def trace(begin_s: float = 0.0, end_s: float = np.inf, name: str = "trace") -> Measure:
+    """Return what keeps time, ICR estimates and left track speed between two times, as array `name`.
+
+    It is (about 400, 5) [s, m, m, m, m/s].
+    """
+
+    def kept(run: StudyRun) -> Found:
+        first = max(int(np.searchsorted(run.t_s, begin_s, "right")) - 1, 0)
+        last = int(np.searchsorted(run.t_s, end_s, "right")) - 1
+        rows = np.unique(np.linspace(first, last, TRACE_POINTS).astype(np.int64))
+        return {name: np.column_stack([run.t_s[rows], run.x[rows, 3:], run.v_left[rows]])}
+
+    return kept
+
+
+def zoom(run: StudyRun) -> Found:
+    """Return the trace around the first change of the ICRs, as array ``zoom``."""
+    change_s = run.scenario.plan.changes[0][0]
+    return trace(change_s - 1.0, change_s + ZOOM_S, "zoom")(run)
+
+
+def measure_open_loop(run: StudyRun) -> Found:
+    """Return the 95th percentile of the open-loop error after 10 m [m]: with the final ICRs, and without slip.
+
+    Notes
+    -----
+    Section 6.4 with the ICRs the filter ended with, over starts all along the true path.
+    """
+    half_width = (run.scenario.config.robot.track_width_m or np.nan) / 2
+    no_slip = np.array([half_width, -half_width, 0.0])
+    models = {"blind_icr_10m_p95_m": run.x[-1, 3:], "blind_no_slip_10m_p95_m": no_slip}
+    return {name: float(np.percentile(_open_loop_errors(run, icrs), 95)) for name, icrs in models.items()}
+
+
+def _open_loop_errors(run: StudyRun, icrs: Floats) -> Floats:
+    truth = run.motion
+    if truth is None:
+        raise ValueError("open-loop errors need the true motion")
+    north, east = truth.pose[:, 0], truth.pose[:, 1]
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(north), np.diff(east)))])
+    ends = np.searchsorted(distance, distance + TRIAL_M)
+    possible = np.flatnonzero(ends < len(distance))
+    if not len(possible):
+        return np.full(1, np.nan)
+    errors = []
+    for first in possible[np.linspace(0, len(possible) - 1, TRIAL_STARTS).astype(np.int64)]:
+        rows = slice(first, int(ends[first]) + 1)
+        t, v_left, v_right = truth.t_s[rows], truth.v_left_mps[rows], truth.v_right_mps[rows]
+        end = drive(t, v_left, v_right, icrs[None, :], np.zeros(len(t), np.int64), truth.pose[first])[-1]
+        errors.append(float(np.hypot(*(end - truth.pose[int(ends[first])])[:2])))
+    return np.array(errors)
+
+
+def measure_consistency(run: StudyRun) -> Found:
+    """Return mean NEES and NIS, the errors at the end in their standard deviations; and those of all stops.
+
+    The arrays: ``stops_s`` (s,), ``all nees`` (s,), of those that count ``settled nees`` (c,), and over their standard
+    deviations ``ratio`` (c, 6); ``all nis_gnss`` (m,), ``all nis_heading`` (h,).
+    """
+    stops_s = run.t_s[run.stops]
+    nees, ratio = errors_over_std(run.x[run.stops] - run.truth[run.stops], run.P)
+    settled = stops_s >= min(SETTLED_S, stops_s[-1])
+    at_end = {f"end_error_over_std_{state}": float(error) for state, error in zip(STATES, ratio[-1], strict=True)}
+    return {
+        "nees": float(nees[settled].mean()), **_mean_nis(run), **at_end,
+        "stops_s": stops_s, "all nees": nees, "settled nees": nees[settled], "ratio": ratio[settled],
+        "all nis_gnss": run.gnss_nis, "all nis_heading": run.heading_nis,
+    }  # fmt: skip
+
+
+def errors_over_std(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """Return NEES (...) and error over its std (..., 6), of errors (..., 6) with covariances (..., 6, 6).
+
+    Notes
+    -----
+    The heading error is wrapped. The covariance is scaled to correlations first: metres and radians differ by orders.
+    """
+    error = error.copy()
+    error[..., 2] = np.angle(np.exp(1j * error[..., 2]))
+    std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), LEAST_STD**2))
+    ratio = error / std
+    correlation = covariance / (std[..., :, None] * std[..., None, :])
+    nees = (ratio * np.linalg.solve(correlation, ratio[..., None])[..., 0]).sum(axis=-1)
+    return nees, ratio

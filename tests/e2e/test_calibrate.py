@@ -110,7 +110,7 @@ def test_info_says_what_the_drive_could_show_and_what_to_drive_next(icrtool) -> 
 
 
 def test_several_runs_are_pooled_and_each_is_left_out(icrtool, tmp_path: Path) -> None:
-    from icrtool.output.files.documents import open_calibration
+    from icrtool.output.files.formats import open_calibration
 
     for seed in (1, 2, 3):
         drive = ("--path", "curved", "--duration", "90", "--seed", seed, "-q")

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from icrtool.cli import main
-from icrtool.output.files.own_files import OWN_FILES
+from icrtool.output.files.atomic import OWN_FILES
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_figure_eight"

@@ -40,7 +40,7 @@ from icrtool.output.exports.paths import (
     paths_of,
     rows_apart,
 )
-from icrtool.output.files.own_files import EXPORTED_MCAP
+from icrtool.output.files.atomic import EXPORTED_MCAP
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.samples import FIXED_FIX

@@ -15,8 +15,8 @@ from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.tables.study import capital, study_subtitle, study_title
 from icrtool.simulation.studies import shown_path
-from icrtool.simulation.study_measures import FATES, STATES, chi2_band, consistency_of
-from icrtool.simulation.study_records import Level, StudyName, StudyResult
+from icrtool.simulation.study_records import Level, StudyName, StudyResult, chi2_band, consistency_of
+from icrtool.simulation.study_runs import FATES, STATES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

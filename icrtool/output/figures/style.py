@@ -128,7 +128,7 @@ ICR_LOOKS: dict[str, Look] = {
     "y_icr_left": {"label": "y left", "color": "#b2182b", "linestyle": (0, (6, 2)), "marker": "s", "markersize": 3.5},
     "x_icr": {"label": "x", "color": "0.25", "linestyle": (0, (1.5, 1.5)), "marker": "^", "markersize": 3.5},
 }
-"""Of the three ICRs where they share a panel, by `icrtool.simulation.study_measures.ICR_NAMES`."""
+"""Of the three ICRs where they share a panel, by `icrtool.simulation.study_runs.ICR_NAMES`."""
 
 
 LABEL_BOX: Look = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}

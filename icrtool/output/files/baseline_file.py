@@ -10,8 +10,7 @@ from pathlib import Path
 from icrtool.dropout_analysis.report import BaselineReport, baseline_report, known_content
 from icrtool.errors import ConfigError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
-from icrtool.output.files.documents import logs_of_fleet
-from icrtool.output.files.formats import read_document
+from icrtool.output.files.formats import logs_of_fleet, read_document
 from icrtool.records.dropout_document import EarlierReport
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular

@@ -1,4 +1,9 @@
-"""The calls that change names on the disk: hidden names beside a place, and their locks; exchange, link, sync."""
+"""What changes names on the disk: hidden names beside a place, and their locks; exchange, link, sync.
+
+A file is put in its place by a rename; a directory exchanges its name with the old one (``renameat2`` of Linux,
+``renamex_np`` of macOS). Where platform or file system cannot exchange, the old one is renamed aside first; where a
+process is killed between both renames, the next one renames it back.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +15,13 @@ import secrets
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
+
+from icrtool.records.process_resources import end, remove, unfinished
 
 if sys.platform != "win32":
     import fcntl
@@ -41,15 +48,15 @@ SYNC_THREADS = 8
 _LOOK = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
-def hidden_name(place: Path, end: str = ".partial") -> Path:
+def hidden_name(place: Path, suffix: str = ".partial") -> Path:
     """Return a new hidden name beside a place, for what shall get its name."""
-    return place.with_name(f"{_hidden_begin(place)}{secrets.token_hex(TOKEN_BYTES)}{end}")
+    return place.with_name(f"{_hidden_begin(place)}{secrets.token_hex(TOKEN_BYTES)}{suffix}")
 
 
-def hidden(place: Path, end: str) -> list[Path]:
+def hidden(place: Path, suffix: str) -> list[Path]:
     """Return what has a name that `hidden_name` made of a place."""
     # Of exactly this length: the directories a and a.b may be beside one another.
-    found = place.parent.glob(glob.escape(_hidden_begin(place)) + 2 * TOKEN_BYTES * "[0-9a-f]" + end)
+    found = place.parent.glob(glob.escape(_hidden_begin(place)) + 2 * TOKEN_BYTES * "[0-9a-f]" + suffix)
     # A link is not ours: it would lead the cleaning elsewhere.
     return [path for path in found if not path.is_symlink()]
 
@@ -57,6 +64,53 @@ def hidden(place: Path, end: str) -> list[Path]:
 def _hidden_begin(place: Path) -> str:
     name = os.fsencode(place.name)
     return f".{blake2b(name, digest_size=16).hexdigest() if len(name) > LONGEST_NAME_BYTES else place.name}."
+
+
+@contextmanager
+def beside(place: Path, make: Callable[[Path], None]) -> Iterator[Path]:
+    """Make a file or directory under a hidden name beside a place, and remove what has that name at the end.
+
+    What killed processes left there is removed too.
+    """
+    # What was renamed aside is needed as long as nothing is in its place.
+    for left in hidden(place, ".partial") + (hidden(place, ".old") if place.exists() else []):
+        if is_abandoned(left):
+            remove(left)
+    partial = hidden_name(place)
+    with unfinished(partial):
+        try:
+            make(partial)
+            with locked(partial):
+                yield partial
+        finally:
+            remove(partial)
+
+
+def put(partial: Path, place: Path) -> None:
+    """Put a hidden file or directory, which is synced, in its place, and remove what was there.
+
+    Raises
+    ------
+    OSError
+        It cannot be renamed; what was there still is.
+    """
+    # From here on its name may be that of the old directory, which has to stay where this process is ended by force.
+    end(partial)
+    old = partial
+    if not place.is_dir():
+        partial.replace(place)
+    elif not exchange(partial, place):
+        old = hidden_name(place, ".old")
+        place.rename(old)
+        try:
+            partial.rename(place)
+        except BaseException:
+            if not place.exists():
+                old.rename(place)
+            raise
+    with unfinished(old):
+        sync(place.parent)
+        remove(old)
 
 
 @contextmanager

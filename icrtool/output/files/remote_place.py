@@ -14,9 +14,8 @@ from typing import TypeVar
 from icrtool.errors import IcrToolError, LogError, OutputError
 from icrtool.logs.containers.address import asked, filesystem
 from icrtool.logs.containers.unpack import ScratchFolder
-from icrtool.output.files.atomic import make_folders, write_file
+from icrtool.output.files.atomic import OWN_FILES, make_folders, reported, write_file
 from icrtool.output.files.formats import CHECKSUM_FILE
-from icrtool.output.files.own_files import OWN_FILES, reported
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.urls import UrlPath
 

@@ -16,9 +16,8 @@ from icrtool.dropout_analysis.reference import with_smoothed_reference
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import RunError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
-from icrtool.output.files.atomic import write_file
+from icrtool.output.files.atomic import is_page, write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
-from icrtool.output.files.own_files import is_page
 from icrtool.output.page.drive_data import drive_data
 from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
 from icrtool.output.run_directory import check_sum

@@ -7,8 +7,8 @@ from itertools import groupby
 
 from icrtool.output.text_blocks import Block, Table, Text, printed
 from icrtool.records.text import counted
-from icrtool.simulation.study_measures import ICR_NAMES
 from icrtool.simulation.study_records import Level, StudyNumber, StudyRequest, StudyResult
+from icrtool.simulation.study_runs import ICR_NAMES
 
 ERRORS = {f"error_{icr}_m": name for icr, name in zip(ICR_NAMES, ("y right", "y left", "x"), strict=True)}
 SETTLE = {"settle_s": "all within 10 % [s]"}

@@ -20,7 +20,7 @@ from icrtool.kernels.arrays import Bools
 from icrtool.motion.fit import Pool, own_constants
 from icrtool.motion.models import FAMILY, MODELS
 from icrtool.motion.recording import Recording, Trials, Windows, cut_trials, cut_windows, predicted_path
-from icrtool.output.files.documents import open_calibration, write_calibration
+from icrtool.output.files.formats import open_calibration, write_calibration
 from icrtool.output.tables.calibration import calibration_blocks
 from icrtool.output.text_blocks import printed
 from icrtool.records.calibration_document import CalibratedRobot

@@ -15,7 +15,7 @@ from icrtool.cli.inputs import runs_or_logs
 from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, write_fleet
 from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
-from icrtool.output.files.documents import open_calibration
+from icrtool.output.files.formats import open_calibration
 from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog
 from icrtool.records.run import Run
 from support.documents import with_summary

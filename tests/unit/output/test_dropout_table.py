@@ -14,7 +14,7 @@ from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import OutputError, RunError
 from icrtool.output.exports.acceptance import format_markdown, format_outcomes, suite_of, write_junit
-from icrtool.output.files.own_files import check_place
+from icrtool.output.files.atomic import check_place
 from icrtool.output.tables.dropout import format_dropout, p95_at, reach_rows
 from icrtool.output.tables.errors import shown_horizons
 from icrtool.output.text_format import error_text

@@ -26,10 +26,8 @@ from icrtool.fleet.fleet_files import write_fleet
 from icrtool.output.exports.foxglove import write_foxglove
 from icrtool.output.figures.style import new_figure
 from icrtool.output.files.atomic import atomic_file, write_file
-from icrtool.output.files.documents import write_calibration
-from icrtool.output.files.formats import save_picture
-from icrtool.output.files.truth_file import log_and_truth
-from icrtool.output.study_directory import write_study
+from icrtool.output.files.formats import save_picture, write_calibration
+from icrtool.output.simulation_files import log_and_truth, write_study
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.run import Run
 from icrtool.simulation.study_records import Level

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.records.regular_file import NotRegularFileError, check_folders, is_regular, read_regular
+from icrtool.records.regular_file import NotRegularFileError, check_links, is_regular, read_regular
 
 
 @pytest.fixture
@@ -52,9 +52,9 @@ def test_a_file_that_is_too_large_is_not_read(place: Path) -> None:
         read_regular(place / "file", place, most_bytes=9)
 
 
-def test_a_path_over_a_link_to_a_folder_is_refused_and_a_link_to_a_file_is_left_to_the_writer(place: Path) -> None:
-    check_folders(place / "inner" / "new", place)
-    check_folders(place / "link", place)
-    for name in ("out", "out/new", "../outside"):
+def test_a_path_that_is_a_link_or_leads_over_one_is_refused(place: Path) -> None:
+    check_links(place / "inner" / "new", place)
+    check_links(place, place)
+    for name in ("link", "out", "out/new", "../outside"):
         with pytest.raises(NotRegularFileError):
-            check_folders(place / name, place)
+            check_links(place / name, place)

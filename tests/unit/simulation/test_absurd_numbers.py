@@ -8,8 +8,7 @@ from dataclasses import replace
 import pytest
 
 from icrtool.errors import ConfigError
-from icrtool.simulation.drives import DrivePlan, Sensors, check_drive
-from icrtool.simulation.paths import PathPlan
+from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, check_drive
 
 
 @pytest.mark.parametrize("value", [1e12, 1e300, math.inf, math.nan, 1e-300])

@@ -13,8 +13,19 @@ from icrtool.cli.simulate import PATHS
 from icrtool.cli.study import NAMES, command
 from icrtool.errors import ConfigError
 from icrtool.kernels.kinematics import body_velocity
-from icrtool.simulation.drives import DrivePlan, Sensors, TrackSpeeds, check_drive, drive_plan, sample_times, sense
-from icrtool.simulation.paths import PathKind, PathPlan, plan_body, track_speeds
+from icrtool.simulation.drives import (
+    DrivePlan,
+    PathKind,
+    PathPlan,
+    Sensors,
+    TrackSpeeds,
+    check_drive,
+    drive_plan,
+    plan_body,
+    sample_times,
+    sense,
+    track_speeds,
+)
 from icrtool.simulation.record import DATUM, START_NS, record, simulate
 
 ROUNDING = 1e-9

@@ -12,10 +12,10 @@ from scipy.stats import chi2
 from icrtool.config import Config, load_config
 from icrtool.errors import ConfigError
 from icrtool.simulation import study_runs
-from icrtool.simulation.paths import PathPlan
+from icrtool.simulation.drives import PathPlan
 from icrtool.simulation.studies import STUDIES, default_request, run_study
-from icrtool.simulation.study_measures import chi2_band, convergence_time, errors_over_std, settling_time, statistics
-from icrtool.simulation.study_records import StudyResult
+from icrtool.simulation.study_records import StudyResult, chi2_band, statistics
+from icrtool.simulation.study_runs import convergence_time, errors_over_std, settling_time
 from support.studies import SMALL, small_study
 from support.studies import small_request as request
 

@@ -14,8 +14,7 @@ from random import Random
 import pytest
 
 from icrtool.errors import OutputError
-from icrtool.output.files.atomic import atomic_directory
-from icrtool.output.files.own_files import check_directory
+from icrtool.output.files.atomic import atomic_directory, check_directory
 
 
 def marked(directory: Path) -> bool:

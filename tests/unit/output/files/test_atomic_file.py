@@ -8,8 +8,7 @@ import pytest
 
 from icrtool.errors import OutputError
 from icrtool.output.exports.acceptance import write_junit
-from icrtool.output.files.atomic import atomic_file, write_file
-from icrtool.output.files.own_files import check_place
+from icrtool.output.files.atomic import atomic_file, check_place, write_file
 
 
 def test_nothing_is_seen_at_the_place_before_all_is_written(tmp_path: Path) -> None:

@@ -1,21 +1,26 @@
-"""The truth beside a simulated log, and track speeds to simulate with."""
+"""Files of simulations: a log with its truth beside it, the track speeds to drive, and the directory of a study.
+
+A study is written whole or not at all: every run as CSV, parameters and statistics as JSON, the picture.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from icrtool import __version__
 from icrtool.errors import DataError, OutputError
 from icrtool.output.files import disk
-from icrtool.output.files.atomic import hidden_directory, put
-from icrtool.output.files.formats import read_numbers
-from icrtool.output.files.own_files import reported, restore
+from icrtool.output.files.atomic import atomic_directory, check_directory, reported, restore
+from icrtool.output.files.formats import csv_bytes, json_bytes, read_numbers, schema_of
 from icrtool.records.process_resources import remove
 from icrtool.simulation.drives import TrackSpeeds
 from icrtool.simulation.record import TruthTable
+from icrtool.simulation.study_records import Column, StudyResult
 
 SPEED_COLUMNS = ("t_s", "v_left_mps", "v_right_mps")
 
@@ -47,17 +52,13 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
                 raise OutputError(place, "exists already", "--force replaces it")
             if place.is_dir() and (place == truth or not _is_bag(place)):
                 raise OutputError(place, "is a directory and no bag", "it is left alone; choose another name")
-        with hidden_directory(log.absolute()) as fresh:
+        with disk.beside(log.absolute(), Path.mkdir) as fresh:
             yield fresh / log.name, fresh / truth.name
             disk.sync_tree(fresh)
             # Killed from here on, it leaves a log without its truth, never with that of another log.
             remove(truth)
-            if log.is_dir():
-                put(fresh / log.name, log, fresh)
-            else:
-                (fresh / log.name).replace(log)
-            (fresh / truth.name).replace(truth)
-            disk.sync(log.absolute().parent)
+            disk.put(fresh / log.name, log.absolute())
+            disk.put(fresh / truth.name, truth.absolute())
 
 
 def _is_bag(place: Path) -> bool:
@@ -92,3 +93,68 @@ def read_speeds(path: Path) -> TrackSpeeds:
         row = int(np.argmax(np.diff(t) <= 0)) + 1
         raise DataError(path, f"the times do not increase at row {row + 1}", f"t_s = {t[row]:g} after {t[row - 1]:g}")
     return TrackSpeeds(t - t[0], left, right)
+
+
+STUDY_SCHEMA = "icrtool/study/1"
+STUDY_FILE = "study.json"
+SCHEMA_FAMILY = "icrtool/study/"
+KIND = "study directory"
+
+
+def check_study_target(directory: Path) -> None:
+    """Refuse a place where a study cannot be put, before any work is done for it.
+
+    Raises
+    ------
+    OutputError
+        A file or a directory that is not a study of ours is there.
+    """
+    check_directory(directory, is_study_directory, kind=KIND)
+
+
+def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] = ("png",)) -> None:
+    """Write ``study.json``, ``NAME.csv`` and ``NAME.png``.
+
+    Parameters
+    ----------
+    directory : where they shall appear; an old study there is replaced
+    plots : formats of the picture, of ``png``, ``svg`` and ``pdf``
+
+    Raises
+    ------
+    OutputError
+        A file or a foreign directory is there, or the disk does not take it.
+    """
+    name = result.request.name
+    with atomic_directory(directory, is_study_directory, kind=KIND) as partial:
+        (partial / STUDY_FILE).write_bytes(json_bytes(study_document(result)))
+        rows = zip(*map(_cells, result.columns.values()), strict=True)
+        (partial / f"{name}.csv").write_bytes(csv_bytes(result.columns, rows))
+        if plots:
+            from icrtool.output.figures.study import study_figure
+            from icrtool.output.figures.style import save
+
+            save(study_figure(result), partial / name, plots)
+
+
+def is_study_directory(directory: Path) -> bool:
+    """Return whether a directory is a study of ours, of whatever version."""
+    return schema_of(directory / STUDY_FILE, directory).startswith(SCHEMA_FAMILY)
+
+
+def study_document(result: StudyResult) -> dict[str, Any]:
+    """Return what study.json holds."""
+    return {
+        "schema": STUDY_SCHEMA,
+        "tool_version": __version__,
+        "study": result.request.name,
+        "about": result.study.about,
+        "paper_figures": result.study.figures,
+        "settings": result.request.settings(),
+        "findings": [one._asdict() for one in result.findings],
+        "levels": result.records(),
+    }
+
+
+def _cells(values: Column) -> list[Any]:
+    return values if isinstance(values, list) else values.tolist()

@@ -15,12 +15,17 @@ from icrtool.cli.printing import show
 from icrtool.errors import DataError, OutputError
 from icrtool.output.figures.study import study_figure
 from icrtool.output.figures.style import new_figure
-from icrtool.output.files.truth_file import log_and_truth, read_speeds, truth_path, write_truth
-from icrtool.output.study_directory import check_study_target, write_study
+from icrtool.output.simulation_files import (
+    check_study_target,
+    log_and_truth,
+    read_speeds,
+    truth_path,
+    write_study,
+    write_truth,
+)
 from icrtool.output.tables.study import finding_text, format_study, runs_text, study_subtitle, study_title
 from icrtool.output.text_blocks import Table
-from icrtool.simulation.drives import DrivePlan, Sensors
-from icrtool.simulation.paths import PathPlan
+from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
 from icrtool.simulation.record import simulate
 from icrtool.simulation.studies import STUDIES, run_study
 from icrtool.simulation.study_records import StudyNumber
