@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import sys
 import textwrap
 import time
 from collections import Counter
@@ -18,7 +17,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.options import LOG, PLACE, POSITIVE, Exports, flag, option
-from icrtool.cli.printing import Printer, error
+from icrtool.cli.printing import LiveLine, Printer, error
 from icrtool.records.text import LogText, counted, escaped, shortened
 
 if TYPE_CHECKING:
@@ -137,7 +136,7 @@ def run_all(
     rows: list[FleetLog] = []
     with (
         executor_of([path_of(one.path) for one in requests], *workers) as (executor, lost),
-        closing(view),
+        view,
         closing(run_batch(requests, executor, batch, view.stage, lost, folder)) as coming,
     ):
         for row in coming:
@@ -147,13 +146,13 @@ def run_all(
     return sorted(rows, key=lambda row: order[row.log])
 
 
-class View:
+class View(LiveLine):
     """What is shown of a batch while it runs: a line per log, and on a terminal a line about those that run."""
 
     def __init__(self, logs: int, printer: Printer) -> None:
+        super().__init__(quiet=printer.quiet)
         self._logs = logs
         self._printer = printer
-        self._live = not printer.quiet and sys.stderr.isatty()
         self._begun = time.monotonic()
         self._counts: Counter[str] = Counter()
         self._processed = 0
@@ -176,7 +175,7 @@ class View:
         self._stages.pop(row.log, None)
         self._counts[row.status] += 1
         self._processed += row.this_time == "processed"
-        self.close()
+        self.clear()
         if row.status == "failed":
             if not self._printer.quiet:
                 error(f"{escaped(row.log)}: {escaped(row.reason)}")
@@ -190,7 +189,7 @@ class View:
         self._show()
 
     def _show(self) -> None:
-        if not self._live:
+        if not self.on_terminal:
             return
         done, worked = self._counts.total(), self._processed
         parts = [f"{done}/{self._logs} done"]
@@ -205,12 +204,7 @@ class View:
         stages = list(self._stages.items())
         space = (width - len("  ".join(parts))) // max(len(stages), 1) - LONGEST_STAGE
         parts += [f"{shortened(escaped(log), max(space, LEAST_NAME))}: {stage}" for log, stage in stages]
-        click.echo(f"\r\x1b[2K{'  '.join(parts)[:width]}", err=True, nl=False)
-
-    def close(self) -> None:
-        """Remove the line about what runs."""
-        if self._live:
-            click.echo("\r\x1b[2K", err=True, nl=False)
+        self.rewrite("  ".join(parts)[:width])
 
 
 def line_of(row: FleetLog) -> str:

@@ -248,7 +248,32 @@ class Inputs:
             raise SystemExit(3 if gate_failed else 1)
 
 
-class Stages:
+class LiveLine:
+    """A line on a terminal about what is being done; what is printed next begins at its left."""
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self.on_terminal = not quiet and sys.stderr.isatty()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.clear()
+
+    def rewrite(self, text: str) -> None:
+        """Show another text in its place."""
+        if self.on_terminal:
+            sys.stderr.write(f"{CLEAR}{text}")
+            sys.stderr.flush()
+
+    def clear(self) -> None:
+        """Remove it."""
+        self.rewrite("")
+
+
+class Stages(LiveLine):
     """The stages of the work on one log; ended, nothing of them stays on a terminal.
 
     Parameters
@@ -259,29 +284,20 @@ class Stages:
     """
 
     def __init__(self, name: str, *, quiet: bool = False, verbose: bool = False) -> None:
+        super().__init__(quiet=quiet)
         self.name = name
-        self.on_terminal = not quiet and sys.stderr.isatty()
         self.prints_lines = verbose and not quiet and not self.on_terminal
         self._stage = ""
         self._shown_s = 0.0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.end()
 
     def begin(self, stage: str) -> None:
         """Begin a stage: what is being done, for example ``reading``."""
         give_back_freed()
         self._stage = stage
         self._shown_s = time.monotonic()
-        if self.on_terminal:
-            self._write(f"{CLEAR}{self._title()} …")
-        elif self.prints_lines:
-            self._write(f"{self.name}: {stage}\n")
+        self.rewrite(f"{self._title()} …")
+        if self.prints_lines:
+            click.echo(f"{self.name}: {stage}", err=True)
 
     def share(self, done: float) -> None:
         """Show which share of the stage is done, 0 to 1; at the end of it, only the stage."""
@@ -289,16 +305,7 @@ class Stages:
         if self.on_terminal and now_s - self._shown_s >= REFRESH_S:
             self._shown_s = now_s
             percent = f"{100 * min(max(done, 0.0), 1.0):.0f} %" if done < 1.0 else "…"
-            self._write(f"{CLEAR}{self._title()} {percent}")
-
-    def end(self) -> None:
-        """Clear the line; what is printed next begins at its left."""
-        if self.on_terminal:
-            self._write(CLEAR)
+            self.rewrite(f"{self._title()} {percent}")
 
     def _title(self) -> str:
         return f"{self.name}: {self._stage}" if self._stage else self.name
-
-    def _write(self, text: str) -> None:
-        sys.stderr.write(text)
-        sys.stderr.flush()
