@@ -249,17 +249,15 @@ def load_config(path: str | Path | None = None, robot: str | None = None, sets: 
     merged: dict[str, Any] = {}
     for layer in layers:
         for section, values in layer.items():
-            if isinstance(values, Mapping) and isinstance(merged.get(section, {}), dict):
-                merged[section] = {**merged.get(section, {}), **values}
-            else:
-                merged[section] = values
+            both = isinstance(values, Mapping) and isinstance(merged.get(section, {}), dict)
+            merged[section] = {**merged.get(section, {}), **values} if both else values
     return parse_config(merged)
 
 
 class ConfigSources(NamedTuple):
     """What a configuration is loaded from: the arguments of `load_config`."""
 
-    path: Path | None = None
+    file: Path | None = None
     robot: str | None = None
     sets: tuple[str, ...] = ()
 

@@ -69,8 +69,8 @@ def together(name: str, home: str | Callable[..., object], *options: Option) -> 
     Parameters
     ----------
     name : of the argument
-    home : the record, or where it is: ``icrtool.config:ConfigSources``, imported when the command is called. Options
-        that have the names of its fields become these, if they are given; the command gets the others as they are
+    home : the record, or where it is: ``icrtool.config:ConfigSources``, imported when the command is called. Those of
+        the options that have the names of its fields become these, if they are given; the command gets the others
     """
     return _joined(name, home, lambda record, values: record(**values), options)
 
@@ -86,6 +86,8 @@ def _joined(
     make: Callable[[Callable[..., object], dict[str, object]], object],
     options: Sequence[Option],
 ) -> Option:
+    known = _names(add_options(lambda: None, *options))
+
     def add(command: Command) -> Command:
         @wraps(command)
         def call(**given: Any) -> object:
@@ -93,13 +95,19 @@ def _joined(
             if isinstance(record, str):
                 module, _, attribute = record.partition(":")
                 record = getattr(import_module(module), attribute)
-            values = {one: given.pop(one) for one in signature(record).parameters if one in given}
+            values = {one: given.pop(one) for one in known.intersection(signature(record).parameters, given)}
             made = make(record, {one: value for one, value in values.items() if value is not None})
             return command(**{name: made}, **given)
 
+        call.__dict__["made"] = {name, *command.__dict__.get("made", ())}
         return add_options(call, *options)
 
     return add
+
+
+def _names(command: Command) -> set[str]:
+    """Return the arguments that a command gets of its options: those that are made of several, and the others."""
+    return {one.name for one in command.__dict__.get("__click_params__", ())}.union(command.__dict__.get("made", ()))
 
 
 def add_options(command: Command, *options: Option) -> Command:
@@ -180,7 +188,7 @@ def numbers(text: str, form: str, count: int | None = None) -> tuple[float, ...]
 CONFIGURATION = together(
     "settings",
     "icrtool.config:ConfigSources",
-    option("--config path", "FILE.toml", FILE, "Configuration file."),
+    option("--config file", "FILE.toml", FILE, "Configuration file."),
     option("--robot", "NAME", None, "Built-in robot, for example husky-a200; icrtool robots lists them.",
            shell_complete=complete_robot),
     option("--set sets", "SECTION.KEY=VALUE", None, "Set a configuration key; icrtool config lists them; repeatable.",
@@ -325,6 +333,6 @@ def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
 
 def given(settings: ConfigSources, span: tuple[str | None, str | None]) -> list[str]:
     """Return the options of a call that the next command takes too."""
-    pairs = [("--config", settings.path), ("--robot", settings.robot), *(("--set", one) for one in settings.sets)]
+    pairs = [("--config", settings.file), ("--robot", settings.robot), *(("--set", one) for one in settings.sets)]
     pairs += [("--from", span[0]), ("--to", span[1])]
     return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]

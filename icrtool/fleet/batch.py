@@ -219,11 +219,11 @@ def _request(one: FoundRecording, known: About, output: Path, options: BatchOpti
 def _config(one: FoundRecording, known: About, options: BatchOptions) -> Config:
     """Return a log's configuration; a robot that is not built in is a name, which needs a configuration of its own."""
     builtin = known.robot in builtin_robots()
-    if known.robot and not builtin and known.config is None and options.settings.path is None:
+    if known.robot and not builtin and known.config is None and options.settings.file is None:
         advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
         raise ConfigError(f"{one.log}: robot {known.robot!r}", "not a built-in robot", advice)
     robot = known.robot if builtin else options.settings.robot if not known.robot else None
-    return options.settings._replace(path=known.config or options.settings.path, robot=robot).load()
+    return options.settings._replace(file=known.config or options.settings.file, robot=robot).load()
 
 
 def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:

@@ -64,12 +64,10 @@ def on_disk(
     if not isinstance(place, UrlPath):
         yield place
         return
-    with _scratch(place) as folder:
-        store = _Store(place)
-        store.probe()
-        before = store.fetch(folder, needed, parts)
-        with _named(place, folder):
-            yield folder
+    store = _Store(place)
+    store.probe()
+    with _copied(place, store, needed, parts) as (folder, before):
+        yield folder
         if begin is not None:
             begin("uploading")
         store.upload(folder, before)
@@ -87,10 +85,8 @@ def fetched(place: Path, needed: Needed) -> Iterator[Path]:
     if not isinstance(place, UrlPath):
         yield place
         return
-    with _scratch(place) as folder:
-        _Store(place, "read").fetch(folder, needed, None)
-        with _named(place, folder):
-            yield folder
+    with _copied(place, _Store(place, "read"), needed, None) as (folder, _):
+        yield folder
 
 
 def write_below(folder: Path, name: str, content: bytes) -> None:
@@ -217,25 +213,21 @@ def _as_output(place: UrlPath) -> Iterator[None]:
 
 
 @contextmanager
-def _scratch(place: UrlPath) -> Iterator[Path]:
-    """Give the name of a folder on disk of the same name, which is removed at the end."""
+def _copied(
+    place: UrlPath, store: _Store, needed: Needed, parts: Collection[str] | None
+) -> Iterator[tuple[Path, dict[str, tuple[int, int]]]]:
+    """Give a folder on disk with what lies at an address, which errors name, and what identifies its files."""
     scratch = ScratchFolder()
+    folder = scratch.path / (place.name or "results")
     try:
-        yield scratch.path / (place.name or "results")
-    finally:
-        scratch.close()
-
-
-@contextmanager
-def _named(place: UrlPath, folder: Path) -> Iterator[None]:
-    """Let errors about a folder name the address that it stands for."""
-    try:
-        yield
+        yield folder, store.fetch(folder, needed, parts)
     except IcrToolError as err:
         texts = [str(err.what), err.why, err.advice]
         if not any(str(folder) in text for text in texts):
             raise
         raise type(err)(*(text.replace(str(folder), str(place)) for text in texts)) from err
+    finally:
+        scratch.close()
 
 
 def _is_below(name: str) -> bool:
