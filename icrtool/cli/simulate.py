@@ -156,7 +156,11 @@ def drive_options(*further: Option, **defaults: object) -> Option:
 @flag("--force", "Replace a log that is there.")
 @options.SEED
 @option("--speeds", "FILE.csv", FILE, "Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")
-@drive_options(*(option(*row, default=default, multiple=default == ()) for *row, default in RECORDED), **DRIVE_DEFAULTS)
+@drive_options(
+    option("--outage outages_s", "BEGIN:END", span_text, "No fixes between these seconds; repeatable.", multiple=True),
+    *(option(*row, default=default) for *row, default in RECORDED),
+    **DRIVE_DEFAULTS,
+)
 @options.CONFIGURATION
 @options.printing(options.QUIET, options.VERBOSE)
 def command(
