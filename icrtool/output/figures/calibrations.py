@@ -39,22 +39,22 @@ def forecast_figure(
     grown, path = figure.subplots(1, 2)
     for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
         if one is not None:
-            grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **style.ICR.keywords() | dash)
-            grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **style.FILTER.keywords() | dash)
+            grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **style.ICR | dash)
+            grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **style.FILTER | dash)
     for budget in budgets_m:
-        grown.axhline(budget, label=f"budget {budget:g} m", **style.CHANGE.keywords())
+        grown.axhline(budget, label=f"budget {budget:g} m", **style.CHANGE)
     if forecast.distance_m[-1] > measured_m:
-        grown.axvline(measured_m, label="measured up to here", **style.MEAN.keywords())
+        grown.axvline(measured_m, label="measured up to here", **style.MEAN)
     grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, None), ylim=(0.0, None))
-    path.plot(forecast.east_m, forecast.north_m, label="path", **style.HALF_WIDTH.keywords() | {"linestyle": "-"})
+    path.plot(forecast.east_m, forecast.north_m, label="path", **style.HALF_WIDTH | {"linestyle": "-"})
     # Where the forecast is extrapolated its circles would bury the path.
     measured = np.flatnonzero(forecast.distance_m <= measured_m)
     rows = measured[:: max(len(measured) // CIRCLES, 1)]
     for east, north, radius in zip(forecast.east_m[rows], forecast.north_m[rows], forecast.p95_m[rows], strict=True):
         path.add_patch(
-            Circle((float(east), float(north)), float(radius), fill=False, edgecolor=style.ICR.color, linewidth=0.8)
+            Circle((float(east), float(north)), float(radius), fill=False, edgecolor=style.ICR["color"], linewidth=0.8)
         )
-    path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=style.ICR.color, linewidth=0.8)
+    path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=style.ICR["color"], linewidth=0.8)
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
     path.set(xlabel="East [m]", ylabel="North [m]")
@@ -76,7 +76,7 @@ BEFORE: style.Look = {
 AFTER: style.Look = BEFORE | {
     "label": "after: calibrated",
     "marker": "o",
-    "color": style.ICR.color,
+    "color": style.ICR["color"],
     "markersize": 2.8,
 }
 
@@ -138,9 +138,9 @@ def transfer(found: GroupComparison) -> Figure:
         calibrated, tested = (style.drawable(name, LONGEST_NAME) for name in (one.calibrated_on, one.tested_on))
         labels.append(f"{calibrated} on {tested}, {one.horizon_m:g} m")
         if one.p95_low_m is not None and one.p95_high_m is not None:
-            costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **style.ICR.keywords() | {"linestyle": "-"})
-        costs.plot([one.p95_m], [y], "o", color=style.ICR.color, markersize=4)
-    costs.axvline(0.0, **style.HALF_WIDTH.keywords())
+            costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **style.ICR | {"linestyle": "-"})
+        costs.plot([one.p95_m], [y], "o", color=style.ICR["color"], markersize=4)
+    costs.axvline(0.0, **style.HALF_WIDTH)
     costs.set_yticks(range(len(rows)), labels, fontsize=7.5, parse_math=False)
     costs.invert_yaxis()
     costs.set_xlabel("95 % error more than with its own calibration [m]")

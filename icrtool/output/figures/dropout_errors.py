@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 OF_THE_FILTER = ("icr", "no_slip")
 PANEL_HEIGHT_IN, LOW_PANEL_IN = 2.0, 1.45
 
-P95 = style.Pen("black", width=1.2)
+P95 = style.line("black", width=1.2)
 """The 95 % mark is a solid line, the expected value a dashed one (`MEAN`), in every picture."""
 
 THIN = 0.9
@@ -57,16 +57,13 @@ def dropout_summary(report: DropoutReport) -> Figure:
     reached = [one for one in report.document.budgets if one.model in {model.name for model in models}]
     best = next((one for one in reached if one.model == models[0].name), None)
     pens = _pens(report)
-    title = (
-        f"Within {best.budget_m:g} m (95 %) for {best.reach_text}" if best is not None else _largest(report, models[0])
-    )
+    title = _largest(report, models[0]) if best is None else f"Within {best.budget_m:g} m (95 %) for {best.reach_text}"
     # Beside the models: the mean of the first, budget, outages.
     most = max(row.trials for row in report.document.trials)
     keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
-    figure = style.new_figure(
-        title, f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals",
-        height_in=4.6 + keys_in, margins_in=(0.75, 0.25, 0.65, 0.95 + keys_in),
-    )  # fmt: skip
+    subtitle = f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals"
+    margins_in = (0.75, 0.25, 0.65, 0.95 + keys_in)
+    figure = style.new_figure(title, subtitle, height_in=4.6 + keys_in, margins_in=margins_in)
     axes = figure.subplots()
     # A line begins where trials do, or where its model has used up the budget.
     first_m = min([report.horizons_m[0], *(one.distance_m for one in reached if one.model != "no_slip")])
@@ -74,18 +71,15 @@ def dropout_summary(report: DropoutReport) -> Figure:
         _draw_model(axes, one, report.horizons_m, first_m, pens[one.name], first=one is models[0])
     outages = [one for one in report.document.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
     if outages:
-        axes.plot(
-            [one.distance_m for one in outages], column_of(outages, "end_error_m"), linestyle="none", marker="X",
-            color="black", markersize=7, zorder=5, label="real outage",
-        )  # fmt: skip
+        look = style.spot("black", 7.0, "X") | {"zorder": 5, "label": "real outage"}
+        axes.plot(column_of(outages, "distance_m"), column_of(outages, "end_error_m"), **look)
     low, high = _shown_errors(models, [*budgets_m, *column_of(outages, "end_error_m")])
     axes.set(xlim=(0, report.horizons_m[-1] * 1.02), ylim=(low, high), xlabel="Distance without GNSS [m]")
     axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
     style.logarithmic_errors(axes, "y")
+    label = f"budget {' and '.join(f'{one:g}' for one in budgets_m)} m"
     for budget in budgets_m:
-        axes.axhline(
-            budget, label=f"budget {' and '.join(f'{one:g}' for one in budgets_m)} m", **style.BUDGET.keywords()
-        )
+        axes.axhline(budget, label=label, **style.BUDGET)
         marked = [one for one in reached if one.budget_m == budget and one.model != "no_slip" and not one.beyond]
         _mark_reaches(axes, marked, pens, low)
     style.add_legend(figure, ncols=KEY_COLUMNS)
@@ -112,19 +106,18 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
     budgets_m = dict.fromkeys(one.budget_m for one in report.document.budgets)
     errors = ", ".join(error_text(model.document.by_horizon[h].p95_m).removesuffix(" m") for h in places)
     distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
-    figure = style.new_figure(
-        f"95 % of the trials end within {errors} m after {distances} m",
-        f"{run_title(report.run_document)}: open-loop error, {MODEL_WORDS.get(model.name, model.label)}",
-        height_in=1.55 + LOW_PANEL_IN * len(places), margins_in=(0.75, 0.25, 0.85, 0.9), hspace=0.38,
-    )  # fmt: skip
+    title = f"95 % of the trials end within {errors} m after {distances} m"
+    subtitle = f"{run_title(report.run_document)}: open-loop error, {MODEL_WORDS.get(model.name, model.label)}"
+    height_in, margins_in = 1.55 + LOW_PANEL_IN * len(places), (0.75, 0.25, 0.85, 0.9)
+    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.38)
     panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
     p95 = model.column("p95_m")[places]
     end = _histogram_end([np.nanmax(p95), *(budget for budget in budgets_m if budget < 2 * np.nanmax(p95))])
     for axes, h in zip(panels, places, strict=True):
         heading = f"after {report.horizons_m[h]:g} m, {model.document.by_horizon[h].trials:,} trials"
-        _draw_bins(axes, model, h, _pens(report)[model.name].color, end, heading)
+        _draw_bins(axes, model, h, _pens(report)[model.name]["color"], end, heading)
         for budget in budgets_m:
-            axes.axvline(budget, label=f"budget {budget:g} m", **style.BUDGET.keywords())
+            axes.axvline(budget, label=f"budget {budget:g} m", **style.BUDGET)
     panels[-1].set_xlabel("Error [m]")
     style.add_legend(figure, columnspacing=3.0)
     return figure
@@ -145,15 +138,15 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     # A model of constant parameters may have no trial of a length that others have.
     results = [result for result in found if len(result.histograms[h].left)]
     p95 = [float(result.column("p95_m")[h]) for result in results]
-    figure = style.new_figure(
-        f"After {horizon_m:g} m 95 % of the trials end within {min(p95):.2f} to {max(p95):.2f} m, by model",
-        f"{run_title(report.run_document)}: open-loop error of {report.document.trials[h].trials:,} trials",
-        height_in=1.5 + PANEL_HEIGHT_IN * len(results), margins_in=(0.75, 0.2, 0.85, 0.9), hspace=0.45,
-    )  # fmt: skip
+    title = f"After {horizon_m:g} m 95 % of the trials end within {min(p95):.2f} to {max(p95):.2f} m, by model"
+    subtitle = f"{run_title(report.run_document)}: open-loop error of {report.document.trials[h].trials:,} trials"
+    height_in, margins_in = 1.5 + PANEL_HEIGHT_IN * len(results), (0.75, 0.2, 0.85, 0.9)
+    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.45)
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
     end = _histogram_end([min(max(p95), MOST_HISTOGRAM_IN_P95 / LEAST_HISTOGRAM_IN_P95 * p95[0])])
     for axes, result in zip(panels, results, strict=True):
-        _draw_bins(axes, result, h, _pens(report)[result.name].color, end, MODEL_WORDS.get(result.name, result.label))
+        color, word = _pens(report)[result.name]["color"], MODEL_WORDS.get(result.name, result.label)
+        _draw_bins(axes, result, h, color, end, word)
     panels[-1].set_xlabel("Error [m]")
     style.add_legend(figure, columnspacing=3.0)
     return figure
@@ -165,7 +158,7 @@ def _held_out(report: DropoutReport) -> list[ModelResult]:
     return found or [one for one in report.results if one.name == "icr"] or list(report.results[:1])
 
 
-def _pens(report: DropoutReport) -> dict[str, style.Pen]:
+def _pens(report: DropoutReport) -> dict[str, style.Look]:
     """Return how the models are drawn that pictures show; final ICRs and rows with a gyro are in the tables alone."""
     own = ("icr_final", "icr_gyro", "icr_final_gyro", "no_slip_gyro", "recommended_gyro", "controller_gyro")
     left_out = {*own, *(one.name for one in report.document.calibrations if one.with_gyro)}
@@ -179,7 +172,7 @@ def _place(report: DropoutReport, horizon_m: float) -> int:
 
 
 def _draw_model(
-    axes: Axes, result: ModelResult, horizons_m: Floats, first_m: float, pen: style.Pen, *, first: bool
+    axes: Axes, result: ModelResult, horizons_m: Floats, first_m: float, pen: style.Look, *, first: bool
 ) -> None:  # fmt: skip
     """Draw the 95 % error of a model with its interval; of the `first` one also the expected error.
 
@@ -195,11 +188,11 @@ def _draw_model(
         return drawn
 
     thin = result.name == "no_slip"
-    look = pen.keywords() | ({"linewidth": THIN} if thin else {}) | {"zorder": 2.6 if first else 2.4}
+    look = pen | ({"linewidth": THIN} if thin else {}) | {"zorder": 2.6 if first else 2.4}
     axes.plot(x, between(result.column("p95_m")), label=f"{label}, 95 %", **look)
     if not thin:
         low, high = (between(values) for values in (result.column("p95_low_m"), result.column("p95_high_m")))
-        axes.fill_between(x, low, high, color=pen.color, alpha=BAND_ALPHA, linewidth=0)
+        axes.fill_between(x, low, high, color=pen["color"], alpha=BAND_ALPHA, linewidth=0)
     if first:
         axes.plot(x, between(result.column("expected_error_m")), label=f"{label}, mean", **look | {"linewidth": THIN})
 
@@ -215,23 +208,18 @@ def _shown_errors(models: list[ModelResult], others_m: list[float]) -> tuple[flo
 
 
 def _mark_reaches(
-    axes: Axes, reached: list[BudgetDistance], pens: Mapping[str, style.Pen], lowest_m: float
+    axes: Axes, reached: list[BudgetDistance], pens: Mapping[str, style.Look], lowest_m: float
 ) -> None:  # fmt: skip
     """Mark where models use up a budget: the nearest is named to the left of its curve, others below to the right."""
     below_pt = LABEL_PT
     for number, one in enumerate(sorted(reached, key=lambda one: one.distance_m)):
         pen = pens[one.model]
-        axes.plot([one.distance_m] * 2, [lowest_m, one.budget_m], color=pen.color, linewidth=0.7, zorder=1.5)
-        axes.plot(
-            [one.distance_m], [one.budget_m], linestyle="none", marker="o", color=pen.color, markerfacecolor="white",
-            markersize=5.5, zorder=5,
-        )  # fmt: skip
+        axes.plot([one.distance_m] * 2, [lowest_m, one.budget_m], color=pen["color"], linewidth=0.7, zorder=1.5)
+        axes.plot([one.distance_m], [one.budget_m], zorder=5, **style.spot("white", color=pen["color"]))
         left = number == 0 and one.distance_m > SPACE_OF_LABEL * axes.get_xlim()[1]
-        axes.annotate(
-            f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), xytext=(-5, 5) if left else (5, -below_pt),
-            textcoords="offset points", ha="right" if left else "left", va="bottom" if left else "top",
-            color=pen.color, fontweight="bold", zorder=6, bbox=style.LABEL_BOX,
-        )  # fmt: skip
+        offset_pt, ha, va = ((-5.0, 5.0), "right", "bottom") if left else ((5.0, -below_pt), "left", "top")
+        look: style.Look = {"ha": ha, "va": va, "color": pen["color"], "fontweight": "bold", "zorder": 6}
+        style.write_beside(axes, f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), offset_pt, **look)
         below_pt += 0.0 if left else LABEL_LINE_PT
 
 
@@ -247,8 +235,8 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     width = float(bins.right[0] - bins.left[0])
     edges = np.append(bins.left, bins.right[-1])
     style.fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
-    axes.axvline(result.column("p95_m")[h], label="95 % of the trials", **P95.keywords())
-    axes.axvline(result.column("expected_error_m")[h], label="expected value", **style.MEAN.keywords())
+    axes.axvline(result.column("p95_m")[h], label="95 % of the trials", **P95)
+    axes.axvline(result.column("expected_error_m")[h], label="expected value", **style.MEAN)
     axes.set_title(heading, loc="left", pad=4.0, fontweight="bold")
     expected, p95, largest = map(error_text, (row.expected_error_m, row.p95_m, row.max_m))
     facts = f"expected {expected},  95 % within {p95},  max {largest}"

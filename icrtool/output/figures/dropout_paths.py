@@ -30,13 +30,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WORST_COLUMNS, WORST_ROWS = 4, 2
-WORST_WIDTH_IN, WORST_CELL_IN = 9.6, 2.15
-CELL_TITLE: dict[str, Any] = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
+WORST_CELL_IN = 2.15
+WORST_LAYOUT: Any = {"width_in": 9.6, "margins_in": (0.15, 0.15, 0.98, 0.5), "wspace": 0.12, "hspace": 0.27}
+CELL_TITLE: style.Look = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
 
 PICTURED = ("no_slip",)
 """Drawn beside the model that trials were chosen by."""
 OUTAGES = {"forced": style.FORCED, "real": style.REAL}
-PATH = style.Pen(style.FIX_COLOR, width=1.4)
+PATH = style.line(style.FIX_COLOR, width=1.4)
 
 MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 5.3
 """Half the size of a mark, height of a line of text, usual width of a character, in points."""
@@ -51,7 +52,7 @@ LINE_FROM_PT = 20.0
 BAR_SHARE = 0.4
 """The bar of a scale is at most this part of the width."""
 FRAME_COLOR = "0.75"
-LOST_LOOK: dict[str, Any] = {"color": "0.82", "linewidth": 6.0, "solid_capstyle": "butt", "zorder": 1}
+LOST_LOOK: style.Look = {"color": "0.82", "linewidth": 6.0, "solid_capstyle": "butt", "zorder": 1}
 """Beneath the paths, where no fix corrected the reference."""
 
 SLOWEST_MPS = 0.001
@@ -70,10 +71,9 @@ def dropout_examples(report: DropoutReport) -> Figure:
     trials = [one.document for one in examples]
     errors = " and ".join(error_text(one.errors_m[one.model]) for one in trials)
     what = "about half a turn (left), as straight as the drive has it (right)"
-    figure = style.new_figure(
-        f"Typical trials of {trials[0].horizon_m:g} m end {errors} off", f"{run_title(report.run_document)}: {what}",
-        height_in=4.7, margins_in=(0.75, 0.2, 1.0, 0.9), wspace=0.34,
-    )  # fmt: skip
+    title = f"Typical trials of {trials[0].horizon_m:g} m end {errors} off"
+    subtitle = f"{run_title(report.run_document)}: {what}"
+    figure = style.new_figure(title, subtitle, height_in=4.7, margins_in=(0.75, 0.2, 1.0, 0.9), wspace=0.34)
     panels = figure.subplots(1, len(examples), squeeze=False)[0]
     for axes, drive, trial in zip(panels, examples, trials, strict=True):
         _draw_drive(axes, report, drive, shape=3.0 / 2.75)
@@ -100,12 +100,9 @@ def dropout_worst(report: DropoutReport) -> Figure:
     first = worst[0].document
     rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), first.model
     which = f"{_word(report, model)}, the {len(worst)} worst trials, none overlapping"
-    figure = style.new_figure(
-        f"The worst trial of {first.horizon_m:g} m ends {error_text(first.errors_m[model])} off",
-        f"{run_title(report.run_document)}: {which}",
-        width_in=WORST_WIDTH_IN, height_in=1.0 + rows * (WORST_CELL_IN + 0.5), margins_in=(0.15, 0.15, 0.98, 0.5),
-        wspace=0.12, hspace=0.27,
-    )  # fmt: skip
+    title = f"The worst trial of {first.horizon_m:g} m ends {error_text(first.errors_m[model])} off"
+    subtitle, height_in = f"{run_title(report.run_document)}: {which}", 1.0 + rows * (WORST_CELL_IN + 0.5)
+    figure = style.new_figure(title, subtitle, height_in=height_in, **WORST_LAYOUT)
     panels = figure.subplots(rows, WORST_COLUMNS, squeeze=False).ravel()
     for axes in panels:
         axes.spines[["top", "right"]].set_visible(True)
@@ -144,10 +141,8 @@ def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, 
         else:
             together.append((trial.north_m, trial.east_m, [rank]))
     for north, east, ranks in together:
-        axes.text(
-            east, north, " ".join(map(str, ranks)), fontsize=8.0, fontweight="bold", ha="center", va="center",
-            zorder=3, bbox=style.LABEL_BOX,
-        )  # fmt: skip
+        look: style.Look = {"fontsize": 8.0, "fontweight": "bold", "ha": "center", "va": "center", "zorder": 3}
+        style.write_beside(axes, " ".join(map(str, ranks)), (east, north), **look)
     _draw_scale(axes)
     axes.set_title("where they start\non the whole path", **CELL_TITLE)
 
@@ -170,10 +165,8 @@ def _draw_scale(axes: Axes) -> None:
     low, high = south + 0.04 * height, south + 0.87 * height
     x, y = min([(right, low), (left, low), (right, high), (left, high)], key=crossed)
     axes.plot([x, x + length], [y, y], color="black", linewidth=1.6, zorder=7, solid_capstyle="butt")
-    axes.annotate(
-        f"{length:g} m", (x + length / 2, y), xytext=(0, 2), textcoords="offset points", ha="center", va="bottom",
-        fontsize=7.5, zorder=7, bbox=style.LABEL_BOX,
-    )  # fmt: skip
+    look: style.Look = {"ha": "center", "va": "bottom", "fontsize": 7.5, "zorder": 7}
+    style.write_beside(axes, f"{length:g} m", (x + length / 2, y), (0.0, 2.0), **look)
 
 
 @style.styled
@@ -221,10 +214,8 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
     """Draw one trial about its start in axes `shape` times as wide as high."""
     trial, pens = drive.document, style.model_pens(list(drive.paths))
     lines = [(drive.reference_north_m, drive.reference_east_m, style.FILTER, "filter")]
-    lines += [
-        (path.north, path.east, pens[name], _word(report, name))
-        for name, path in drive.paths.items() if name in (*PICTURED, trial.model)
-    ]  # fmt: skip
+    drawn = {name: path for name, path in drive.paths.items() if name in (*PICTURED, trial.model)}
+    lines += [(path.north, path.east, pens[name], _word(report, name)) for name, path in drawn.items()]
     lines = [(north - trial.north_m, east - trial.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
     cell = look_down(axes, norths, easts, shape, ticks=ticks)
@@ -232,10 +223,8 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
     for order, (north, east, pen, label) in enumerate(lines):
         draw_path(axes, north, east, cell, pen, zorder=2 + min(order, 1), label=label)
     for north, east, pen, _ in lines:
-        axes.plot(
-            east[-1:], north[-1:], linestyle="none", marker="D", color=pen.color, markersize=4.5, zorder=5,
-            label="where each ends",
-        )  # fmt: skip
+        look = style.spot(pen["color"], 4.5, "D", pen["color"])
+        axes.plot(east[-1:], north[-1:], zorder=5, label="where each ends", **look)
     end_s = trial.t_s + trial.horizon_m / max(trial.speed_mean_mps, SLOWEST_MPS)
     for one in report.outages:
         span = one.document
@@ -243,10 +232,8 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
             axes.plot(one.east_m - trial.east_m, one.north_m - trial.north_m, label="real outage", **LOST_LOOK)
     jumps = [one for one in report.run_document.reference_jumps if trial.t_s <= one.end_s and one.begin_s <= end_s]
     if jumps:
-        axes.plot(
-            [one.east_m - trial.east_m for one in jumps], [one.north_m - trial.north_m for one in jumps],
-            label="step of the reference", **JUMP_LOOK,
-        )  # fmt: skip
+        place = [[one.east_m - trial.east_m for one in jumps], [one.north_m - trial.north_m for one in jumps]]
+        axes.plot(*place, label="step of the reference", **JUMP_LOOK)
 
 
 def _outages_text(outages: Sequence[OutageDocument]) -> str:
@@ -280,11 +267,9 @@ def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
             continue
         taken.append(boxes[found])
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(*found) > LINE_FROM_PT else None
-        axes.annotate(
-            text, (float(one.east_m[-1]), float(one.north_m[-1])), xytext=found, textcoords="offset points",
-            ha="left" if found[0] > 0 else "right", va="center", fontsize=8.0, zorder=6, bbox=style.LABEL_BOX,
-            arrowprops=line,
-        )  # fmt: skip
+        side = "left" if found[0] > 0 else "right"
+        look: style.Look = {"ha": side, "va": "center", "fontsize": 8.0, "zorder": 6, "arrowprops": line}
+        style.write_beside(axes, text, (float(one.east_m[-1]), float(one.north_m[-1])), found, **look)
 
 
 def _spot_box(place: Floats, point_px: float) -> Bbox:
@@ -293,13 +278,13 @@ def _spot_box(place: Floats, point_px: float) -> Bbox:
 
 def _label_boxes(place: Floats, width_pt: float, point_px: float) -> dict[tuple[float, float], Bbox]:
     """Return where a label of this width can stand beside a place [px], by its offset [points], nearest first."""
+    x, y, width, height = *place, point_px * width_pt, point_px * LINE_PT
     return {
         (dx, dy): Bbox.from_bounds(
-            place[0] + point_px * (dx if dx > 0 else dx - width_pt), place[1] + point_px * (dy - LINE_PT / 2),
-            point_px * width_pt, point_px * LINE_PT,
+            x + point_px * dx - (width if dx <= 0 else 0.0), y + point_px * dy - height / 2, width, height
         )
         for dx, dy in LABEL_OFFSETS_PT
-    }  # fmt: skip
+    }
 
 
 def _free_box(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-SEGMENT = style.Pen("#e08214", width=1.6)
+SEGMENT = style.line("#e08214", width=1.6)
 # Plain text: mathtext costs more than the rest of a figure.
 NAMES = {
     "y_icr_right_m": "ICR y right [m]",
@@ -29,7 +29,7 @@ NAMES = {
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 """Where no slip puts an ICR, in half track widths."""
 
-NO_SLIP_PLACE = {"label": "no slip (±b/2, 0)", **style.HALF_WIDTH.keywords()}
+NO_SLIP_PLACE = {"label": "no slip (±b/2, 0)", **style.HALF_WIDTH}
 
 RANGE_PERCENT = (0.2, 99.8)
 BAND_RANGE_PERCENT = (2.0, 98.0)
@@ -139,11 +139,11 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
     axes.locator_params(axis="y", nbins=5)
     for change in run.changes_s:
-        axes.axvline(change / unit, zorder=2.6, label="terrain change", **style.CHANGE.keywords())
+        axes.axvline(change / unit, zorder=2.6, label="terrain change", **style.CHANGE)
     for segment in run.document.segments:
         if (mean := segment.mean[column]) is not None:
             stretch = segment.begin_s / unit, segment.end_s / unit
-            axes.plot(stretch, (mean, mean), zorder=2.5, label="mean between", **SEGMENT.keywords())
+            axes.plot(stretch, (mean, mean), zorder=2.5, label="mean between", **SEGMENT)
     style.shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit, label="no usable GNSS")
     _mark_clipped(axes, t, value)
 
@@ -198,7 +198,7 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
     mean, std = run.document.icr.mean[column], run.document.icr.std[column]
     title = "not shown"
     if mean is not None:
-        axes.axvline(mean, label="mean", **style.MEAN.keywords())
+        axes.axvline(mean, label="mean", **style.MEAN)
         title = f"{signed(mean)} ± {std:.3f} m"
     if (track := run.track_width_m) is not None:
         place = SIDES[column] * track / 2
@@ -246,7 +246,7 @@ def gnss_difference(run: Run) -> Figure:
     if mean is not None and most is not None:
         trusted = used & ~run.sensors.fixes.down_weighted
         _draw_used(axes, t[trusted], difference[trusted], f"used, max {error_text(most)}")
-        axes.axhline(mean, label=f"mean {error_text(mean)}", **style.MEAN.keywords())
+        axes.axhline(mean, label=f"mean {error_text(mean)}", **style.MEAN)
     _mark(axes, t, difference, gated, top, "rejected", "x", color=style.BAD_FIX_COLOR, markersize=4.5)
     weak = run.sensors.fixes.down_weighted & used
     _mark(axes, t, difference, weak, top, "down-weighted", ".", color=style.FLOAT_COLOR, markersize=4.0)
@@ -278,7 +278,7 @@ def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:
     low, middle, high = np.array([np.percentile(part, (0, 50, 100)) if len(part) else empty for part in parts]).T
     centre = (edges[1:] + edges[:-1]) / 2
     axes.fill_between(centre, low, high, color=style.BAND_COLOR, linewidth=0, label=label)
-    axes.plot(centre, middle, color=style.ICR.color, linewidth=1.0, label="median")
+    axes.plot(centre, middle, color=style.ICR["color"], linewidth=1.0, label="median")
 
 
 def _mark(

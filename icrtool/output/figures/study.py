@@ -41,7 +41,7 @@ LOOKS: tuple[style.Look, ...] = (
 """Of lines that are no ICRs, in turn."""
 
 OPEN_LOOP = {"label": "open loop, final ICRs", **LOOKS[3]}
-OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP.keywords()}
+OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP}
 PATH_COLORS = ("#2166ac", "#e08214", "#1b7837", "#b2182b")
 WIDE: style.Look = {"linewidth": 1.5}
 TRUTH: style.Look = {"linewidth": 0.9, "linestyle": (0, (4, 2))}

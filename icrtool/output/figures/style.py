@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import wraps
 from io import BytesIO
 from pathlib import Path
@@ -88,17 +87,9 @@ LABEL_BELOW_IN, LABEL_LEFT_IN = 0.31, 0.54
 """Names of axes stand this far from them: matplotlib would lay out all ticks a second and third time to place them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pen:
-    """How a line is distinguished: by dash and by luminance, so that a grey print still reads."""
-
-    color: str
-    dash: str | tuple[float, tuple[float, ...]] = "-"
-    width: float = 1.3
-
-    def keywords(self) -> Look:
-        """Return the keywords `Axes.plot` takes."""
-        return {"color": self.color, "linestyle": self.dash, "linewidth": self.width}
+def line(color: str, dash: str | tuple[float, tuple[float, ...]] = "-", width: float = 1.3) -> Look:
+    """Return how a line is distinguished: by dash and by luminance, so that a grey print still reads."""
+    return {"color": color, "linestyle": dash, "linewidth": width}
 
 
 FIX_COLOR = "0.70"
@@ -107,21 +98,25 @@ BAD_FIX_COLOR = "#b2182b"
 OUTAGE_COLOR = "0.90"
 BAR_COLOR = "#5b8db8"
 BAND_COLOR = "#a6c4e0"
-FILTER = Pen("black", width=1.1)
-ICR = Pen("#2166ac", (0, (6, 2)), 1.5)
-NO_SLIP = Pen("#e08214", (0, (6, 1.5, 1.2, 1.5)), 1.5)
-HALF_WIDTH = Pen("0.35", (0, (1.5, 2.0)), 1.1)
-CHANGE = Pen("#b2182b", (0, (3, 1.5)), 1.1)
-MEAN = Pen("black", (0, (5, 2)), 1.1)
-BUDGET = Pen("#b2182b", (0, (1.5, 2.0)), 1.2)
+FILTER = line("black", width=1.1)
+ICR = line("#2166ac", (0, (6, 2)), 1.5)
+NO_SLIP = line("#e08214", (0, (6, 1.5, 1.2, 1.5)), 1.5)
+HALF_WIDTH = line("0.35", (0, (1.5, 2.0)), 1.1)
+CHANGE = line("#b2182b", (0, (3, 1.5)), 1.1)
+MEAN = line("black", (0, (5, 2)), 1.1)
+BUDGET = line("#b2182b", (0, (1.5, 2.0)), 1.2)
 MODEL_PENS = {
-    "recommended": Pen("#1b7837", "-", 1.8), "controller": Pen("#762a83", (0, (6, 1.5)), 1.5), "icr": ICR,
+    "recommended": line("#1b7837", "-", 1.8), "controller": line("#762a83", (0, (6, 1.5)), 1.5), "icr": ICR,
     "no_slip": NO_SLIP,
 }  # fmt: skip
-OTHER_PENS = (Pen("#8c510a", (0, (3, 1.2)), 1.4), Pen("#01665e", (0, (6, 1.5, 2, 1.5)), 1.4), Pen("#c51b7d", "-", 1.2))
+OTHER_PENS = (
+    line("#8c510a", (0, (3, 1.2)), 1.4),
+    line("#01665e", (0, (6, 1.5, 2, 1.5)), 1.4),
+    line("#c51b7d", "-", 1.2),
+)
 """Of calibrations, in the order of the report."""
-FORCED = Pen(BAD_FIX_COLOR, width=1.8)
-REAL = Pen("black", (0, (2.0, 1.2)), 1.8)
+FORCED = line(BAD_FIX_COLOR, width=1.8)
+REAL = line("black", (0, (2.0, 1.2)), 1.8)
 
 ICR_LOOKS: dict[str, Look] = {
     "y_icr_right": {"label": "y right", "color": "#2166ac", "linestyle": "-", "marker": "o", "markersize": 3.5},
@@ -261,7 +256,7 @@ def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
     filled.sticky_edges.y.append(0.0)
 
 
-def model_pens(names: Sequence[str]) -> dict[str, Pen]:
+def model_pens(names: Sequence[str]) -> dict[str, Look]:
     """Return how the models of a report are drawn, by name; calibrations in their order."""
     others = [name for name in names if name not in MODEL_PENS]
     return MODEL_PENS | {name: OTHER_PENS[number % len(OTHER_PENS)] for number, name in enumerate(others)}

@@ -110,7 +110,7 @@ def _corners(path: States | OdometryPath) -> Corners:
     return np.array([north.min(), east.min()]), np.array([north.max(), east.max()])
 
 
-def _draw_odometry(axes: Axes, path: OdometryPath, cell_m: float, pen: style.Pen, name: str, order: int) -> None:
+def _draw_odometry(axes: Axes, path: OdometryPath, cell_m: float, pen: style.Look, name: str, order: int) -> None:
     """Draw a wheels-only path and its end; the label states where it leaves the view."""
     low, high = _corners(path)
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
@@ -119,7 +119,7 @@ def _draw_odometry(axes: Axes, path: OdometryPath, cell_m: float, pen: style.Pen
     draw_path(axes, path.north_m, path.east_m, cell_m, pen, label=label, zorder=order)
     # copies: views would keep the whole path in memory with the picture
     ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
-    axes.plot(*ends, marker="D", color=pen.color, markersize=5.0, zorder=4.8)
+    axes.plot(*ends, marker="D", color=pen["color"], markersize=5.0, zorder=4.8)
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:
@@ -224,10 +224,10 @@ def name_directions(axes: Axes) -> None:
     axes.set_ylabel("North [m]" + _short_ticks(axes.yaxis, axes.get_ylim()[0]))
 
 
-def draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: style.Pen, **look: Any) -> None:
+def draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: style.Look, **look: Any) -> None:
     """Draw a path (n,), a point for each cell it enters."""
     shown = places(north_m, east_m, cell_m)
-    axes.plot(east_m[shown], north_m[shown], **pen.keywords(), **look)
+    axes.plot(east_m[shown], north_m[shown], **pen, **look)
 
 
 def _short_ticks(axis: Axis, lowest_m: float) -> str:

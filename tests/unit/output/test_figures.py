@@ -235,10 +235,10 @@ def test_line_styles_differ_in_grey() -> None:
 
     grey = [
         float(np.dot(mpl.colors.to_rgb(color), (0.299, 0.587, 0.114)))
-        for color in (FILTER.color, ICR.color, NO_SLIP.color, FIX_COLOR)
+        for color in (FILTER["color"], ICR["color"], NO_SLIP["color"], FIX_COLOR)
     ]
     assert min(np.diff(sorted(grey))) > 0.09
-    assert len({str(pen.dash) for pen in (FILTER, ICR, NO_SLIP)}) == 3
+    assert len({str(pen["linestyle"]) for pen in (FILTER, ICR, NO_SLIP)}) == 3
 
 
 def test_the_picture_of_a_comparison_answers_with_both_errors_and_its_words_stand_apart() -> None:
