@@ -103,9 +103,8 @@ def _examine(found: Found, config: Config, part: Span, stages: Stages) -> None:
         The log cannot be fitted.
     """
     from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
-    from icrtool.logs.read_log import read_log, survey_log
+    from icrtool.logs.read_log import is_table, read_log, survey_log
     from icrtool.logs.streams.assembly import assemble
-    from icrtool.logs.table_file import is_table
 
     start, end = part
     stages.begin("reading")

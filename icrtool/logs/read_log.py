@@ -1,34 +1,51 @@
-"""Read a log: open it, read the columns of all candidates in one pass, choose, convert to the frames of `icrtool`."""
+"""Read a log: open it, read the columns of all candidates in one pass, choose, convert to the frames of `icrtool`.
+
+A log may also be one CSV file (columns: `icrtool.records.frames`).
+"""
 
 from __future__ import annotations
 
 import contextlib
+import math
+import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.errors import DefinitionError
-from icrtool.logs.containers.channel import WHOLE, Cut
+from icrtool.errors import DataError, DefinitionError, LogError
+from icrtool.logs.containers.channel import LATEST_NS, WHOLE, Cut
 from icrtool.logs.containers.container import Container
-from icrtool.logs.containers.open_log import check_unchanged, open_log, states_of
-from icrtool.logs.containers.recording_files import log_name
-from icrtool.logs.cut import Moment, cut_of, moment
+from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
+from icrtool.logs.containers.recording_files import PACKED, log_name
 from icrtool.logs.messages.collectors import collector_for
 from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable
-from icrtool.logs.streams.assembly import Survey, assemble
+from icrtool.logs.streams.assembly import Survey, assemble, longest_part
 from icrtool.logs.streams.headings import GYRO_AXES
 from icrtool.logs.streams.select import fields_to_take, find_candidates
 from icrtool.logs.streams.transforms import FIELDS, is_static, transform_channels, transform_pose
-from icrtool.logs.table_file import is_table, read_table
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText, escaped
-from icrtool.records.urls import place_of
+from icrtool.records.urls import UrlPath, place_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Progress = Callable[[float], None]
+
+Moment = float | str | datetime
+"""Seconds since the log's first message, or a time of day: a `datetime`, or a text in ISO 8601."""
+
+_NAME = re.compile(rf"\.csv(?:{PACKED})?$", re.IGNORECASE)
+
+LONGEST_HEAD_BYTES = 1 << 18
+"""Of the line that names the columns: pandas takes a minute for a million of them."""
 
 
 def survey_log(
@@ -179,3 +196,131 @@ def _collect(
             except DefinitionError as err:
                 unread[table.topic] = err.why
     return tables, unread
+
+
+def moment(given: Moment | None, key: str) -> float | datetime | None:
+    """Return a moment as seconds since the log's first message, or as a time with a zone.
+
+    Raises
+    ------
+    LogError
+        Neither a finite number nor a time in ISO 8601.
+    """
+    if given is None:
+        return None
+    if isinstance(given, str):
+        given = _parsed(given, key)
+    if isinstance(given, datetime):
+        return given if given.tzinfo is not None else given.replace(tzinfo=UTC)
+    if not math.isfinite(given):
+        raise LogError(key, f"{given} is not a number of seconds")
+    return float(given)
+
+
+def _parsed(text: str, key: str) -> float | datetime:
+    with contextlib.suppress(ValueError):
+        return float(text)
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError as err:
+        why = f"{text!r} is neither a number of seconds nor a time in ISO 8601"
+        raise LogError(key, why, "for example 12.5, or 2026-05-04T09:30:00") from err
+
+
+def cut_of(container: Container, start: float | datetime | None, end: float | datetime | None, log: Path) -> Cut:
+    """Return the part of a log between two times, as log times.
+
+    Raises
+    ------
+    DataError
+        The end is not after the start.
+    """
+    if start is None and end is None:
+        return WHOLE
+    first = 0
+    if isinstance(start, float) or isinstance(end, float):
+        first = _first_ns(container)
+    begin_ns = max(nanoseconds(start, first), 0) if start is not None else 0
+    end_ns = nanoseconds(end, first) if end is not None else LATEST_NS
+    if begin_ns >= end_ns:
+        raise DataError(log, "the part to read ends before it begins", "give an end later than the start")
+    return Cut(begin_ns, min(end_ns, LATEST_NS))
+
+
+def nanoseconds(given: float | datetime, first_ns: int) -> int:
+    """Return a moment as log time [ns]."""
+    if isinstance(given, datetime):
+        passed = given - datetime(1970, 1, 1, tzinfo=UTC)
+        return (passed.days * 86_400 + passed.seconds) * 1_000_000_000 + passed.microseconds * 1000
+    return first_ns + round(max(min(given, 1e9), -1e9) * 1e9)
+
+
+def _first_ns(container: Container) -> int:
+    """Return the log time of the first message [ns]; without an index all messages are read for it."""
+    if (span := container.span_ns()) is not None:
+        return span[0]
+    numbers = frozenset(channel.id for channel in container.channels)
+    begins = (int(block.log_time_ns.min()) for block in container.blocks(numbers) if len(block.log_time_ns))
+    return min(begins, default=0)
+
+
+def is_table(path: Path) -> bool:
+    """Return whether a path, or an address, names a table."""
+    return _NAME.search(path.name) is not None and (path.is_file() or isinstance(path, UrlPath))
+
+
+def csv_frame(path: Path) -> pd.DataFrame:
+    """Return the columns of a CSV file whose first line names them.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    ValueError
+        It is not a table: text that is not UTF-8, a line that names too many columns, or rows with more values.
+    """
+    import pandas as pd
+
+    with path.open("rb") as stream:
+        if len(head := stream.readline(LONGEST_HEAD_BYTES)) == LONGEST_HEAD_BYTES:
+            raise ValueError(f"its first line has more than {head.count(b',')} columns")
+    table = pd.read_csv(path, skipinitialspace=True)
+    if not isinstance(table.index, pd.RangeIndex):
+        raise ValueError("its rows have more values than its first line has names")  # noqa: TRY004 - of the file
+    return table
+
+
+def read_table(path: Path, start: Moment | None = None, end: Moment | None = None) -> RobotLog:
+    """Read a CSV file, also compressed: a row for each stamp, with the columns that were measured then.
+
+    Raises
+    ------
+    LogError
+        The file is not a CSV table.
+    DataError
+        A column is missing or holds a value that is not a number.
+    """
+    import pandas as pd
+
+    begin, stop = moment(start, "start"), moment(end, "end")
+    before = states_of(path)
+    try:
+        with plain_file(path) as (file, read):
+            table = csv_frame(file)
+        check_unchanged(path, before, [read])
+    except OSError as err:
+        raise LogError(path, "cannot be read", err.strerror or str(err)) from err
+    except ValueError as err:
+        raise LogError(path, "not a CSV table", str(err)) from err
+    table = table.rename(columns=str)
+    if begin is not None or stop is not None:
+        clock, unit = ("stamp_ns", 1) if "stamp_ns" in table else ("t_s", 1e9)
+        if clock in table and len(table):
+            stamps = pd.to_numeric(table[clock], errors="coerce") * unit
+            inside = np.isfinite(stamps)
+            first = int(stamps[inside].min()) if inside.any() else 0
+            inside &= stamps >= nanoseconds(begin, first) if begin is not None else True
+            inside &= stamps < nanoseconds(stop, first) if stop is not None else True
+            table = table[inside]
+    log = RobotLog.from_frames(table, table, table, table, log_name(path))
+    return longest_part(replace(log, inputs=(read,)))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.records.text import LogText, escaped, shortened
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
 
@@ -117,6 +121,33 @@ def made_ahead(blocks: Iterator[Block], stop: Callable[[], object] | None = None
             if stop is not None:
                 stop()
             raise
+
+
+def ahead(
+    work: Callable[[Item], Result], items: Iterable[Item], threads: int, count: int,
+    weight: Callable[[Item], float] = lambda _: 0.0,
+) -> Generator[tuple[Item, Callable[[], Result]]]:  # fmt: skip
+    """Yield items, each with what returns the result of some work on it; threads work on the next ones meanwhile.
+
+    Parameters
+    ----------
+    count : of the items worked on before they are used
+    weight : the share that an item takes of what may be worked on before it is used
+    """
+    pending: deque[tuple[Item, Future[Result]]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                pending.append((item, pool.submit(work, item)))
+                while len(pending) > count or sum(weight(one) for one, _ in pending) > 1:
+                    first, made = pending.popleft()
+                    yield first, made.result
+            while pending:
+                first, made = pending.popleft()
+                yield first, made.result
+        finally:
+            for _, made in pending:
+                made.cancel()
 
 
 CUT_OFF = "cut off"

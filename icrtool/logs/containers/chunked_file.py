@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import Block, Cut, made_ahead, with_possible_times
+from icrtool.logs.containers.channel import Block, Cut, ahead, made_ahead, with_possible_times
 from icrtool.logs.containers.container import Container
 from icrtool.logs.containers.decompress import (
     LARGEST_CHUNK_BYTES,
@@ -25,8 +24,6 @@ from icrtool.logs.containers.decompress import (
 )
 from icrtool.logs.containers.record_table import Chunk, Part, Records
 from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile, Source
-
-Item = TypeVar("Item")
 
 THREADS, BLOCKS_AHEAD = 2, 3
 """Threads that make blocks of chunks, and blocks that they make while one is used."""
@@ -63,6 +60,11 @@ class Spaces(NamedTuple):
     joined: Space
 
 
+def reused_spaces() -> Iterator[Spaces]:
+    """Yield memory for blocks, again when as many further ones have been made as are made ahead."""
+    return cycle([Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1)])
+
+
 class ChunkedFile(Container):
     """An open file of chunks; `_chunks` is None for a file without an index, which is read from start to end.
 
@@ -87,8 +89,6 @@ class ChunkedFile(Container):
     def __init__(self, path: Path, message_compression: str = "", source: Source | None = None) -> None:
         super().__init__(path, message_compression)
         self._inflation = Inflation()
-        self._spaces: deque[Spaces] = deque()
-        self._free()
         self._source: Source = source if source is not None else LocalFile(path)
         self._remote = source if isinstance(source, RemoteFile) else None
         self._at = 0
@@ -137,28 +137,19 @@ class ChunkedFile(Container):
                 yield from self._indexed(self._read_ahead(self._remote, needed, wanted))
             else:
                 yield from self._indexed(self._located(chunk, wanted) for chunk in needed)
-        self._free()
 
     def _read_ahead(self, remote: RemoteFile, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Part]:
         """Yield parts of a distant file as `_located` does, with what is wanted of the next ones read meanwhile."""
 
-        def located(group: Sequence[Chunk], begin: int, end: int) -> list[Part]:
+        def located(span: tuple[list[Chunk], int, int]) -> list[Part]:
+            group, begin, end = span
             if 0 < end - begin <= 2 * LARGEST_CHUNK_BYTES:
                 remote.hold(begin, end - begin)
             return [self._located(chunk, wanted) for chunk in group]
 
-        pending: deque[tuple[int, Future[list[Part]]]] = deque()
-        with ThreadPoolExecutor(READERS) as pool:
-            try:
-                for group, begin, end in _spans(chunks, wanted):
-                    pending.append((end - begin, pool.submit(located, group, begin, end)))
-                    while len(pending) > SPANS_AHEAD or sum(length for length, _ in pending) > BYTES_AHEAD:
-                        yield from pending.popleft()[1].result()
-                while pending:
-                    yield from pending.popleft()[1].result()
-            finally:
-                for _, group_read in pending:
-                    group_read.cancel()
+        spans = _spans(chunks, wanted)
+        for _, parts in ahead(located, spans, READERS, SPANS_AHEAD, lambda span: (span[2] - span[1]) / BYTES_AHEAD):
+            yield from parts()
 
     def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Part:
         """Return what is read of a chunk: its messages by the message index; of a small part also the wanted ranges.
@@ -195,12 +186,10 @@ class ChunkedFile(Container):
 
     def _indexed(self, parts: Iterable[Part]) -> Iterator[Block]:
         """Yield the messages in some chunks."""
-        with ThreadPoolExecutor(THREADS) as pool:
-            groups = ((group, self._next_spaces()) for group in _groups(parts))
-            begun = ((group, spaces, pool.submit(self._joined, group, spaces)) for group, spaces in groups)
-            for group, spaces, pending in ahead(begun, BLOCKS_AHEAD):
-                self._at = group[-1].chunk.at
-                yield from self._sound(group, spaces, pending.result)
+        groups = zip(_groups(parts), reused_spaces(), strict=False)
+        for (group, spaces), made in ahead(lambda one: self._joined(*one), groups, THREADS, BLOCKS_AHEAD):
+            self._at = group[-1].chunk.at
+            yield from self._sound(group, spaces, made)
 
     def _sound(
         self, group: Sequence[Part], spaces: Spaces, made: Callable[[], tuple[Block, Inflation]]
@@ -295,16 +284,6 @@ class ChunkedFile(Container):
             raise NotByRangesError
         for _ in self._read_in_order(learn=True):
             pass
-        self._free()
-
-    def _free(self) -> None:
-        """Give back the memory of chunks: a directory holds many files open."""
-        self._spaces = deque(Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1))
-
-    def _next_spaces(self) -> Spaces:
-        """Return the memory of the block that was used first."""
-        self._spaces.rotate(1)
-        return self._spaces[0]
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""
@@ -397,13 +376,3 @@ def _groups(parts: Iterable[Part]) -> Iterator[list[Part]]:
         group.append(part)
     if group:
         yield group
-
-
-def ahead(items: Iterable[Item], count: int) -> Iterator[Item]:
-    """Yield items, each once `count` more of them have been made."""
-    made: deque[Item] = deque()
-    for item in items:
-        made.append(item)
-        if len(made) > count:
-            yield made.popleft()
-    yield from made

@@ -5,25 +5,23 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.records import Channel as McapChannel
+from mcap.records import Schema, Statistics
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import CUT_OFF, Block, Channel, ros_type_name
-from icrtool.logs.containers.chunked_file import ChunkedFile
+from icrtool.logs.containers.chunked_file import ChunkedFile, reused_spaces
 from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Packed, Space
 from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, Part, scan_mcap
 from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
-
-if TYPE_CHECKING:
-    from mcap.records import Channel as McapChannel
-    from mcap.records import Schema, Statistics
-
-    _Parsed = Schema | McapChannel | Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 PIECE_BYTES = 1 << 22
@@ -92,21 +90,19 @@ class McapFile(ChunkedFile):
         channel = self._channels[number]
         schema = self._schemas.get(channel.schema_id)
         encoding, written = channel.message_encoding, schema.encoding if schema else ""
+        text = ("latin-1",) if written == "protobuf" else ("utf-8", "replace")
         return Channel(
             id=number,
             topic=LogText(channel.topic),
             message_type=ros_type_name(schema.name) if schema else LogText(""),
             encoding=LogText(encoding),
-            definition=_definition(schema) if schema is not None and (encoding, written) in _ENCODINGS else "",
+            definition=schema.data.decode(*text) if schema is not None and (encoding, written) in _ENCODINGS else "",
             definition_format="idl" if written == "ros2idl" else "msg",
             count=self._counts.get(number) if self._chunks is not None else None,
         )
 
     def _read_index(self) -> list[Chunk] | None:
         """Return the chunks listed in the file's index; None without an index, or where it does not fit the file."""
-        from mcap.records import Channel as McapChannel
-        from mcap.records import Schema, Statistics
-
         chunks: list[Chunk] = []
         schemas: dict[int, Schema] = {}
         channels: dict[int, McapChannel] = {}
@@ -191,6 +187,7 @@ class McapFile(ChunkedFile):
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
         """Yield the messages record by record; behind damage it goes on at the next chunk that the index lists."""
         begin = at = len(MAGIC)
+        spaces = reused_spaces()
         while True:
             opcode, length = self._head(at)
             left = self._size - at - _HEAD_BYTES
@@ -198,7 +195,7 @@ class McapFile(ChunkedFile):
                 return
             if opcode == _CHUNK:
                 chunk = Chunk(at + _HEAD_BYTES, min(length, left))
-                yield from self._read_chunk(Part(chunk), self._next_spaces(), learn=learn, cut=length > left)
+                yield from self._read_chunk(Part(chunk), next(spaces), learn=learn, cut=length > left)
             elif opcode in (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE) and length <= left:
                 block, length = self._read_loose(at, length, learn=learn)
                 if block is not None:
@@ -245,9 +242,6 @@ class McapFile(ChunkedFile):
         return Packed(data, compression, size, checksum=checksum)
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
-        from mcap.records import Channel as McapChannel
-        from mcap.records import Schema
-
         code, _, start, end = record
         described = _parse(code, bytes(data[start:end]))
         if isinstance(described, Schema):
@@ -277,31 +271,11 @@ def _chunk_of_index(content: bytes) -> Chunk | None:
     return Chunk(at, length, channels or None, begin_ns, end_ns, index_length, size, compression)
 
 
-def _parse(opcode: int, content: bytes) -> _Parsed | None:
+def _parse(opcode: int, content: bytes) -> Schema | McapChannel | Statistics | None:
     """Return a schema, channel or statistics record, None where it is damaged."""
-    from io import BytesIO
-
-    from mcap.data_stream import ReadDataStream
-    from mcap.exceptions import McapError
-    from mcap.records import Channel as McapChannel
-    from mcap.records import Schema, Statistics
-
-    kinds: dict[int, type[Schema | McapChannel | Statistics]] = {
-        MCAP_SCHEMA: Schema,
-        MCAP_CHANNEL: McapChannel,
-        _STATISTICS: Statistics,
-    }
+    kinds = {MCAP_SCHEMA: Schema.read, MCAP_CHANNEL: McapChannel.read, _STATISTICS: Statistics.read}
     try:
-        record: _Parsed = kinds[opcode].read(ReadDataStream(BytesIO(content)))
+        record: Schema | McapChannel | Statistics = kinds[opcode](ReadDataStream(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError, MemoryError):
         return None
     return record
-
-
-def _definition(schema: Schema) -> str:
-    return schema.data.decode("latin-1") if schema.encoding == "protobuf" else schema.data.decode("utf-8", "replace")
-
-
-def is_mcap(stream: BinaryIO) -> bool:
-    """Return whether a stream begins like an MCAP file."""
-    return stream.read(len(MAGIC)) == MAGIC

@@ -13,14 +13,15 @@ from types import MappingProxyType
 from typing import BinaryIO, NamedTuple
 
 from icrtool.errors import LogChangedError, LogError
+from icrtool.logs.containers import mcap_file, ros1_bag, sqlite_bag
 from icrtool.logs.containers.bag_directory import BagDirectory
 from icrtool.logs.containers.chunked_file import NotByRangesError
 from icrtool.logs.containers.container import Container, Origin
-from icrtool.logs.containers.mcap_file import McapFile, is_mcap
+from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.containers.recording_files import STANDARD_INPUT, files_of_log, inputs_of, split_files
-from icrtool.logs.containers.ros1_bag import Ros1Bag, is_ros1_bag
+from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, read_by_ranges
-from icrtool.logs.containers.sqlite_bag import SqliteBag, is_sqlite
+from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save, unpack
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
 from icrtool.records.samples import InputFile
@@ -28,6 +29,14 @@ from icrtool.records.urls import UrlPath
 
 MOST_CHANNELS = 2048
 """Topics of a log, each publisher of a ROS 1 bag by itself, that are looked at: some 0.5 ms of time each."""
+
+# A bag of any version: one of another than 2.0 is refused by name.
+_CONTAINERS: dict[bytes, type[McapFile | Ros1Bag | SqliteBag]] = {
+    mcap_file.MAGIC: McapFile,
+    ros1_bag.MAGIC[:9]: Ros1Bag,
+    sqlite_bag.MAGIC: SqliteBag,
+}
+_LONGEST_MAGIC = 16
 
 KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file, also compressed"
 
@@ -65,7 +74,20 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
         The path does not exist, the file is empty, is not a known container, or nothing in it can be read.
     """
     try:
-        return _open(path, share)
+        remote, why = RemoteFile(path) if isinstance(path, UrlPath) else None, ""
+        if remote is not None:
+            opened = _by_ranges(path, remote)
+            if not isinstance(opened, str):
+                return opened
+            why = opened
+        elif path != STANDARD_INPUT and not _is_packed_file(path):
+            return _plain_log(path)
+        scratch = ScratchFolder()
+        try:
+            return _unpacked_log(path, _brought(path, scratch.path, remote, why, share), scratch, share)
+        except BaseException:
+            scratch.close()
+            raise
     except FileNotFoundError as err:
         raise LogError(path, "no such file or directory") from err
     except OSError as err:
@@ -130,23 +152,6 @@ def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
         yield file, (inputs or inputs_of([path], Event()))[0]
     finally:
         scratch.close()
-
-
-def _open(path: Path, share: Callable[[float], None] | None) -> Container:
-    remote, why = RemoteFile(path) if isinstance(path, UrlPath) else None, ""
-    if remote is not None:
-        opened = _by_ranges(path, remote)
-        if not isinstance(opened, str):
-            return opened
-        why = opened
-    elif path != STANDARD_INPUT and not _is_packed_file(path):
-        return _plain_log(path)
-    scratch = ScratchFolder()
-    try:
-        return _unpacked_log(path, _brought(path, scratch.path, remote, why, share), scratch, share)
-    except BaseException:
-        scratch.close()
-        raise
 
 
 def _unpacked_log(
@@ -221,11 +226,6 @@ def _is_packed_file(path: Path) -> bool:
         return is_packed(stream.read(512))
 
 
-def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType({})) -> Container:
-    """Return the container of a log that is not packed; `distant` as in `BagDirectory`."""
-    return _usable(BagDirectory(path, distant=distant) if distant else _container_at(path), path)
-
-
 def _usable(container: Container, path: Path) -> Container:
     """Return a container with the channels that are looked at; refuse one without any."""
     if (count := len(container.channels)) > MOST_CHANNELS:
@@ -238,11 +238,12 @@ def _usable(container: Container, path: Path) -> Container:
     return container
 
 
-def _container_at(path: Path) -> Container:
+def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType({})) -> Container:
+    """Return the container of a log that is not packed; `distant` as in `BagDirectory`."""
     if files := split_files(path):
-        return BagDirectory(path, files)
+        return _usable(BagDirectory(path, files), path)
     if stat.S_ISDIR(path.stat().st_mode):
-        return BagDirectory(path)
+        return _usable(BagDirectory(path, distant=distant), path)
     if is_special(path):
         # Opening a pipe would block, and every container needs random access.
         raise LogError(path, NOT_REGULAR, SAVE_IT)
@@ -250,14 +251,12 @@ def _container_at(path: Path) -> Container:
         if not stream.read(1):
             raise LogError(path, "an empty file", "the recording never began, or the copy failed")
         if (container := container_of(stream)) is not None:
-            return container(path)
+            return _usable(container(path), path)
     raise LogError(path, "not a log", f"a log is {KINDS}")
 
 
 def container_of(stream: BinaryIO) -> type[McapFile | Ros1Bag | SqliteBag] | None:
     """Return which container the first bytes of a file are of; None where it is no log."""
-    for is_kind, container in ((is_mcap, McapFile), (is_ros1_bag, Ros1Bag), (is_sqlite, SqliteBag)):
-        stream.seek(0)
-        if is_kind(stream):
-            return container
-    return None
+    stream.seek(0)
+    start = stream.read(_LONGEST_MAGIC)
+    return next((container for magic, container in _CONTAINERS.items() if start.startswith(magic)), None)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.channel import CUT_OFF, Block, Channel, ros_type_name
-from icrtool.logs.containers.chunked_file import ChunkedFile, Spaces
+from icrtool.logs.containers.chunked_file import ChunkedFile, Spaces, reused_spaces
 from icrtool.logs.containers.decompress import STORED, DecompressionError, Packed, Space
 from icrtool.logs.containers.record_table import BAG_CONNECTION, Chunk, Part, scan_bag
 from icrtool.logs.containers.source import Source
@@ -181,14 +181,14 @@ class Ros1Bag(ChunkedFile):
         ]
 
     def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
-        at = len(MAGIC)
+        at, spaces = len(MAGIC), reused_spaces()
         while at < self._size:
             record = self._record(at)
             if record is None or not 0 < record.op <= BAG_CONNECTION:
                 break
             cut = record.length > self._size - record.at
             if record.op == _CHUNK:
-                yield from self._read_chunk(Part(_chunk_of(record)), self._next_spaces(), learn=learn, cut=cut)
+                yield from self._read_chunk(Part(_chunk_of(record)), next(spaces), learn=learn, cut=cut)
             if cut:
                 break
             if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
@@ -234,8 +234,3 @@ def _chunk_of(record: _Record) -> Chunk:
     compression = record.text(b"compression")
     size = record.length if compression in STORED else record.number(b"size")
     return Chunk(record.at, record.length, size=size, compression=compression)
-
-
-def is_ros1_bag(stream: BinaryIO) -> bool:
-    """Return whether a stream begins like a ROS 1 bag of any version."""
-    return stream.read(9) == MAGIC[:9]

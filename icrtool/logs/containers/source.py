@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock, local
@@ -17,6 +16,7 @@ from msgspec import UNSET
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.address import address_of, asked, filesystem
+from icrtool.logs.containers.channel import ahead
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, natural_order, unpacked_name
 from icrtool.records.samples import InputFile
 from icrtool.records.urls import UrlPath, without_secrets
@@ -180,14 +180,9 @@ class RemoteFile:
                 while piece := asked(self.path, lambda: stream.read(_PIECE_BYTES), again=False):
                     yield piece
             return
-        with ThreadPoolExecutor(PIECES_AHEAD) as pool:
-            places = range(0, self.size, _PIECE_BYTES)
-            pending = [pool.submit(self._range, at, _PIECE_BYTES) for at in places[:PIECES_AHEAD]]
-            for number in range(len(places)):
-                piece = pending.pop(0).result()
-                if number + PIECES_AHEAD < len(places):
-                    pending.append(pool.submit(self._range, places[number + PIECES_AHEAD], _PIECE_BYTES))
-                yield piece
+        places = range(0, self.size, _PIECE_BYTES)
+        for _, piece in ahead(lambda at: self._range(at, _PIECE_BYTES), places, PIECES_AHEAD, PIECES_AHEAD):
+            yield piece()
 
     def fetch(self, place: Path, share: Callable[[float], None] | None) -> InputFile:
         """Write the file to a place on disk, and return what run.json states about it.

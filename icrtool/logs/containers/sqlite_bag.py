@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO
 from urllib.parse import quote
 
 import numpy as np
@@ -346,8 +345,3 @@ def _without_last(blocks: Iterable[Block], lost: int) -> Iterator[Block]:
         whole = block.end <= size - lost
         yield Block(block.data, *(column[whole] for column in columns))
         size -= len(block.data)
-
-
-def is_sqlite(stream: BinaryIO) -> bool:
-    """Return whether a stream begins like an SQLite database."""
-    return stream.read(len(MAGIC)) == MAGIC

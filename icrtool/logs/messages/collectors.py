@@ -123,18 +123,17 @@ def collector_for(channel: Channel, wanted: tuple[str, ...], before: TopicCollec
     if channel.encoding not in READ_ENCODINGS:
         raise DefinitionError(channel.topic, f"serialization {str(channel.encoding)!r} is not read")
     collector = before if before is not None else TopicCollector(channel)
-    collector.decoders[channel.id] = _decoder_for(channel, wanted)
-    return collector
-
-
-def _decoder_for(channel: Channel, wanted: tuple[str, ...]) -> MessageDecoder:
+    decoder: MessageDecoder
     if channel.message_type == DYNAMIC_JOINT_STATE:
-        return _interface_decoder(channel)
-    if channel.encoding in ("protobuf", "json"):
-        return _value_decoder(channel, wanted)
-    if channel.message_type == NMEA_SENTENCE:
-        return SentenceDecoder(ros_decoder(channel, (*HEADER, "sentence")))
-    return ros_decoder(channel, wanted)
+        decoder = _interface_decoder(channel)
+    elif channel.encoding in ("protobuf", "json"):
+        decoder = _value_decoder(channel, wanted)
+    elif channel.message_type == NMEA_SENTENCE:
+        decoder = SentenceDecoder(ros_decoder(channel, (*HEADER, "sentence")))
+    else:
+        decoder = ros_decoder(channel, wanted)
+    collector.decoders[channel.id] = decoder
+    return collector
 
 
 def _interface_decoder(channel: Channel) -> InterfaceDecoder:

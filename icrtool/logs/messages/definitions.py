@@ -120,7 +120,7 @@ def definitions_of(channel: Channel) -> Definitions:
     if channel.encoding == "json":
         return definitions_in_schema(channel.definition, channel.message_type)
     if channel.definition:
-        types = {**_TIME, **parse_definition(channel)}
+        types = {**_TIME, **_parse(channel.definition, channel.definition_format, channel.message_type)}
         return types if _is_complete(types) else {**standard_definitions(), **types}
     name = full_name(channel.message_type)
     if channel.encoding == "ros1":
@@ -181,16 +181,6 @@ def full_name(message_type: str) -> str:
     """Return ``package/msg/Name`` for ``package/Name``; a name without a package, as Protobuf's, as it is."""
     package, _, name = message_type.partition("/")
     return f"{package}/msg/{name}" if name else message_type
-
-
-def parse_definition(channel: Channel) -> Definitions:
-    """Parse the definition text of a channel, with those of the types it contains.
-
-    Raises
-    ------
-    DefinitionError
-    """
-    return _parse(channel.definition, "idl" if channel.definition_format == "idl" else "msg", channel.message_type)
 
 
 @lru_cache(maxsize=64)

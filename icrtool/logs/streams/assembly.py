@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.channel import Channel
-from icrtool.logs.cut import longest_part
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.headings import GYRO_TYPE, find_gyro, find_gyros
 from icrtool.logs.streams.select import Candidates, Choice, choose_streams, ignored_joints, other_references
@@ -283,3 +282,44 @@ def _alive(positions: Pair, speeds: Pair | None) -> bool:
     still = [float(np.ptp(side[finite])) == 0.0 for side in positions]
     moves = [float(np.nanmax(np.abs(side))) > 0.0 for side in speeds]
     return not any(s and m for s, m in zip(still, moves, strict=True))
+
+
+PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0
+"""A longer interval between samples is reported; a log whose samples are a day apart is of two recordings."""
+
+
+def longest_part(log: RobotLog) -> RobotLog:
+    """Return a log without what another clock stamped, and with warnings where its clock may have been set forward.
+
+    Of parts that are `LONGEST_PAUSE_S` and more apart, that with the most wheel samples, and positions, is kept.
+    """
+    stamps, fixes = log.wheels.stamp_ns, log.gnss.stamp_ns
+    ends = np.append(np.flatnonzero(np.diff(stamps) > LONGEST_PAUSE_S * 1e9), len(stamps) - 1)
+    begins = np.append(0, ends[:-1] + 1)
+    positions = np.searchsorted(fixes, stamps[ends], side="right") - np.searchsorted(fixes, stamps[begins])
+    longest = int(np.argmax((ends - begins) * (positions > 1)))
+    parts: dict[str, Any] = {}
+    for role, margin_s in (("wheels", 0.0), ("gnss", LONGEST_PAUSE_S), ("heading", LONGEST_PAUSE_S)):
+        margin_ns = int(margin_s * 1e9)
+        first, last = stamps[begins[longest]] - margin_ns, stamps[ends[longest]] + margin_ns
+        parts[role] = _between(getattr(log, role), first, last)
+    counts = {role: (len(kept.stamp_ns), len(getattr(log, role).stamp_ns)) for role, kept in parts.items()}
+    warnings = list(log.warnings)
+    if lost := [f"{every - kept} of {every} ({role})" for role, (kept, every) in counts.items() if kept < every]:
+        warnings.append(
+            f"{log.name}: more than a day apart from the other samples, and left out: {', '.join(lost)}; if the clock "
+            "was set, --from and --to read that part"
+        )
+    for role, kept in parts.items():
+        longest_s = np.diff(kept.stamp_ns).max(initial=0) / 1e9
+        if longest_s > PAUSE_S:
+            why = "the recording was paused, or its clock was set forward"
+            warnings.append(f"{log.name}: {role}: no samples for {longest_s:.0f} s: {why}")
+            break
+    return replace(log, warnings=tuple(warnings), **parts)
+
+
+def _between(samples: Samples, begin_ns: int, end_ns: int) -> Samples:
+    """Return the samples with stamps in [begin_ns, end_ns]."""
+    inside = (samples.stamp_ns >= begin_ns) & (samples.stamp_ns <= end_ns)
+    return samples if inside.all() else samples.cut(inside)

@@ -116,9 +116,9 @@ def stated_variance(table: TopicTable, covariance: tuple[str, ...], std: tuple[s
     return variance
 
 
-def _reject(usable: Bools, reasons: Mapping[str, Bools]) -> tuple[Bools, dict[str, int]]:
+def _reject(table: TopicTable, reasons: Mapping[str, Bools]) -> tuple[Bools, dict[str, int]]:
     """Return the rows (n,) that no reason excludes, and how many each one excludes of those that are left."""
-    rejected: dict[str, int] = {}
+    usable, rejected = np.ones(len(table), np.bool_), dict[str, int]()
     for reason, bad in reasons.items():
         if count := int(np.count_nonzero(bad & usable)):
             rejected[reason] = count
@@ -178,7 +178,7 @@ class Fix:
             possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 360.0)
         places = np.column_stack([latitude, longitude])
         usable, rejected = _reject(
-            np.ones(len(table), np.bool_),
+            table,
             {
                 "no fix": no_fix,
                 "not finite": ~finite,
@@ -306,7 +306,7 @@ class Pose:
         """Return its positions; those of goals, of dead reckoning and of frames whose z is not up are refused."""
         x, y = (table.column(f"{self.path}.position.{axis}").astype(np.float64) for axis in "xy")
         usable, rejected = _reject(
-            np.ones(len(table), np.bool_),
+            table,
             {"not finite": ~(np.isfinite(x) & np.isfinite(y)), "no fix": ~all_valid(table, self.valid)},
         )
         places = np.column_stack([x, y, table.floats(f"{self.path}.position.z")])[usable]

@@ -29,6 +29,7 @@ class Source:
     score : how suitable the type is; why : the reason as text
     problem : why it cannot be used, empty when it can
     note : what a user must know of it
+    usable : (n,) rows to use, of positions and headings
     """
 
     topic: str
@@ -38,11 +39,12 @@ class Source:
     why: str = ""
     problem: str = ""
     note: str = ""
+    usable: Bools = field(default_factory=lambda: NO_ROWS)
 
     @property
     def is_empty(self) -> bool:
         """Whether no row can be used, even where the topic is configured."""
-        return True
+        return not self.usable.any()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,21 +56,15 @@ class PositionSource(Source):
     geodetic : (n, 3) latitude, longitude [deg], ellipsoidal height [m]; None where metric
     metric : (n, 2) north, east [m] in the topic's own frame; None where geodetic
     variance : (n, 3) north, east, covariance of both [m^2]; NaN where not stated
-    usable : (n,) rows to use; `rejected` counts the others by reason
+    rejected : how many rows are not used, by reason
     stated_class : uint8 (n,) how the position was solved, None where no message states it
     """
 
     geodetic: Floats | None = None
     metric: Floats | None = None
     variance: Floats = field(default_factory=lambda: np.empty((0, 3)))
-    usable: Bools = field(default_factory=lambda: NO_ROWS)
     rejected: dict[str, int] = field(default_factory=dict)
     stated_class: Bytes | None = None
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no row can be used."""
-        return not self.usable.any()
 
 
 Convention = Literal["enu", "ned"]
@@ -82,20 +78,13 @@ class HeadingSource(Source):
     ----------
     yaw_rad : (n,) as recorded: counter-clockwise from east where `convention` is ``enu``, else clockwise from north
     variance : (n,) [rad^2], NaN where not stated
-    usable : (n,)
     convention_why : how the convention is known
     """
 
     yaw_rad: Floats = field(default_factory=lambda: np.empty(0))
     variance: Floats = field(default_factory=lambda: np.empty(0))
-    usable: Bools = field(default_factory=lambda: NO_ROWS)
     convention: Convention = "enu"
     convention_why: str = ""
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no row can be used."""
-        return not self.usable.any()
 
     def heading_rad(self, convention: Convention) -> Floats:
         """Return headings clockwise from north in (-pi, pi]."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -67,20 +67,29 @@ class StampedRows:
 
 def stamp_rows(table: TopicTable) -> StampedRows:
     """Return the stamps of a topic; header stamps only where they are non-zero, near log time and increasing."""
-    return replace(_usable(table), set_back=table.set_back)
-
-
-def _usable(table: TopicTable) -> StampedRows:
     log_ns = table.log_time_ns
+
+    def unusable(note: str, clock_set: ClockSet = NEVER_SET) -> StampedRows:
+        return StampedRows(None, log_ns, note, 0, set_back=table.set_back, clock_set=clock_set)
+
     seconds, nanoseconds = (table.integers(*paths) for paths in zip(*STAMPS, strict=True))
     if seconds is None or nanoseconds is None or not len(log_ns):
-        return StampedRows(None, log_ns, "no header", 0)
+        return unusable("no header")
     header = seconds * 1_000_000_000 + nanoseconds
     zeros = np.count_nonzero(header == 0)
     if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
-        return StampedRows(None, log_ns, f"{100 * zeros / len(header):.0f} % of the header stamps are 0", 0)
+        return unusable(f"{100 * zeros / len(header):.0f} % of the header stamps are 0")
     header, clock_set = _without_clock_steps(header, log_ns)
-    return replace(_near_log_time(header, log_ns), clock_set=clock_set)
+    delay = int(np.median(log_ns - header))
+    if abs(delay) > NEAR_NS:
+        return unusable(f"header stamps are {delay / 1e9:+.1f} s from log time", clock_set)
+    # A few stamps of another clock (a first message at 0) are replaced by their log times.
+    other = np.abs(log_ns - header - delay) > NEAR_NS
+    header[other] = log_ns[other] - delay
+    backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
+    if backwards > LARGEST_SHARE_BACKWARDS:
+        return unusable(f"{100 * backwards:.0f} % of the header stamps go back", clock_set)
+    return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)), table.set_back, clock_set)
 
 
 def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
@@ -111,20 +120,6 @@ def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
     moved[steps[lasting] + 1] = grown[lasting]
     found = ClockSet(abs(int(grown[largest])), back=bool(grown[largest] > 0), before_ns=int(header[steps[largest]]))
     return header + np.cumsum(moved), found
-
-
-def _near_log_time(header: Ints, log_ns: Ints) -> StampedRows:
-    """Return header stamps that are near log time and increasing, log times in place of a few others, or why not."""
-    delay = int(np.median(log_ns - header))
-    if abs(delay) > NEAR_NS:
-        return StampedRows(None, log_ns, f"header stamps are {delay / 1e9:+.1f} s from log time", 0)
-    # A few stamps of another clock (a first message at 0) are replaced by their log times.
-    other = np.abs(log_ns - header - delay) > NEAR_NS
-    header[other] = log_ns[other] - delay
-    backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
-    if backwards > LARGEST_SHARE_BACKWARDS:
-        return StampedRows(None, log_ns, f"{100 * backwards:.0f} % of the header stamps go back", 0)
-    return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)))
 
 
 def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:

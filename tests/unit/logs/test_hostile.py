@@ -27,12 +27,11 @@ from icrtool.logs.containers.decompress import (
     unpack_messages,
 )
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
-from icrtool.logs.cut import moment
 from icrtool.logs.messages.collectors import collector_for
 from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.read_log import read_log, survey_log
+from icrtool.logs.read_log import LONGEST_HEAD_BYTES, moment, read_log, survey_log
 from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.stamps import stamp_rows
 from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
@@ -432,7 +431,6 @@ def test_a_header_of_empty_fields_costs_no_time(tmp_path: Path) -> None:
 def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool import config
     from icrtool.fleet import manifest
-    from icrtool.logs import table_file
     from icrtool.logs.containers import bag_directory, decompress, open_log, sqlite_bag, unpack
     from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf, schema
     from icrtool.logs.streams import wheel_pairs, wheels
@@ -450,7 +448,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
         bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheels.MOST_WHEELS,
             wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PAIRS,
-        table_file.LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
+        LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
     ]  # fmt: skip
 
 

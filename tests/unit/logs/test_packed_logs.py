@@ -28,11 +28,10 @@ import zstandard
 from icrtool.config import load_config
 from icrtool.errors import LogChangedError, LogError
 from icrtool.fleet.recordings import find_recordings
-from icrtool.logs import table_file
 from icrtool.logs.containers import unpack
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.recording_files import log_name
-from icrtool.logs.read_log import read_log
+from icrtool.logs.read_log import csv_frame, read_log
 
 SAMPLES = Path(__file__).parents[3] / "sample_logs"
 MCAP, BAG, DIRECTORY = (
@@ -345,13 +344,13 @@ def test_a_log_that_is_written_to_while_it_is_read_is_refused(tmp_path, log):
 def test_a_table_that_is_written_to_while_it_is_read_is_refused(tmp_path, monkeypatch):
     file = tmp_path / "drive.csv"
     file.write_bytes(TABLE)
-    whole = table_file.csv_frame
+    whole = csv_frame
 
     def while_it_is_written(path: Path) -> object:
         append(file)
         return whole(path)
 
-    monkeypatch.setattr(table_file, "csv_frame", while_it_is_written)
+    monkeypatch.setattr("icrtool.logs.read_log.csv_frame", while_it_is_written)
     with pytest.raises(LogChangedError):
         read_log(file)
 
