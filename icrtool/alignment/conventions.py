@@ -56,7 +56,6 @@ other's names is rarer."""
 ABOUT_RAD = math.radians(135.0)
 BACKWARDS_SHARE = 0.8
 """People drive robots forward: one whose wheels go backwards on this share of the distance is more likely turned."""
-MOST_WINDOWS = 4000
 CHORD_IN_POSITION_STD = 4.0
 """Without a heading, distances are compared where the robot moves clearly."""
 
@@ -183,21 +182,19 @@ def _show(windows: DriveWindows, hand: int) -> _Shown:
     """Fit displacements and turns for one handedness, with hardly any prior."""
     track = windows.track
     v, u = track.mean_speed, track.half_difference
-    some = slice(None, None, max(1, len(windows.begin) // MOST_WINDOWS))
-    begin, end = windows.begin[some], windows.end[some]
+    begin, end = windows.begin, windows.end
     nose = track.nose if hand > 0 else track.nose.conj()
     spans = [(at[end] - at[begin]) / windows.length_m for at in (track.at_places(rate * nose) for rate in (v, u))]
     seen = (track.place[end] - track.place[begin]) / windows.length_m
     columns = np.column_stack([spans[0], 1j * spans[0], spans[1], 1j * spans[1]])
     design, target = np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])
     place = _linear(design, target)
-    few = slice(None, None, max(1, len(windows.turn_begin) // MOST_WINDOWS))
-    first, last = windows.turn_begin[few], windows.turn_end[few]
+    first, last = windows.turn_begin, windows.turn_end
     turned = hand * (track.heading_at(last) - track.heading_at(first))
     by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in map(track.cumulate, (u, v))]
     turn = _linear(np.column_stack(by), turned)
-    of_place = sandwich_covariance(place, np.tile(windows.group[some], 2))
-    return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group[few]), place.residuals)
+    of_place = sandwich_covariance(place, np.tile(windows.group, 2))
+    return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group), place.residuals)
 
 
 def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:

@@ -7,8 +7,7 @@ reported. Preset ``paper`` corrects nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,8 +81,7 @@ class Delay(NamedTuple):
 UNKNOWN = Delay(math.nan, math.nan)
 
 
-@dataclass(frozen=True, slots=True)
-class StreamDelays:
+class StreamDelays(NamedTuple):
     """What was found, and what is corrected: what was clear, or is configured.
 
     Attributes
@@ -129,40 +127,37 @@ class StreamDelays:
 
 def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDelays:
     """Return the delays of heading and positions against the wheels, and which of them are corrected."""
-    field = config.filter.preset == "field"
-    found = {"heading": UNKNOWN, "position": UNKNOWN}
-    apart = UNKNOWN
+    heading = position = apart = UNKNOWN
     if fit is not None:
-        for what in found:
-            value, std = fit.estimate(f"{what}_delay")
-            found[what] = Delay(value, std) if std < 2 * LARGEST_STD_S else UNKNOWN
+        found = (Delay(*fit.estimate(name)) for name in ("heading_delay", "position_delay"))
+        heading, position = (one if one.std_s < 2 * LARGEST_STD_S else UNKNOWN for one in found)
         apart = Delay(*fit.estimate("position_after_heading"))
-    together = log.heading_is_of_position
-    given = {"heading": config.frames.heading_delay_s, "position": config.frames.reference_delay_s}
-    applied, notes = {"heading": 0.0, "position": 0.0}, []
-    if field and fit is not None and not fit.slips:
-        applied = _clear_delays(found["heading"], found["position"], apart, together=together)
-        notes = _delay_notes(log.name, applied, {**found, "apart": apart}, given, together=together)
-    for what, setting in given.items():
-        if field and setting != "auto":
-            applied[what] = setting
-    if together:
-        applied["heading"] = 0.0
+    together, notes, applied = log.heading_is_of_position, list[str](), (0.0, 0.0)
+    if config.filter.preset == "field":
+        if fit is not None and not fit.slips:
+            applied = _clear_delays(heading, position, apart, together=together)
+        given = config.frames.heading_delay_s, config.frames.reference_delay_s
+        shown = [one if one.is_significant else apart for one in (heading, position)]
+        free = [one == "auto" for one in given]
+        notes = _delay_notes(applied, [one.std_s for one in shown], free, together=together)
+        of_heading, of_position = (own if lag == "auto" else lag for own, lag in zip(applied, given, strict=True))
+        applied = of_heading, of_position
     return StreamDelays(
-        found["heading"], found["position"], apart, together, applied["heading"], applied["position"], tuple(notes)
-    )
+        heading, position, apart, together, 0.0 if together else applied[0], applied[1],
+        tuple(f"{log.name}: {note}" for note in notes),
+    )  # fmt: skip
 
 
-def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> dict[str, float]:
-    """Return the delays to correct: of the ways in which streams lag, the likeliest.
+def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> tuple[float, float]:
+    """Return the delays of heading and position to correct: of the ways in which streams lag, the likeliest.
 
     Twice the negative log-likelihood, with a penalty for each delay that is not zero (`SIGNIFICANT_SIGMAS` squared).
     """
     if together:
         common = position.value_s if position.is_clear else 0.0
-        return {"heading": common, "position": common}
+        return common, common
     if not heading.std_s < LARGEST_STD_S:
-        return {"heading": 0.0, "position": 0.0}
+        return 0.0, 0.0
     lag, after = heading.value_s, apart.value_s
     # as stamped; both alike; the heading alone; the position alone; each by itself
     free = {(0.0, 0.0): 0, (lag, lag): 1, (lag, 0.0): 1, (0.0, after): 1, (lag, lag + after): 2}
@@ -171,8 +166,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
         misfits = (lag - delays[0]) / heading.std_s, (after - delays[1] + delays[0]) / apart.std_s
         return misfits[0] ** 2 + misfits[1] ** 2 + SIGNIFICANT_SIGMAS**2 * free[delays]
 
-    chosen = min((one for one in free if all(value == 0.0 or _is_large(value) for value in one)), key=cost)
-    return dict(zip(("heading", "position"), chosen, strict=True))
+    return min((one for one in free if all(value == 0.0 or _is_large(value) for value in one)), key=cost)
 
 
 def _is_large(delay_s: float) -> bool:
@@ -180,22 +174,22 @@ def _is_large(delay_s: float) -> bool:
     return delay_s > SMALLEST_LAG_S or delay_s < -SMALLEST_LEAD_S
 
 
-def _delay_notes(
-    name: str, applied: dict[str, float], found: dict[str, Delay], given: Mapping[str, float | str], *, together: bool
-) -> list[str]:
-    """Return a line for each stream that was moved."""
-    notes = []
-    keys = {"heading": "frames.heading_delay_s", "position": "frames.reference_delay_s"}
-    alike = not together and applied["heading"] == applied["position"] and given["heading"] == "auto"
+def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bool], *, together: bool) -> list[str]:
+    """Return a line for each stream, heading and position, that was moved and is free to be."""
+    if together:
+        subjects = [("", "", ""), ("the position and its heading", "lag", "frames.reference_delay_s")]
+    else:
+        subjects = [
+            ("the heading", "lags", "frames.heading_delay_s"),
+            ("the position", "lags", "frames.reference_delay_s"),
+        ]
+    alike = not together and applied[0] == applied[1] and free[0]
     also = "; the position is corrected alike, as nothing shows that its delay differs" if alike else ""
-    for what, key in keys.items():
-        value = applied[what]
-        if value == 0.0 or given[what] != "auto" or (together and what == "heading") or (alike and what == "position"):
-            continue
-        subject, lags = ("the position and its heading", "lag") if together else (f"the {what}", "lags")
-        std = (found[what] if found[what].is_significant else found["apart"]).std_s
-        fact = f"{subject} {lags} the wheels" if value > 0 else f"the wheels lag {subject}"
-        notes.append(f"{name}: {fact} by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it{also}")
+    notes = list[str]()
+    for (subject, lags, key), value, std, is_free in zip(subjects, applied, std_s, free, strict=True):
+        if subject and value != 0.0 and is_free and not (alike and notes):
+            fact = f"{subject} {lags} the wheels" if value > 0 else f"the wheels lag {subject}"
+            notes.append(f"{fact} by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it{also}")
     return notes
 
 

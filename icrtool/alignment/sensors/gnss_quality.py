@@ -236,9 +236,6 @@ BESIDE_JUMP = 5
 SIDES_VARIANCE = 1.7
 """Beside a jump, the side whose noise over this many stretches has this many times the other's variance is float."""
 
-MOST_JUMPS = 500
-"""With more of them the position reference is something else than RTK that is lost now and then."""
-
 
 def find_misreported(steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
     """Return the fixes (m,) among the `claimed` ones that move like RTK float.
@@ -260,7 +257,7 @@ def find_misreported(steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
     noisy &= ~flagged[1 : 1 + len(level) * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).any(axis=1)
     jumps = np.flatnonzero(claimed[steps.jump_row] & claimed[np.maximum(steps.jump_row - 1, 0)])
     beside, nearby = _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
-    for row in steps.jump_row[jumps].tolist() if len(jumps) <= MOST_JUMPS else ():
+    for row in steps.jump_row[jumps].tolist():
         noisy[_noisy_side(beside, nearby, moves, (row - 1) // FEWEST_STEPS)] = True
     misreported[1 : 1 + len(level) * FEWEST_STEPS] = np.repeat(noisy, FEWEST_STEPS)
     return misreported & claimed

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.estimator import TURNS_SLIPPING, AlignmentFit
+from icrtool.alignment.estimator import AlignmentFit
 from icrtool.alignment.log_track import FEWEST_WINDOWS, DriveWindows
 from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
@@ -244,7 +244,7 @@ def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tu
     side, other = ("left", "right") if difference < 0 else ("right", "left")
     text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other} one"
     text = f"{text} where both report the same distance"
-    if may and abs(difference) <= LARGEST_SCALE_CORRECTION:
+    if may:
         notes.append(f"{text}: corrected; wheels.left_scale and right_scale set it")
         return (scale * (1.0 + difference / 2), scale * (1.0 - difference / 2)), notes
     return (scale, scale), [*notes, f"{text}: check wheel radii and tyre pressures"]
@@ -262,8 +262,7 @@ def _common_scale(fit: AlignmentFit, *, may: bool) -> tuple[float, list[str]]:
     """Return the factor to apply to both sides, and what to report."""
     scale, std = fit.estimate("scale")
     error = abs(scale - 1.0)
-    # a heading that scatters makes the path along it shorter by half its variance
-    if std > LARGEST_SCALE_STD or error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std, fit.heading_scatter**2):
+    if std > LARGEST_SCALE_STD or error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std):
         return 1.0, []
     if error <= LARGEST_SCALE_CORRECTION:
         scale = 1.0 + (scale - 1.0) * USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
@@ -324,7 +323,7 @@ def find_filtering(fit: AlignmentFit) -> str:
         return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of what they show"
     at_middle, at_end = (math.sqrt(max(one.left_rad**2 - noise.left_rad**2, 0.0)) for one in (middle, long))
     least = max(LARGE_SHARE * short.turn_rad, LARGE_RAD)
-    if fit.turn_slip > TURNS_SLIPPING and at_middle > least and at_end < BOUNDED * at_middle:
+    if at_middle > least and at_end < BOUNDED * at_middle:
         angles = f"{math.degrees(at_middle):.0f}° over {MIDDLE_S:g} s and by no more than {math.degrees(at_end):.0f}°"
         return f"their turn differs from the robot's by {angles} over {long_s:.0f} s, which slip would add up"
     return ""

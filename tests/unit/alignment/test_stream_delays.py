@@ -181,7 +181,7 @@ def test_a_stamp_decades_away_neither_fills_the_memory_nor_changes_the_delay(row
 )
 def test_the_likeliest_delays_are_corrected(heading: float, after: float, expected: tuple[float, float]) -> None:
     found = _clear_delays(Delay(heading, 0.03), Delay(heading + after, 0.06), Delay(after, 0.05), together=False)
-    assert (found["heading"], found["position"]) == pytest.approx(expected)
+    assert found == pytest.approx(expected)
 
 
 def test_clocks_that_show_no_difference_are_known_better_than_the_drive_shows() -> None:
