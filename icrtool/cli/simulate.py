@@ -11,17 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from icrtool.cli import options
-from icrtool.cli.options import (
-    FILE,
-    NOT_NEGATIVE,
-    POSITIVE,
-    Change,
-    Option,
-    changes,
-    flag,
-    numbers,
-    option,
-)
+from icrtool.cli.options import NOT_NEGATIVE, POSITIVE, Change, Option, changes, flag, numbers, option
 from icrtool.cli.printing import Printer
 
 if TYPE_CHECKING:
@@ -152,10 +142,10 @@ def drive_options(*further: Option, **defaults: object) -> Option:
 
 
 @click.command("simulate")
-@option("-o --output log", "LOG", FILE, "Log to make: .mcap, .bag, or a ROS 2 directory.", required=True)
+@option("-o --output log", "LOG", options.FILE, "Log to make: .mcap, .bag, or a ROS 2 directory.", required=True)
 @flag("--force", "Replace a log that is there.")
 @options.SEED
-@option("--speeds", "FILE.csv", FILE, "Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")
+@option("--speeds", "FILE.csv", options.FILE, "Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")
 @drive_options(
     option("--outage outages_s", "BEGIN:END", span_text, "No fixes between these seconds; repeatable.", multiple=True),
     *(option(*row, default=default) for *row, default in RECORDED),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
@@ -199,11 +200,9 @@ def _row_of(future: Future[FleetLog], request: Request) -> FleetLog:
 def _request(one: FoundRecording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:
     config = _config(one, known, options)
     report = options.report
-    document = {"config": config.effective(), "version": __version__, "plots": report.plots, "figures": report.figures,
-                "gates": report.gates,
-                "budgets": report.budgets_m, "ladder": report.ladder, "robot": known.robot,
-                "baseline": baseline, "strict": report.strict, "allow_unusable": report.allow_unusable}  # fmt: skip
-    key = sha256(msgspec.json.encode(document, order="sorted")).hexdigest()
+    # Whether the page is there is seen by its file.
+    asked = [config.effective(), __version__, dataclasses.replace(report, page=True), known.robot, baseline]
+    key = sha256(msgspec.json.encode(asked, order="sorted")).hexdigest()
     row = FleetLog(
         one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot or config.robot.name or "", group=known.group,
         tags=known.tags, key=key,

@@ -32,7 +32,6 @@ from icrtool.records.fleet_document import (
     FleetDocument,
     FleetLog,
 )
-from icrtool.records.plain_data import rows_of
 from icrtool.records.process_resources import remove
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.text import LogText, counted, escaped
@@ -96,24 +95,24 @@ def fleet_document(rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibra
     )
 
 
-def fleet_columns(rows: Sequence[FleetLog]) -> dict[str, list[object]]:
-    """Return the columns of fleet.csv, those of the errors in the order of models and horizons."""
+def fleet_rows(rows: Sequence[FleetLog]) -> list[dict[str, object]]:
+    """Return the rows of fleet.csv by the names of its columns; errors in the order of models and horizons."""
     errors = list(dict.fromkeys(name for row in rows for name in row.errors))
-    found: dict[str, list[object]] = {name: [getattr(row, name) for row in rows] for name in BEFORE_ICRS}
-    found |= {
-        name: [row.icr.get(name) for row in rows] for name in (*ICR_COLUMNS, *(f"std_{one}" for one in ICR_COLUMNS))
-    }
-    found |= {name: [getattr(row, name) for row in rows] for name in ("multiplier", "multiplier_std")}
+    return [_fleet_row(row, errors) for row in rows]
+
+
+def _fleet_row(row: FleetLog, errors: Sequence[str]) -> dict[str, object]:
+    found: dict[str, object] = {name: getattr(row, name) for name in BEFORE_ICRS}
+    found |= {name: row.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{one}" for one in ICR_COLUMNS))}
+    found |= {"multiplier": row.multiplier, "multiplier_std": row.multiplier_std}
     for name in errors:
-        found[name] = [row.errors.get(name) for row in rows]
+        found[name] = row.errors.get(name)
         if WITHIN in name:
-            bounds = [int(name in row.bounds) if row.errors.get(name) is not None else None for row in rows]
-            found[f"{name.removesuffix('_m')}{IS_BOUND}"] = list(bounds)
-    found |= {name: [getattr(row, name) for row in rows] for name in AFTER_ERRORS}
-    found["tags"] = [";".join(row.tags) for row in rows]
-    found["gates_failed"] = [row.gates_failed if row.status != "failed" else None for row in rows]
-    found["took_s"] = [row.took_s for row in rows]
-    return found
+            is_bound = None if found[name] is None else int(name in row.bounds)
+            found[f"{name.removesuffix('_m')}{IS_BOUND}"] = is_bound
+    found |= {name: getattr(row, name) for name in AFTER_ERRORS}
+    limits = row.gates_failed if row.status != "failed" else None
+    return found | {"tags": ";".join(row.tags), "gates_failed": limits, "took_s": row.took_s}
 
 
 def write_fleet(
@@ -136,12 +135,12 @@ def write_fleet(
     OutputError
         The disk does not take them.
     """
-    columns = fleet_columns(rows)
-    write_file(directory / "fleet.csv", csv_bytes(columns, zip(*columns.values(), strict=True)), directory)
+    cells = fleet_rows(rows)
+    write_file(directory / "fleet.csv", csv_bytes(cells[0], (row.values() for row in cells)), directory)
     failures = [[getattr(row, name) for name in FAILURES] for row in rows if row.status == "failed"]
     write_file(directory / "failures.csv", csv_bytes(FAILURES, failures), directory)
     with atomic_file(directory / "fleet.parquet", directory) as file:
-        _write_parquet(columns, file)
+        _write_parquet(cells, file)
     if calibrations:
         write_file(directory / "calibrations.txt", calibrations_text(calibrations), directory)
     if plots:
@@ -207,16 +206,16 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, formats: tuple[str, ..
             remove(old)
 
 
-def _write_parquet(columns: Mapping[str, Sequence[object]], file: Path) -> None:
+def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
     import pyarrow as pa
     import pyarrow.json as pj
     import pyarrow.parquet as pq
 
     texts = {"log", "status", "this_time", "reason", "robot", "group", "start_utc", "tool_version", "run", "tags"}
-    counts = {"events", "outages", "warnings", "gates_failed", *(name for name in columns if name.endswith(IS_BOUND))}
-    kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in columns}
+    counts = {"events", "outages", "warnings", "gates_failed", *(name for name in rows[0] if name.endswith(IS_BOUND))}
+    kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in rows[0]}
     # Names of files need not be text. As JSON, since to convert lists pyarrow would load pandas.
-    cells = ({name: as_text(one) if name in texts else one for name, one in row.items()} for row in rows_of(columns))
+    cells = ({name: as_text(one) if name in texts else one for name, one in row.items()} for row in rows)
     lines = b"\n".join(map(msgspec.json.encode, cells))
     table = pj.read_json(
         pa.BufferReader(lines), pj.ReadOptions(block_size=len(lines) + 1), pj.ParseOptions(pa.schema(kinds))

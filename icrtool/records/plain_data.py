@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -38,8 +38,3 @@ def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def rows_of(columns: Mapping[str, Iterable[Any]]) -> list[dict[str, Any]]:
-    """Return columns of one length as rows, each by the names of the columns."""
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]

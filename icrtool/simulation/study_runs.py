@@ -21,19 +21,8 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GUARDED
 from icrtool.kernels.kinematics import drive, model_states
-from icrtool.simulation.drives import (
-    DrivePlan,
-    PathPlan,
-    Readings,
-    Sensors,
-    Truth,
-    check_drive,
-    drive_plan,
-    plan_body,
-    sample_times,
-    sense,
-    track_speeds,
-)
+from icrtool.simulation import drives
+from icrtool.simulation.drives import DrivePlan, PathPlan, Readings, Sensors, Truth
 from icrtool.simulation.record import readings_log
 
 Progress = Callable[[float], None]
@@ -140,7 +129,7 @@ def run_scenarios(
     list of the columns of `measures`, (runs, ...), a scenario each
     """
     for scenario in scenarios:
-        check_drive(scenario.plan, scenario.sensors)
+        drives.check_drive(scenario.plan, scenario.sensors)
     jobs = [(scenario, run) for scenario in scenarios for run in range(runs)]
 
     def work(job: tuple[Scenario, int]) -> Found:
@@ -195,8 +184,8 @@ def _simulate(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, F
     plan, phase = scenario.plan, rng.uniform(0.0, 2 * np.pi)
     if isinstance(plan.path, PathPlan):
         plan = replace(plan, path=replace(plan.path, phase_rad=phase))
-    motion = drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz)
-    readings = sense(motion, scenario.sensors, plan.duration_s, rng)
+    motion = drives.drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz)
+    readings = drives.sense(motion, scenario.sensors, plan.duration_s, rng)
     icrs = motion.icrs_m[motion.which[motion.rows(readings.wheel_t)]]
     return readings, np.column_stack([motion.poses(readings.wheel_t), icrs]), motion
 
@@ -204,8 +193,8 @@ def _simulate(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, F
 def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, Floats, None]:
     """Return the measurements of true states (n, 6) that obey the filter's model, and those."""
     plan, sensors = scenario.plan, scenario.sensors
-    t = sample_times(sensors.wheel_rate_hz, plan.duration_s)
-    speeds = track_speeds(*plan_body(cast(PathPlan, plan.path), t, plan.icrs_m), plan.icrs_m)
+    t = drives.sample_times(sensors.wheel_rate_hz, plan.duration_s)
+    speeds = drives.track_speeds(*drives.plan_body(cast(PathPlan, plan.path), t, plan.icrs_m), plan.icrs_m)
     icrs = np.array(plan.icrs_m) + rng.normal(0.0, scenario.model_icr_std_m or 0.0, 3)
     x0 = np.array([0.0, 0.0, plan.start_heading_rad, *icrs])
     variance = np.array(process_variance(scenario.config, configured_noise(scenario.config)))
