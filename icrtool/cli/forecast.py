@@ -51,7 +51,7 @@ def command(
     """  # noqa: D301 - click reads the escape
     from icrtool.output.files.atomic import write_file
     from icrtool.output.files.formats import save_picture
-    from icrtool.output.tables.calibration import forecast_csv, forecast_document, format_forecast, measured_to_m
+    from icrtool.output.tables.calibration import forecast_blocks, forecast_csv, forecast_document, measured_to_m
 
     _, calibration = read_calibration(calibration_file)
     forecast, gyro = _forecasts(calibration, path)
@@ -63,7 +63,7 @@ def command(
         measured_m = measured_to_m(calibration)
         save_picture(forecast_figure(forecast, path.name, budgets_m, measured_m, gyro), plot)
     printer.json("forecast", forecast_document(forecast, calibration, budgets_m, gyro))
-    printer.text(format_forecast(forecast, calibration, budgets_m, gyro))
+    printer.show(forecast_blocks(forecast, calibration, budgets_m, gyro))
 
 
 def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast | None]:

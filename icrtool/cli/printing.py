@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import click
 
-from icrtool.output.text_blocks import Block, Line, Table, Text, narrowed, printed
+from icrtool.output.text_blocks import Block, Line, Printed, Table, format_blocks, narrowed, printed
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
 
@@ -41,23 +41,23 @@ FEWEST_COLUMNS = 3
 STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
 
 
-def show(text: str) -> None:
-    """Print a result. ``NO_COLOR`` and ``TERM=dumb`` are respected; nothing in the text is read as markup."""
-    if not isinstance(text, Text) or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
-        click.echo(text)
+def show(blocks: Iterable[Block], *, verbose: bool) -> None:
+    """Print a document. ``NO_COLOR`` and ``TERM=dumb`` are respected; nothing in its text is read as markup."""
+    if not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
+        click.echo(format_blocks(blocks, verbose=verbose))
         return
     from rich.console import Console
 
     console = Console(force_terminal=True, highlight=False, markup=False, emoji=False)
     console.width = min(console.width, WIDEST)
-    _print(text, console)
+    _print(printed(blocks, verbose=verbose), console)
 
 
-def _print(text: Text, console: Console) -> None:
+def _print(blocks: Iterable[Printed], console: Console) -> None:
     from rich.table import Table as RichTable
     from rich.text import Text as RichText
 
-    for block in text.blocks:
+    for block in blocks:
         if isinstance(block, Line):
             console.print(RichText(block.text, STYLES[block.look]), soft_wrap=block.look == "as is")
         elif isinstance(block, str):
@@ -162,12 +162,12 @@ class Printer(NamedTuple):
     def show(self, blocks: Iterable[Block]) -> None:
         """Print a document as text, with -v all of it."""
         if self.shows:
-            show(printed(blocks, verbose=self.verbose))
+            show(blocks, verbose=self.verbose)
 
     def text(self, text: str) -> None:
         """Print a result that is laid out."""
         if self.shows:
-            show(text)
+            click.echo(text)
 
     def json(self, command: str, document: msgspec.Struct | Mapping[str, object]) -> None:
         """Print the document of a command, with --json; parameters as of `print_json`."""

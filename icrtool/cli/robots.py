@@ -6,7 +6,7 @@ import click
 
 from icrtool.cli import options
 from icrtool.cli.printing import Printer
-from icrtool.output.text_blocks import Line, Table, Text
+from icrtool.output.text_blocks import Line, Table
 
 
 @click.command("robots")
@@ -32,4 +32,4 @@ def command(printer: Printer) -> None:
     ]  # fmt: skip
     head = ("robot", "track width", "wheel radius", "counts per turn")
     sources = Table("l", [(f"  {name}", robot["source"]) for name, robot in robots.items()])
-    printer.text(Text([Table("lr", rows, head), "", Line("Sources", "title"), sources]))
+    printer.show([Table("lr", rows, head), "", Line("Sources", "title"), sources])

@@ -104,12 +104,12 @@ def command(
         asked = replace(asked, presets=(preset,))
     directory = output if output is not None else RUNS / f"study-{name}"
     check_study_target(directory)
-    from icrtool.output.tables.study import format_study
+    from icrtool.output.tables.study import study_blocks
 
     with printer.progress(f"study {name}") as progress:
         result = run_study(asked, progress)
     write_study(result, directory, plots=plots)
-    printer.text(format_study(result))
+    printer.show(study_blocks(result))
     printer.text(f"\nwritten to {directory}")
     printer.detail(f"settings: {asked.settings()}")
 

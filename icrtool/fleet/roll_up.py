@@ -93,7 +93,7 @@ def _pooled(
     from icrtool.calibration.pooled import calibrate_runs
     from icrtool.output.run_directory import open_run
     from icrtool.output.tables.calibration import held_out_blocks
-    from icrtool.output.text_blocks import printed
+    from icrtool.output.text_blocks import format_blocks
 
     # A copy of a log would be tested on itself.
     distinct = {_content(row.inputs): row for row in reversed(members)}
@@ -121,7 +121,7 @@ def _pooled(
         left_out = tuple(log for log in one.logs if log not in used)
         return replace(one, left_out=left_out, reason=str(err))
     numbers = result.calibration.controller
-    table = str(printed(held_out_blocks(result.table), verbose=True))
+    table = format_blocks(held_out_blocks(result.table))
     reached = result.table.score("recommended").within(result.table.horizons_m, BUDGET_M)
     short = {name for name, _ in result.left_out}
     used = [log for log, logged in zip(used, opened, strict=True) if logged not in short]

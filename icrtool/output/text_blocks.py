@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple
 
 from icrtool.records.text import shortened
 
@@ -180,34 +180,17 @@ Block = str | Title | Line | Table | Facts | Checks | Items | Figure | Section
 Printed = str | Line | Table
 
 
-class Text(str):
-    """Plain text that knows its sentences and tables.
-
-    Attributes
-    ----------
-    blocks : of which it is made
-    """
-
-    blocks: tuple[Printed, ...]
-
-    def __new__(cls, blocks: Iterable[Printed]) -> Self:
-        """Return `blocks` as plain text, at most `TEXT_WIDTH` wide where it can be wrapped; no line end."""
-        blocks = tuple(blocks)
-        self = super().__new__(cls, "\n".join(line.rstrip() for block in blocks for line in _lines(block)))
-        self.blocks = blocks
-        return self
-
-
-def printed(blocks: Iterable[Block], *, verbose: bool) -> Text:
-    """Return a document as text: the brief answer in lines of `BRIEF_WIDTH`, or all but what is for a page alone."""
-    return Text(_printed(blocks, verbose))
+def format_blocks(blocks: Iterable[Block], *, verbose: bool = True) -> str:
+    """Return a document as plain text, at most `TEXT_WIDTH` wide where it can be wrapped; no line end."""
+    return "\n".join(line.rstrip() for block in printed(blocks, verbose=verbose) for line in _lines(block))
 
 
 LOOKS: dict[Grade, Look] = {"good": "good", "care": "as is", "bad": "bad", "fact": "as is"}
 MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": ""}
 
 
-def _printed(blocks: Iterable[Block], verbose: bool) -> Iterator[Printed]:
+def printed(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:
+    """Yield what is printed of a document: the brief answer in `BRIEF_WIDTH`, or all but what is for a page alone."""
     for block in blocks:
         if isinstance(block, str | Line):
             yield block
@@ -239,7 +222,7 @@ def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
     if section.label:
         label, text = f"{section.label:{LABEL + 2}}", f"{section.lead} {section.text}".strip()
         yield _sentence(label, text, 3, LOOKS[section.grade], verbose=verbose)
-    yield from _printed(section.blocks, verbose)
+    yield from printed(section.blocks, verbose=verbose)
 
 
 def _check_lines(checks: Checks, verbose: bool) -> Iterator[tuple[str, str, int]]:

@@ -11,7 +11,7 @@ from xml.etree import ElementTree as ET
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.files.atomic import write_file
-from icrtool.output.text_blocks import Line, Table
+from icrtool.output.text_blocks import Line, Table, printed
 from icrtool.output.text_format import run_title, xml_text
 from icrtool.records.fleet_document import FleetVerdict, fleet_verdict
 
@@ -70,14 +70,14 @@ def format_outcomes(outcomes: Iterable[tuple[str, Outcome]]) -> str:
 def format_markdown(report: DropoutReport) -> str:
     """Return one report as Markdown: the verdicts, then the sentences and tables that are printed."""
     # Not at import: a batch needs the verdicts alone.
-    from icrtool.output.tables.dropout import format_dropout
+    from icrtool.output.tables.dropout import dropout_blocks
 
     title, verdicts = run_title(report.run_document), [one.verdict for one in report.document.gates]
     lines = [f"## {escaped_markdown(title)}", ""]
     if verdicts:
         word = "All acceptance limits are met." if report.passed else "**An acceptance limit is not met.**"
         lines += [word, "", *(f"- {escaped_markdown(line)}" for line in verdicts), ""]
-    for block in format_dropout(report).blocks:
+    for block in printed(dropout_blocks(report), verbose=True):
         if isinstance(block, Table):
             rows = [[escaped_markdown(cell.strip()) for cell in row] for row in block.lines()]
             texts = [column for column, side in enumerate(block.sides()) if side == "l"]

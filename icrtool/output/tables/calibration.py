@@ -29,9 +29,7 @@ from icrtool.output.text_blocks import (
     Line,
     Section,
     Table,
-    Text,
     Title,
-    printed,
 )
 from icrtool.output.text_format import model_text
 from icrtool.records.calibration_document import (
@@ -213,10 +211,10 @@ def reach(forecast: Forecast, budget_m: float) -> float:
     return math.nan if found is None else found[0]
 
 
-def format_forecast(
+def forecast_blocks(
     forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
-) -> Text:
-    """Return the table of a forecast, no line end."""
+) -> list[Block]:
+    """Return the table of a forecast, and how far within each budget."""
     total = float(forecast.distance_m[-1])
     fitted, logs = calibration.fitted, counted(len(calibration.logs), "log")
     model = f"{model_text(fitted)} from {logs}"
@@ -241,7 +239,7 @@ def format_forecast(
         blocks.append(f"errors were measured up to {longest:g} m; what is beyond is extrapolated")
     if unknown := "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown):
         blocks.append(f"not found by the calibration, too small or not driven: {unknown}")
-    return printed([*blocks, *calibration.warnings], verbose=True)
+    return [*blocks, *calibration.warnings]
 
 
 def transfer_csv(found: GroupComparison) -> bytes:

@@ -26,9 +26,8 @@ from icrtool.output.text_blocks import (
     Line,
     Section,
     Table,
-    Text,
     Title,
-    printed,
+    format_blocks,
 )
 from icrtool.output.text_format import controller_error_text, duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
@@ -49,9 +48,9 @@ REACH_NOTES = {"controller": "in any diff_drive_controller"}
 Row = tuple[str, str, str]
 
 
-def format_dropout(report: DropoutReport) -> Text:
+def format_dropout(report: DropoutReport) -> str:
     """Return all that is printed of a report, no line end."""
-    return printed(dropout_blocks(report), verbose=True)
+    return format_blocks(dropout_blocks(report))
 
 
 def dropout_blocks(report: DropoutReport) -> list[Block]:

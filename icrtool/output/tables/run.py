@@ -23,9 +23,8 @@ from icrtool.output.text_blocks import (
     Line,
     Section,
     Table,
-    Text,
     Title,
-    printed,
+    format_blocks,
 )
 from icrtool.output.text_format import (
     duration_text,
@@ -71,12 +70,12 @@ Row = tuple[str, str]
 """What a line is about, and its sentence."""
 
 
-def format_run(run: Run) -> Text:
+def format_run(run: Run) -> str:
     """Return all that is printed of a run; at most 100 columns wide, no line end.
 
     Warnings are not in it: they belong to stderr.
     """
-    return printed(run_blocks(run.document), verbose=True)
+    return format_blocks(run_blocks(run.document))
 
 
 def run_blocks(summary: RunDocument) -> list[Block]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from itertools import groupby
 
-from icrtool.output.text_blocks import Block, Table, Text, printed
+from icrtool.output.text_blocks import Block, Table
 from icrtool.records.text import counted
 from icrtool.simulation.study_records import Level, StudyNumber, StudyRequest, StudyResult
 from icrtool.simulation.study_runs import ICR_NAMES
@@ -27,7 +27,7 @@ SHOWN: dict[str, dict[str, str]] = {
 """Metrics by study, with the heading of their column; the studies left out have no settings to list."""
 
 
-def format_study(result: StudyResult) -> Text:
+def study_blocks(result: StudyResult) -> list[Block]:
     """Return the tables of a study, of at most 80 columns but for the paper's numbers; no line end."""
     request, study = result.request, result.study
     figures = f" (Fig{'s' if len(study.figures) > 2 else ''}. {study.figures})" if study.figures else ""
@@ -41,7 +41,7 @@ def format_study(result: StudyResult) -> Text:
         rows = [row for level in result.levels for row in _level_rows(level, shown)]
         blocks += [Table("lr", rows, ("", varies.rpartition(" ")[2], *shown.values()))]
         blocks += [f"{varies}{errors}; median, and below it [5 %, 95 %] of the runs", ""]
-    return printed([*blocks, _findings_table(result)], verbose=True)
+    return [*blocks, _findings_table(result)]
 
 
 def _level_rows(level: Level, shown: dict[str, str]) -> list[list[str]]:

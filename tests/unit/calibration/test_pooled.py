@@ -22,7 +22,7 @@ from icrtool.motion.models import FAMILY, MODELS
 from icrtool.motion.recording import Recording, Trials, Windows, cut_trials, cut_windows, predicted_path
 from icrtool.output.files.formats import open_calibration, write_calibration
 from icrtool.output.tables.calibration import calibration_blocks
-from icrtool.output.text_blocks import printed
+from icrtool.output.text_blocks import format_blocks
 from icrtool.records.calibration_document import CalibratedRobot
 from icrtool.records.dropout import MeasuredHeading
 from support.drives import make_log
@@ -225,7 +225,7 @@ def test_a_run_with_configured_scales_gives_the_same_calibration(scales: tuple[f
 
 
 def test_the_tables_name_what_they_show(result: CalibrationResult) -> None:
-    text = printed(calibration_blocks(result, None), verbose=True)
+    text = format_blocks(calibration_blocks(result, None))
     assert f"Motion model: {result.calibration.fitted.model.label}" in text
     assert "each log left out in turn (3 logs)" in text
     assert max(map(len, text.splitlines())) <= 110

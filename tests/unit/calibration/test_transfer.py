@@ -18,7 +18,7 @@ from icrtool.motion.models import MODELS
 from icrtool.motion.recording import Recording
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.tables.calibration import transfer_blocks, transfer_csv
-from icrtool.output.text_blocks import printed
+from icrtool.output.text_blocks import format_blocks
 from icrtool.records.calibration_document import GroupComparison
 from support.recordings import make_recording
 
@@ -64,7 +64,7 @@ def test_the_diagonal_is_the_held_out_score(transfer: GroupComparison) -> None:
 
 
 def test_text_csv_and_json_hold_the_same(transfer: GroupComparison) -> None:
-    text, document = printed(transfer_blocks(transfer), verbose=True), json.loads(json_bytes(transfer))
+    text, document = format_blocks(transfer_blocks(transfer)), json.loads(json_bytes(transfer))
     assert msgspec.convert(document, GroupComparison) == transfer
     assert document["pairs"][0]["verdict"].split(";")[0] in " ".join(text.split())
     rows = list(csv.DictReader(io.StringIO(transfer_csv(transfer).decode())))
@@ -105,4 +105,4 @@ def test_the_same_route_driven_twice_is_paired() -> None:
     groups = {"one": [first], "two": [second]}
     found = compare_calibrations({name: calibrate_recordings(logs) for name, logs in groups.items()}, groups)
     assert found.pairs[0].errors[0].paired
-    assert "the same route" in printed(transfer_blocks(found), verbose=True)
+    assert "the same route" in format_blocks(transfer_blocks(found))

@@ -23,8 +23,8 @@ from icrtool.output.simulation_files import (
     write_study,
     write_truth,
 )
-from icrtool.output.tables.study import finding_text, format_study, runs_text, study_subtitle, study_title
-from icrtool.output.text_blocks import Table
+from icrtool.output.tables.study import finding_text, runs_text, study_blocks, study_subtitle, study_title
+from icrtool.output.text_blocks import Table, format_blocks
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
 from icrtool.simulation.record import simulate
 from icrtool.simulation.studies import STUDIES, run_study
@@ -57,18 +57,16 @@ def test_a_study_directory_holds_json_csv_and_picture(name, tmp_path: Path) -> N
 def test_every_number_of_the_table_is_whole_on_a_terminal_of_80_columns(
     name, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = format_study(small_study(name))
+    blocks = study_blocks(small_study(name))
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("NO_COLOR", "1")
-    show(text)
+    show(blocks, verbose=False)
     shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
-    assert text.startswith(name)
+    assert shown.startswith(name)
     assert max(map(len, shown.splitlines())) <= 80
-    cells = [cell for block in text.blocks if isinstance(block, Table) for row in block.rows for cell in row[:-1]]
-    inverted = [
-        row[-1] for block in text.blocks if isinstance(block, Table) if "r" in block.align for row in block.rows
-    ]
+    cells = [cell for block in blocks if isinstance(block, Table) for row in block.rows for cell in row[:-1]]
+    inverted = [row[-1] for block in blocks if isinstance(block, Table) if "r" in block.align for row in block.rows]
     assert [cell for cell in (*cells, *inverted) if cell not in shown] == []
 
 
@@ -115,7 +113,7 @@ def test_a_study_that_cannot_be_drawn_leaves_nothing_behind(tmp_path: Path, monk
 
 
 def test_the_table_names_the_robot_settings_and_the_paper(tmp_path: Path) -> None:
-    text = format_study(small_study("turn-radius"))
+    text = format_blocks(study_blocks(small_study("turn-radius")))
     assert "turn-radius (Fig. 10): convergence after a change" in text
     assert "2 runs of 25 s each, seed 0; circle at 0.4 m/s, ICRs +0.500, -0.750, -0.250 m" in text
     assert "0.1 s (Fig. 10)" in text
@@ -223,4 +221,4 @@ def test_a_place_that_does_not_exist_is_said_in_one_line(tmp_path: Path) -> None
 def test_a_path_may_be_named_in_any_study(tmp_path: Path) -> None:
     request = small_request("rate", 1, 6.0, values=(50.0,))
     result = run_study(replace(request, plan=replace(request.plan, path=PathPlan("spins"))))
-    assert "spins at 0.4 m/s" in format_study(result)
+    assert "spins at 0.4 m/s" in format_blocks(study_blocks(result))

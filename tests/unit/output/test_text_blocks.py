@@ -9,23 +9,23 @@ import pytest
 
 from icrtool.cli.printing import show
 from icrtool.output.tables.calibration import setting_blocks
-from icrtool.output.text_blocks import TEXT_WIDTH, Facts, Line, Table, Text, printed
+from icrtool.output.text_blocks import TEXT_WIDTH, Facts, Line, Table, format_blocks
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, SensorDocument, SensorDrive
 
 TABLE = Table("lr", [("wheels", "50.0 Hz"), ("a [bold]b", "1.25 Hz")], ("stream", "rate"))
 
 
 def test_columns_are_as_wide_as_their_cells_and_numbers_stand_at_the_right() -> None:
-    assert Text([TABLE]).splitlines() == ["stream        rate", "wheels     50.0 Hz", "a [bold]b  1.25 Hz"]
+    assert format_blocks([TABLE]).splitlines() == ["stream        rate", "wheels     50.0 Hz", "a [bold]b  1.25 Hz"]
 
 
 def test_sentences_are_wrapped_and_what_is_copied_is_not() -> None:
     words = " ".join(["word"] * 60)
-    (first, *later) = Text([words]).splitlines()
+    (first, *later) = format_blocks([words]).splitlines()
     assert len(first) <= TEXT_WIDTH
     assert all(line.startswith("  word") for line in later)
-    assert Text([Line(words, "as is")]) == words
-    (first, *later) = printed([Facts([("drive", words), ("", "next")])], verbose=True).splitlines()
+    assert format_blocks([Line(words, "as is")]) == words
+    (first, *later) = format_blocks([Facts([("drive", words), ("", "next")])]).splitlines()
     assert first.startswith("drive       word")
     assert [line[:13] for line in later] == [f"{'':12}w"] * (len(later) - 1) + [f"{'':12}n"]
 
@@ -36,14 +36,14 @@ def test_settings_to_copy_are_words_that_a_shell_joins_and_a_terminal_holds() ->
         schema=CALIBRATION_SCHEMA, log="log", inputs=(), windows=1, independent_stretches=1, window_miss_m=0.1,
         drive=SensorDrive(*[0.0] * len(SensorDrive.__struct_fields__)), settings=settings, alignment={}, parameters={},
     )  # fmt: skip
-    text = printed(setting_blocks(log), verbose=False)
+    text = format_blocks(setting_blocks(log), verbose=False)
     assert max(map(len, text.splitlines())) <= 80
     script = f"printf '%s\\n' {text.partition(':')[2].strip()}"
     options = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True).stdout.splitlines()
     assert options == [word for key in settings for word in ("--set", f"{key}=0.123457")]
 
 
-PAGE = printed([Line("NOT USABLE: x", "bad"), TABLE, Facts([("drive", " ".join(["word"] * 30))])], verbose=True)
+PAGE = [Line("NOT USABLE: x", "bad"), TABLE, Facts([("drive", " ".join(["word"] * 30))])]
 
 
 def test_a_terminal_gets_its_width_and_colours_and_no_markup_of_a_log(
@@ -53,20 +53,20 @@ def test_a_terminal_gets_its_width_and_colours_and_no_markup_of_a_log(
         monkeypatch.setenv(name, value)
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    show(PAGE)
+    show(PAGE, verbose=True)
     shown = capsys.readouterr().out
     assert "\x1b[1;31mNOT USABLE: x" in shown
     assert "a [bold]b" in shown
     monkeypatch.setenv("NO_COLOR", "1")
-    show(PAGE)
+    show(PAGE, verbose=True)
     plain = capsys.readouterr().out
     assert "\x1b[1;31m" not in plain
     assert max(map(len, plain.splitlines())) <= 60 + 8
     monkeypatch.setenv("TERM", "dumb")
-    show(PAGE)
-    assert capsys.readouterr().out == f"{PAGE}\n"
+    show(PAGE, verbose=True)
+    assert capsys.readouterr().out == f"{format_blocks(PAGE)}\n"
 
 
 def test_a_pipe_gets_plain_text(capsys: pytest.CaptureFixture[str]) -> None:
-    show(PAGE)
-    assert capsys.readouterr().out == f"{PAGE}\n"
+    show(PAGE, verbose=True)
+    assert capsys.readouterr().out == f"{format_blocks(PAGE)}\n"

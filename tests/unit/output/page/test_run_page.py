@@ -24,7 +24,7 @@ from icrtool.output.page.drive_data import packed, packed_levels, packed_sums
 from icrtool.output.page.render import pictures_of
 from icrtool.output.page.run_page import draw_pictures, run_page, write_page
 from icrtool.output.tables.dropout import reach_rows, report_blocks
-from icrtool.output.text_blocks import printed
+from icrtool.output.text_blocks import format_blocks
 from icrtool.records.measurements import ReferenceJump
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
@@ -99,7 +99,7 @@ def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutRep
     event = EventDocument("skid", 1.0, 2.0, 10**9, 2 * 10**9, 0.0, 0.0, 0.1, 0.5, 1.0)
     document = msgspec.structs.replace(run.document, events=(event, event))
     stated = msgspec.structs.replace(report.document, budgets=budgets)
-    brief = str(printed(report_blocks(document, stated), verbose=False))
+    brief = format_blocks(report_blocks(document, stated), verbose=False)
     text = "".join("".join(Elements(run_page(replace(run, document=document), stated, {})).text).split())
     rows, _ = reach_rows(stated, report.document.budgets[0].budget_m, 2)
     assert rows[-1][:2] == ("without its 2 slip events", "more than 20 m")
@@ -108,7 +108,7 @@ def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutRep
         [word for word in re.split("  +", line.strip()) if word] for line in lines
     ]
     assert all("".join(f"{label}:{distance}".split()) in text for label, distance, _ in rows)
-    assert "without its" not in str(printed(report_blocks(run.document, report.document), verbose=False))
+    assert "without its" not in format_blocks(report_blocks(run.document, report.document), verbose=False)
 
 
 def test_every_warning_stands_on_the_page(run: Run, report: DropoutReport) -> None:
