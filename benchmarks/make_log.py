@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from pymap3d import ned2geodetic
 
-from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
 
 EPOCH_NS = 1_760_000_000_000_000_000
 Y_RIGHT, Y_LEFT, X = 0.74, -0.73, 0.05

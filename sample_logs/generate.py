@@ -29,7 +29,7 @@ from skid_steer import (
     plan_lawnmower,
 )
 
-from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -199,7 +199,7 @@ def name_of(kind: int) -> str:
 
 def write(folder: Path, columns: dict[str, np.ndarray], kind: int, wheels: str) -> Path:
     """Write a log."""
-    from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+    from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
 
     container, compression = KINDS[kind]
     if container == "csv":

@@ -70,7 +70,7 @@ def call_all_kernels() -> None:
     from icrtool.estimation.run_filter import smooth
     from icrtool.kernels.open_loop import open_loop_errors_direct
     from icrtool.kernels.track import FrozenIcrs, trial_ends
-    from icrtool.logs.writing.log import WriteOptions, write_log
+    from icrtool.logs.write_log import WriteOptions, write_log
     from icrtool.records.process_resources import unfinished
     from icrtool.records.run import track_of
     from icrtool.simulation.drives import DrivePlan, Sensors

@@ -16,7 +16,7 @@ from icrtool.cli.printing import Printer
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
-    from icrtool.logs.writing.messages import WheelMessages, WriteOptions
+    from icrtool.logs.written_messages import WheelMessages, WriteOptions
     from icrtool.records.tables import Icrs
     from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
     from icrtool.simulation.record import TruthTable
@@ -169,7 +169,7 @@ def command(
       icrtool simulate -o drive.mcap --robot husky-a200 --path figure-eight
       icrtool fit drive.mcap --robot husky-a200
     """  # noqa: D301 - click reads the escape
-    from icrtool.logs.writing.log import write_log
+    from icrtool.logs.write_log import write_log
     from icrtool.output.simulation_files import log_and_truth, read_speeds, truth_path, write_truth
     from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
     from icrtool.simulation.record import simulate
@@ -228,7 +228,7 @@ def _write_options(
     log: Path, config: Config, sensors: Sensors, wheels: WheelMessages, heading: Literal["enu", "ned"], counts: float
 ) -> WriteOptions:
     from icrtool.errors import ConfigError
-    from icrtool.logs.writing.messages import WriteOptions
+    from icrtool.logs.written_messages import WriteOptions
 
     if log.suffix not in ("", ".mcap", ".bag"):
         raise ConfigError(

@@ -24,8 +24,7 @@ from icrtool.logs.containers.channel import LATEST_NS, WHOLE, Cut
 from icrtool.logs.containers.container import Container
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED, log_name
-from icrtool.logs.messages.collectors import collector_for
-from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable
+from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable, collector_for
 from icrtool.logs.streams.assembly import Survey, assemble, longest_part
 from icrtool.logs.streams.headings import GYRO_AXES
 from icrtool.logs.streams.select import fields_to_take, find_candidates

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.logs.writing.log import write_bag, write_db3, write_mcap
-from icrtool.logs.writing.messages import (
+from icrtool.logs.write_log import write_bag, write_db3, write_mcap
+from icrtool.logs.written_messages import (
     TopicMessages,
     WriteOptions,
     _plan_heading,

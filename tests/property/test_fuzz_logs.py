@@ -30,7 +30,7 @@ from icrtool.config import load_config
 from icrtool.errors import IcrToolError
 from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.assembly import assemble
-from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
 
 START_NS = 1_760_000_000_000_000_000
 CONFIG = load_config(

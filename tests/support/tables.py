@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from icrtool.logs.containers.channel import Block, Channel
-from icrtool.logs.messages.collectors import collector_for
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.records.text import LogText
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 50_000_000

@@ -10,8 +10,7 @@ from typing import TypeVar, cast
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
 from icrtool.logs.containers.channel import Channel, some_of
-from icrtool.logs.messages.collectors import READ_ENCODINGS
-from icrtool.logs.messages.topic_table import HEADER, TopicTable
+from icrtool.logs.messages.topic_table import HEADER, READ_ENCODINGS, TopicTable
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE
 from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelMotion, of_topic

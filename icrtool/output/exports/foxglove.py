@@ -20,8 +20,8 @@ from icrtool import __version__
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.kinematics import body_velocity
-from icrtool.logs.writing.log import write_mcap
-from icrtool.logs.writing.messages import (
+from icrtool.logs.write_log import write_mcap
+from icrtool.logs.written_messages import (
     TopicMessages,
     TopicPlan,
     blank_message,

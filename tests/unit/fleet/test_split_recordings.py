@@ -11,7 +11,7 @@ from icrtool.config import load_config
 from icrtool.fleet.recordings import find_recordings, logs_among
 from icrtool.logs.containers.recording_files import numbered_file, split_files, split_path
 from icrtool.logs.read_log import read_log
-from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
+from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
 
 START_NS = 1_760_000_000_000_000_000
 CONFIG = load_config(sets=["robot.track_width_m=0.55", "robot.wheel_radius_m=0.165"])

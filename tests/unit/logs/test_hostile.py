@@ -27,10 +27,9 @@ from icrtool.logs.containers.decompress import (
     unpack_messages,
 )
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
-from icrtool.logs.messages.collectors import collector_for
 from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
-from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.logs.read_log import LONGEST_HEAD_BYTES, moment, read_log, survey_log
 from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.stamps import stamp_rows

@@ -27,9 +27,8 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from icrtool.logs.messages.collectors import DYNAMIC_JOINT_STATE
 from icrtool.logs.messages.decoded_values import NMEA_SENTENCE
-from icrtool.logs.messages.topic_table import HEADER, TopicTable
+from icrtool.logs.messages.topic_table import DYNAMIC_JOINT_STATE, HEADER, TopicTable
 from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.assembly import Survey
 from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of

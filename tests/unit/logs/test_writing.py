@@ -13,11 +13,11 @@ import pytest
 
 from icrtool.config import load_config
 from icrtool.errors import ConfigError, OutputError
+from icrtool.logs import write_log as writing_log
 from icrtool.logs.messages.definitions import bundled_definitions, standard_definitions
 from icrtool.logs.read_log import read_log
-from icrtool.logs.writing import log as writing_log
-from icrtool.logs.writing.log import SensorColumns, WriteOptions, write_log
-from icrtool.logs.writing.messages import load_typestore, serialise_topics
+from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
+from icrtool.logs.written_messages import load_typestore, serialise_topics
 
 START_NS = 1_760_000_000_000_000_000
 RADIUS_M = 0.27

@@ -17,7 +17,7 @@ from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Bools
 from icrtool.kernels.filter_records import GATED
 from icrtool.logs.read_log import read_log
-from icrtool.logs.writing.log import WriteOptions, write_log
+from icrtool.logs.write_log import WriteOptions, write_log
 from icrtool.records.run import Run
 from icrtool.records.samples import (
     FIXED_FIX,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from icrtool.errors import OutputError
-from icrtool.logs.writing.messages import (
+from icrtool.logs.written_messages import (
     Compression,
     Container,
     WheelMessages,
@@ -26,7 +26,7 @@ from icrtool.records.samples import SensorColumns
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-    from icrtool.logs.writing.messages import TopicMessages
+    from icrtool.logs.written_messages import TopicMessages
 
 ROSBAG2_VERSION: Final = 9
 

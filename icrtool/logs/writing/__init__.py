@@ -1,1 +1,0 @@
-"""Write logs: columns to messages, messages to containers."""
