@@ -52,12 +52,13 @@ from icrtool.alignment.sensors.wheel_units import refuse_parked
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.track import Track
+from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
 SIGNIFICANT_SIGMAS = 2.5
-SMALLEST_LAG_S, SMALLEST_LEAD_S, LARGEST_STD_S = 0.1, 0.2, 0.1
-"""A robot follows its wheels by up to 0.1 s, which is no clock; the standard deviation of a delay holds that. A
+SMALLEST_LEAD_S, LARGEST_STD_S = 0.2, 0.1
+"""A robot follows its wheels by up to `RESPONSE_S`, which is no clock; the standard deviation of a delay holds that. A
 stream that leads by little is more often a response that the model lacks than a clock."""
 
 
@@ -171,7 +172,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
 
 def _is_large(delay_s: float) -> bool:
     """Return whether a delay is more than a robot's response to its wheels."""
-    return delay_s > SMALLEST_LAG_S or delay_s < -SMALLEST_LEAD_S
+    return delay_s > RESPONSE_S or delay_s < -SMALLEST_LEAD_S
 
 
 def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bool], *, together: bool) -> list[str]:

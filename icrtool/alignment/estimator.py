@@ -93,6 +93,10 @@ MOUNTING_STD_RAD = math.radians(3.0)
 
 MOST_STEPS = 15
 
+SIGNIFICANT_SIGMAS = 4.0
+"""What contradicts that sensors are mounted along the robot, sides alike or wheels measured is this sure: standard
+deviations of few stretches of distance are uncertain themselves."""
+
 FIVE_TERMS = MODELS[FIVE]
 """The motion model of the displacements and turns, but for drag and drift."""
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensors.sensor_noise import bend_std_m, unbroken
+from icrtool.alignment.sensors.sensor_noise import NOISIER, USUAL_POSITION_STD_M, bend_std_m, unbroken
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.track import Track, cut
@@ -34,10 +34,6 @@ LONGEST_WINDOW_S = 30.0
 
 TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS, TURN_STEP_S = 1.0, 2.0, 0.5
 """Heading changes are compared over this time, and at least so many intervals; windows start at every step."""
-
-UNSTATED_STD_M, NOISIER = 0.01, 1.5
-"""Noise of fixes that state none; and what their second differences must exceed it by to be used instead."""
-
 
 CHORD_S, LEAST_CHORD_M = 2.0, 0.3
 """Without a heading, distances are compared over this time, and where the chord is so long [m]."""
@@ -165,7 +161,7 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     """Return the noise of the fixes, an axis [m]: what they state, or what they show where that is clearly more."""
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance) & (variance > 0)]
-    stated = math.sqrt(float(np.median(known))) if len(known) else UNSTATED_STD_M
+    stated = math.sqrt(float(np.median(known))) if len(known) else USUAL_POSITION_STD_M
     seen = bend_std_m(gnss)
     return seen if seen > NOISIER * stated else stated
 

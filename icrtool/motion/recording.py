@@ -13,6 +13,7 @@ from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.track import Track, cut, ends_from
 from icrtool.kernels.window_residuals import OMEGA, path_at
 from icrtool.motion.models import NO_LEVER, FittedModel, Lever, wheel_motion
+from icrtool.records.measurements import TURNING_MPS
 
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
@@ -37,9 +38,6 @@ STRETCH_M = 20.0
 """Distance whose errors depend on one another, for the covariance: twice the longest window."""
 
 FEWEST_WINDOWS = 10
-
-MOVING_MPS = 0.01
-"""Slower than this the robot stands: its starts are copies of one another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,8 +168,8 @@ def cut_windows(
 
 
 def moving_states(track: Track) -> Bools:
-    """Return the states (n,) in which the robot moves."""
-    return np.append(np.diff(track.distance) > MOVING_MPS * np.diff(track.t), False)
+    """Return the states (n,) in which the robot moves: starts where it stands are copies of one another."""
+    return np.append(np.diff(track.distance) > TURNING_MPS * np.diff(track.t), False)
 
 
 def samples_a_step(track: Track, pooled_s: float | None = None) -> int:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS
 from icrtool.alignment.heading.turn_rates import Guess, TurnRate, fit_middle, measure_courses
 from icrtool.alignment.log_track import FEWEST_WINDOWS
 from icrtool.kernels.arrays import Floats, Ints
@@ -34,7 +35,6 @@ STATES, STATES_OF_A_SOURCE = 5, 3
 COURSE, STANDING, NOTHING, ABSOLUTE = range(4)
 
 SETTLED_SIGMAS = 3.0
-LEAST_OFFSET_SIGMAS = 4.0
 LARGEST_RATE_HZ = 20.0
 
 STANDING_S = 0.6
@@ -161,7 +161,7 @@ def estimate_heading(
     found = problem.solve(noises)
     if absolute and math.isfinite(absolute[0].aligned_std):
         offset = math.remainder(float(found.constants[OFFSET]), 2.0 * math.pi)
-        if abs(offset) <= LEAST_OFFSET_SIGMAS * float(found.constants_std[OFFSET]):
+        if abs(offset) <= SIGNIFICANT_SIGMAS * float(found.constants_std[OFFSET]):
             # not significant: that of a sensor mounted along the robot
             problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
             found = problem.solve(noises)

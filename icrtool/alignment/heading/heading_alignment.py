@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.conventions import Convention
-from icrtool.alignment.estimator import AlignmentFit
+from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
 from icrtool.alignment.heading.heading_choice import NOISY_SCATTER_RAD, DerivedHeading, stated_source
 from icrtool.alignment.log_track import FEWEST_WINDOWS, STARTS_A_WINDOW, DriveWindows
 from icrtool.alignment.sensors.sensor_noise import unbroken
@@ -107,7 +107,6 @@ def _declination_deg(datum: Datum, stamp_ns: int) -> float | None:
         return None
 
 
-SIGNIFICANT_SIGMAS = 4.0
 SMALLEST_OFFSET_RAD = math.radians(1.0)
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
 

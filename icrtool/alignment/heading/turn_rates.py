@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensors.sensor_noise import is_hole
+from icrtool.alignment.sensors.sensor_noise import OUTLIER_SIGMAS, is_hole
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import mad_std, robust_regression
 from icrtool.kernels.track import Track
@@ -33,10 +33,9 @@ ENOUGH_COURSES = 24.0
 LARGEST_TURN_ERROR_RAD = 2.0
 """A window is used where what is not known of bias and scale of the turn rate turns its window by less than this."""
 
-FEWEST_FIXES = 5
+FIXES_A_WINDOW = 5
 """Windows share no fix, so that their errors are independent; with fewer fixes, most of the distance would be lost."""
 
-SPIKE_SIGMAS = 8.0
 MIDDLE_STD = 0.2
 """The antenna's speed grows by about so much of half the difference of the sides."""
 
@@ -212,7 +211,7 @@ def _edges(gone: Floats, length: float) -> np.ndarray:
     edges, last = [0], 0
     cell = np.floor(gone / length)
     for one in np.flatnonzero(np.diff(cell) > 0) + 1:
-        if one - last >= FEWEST_FIXES:
+        if one - last >= FIXES_A_WINDOW:
             edges.append(int(one))
             last = int(one)
     return np.array(edges)
@@ -225,7 +224,7 @@ def _without_spikes(track: Track, first: float, last: float) -> tuple[Floats, Co
     if len(rows) < 3:
         return t, place
     bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
-    far = bend > SPIKE_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
+    far = bend > OUTLIER_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
     # the neighbours of a spike bend by half as much
     spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
     kept = np.concatenate([[True], ~spike, [True]])

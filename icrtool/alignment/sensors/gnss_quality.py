@@ -16,6 +16,7 @@ import numpy as np
 from icrtool.alignment.sensors.sensor_noise import (
     FEWEST_STEPS,
     LARGEST_SANE_GNSS_STD_M,
+    NOISIER,
     FixSteps,
     position_variance,
     unstated_position_std_m,
@@ -44,9 +45,6 @@ CLASS_STD_M = {OTHER_FIX: 1.0, FLOAT_FIX: 0.4}
 
 CORRELATION_S = 10.0
 """How long such a fix errs alike."""
-
-NOISIER = 1.5
-"""White noise from step to step that is this many times what the messages state is used instead."""
 
 SHORTEST_LOSS_S = 2.0
 

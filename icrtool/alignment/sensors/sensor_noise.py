@@ -22,12 +22,16 @@ FEWEST_FIXES = 30
 MEDIAN_OF_RAYLEIGH = 1.1774
 """... over its scale."""
 
-CLIP_SIGMAS = 6.0
-JUMP_SIGMAS = 8.0
+OUTLIER_SIGMAS = 6.0
+"""A step this many robust deviations out of the usual is no noise."""
+
 SMALLEST_JUMP_M = 0.1
 PERSISTS_S = 1.0
 PERSISTS_SHARE = 0.5
 """A jump is a step this far out of the usual, after which the fixes stay away for this long; an outlier comes back."""
+
+NOISIER = 1.5
+"""Noise that is this many times what is stated is used instead."""
 
 MOVES_MPS = 0.05
 """Wheels on average faster than this: what delays and jitter of stamps add to the noise shows only then."""
@@ -103,7 +107,7 @@ def measure_steps(t: Floats, place: Complexes, expected: Complexes) -> FixSteps:
     size = np.abs(moving if len(moving) >= FEWEST_STEPS else step[np.isfinite(step)])
     scale = max(float(np.median(size)) / MEDIAN_OF_RAYLEIGH, 1e-6) if len(size) else 1e-6
     with np.errstate(invalid="ignore"):
-        usual_step = np.where(np.abs(step) <= CLIP_SIGMAS * scale, step, np.nan)
+        usual_step = np.where(np.abs(step) <= OUTLIER_SIGMAS * scale, step, np.nan)
     product = -(usual_step[1:] * np.conj(usual_step[:-1])).real
     return FixSteps(
         step, product, moves, _jump_rows(step, scale, max(3, round(PERSISTS_S / usual)) if usual > 0 else 3)
@@ -127,7 +131,7 @@ def _jump_rows(step: Complexes, scale: float, span: int) -> Ints:
     """Return the first row after each jump."""
     count = len(step)
     with np.errstate(invalid="ignore"):
-        found = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, JUMP_SIGMAS * scale))
+        found = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, OUTLIER_SIGMAS * scale))
     found = found[(found >= span) & (found + span < count)]
     if not len(found):
         return np.empty(0, np.int64)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.estimator import AlignmentFit
+from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
 from icrtool.alignment.log_track import FEWEST_WINDOWS, DriveWindows
 from icrtool.alignment.sensors.sensor_noise import unbroken
 from icrtool.config import Config
@@ -37,7 +37,7 @@ HELD_SHARE = 0.65
 SMALLEST_SCALE_ERROR, SCALE_SIGMAS, LARGEST_SCALE_STD, USUAL_SCALE_STD = 0.01, 2.0, 0.1, 0.04
 """A scale that is shown is corrected by what remains of it beside a prior: wheels roll at their radius to 4 %."""
 
-SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS = 0.005, 4.0
+SMALLEST_SIDE_DIFFERENCE = 0.005
 """Sides are scaled apart where they differ by more than this. The robot then veers where both report one speed."""
 
 LARGEST_SCALE_CORRECTION = 0.15
@@ -239,7 +239,7 @@ def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tu
     may = config.filter.preset == "field" and sound and not given
     scale, notes = _common_scale(fit, may=may)
     difference, std = _side_difference(fit)
-    if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, SIDE_SIGMAS * std):
+    if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, SIGNIFICANT_SIGMAS * std):
         return (scale, scale), notes
     side, other = ("left", "right") if difference < 0 else ("right", "left")
     text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other} one"
@@ -293,7 +293,7 @@ NOISE_S, SHORT_S, MIDDLE_S, LONGEST_S = 0.3, 1.0, 5.0, 40.0
 SHORTEST_LONG_S, LONG_WINDOWS = 15.0, 8.0
 """The long windows last at least so long, and a drive has so many of them."""
 
-SIGMAS, SMALLEST_CHANGE = 3.0, 0.1
+SMALLEST_CHANGE = 0.1
 """The ratio of turn to wheels' turn changes from short to long windows where it differs by more than both."""
 
 AS_THE_ROBOT = 0.1
@@ -318,7 +318,7 @@ def find_filtering(fit: AlignmentFit) -> str:
     if noise is None or short is None or middle is None or long is None:
         return ""
     change, std = long.ratio - short.ratio, math.hypot(short.ratio_std, long.ratio_std)
-    if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(SIGMAS * std, SMALLEST_CHANGE * long.ratio):
+    if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(SIGNIFICANT_SIGMAS * std, SMALLEST_CHANGE * long.ratio):
         ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {SHORT_S:g} s and {long.ratio:.2f} ± "
         return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of what they show"
     at_middle, at_end = (math.sqrt(max(one.left_rad**2 - noise.left_rad**2, 0.0)) for one in (middle, long))

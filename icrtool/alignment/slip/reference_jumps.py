@@ -12,13 +12,13 @@ import math
 
 import numpy as np
 
+from icrtool.alignment.sensors.sensor_noise import OUTLIER_SIGMAS
 from icrtool.alignment.slip.slip_windows import ComparedWindows, Knots, Motion, compare
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.records.measurements import ReferenceJump
 
-JUMP_SIGMAS = 6.0
 JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3
-"""A step beyond the noise by so many deviations, and beyond what wheels and a slow slide can do, may be a jump."""
+"""A step beyond the noise, and beyond what wheels and a slow slide can do, may be a jump."""
 
 SLIDE_MPS = 2.0
 """A robot slides by up to this much faster than its wheels ever are: it needs 1 s of free slide at 0.2 g, and a robot
@@ -46,12 +46,12 @@ def _beyond(knots: Knots, first: Ints, last: Ints, width_m: float) -> Bools:
     path, duration = knots.track.distance[last] - knots.track.distance[first], knots.t[last] - knots.t[first]
     by_robot = JUMP_SPEED_SHARE * path + JUMP_MPS * duration
     noise = np.sqrt(knots.variance[first] + knots.variance[last])
-    moved = np.abs(knots.place[last] - knots.place[first]) > JUMP_SIGMAS * noise + by_robot
+    moved = np.abs(knots.place[last] - knots.place[first]) > OUTLIER_SIGMAS * noise + by_robot
     if knots.turn_follows_place:
         return np.asarray(moved)
     turned = width_m * np.abs(knots.heading[last] - knots.heading[first])
     turn_noise = width_m * math.sqrt(2 * knots.turn_variance)
-    return np.asarray(moved | (turned > JUMP_SIGMAS * turn_noise + by_robot))
+    return np.asarray(moved | (turned > OUTLIER_SIGMAS * turn_noise + by_robot))
 
 
 def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJump, ...]:
@@ -70,7 +70,7 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     slide = (SLIDE_MPS + motion.scale * float(np.quantile(speed, 0.99))) * duration
     along, turns = motion.scale * knots.track.distance, motion.lever_m * motion.turn
     jitter, spin = (_by_jitter(knots, one, first) for one in (along, turns))
-    noise = JUMP_SIGMAS * np.sqrt(windows.sensor)
+    noise = OUTLIER_SIGMAS * np.sqrt(windows.sensor)
     ahead = np.maximum(np.abs(windows.ahead) - jitter, 0.0)
     moved = np.hypot(ahead, windows.aside) - noise[:, :2].max(axis=1)
     turned = np.maximum(np.abs(windows.turned) - spin, 0.0) - noise[:, 2]

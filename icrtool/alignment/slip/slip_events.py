@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.sensors.sensor_noise import MOVES_MPS
 from icrtool.alignment.slip.reference_jumps import decide_jumps, without_jumps
 from icrtool.alignment.slip.slip_extent import Extent, find_extent
 from icrtool.alignment.slip.slip_windows import ComparedWindows, Knots, Motion, compare, fit_motion, lay_knots, spans_of
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.records.measurements import ReferenceJump, SensorData, SlipEvent
+from icrtool.records.measurements import RESPONSE_S, ReferenceJump, SensorData, SlipEvent
 
 WINDOWS_S = (0.5, 1.0, 2.0)
 LONGEST_WINDOW_S = 16.0
@@ -35,9 +36,6 @@ STUCK_SHARE = 0.2
 
 FEWEST_INTERVALS = 2
 """An event is seen in at least so many intervals between fixes: one alone may be a jump."""
-
-RESPONSE_STD_S = 0.1
-"""How far the time differs by which a robot follows its wheels."""
 
 LEAST_MODEL_ERROR = 0.03
 FIRST_QUANTILE, LATER_QUANTILE = 0.7, 0.95
@@ -63,9 +61,6 @@ RETURN_S, RETURNED_SHARE, RETURN_SIGMAS = 5.0, 0.5, 5.0
 
 MOVING_SHARE = 0.2
 """Windows in which the wheels do less than this part of the usual show nothing of the model's error."""
-
-TURNING_MPS = 0.05
-"""Wheels slower than this do not turn."""
 
 
 class _Evidence(NamedTuple):
@@ -160,10 +155,10 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
     for duration in reversed(_durations(knots)):
         first, last = spans_of(knots, duration)
         long = last - first >= FEWEST_INTERVALS
-        windows = compare(knots, motion, first[long], last[long], RESPONSE_STD_S)
+        windows = compare(knots, motion, first[long], last[long], RESPONSE_S)
         error = _model_error(windows, quiet, quantile)
         # while the robot parks, sensors without noise leave no variance to divide by
-        windows = windows.rows(windows.path_m > TURNING_MPS * duration)
+        windows = windows.rows(windows.path_m > MOVES_MPS * duration)
         square = (windows.residual**2 / (windows.sensor + (error * windows.path_m[:, None]) ** 2)).sum(axis=1)
         missed = np.hypot(np.hypot(windows.ahead, windows.turned), windows.aside)
         drives = np.abs(windows.model_ahead) > np.abs(windows.model_turned)
@@ -186,7 +181,7 @@ def _weigh(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple
 def _durations(knots: Knots) -> list[float]:
     """Return the durations of the windows: doubled until the usual distance stands out of the noise of the fixes."""
     path, dt = np.diff(knots.track.distance), np.diff(knots.t)
-    moving = path > TURNING_MPS * dt
+    moving = path > MOVES_MPS * dt
     if not moving.any():
         return list(WINDOWS_S)
     speed = float(np.median(path[moving] / dt[moving]))
@@ -253,7 +248,7 @@ def _false_rate(windows: ComparedWindows, distance2: Floats, targets: Bools, dec
 def _separate(knots: Knots, motion: Motion, evidence: _Evidence, error: Floats) -> list[tuple[Extent, int]]:
     """Return events and the window that shows each, the clearest first; events do not overlap."""
     row = np.arange(len(knots.t))
-    steps = compare(knots, motion, row[:-1], row[1:], RESPONSE_STD_S)
+    steps = compare(knots, motion, row[:-1], row[1:], RESPONSE_S)
     free = knots.holes[1:] == knots.holes[:-1]
     whole, found = free.copy(), []
     for at in np.argsort(-evidence.distance2, kind="stable"):

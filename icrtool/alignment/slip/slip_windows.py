@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import cut_windows, track_of_streams, window_length
-from icrtool.alignment.sensors.sensor_noise import is_hole
+from icrtool.alignment.sensors.sensor_noise import FEWEST_FIXES, USUAL_POSITION_STD_M, is_hole
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapezoids
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
@@ -28,14 +28,13 @@ SPEED_S = 0.1
 LONGEST_HOLE_S = 0.6
 """Longer without a sample: a hole, which no window spans."""
 
-FEWEST_KNOTS = 30
 LONGEST_HELD_IN_USUAL = 2.0
 """A value held for longer than this many times the usual was constant."""
 
 WINDOW_M = 1.0
 """The motion is estimated over shorter windows than the alignment: events disturb fewer of them."""
 
-LEAST_STD_M, LEAST_TURN_GAIN = 0.01, 1e-3
+LEAST_TURN_GAIN = 1e-3
 
 
 class Knots(NamedTuple):
@@ -147,13 +146,13 @@ class ComparedWindows(NamedTuple):
 def lay_knots(sensors: SensorData) -> Knots | None:
     """Integrate the wheels to the times of the fixes; None where the streams share too little time."""
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
-    if min(len(wheels.stamp_ns), len(fixes.stamp_ns), len(headings.stamp_ns)) < FEWEST_KNOTS:
+    if min(len(wheels.stamp_ns), len(fixes.stamp_ns), len(headings.stamp_ns)) < FEWEST_FIXES:
         return None
     track = track_of_streams(wheels, fixes, headings, same_clock=sensors.heading_from_position)
     left, right = track.v_left, track.v_right
     begin, end = (pick(track.t[at], track.heading_t[at]) for pick, at in ((max, 0), (min, -1)))
     rows = _thinned(track.place_t, begin, end)
-    if len(rows) < FEWEST_KNOTS:
+    if len(rows) < FEWEST_FIXES:
         return None
     track = track.places(rows)
     t = track.place_t
@@ -162,7 +161,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     heading = track.heading_at(t)
     return Knots(
         epoch_ns=int(wheels.stamp_ns[0]), track=track,
-        variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2)[rows] / 2, LEAST_STD_M**2),
+        variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2)[rows] / 2, USUAL_POSITION_STD_M**2),
         heading=heading, turn_variance=_white_variance(heading),
         velocity=(speeds[0] + speeds[1]) / 2 * np.exp(1j * heading), apart=speeds[0] - speeds[1],
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
@@ -175,7 +174,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
 def _turn_by_gyro(sensors: SensorData, t: Floats, heading: Floats) -> Floats | None:
     """Return the turn of the gyro at times (m,) [rad], in sense and scale of the headings (m,), without its bias."""
     gyro = sensors.gyro
-    if gyro is None or len(gyro.stamp_ns) < FEWEST_KNOTS:
+    if gyro is None or len(gyro.stamp_ns) < FEWEST_FIXES:
         return None
     at = (gyro.stamp_ns - sensors.wheels.stamp_ns[0]) / 1e9
     turned = trapezoids(at, gyro.rate_radps)
