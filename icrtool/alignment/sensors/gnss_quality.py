@@ -2,13 +2,14 @@
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
 tens of seconds: treated as independent they would mislead the filter. Some drivers still state a centimetre: such fixes
-are found by their noise, best beside a jump.
+are found by their noise, best beside a jump, or between a jump and its return.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -84,9 +85,9 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
     """Return the classes of the fixes, and the noise of each.
 
     The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
-    fixes move against the wheels: a stretch that is noisier than the rest is no fixed solution. Where fixed is the
-    norm, the others get the variance of their class, times the number of samples that err alike. Preset ``paper`` takes
-    every fix as it is.
+    fixes move against the wheels: a stretch that is noisier than the rest, or lies between two jumps that take each
+    other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
+    number of samples that err alike. Preset ``paper`` takes every fix as it is.
 
     Parameters
     ----------
@@ -133,7 +134,7 @@ def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Boo
     rtk = np.where(stated > FIXED_STD_M, FLOAT_FIX, FIXED_FIX)
     silent = np.where(stated <= SURELY_FIXED_STD_M, FIXED_FIX, OTHER_FIX)
     kinds = np.select([status == RTK_FIX, status == NOT_STATED], [rtk, silent], status)
-    misreported = find_misreported(steps, kinds == FIXED_FIX, status == FIXED_FIX)
+    misreported = find_misreported(log.gnss.stamp_ns, steps, kinds == FIXED_FIX, status == FIXED_FIX)
     return np.where(misreported, FLOAT_FIX, kinds).astype(np.uint8), misreported
 
 
@@ -234,15 +235,22 @@ BESIDE_JUMP = 5
 SIDES_VARIANCE = 1.7
 """Beside a jump, the side whose noise over this many stretches has this many times the other's variance is float."""
 
+LONGEST_EXCURSION_S = 60.0
+TAKEN_BACK = 0.25
+"""A jump that another takes back, up to this part, within this time: the fixes between were off."""
 
-def find_misreported(steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
+MOST_JUMPS = 500
+"""With more of them the position reference is something else than RTK that is lost now and then."""
+
+
+def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
     """Return the fixes (m,) among the `claimed` ones that move like RTK float.
 
     Parameters
     ----------
     claimed : bool (m,), reported as fixed; flagged : bool (m,), by a flag of the message itself and not by its variance
 
-    A jump alone does not show which of its sides is wrong: noise does. Else the class stays.
+    A jump alone does not show which of its sides is wrong: noise does, or a return. Else the class stays.
     """
     misreported = np.zeros(len(claimed), np.bool_)
     level, moves = steps.stretch_levels(claimed), steps.stretch_moves()
@@ -255,9 +263,19 @@ def find_misreported(steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
     noisy &= ~flagged[1 : 1 + len(level) * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).any(axis=1)
     jumps = np.flatnonzero(claimed[steps.jump_row] & claimed[np.maximum(steps.jump_row - 1, 0)])
     beside, nearby = _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
-    for row in steps.jump_row[jumps].tolist():
-        noisy[_noisy_side(beside, nearby, moves, (row - 1) // FEWEST_STEPS)] = True
+    undecided = []
+    for jump in jumps.tolist() if len(jumps) <= MOST_JUMPS else ():
+        float_side = _noisy_side(beside, nearby, moves, (int(steps.jump_row[jump]) - 1) // FEWEST_STEPS)
+        noisy[float_side] = True
+        if float_side.start == float_side.stop:
+            undecided.append(jump)
     misreported[1 : 1 + len(level) * FEWEST_STEPS] = np.repeat(noisy, FEWEST_STEPS)
+    for jump, back in pairwise(undecided):
+        first, last = steps.jump_row[[jump, back]]
+        away, home = steps.step[[first - 1, last - 1]]
+        short = back == jump + 1 and stamps[last] - stamps[first] < LONGEST_EXCURSION_S * 1e9
+        if short and abs(away + home) < TAKEN_BACK * min(abs(away), abs(home)):
+            misreported[first:last] = True
     return misreported & claimed
 
 

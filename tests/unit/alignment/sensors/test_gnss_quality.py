@@ -98,6 +98,17 @@ def test_rtk_that_is_lost_and_regained_neither_moves_the_icrs_nor_locks_the_filt
     assert np.count_nonzero(run.sensors.fixes.down_weighted & ~float_) < 0.1 * np.count_nonzero(~float_)
 
 
+@pytest.mark.parametrize("away_m", [0.15, 0.5])
+def test_fixes_between_a_jump_and_its_return_are_no_rtk_though_they_are_as_quiet(away_m: float) -> None:
+    log = confess(clean(), np.zeros(len(clean().gnss.stamp_ns), np.bool_), "not")
+    t = (log.gnss.stamp_ns - log.gnss.stamp_ns[0]) / 1e9
+    off = (t > 40.0) & (t < 65.0)
+    moved = replace(log, gnss=replace(log.gnss, north_m=log.gnss.north_m + away_m * off))
+    misreported = fit(moved, CONFIG).sensors.fixes.misreported
+    assert (misreported == off).all()
+    assert not fit(log, CONFIG).sensors.fixes.misreported.any()
+
+
 def test_rtk_losses_are_outages_with_a_miss_at_the_first_fixed_fix() -> None:
     log = clean()
     lossy, float_ = lose_rtk(log)
