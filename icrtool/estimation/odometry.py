@@ -33,7 +33,7 @@ class OdometryPath:
 
     Attributes
     ----------
-    north_m, east_m : float64 (n,), at every recorded state
+    north_m, east_m : float64 (n,), at every recorded state, or at some of them
     heading_rad : float64 (n,), clockwise from north, unwrapped
     end_error_m : distance to the filter's estimate at the last state
     """
@@ -53,7 +53,7 @@ def odometry_icrs(run: Run) -> dict[OdometryName, Icrs]:
     return icrs if run.track_width_m is None else icrs | {"no_slip": no_slip_icrs(run.track_width_m)}
 
 
-def drive_wheels(table: States, in_gap: Bools, icrs: Icrs) -> OdometryPath:
+def drive_wheels(table: States, in_gap: Bools, icrs: Icrs, every: int = 1) -> OdometryPath:
     """Drive from the first state to the last; through a gap in the wheel data move as the filter did.
 
     Parameters
@@ -61,15 +61,19 @@ def drive_wheels(table: States, in_gap: Bools, icrs: Icrs) -> OdometryPath:
     table : the recorded states
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
     icrs : the run's final ones, or `no_slip_icrs`
+    every : the path is kept at so many states each, and at the last
 
     Notes
     -----
     Nobody knows what the wheels did in a gap. The filter's displacement stands in for it, turned by the heading error
     that the odometry has gathered so far, so that a gap neither adds an error nor forgives one.
     """
-    path = OpenLoopPath(*np.empty((3, len(table))))
+    kept = np.append(np.arange(0, len(table) - 1, every), len(table) - 1)
+    path = OpenLoopPath(*np.empty((3, len(kept))))
     for rows, piece in _pieces(table, in_gap, icrs):
-        path.north[rows], path.east[rows], path.heading[rows] = piece
+        here = slice(*np.searchsorted(kept, [rows.start, rows.stop]))
+        for column, values in zip(path, piece, strict=True):
+            column[here] = values[kept[here] - rows.start]
     return OdometryPath(*path, _apart(table, path))
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints
 from icrtool.logs.messages.decoded_values import HDT
 from icrtool.logs.messages.topic_table import FRAME, TopicTable
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
@@ -178,7 +179,7 @@ class Orientation:
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
         """Return the yaw of its orientations."""
-        q = np.array([table.column(f"{self.path}.{axis}") for axis in "xyzw"], np.float64).T
+        q = [table.column(f"{self.path}.{axis}").astype(np.float64, copy=False) for axis in "xyzw"]
         yaw, usable, note = nose_yaw(q, table.floats(self.rate) if self.rate in table.columns else None)
         variance = table.floats(self.variance)
         variance = np.where(variance > 0, variance, np.nan)
@@ -232,7 +233,7 @@ def frame_convention(table: TopicTable) -> tuple[Convention, str]:
     return "enu", "REP-103"
 
 
-def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, Bools, str]:
+def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple[Floats, Bools, str]:
     """Return yaw [rad] (n,), which rows are rotations (n,), and a note where the sensor is not mounted upright.
 
     Yaw is that of the sensor's x axis seen from above. In a sensor mounted on its side another axis is level all the
@@ -240,51 +241,67 @@ def nose_yaw(q: Floats, yaw_rate_radps: Floats | None = None) -> tuple[Floats, B
 
     Parameters
     ----------
-    q : (n, 4) the fields x, y, z, w
+    q : the fields x, y, z, w, (n,) each
     yaw_rate_radps : (n,) of a gyro in the same message; a quaternion in another order must turn with it
     """
     with np.errstate(over="ignore"):
-        norm = np.sqrt(np.einsum("ij,ij->i", q, q))
+        norm = _of_rows(lambda *fields: np.sqrt(sum(field * field for field in fields)), q)
     usable = np.abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
-    unit = q / np.where(usable, norm, np.nan)[:, None]
-    if usable.all():
-        order, note = _written_order(unit, yaw_rate_radps)
-    else:
-        order, note = _written_order(unit[usable], None if yaw_rate_radps is None else yaw_rate_radps[usable])
-    x, y, z, w = (unit[:, place] for place in order)
-    upright = float(np.median(np.abs(1 - 2 * (x * x + y * y))[usable])) if usable.any() else 1.0
-    if upright >= UPRIGHT_COSINE:
-        return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), usable, note
-    axes = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + w * z)],
-            [2 * (x * y - w * z), 1 - 2 * (x * x + z * z)],
-            [2 * (x * z + w * y), 2 * (y * z - w * x)],
-        ]
-    )
-    vertical = _vertical(x, y, z, w)
-    level = int(np.argmin([np.median(np.abs(v[usable])) for v in vertical]))
+    norm[~usable] = np.nan
+    places, note = _written_order(q, norm, usable, yaw_rate_radps)
+    ordered = [q[place] for place in places]
+
+    def tilt(axis: int) -> float:
+        upward = _of_rows(lambda *unit: _vertical(*unit)[axis], ordered, norm)[usable]
+        return float(np.median(np.abs(upward))) if len(upward) else 1.0
+
+    if tilt(2) >= UPRIGHT_COSINE:
+        return _of_rows(partial(_bearing, 0), ordered, norm), usable, note
+    level = min(range(3), key=tilt)
     note = (
         f"mounted on its side: its {'xyz'[level]} axis is level and is used as heading, with an offset to be estimated"
     )
-    return np.arctan2(axes[level, 1], axes[level, 0]), usable, note
+    return _of_rows(partial(_bearing, level), ordered, norm), usable, note
 
 
-def _written_order(unit: Floats, yaw_rate_radps: Floats | None) -> tuple[Sequence[int], str]:
+def _of_rows(make: Callable[..., Floats], q: Sequence[Floats], norm: Floats | float = 1.0) -> Floats:
+    """Return what a function makes (n,) of four columns over their norm, some rows at a time, to bound memory."""
+    found, norms = np.empty(len(q[0])), np.broadcast_to(norm, len(q[0]))
+    for lo in range(0, len(found), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        found[some] = make(*(field[some] / norms[some] for field in q))
+    return found
+
+
+def _bearing(axis: int, x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
+    """Return the direction in which an axis of the sensor points, seen from above [rad] (n,)."""
+    east, north = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x)),
+    )[axis]
+    return np.arctan2(north, east)
+
+
+def _written_order(
+    q: Sequence[Floats], norm: Floats, usable: Bools, yaw_rate_radps: Floats | None
+) -> tuple[Sequence[int], str]:
     """Return the positions of x, y, z, w, and a note where they are not in this order.
 
     On the ground one axis of the sensor stays upright, whatever the mounting. If no axis does, and another order of the
     components gives a level sensor all the time, that order is used.
     """
-    as_named = (0, 1, 2, 3)
-    some = unit[:: max(1, len(unit) // MOST_LOOKED_AT)]
+    rows = np.flatnonzero(usable)
+
+    def unit(chosen: Ints) -> Floats:
+        return np.column_stack([field[chosen] for field in q]) / norm[chosen, None]
+
+    as_named, some = (0, 1, 2, 3), unit(rows[:: max(1, len(rows) // MOST_LOOKED_AT)])
     if len(some) < 2 or (_tilted_share(some, UPRIGHT_COSINE) < TILTED_SHARE).any():
         return as_named, ""
+    rate = None if yaw_rate_radps is None else yaw_rate_radps[rows]
     for order, note in ORDERS:
-        meant = unit[:, order]
-        if _tilted_share(meant[:: max(1, len(unit) // MOST_LOOKED_AT)], LEVEL_COSINE)[2] < TILTED_SHARE and _turns_with(
-            meant, yaw_rate_radps
-        ):
+        if _tilted_share(some[:, order], LEVEL_COSINE)[2] < TILTED_SHARE and _turns_with(unit(rows)[:, order], rate):
             return order, note
     return as_named, ""
 

@@ -88,11 +88,12 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
     """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace."""
     topics = config.topics
-    gnss = _read_all(tables, "gnss", config, PositionSource)
-    heading = _read_all(tables, "heading", config, HeadingSource)
+    # the wheels first: they take most memory for a while, which is then free for the others
     wheels = pair_candidates(tables, config)
     if topics.wheel_left is None:
         wheels = _read_all(tables, "wheels", config, WheelMotion) + wheels
+    gnss = _read_all(tables, "gnss", config, PositionSource)
+    heading = _read_all(tables, "heading", config, HeadingSource)
     filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
     complete = {name: COMPLETE * sum(name in names for names in filled) for name in set().union(*filled)}
     wheels = _ranked(wheels, topics.wheels, complete)

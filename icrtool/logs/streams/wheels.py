@@ -68,9 +68,12 @@ def _side_means(values: NDArray[Any], lefts: int) -> tuple[Sides, set[int]]:
         if len(finite) == 1:
             means.append(values[:, finite[0]].astype(np.float64, copy=False))
         elif finite:
-            of_side = values.T[finite].astype(np.float64, copy=False)
-            of_side[np.isinf(of_side)] = np.nan  # infinity less infinity would warn
-            means.append(of_side.mean(axis=0))
+            total = np.zeros(len(values))
+            for wheel in finite:
+                # infinity less infinity would warn
+                total += np.where(np.isinf(values[:, wheel]), np.nan, values[:, wheel])
+            total /= len(finite)
+            means.append(total)
         else:
             means.append(None)
     return (means[0], means[1]), dead

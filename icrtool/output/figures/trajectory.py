@@ -56,15 +56,17 @@ REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth"
 ODOMETRIES = {"icr": (style.ICR, "ICR odometry", 3), "no_slip": (style.NO_SLIP, "no-slip odometry", 2)}
 """Pen, label and order of the paths that wheel speeds alone lead along."""
 
+MOST_STATES = 500_000
+"""A path of wheels alone is drawn through at most so many states: 1 h at 100 Hz has each, 10 h one in 0.1 s."""
+
 
 @style.styled
 def trajectory(run: Run) -> Figure:
     """Return fixes, filter, ICR odometry with the final ICRs and no-slip odometry over east and north [m]."""
     table = run.table
-    paths = [(icrs, *ODOMETRIES[name]) for name, icrs in odometry_icrs(run).items()]
-    # Each path is driven twice, here for its corners only: both at once would be in memory beside the picture.
-    corners = [_corners(drive_wheels(table, run.in_gap, icrs)) for icrs, *_ in paths]
-    lowest, highest = _extent(_corners(table), *corners)
+    every = -(-len(table) // MOST_STATES)
+    paths = {name: drive_wheels(table, run.in_gap, icrs, every) for name, icrs in odometry_icrs(run).items()}
+    lowest, highest = _extent(_corners(table), *map(_corners, paths.values()))
     norths, easts = np.column_stack([lowest, highest])
     width_in = style.WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
@@ -77,8 +79,8 @@ def trajectory(run: Run) -> Figure:
     lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, style.FILTER, label="filter", zorder=4)
-    for icrs, pen, name, order in paths:
-        _draw_odometry(axes, drive_wheels(table, run.in_gap, icrs), cell, pen, name, order)
+    for name, path in paths.items():
+        _draw_odometry(axes, path, cell, *ODOMETRIES[name])
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     _draw_events(axes, run)

@@ -40,7 +40,7 @@ def away(found: np.ndarray, expected: np.ndarray) -> float:
 @pytest.mark.parametrize("with_gyro", [True, False])
 def test_the_yaw_is_found_whatever_the_order(fields: tuple[int, ...], words: str, with_gyro: bool) -> None:
     yaw, rate, q = drive()
-    found, usable, note = nose_yaw(q[:, fields], rate if with_gyro else None)
+    found, usable, note = nose_yaw(q[:, fields].T, rate if with_gyro else None)
     assert usable.all()
     assert away(found, yaw) < YAW_TOLERANCE_RAD
     assert (words in note) if words else not note
@@ -48,7 +48,7 @@ def test_the_yaw_is_found_whatever_the_order(fields: tuple[int, ...], words: str
 
 def test_another_order_is_not_taken_against_the_gyro() -> None:
     _, rate, q = drive()
-    _, _, note = nose_yaw(q[:, (3, 0, 1, 2)], -rate)
+    _, _, note = nose_yaw(q[:, (3, 0, 1, 2)].T, -rate)
     assert "w first" not in note
 
 
@@ -58,7 +58,7 @@ def test_a_sensor_on_its_side_is_no_other_order() -> None:
     # The body's orientation times a quarter turn about x.
     h = math.sqrt(0.5)
     aside = np.column_stack([h * (x + w), h * (y + z), h * (z - y), h * (w - x)])
-    found, _, note = nose_yaw(aside)
+    found, _, note = nose_yaw(aside.T)
     assert "mounted on its side" in note
     offset = found - yaw
     assert float(np.abs(np.exp(1j * offset).mean())) > 0.99
