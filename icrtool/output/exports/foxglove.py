@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool import __version__
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.kinematics import body_velocity
@@ -34,6 +33,7 @@ from icrtool.output.exports.paths import (
     ExportPath,
     Globe,
     PathName,
+    about_run,
     globe_of,
     line_rows,
     outage_rows,
@@ -117,11 +117,8 @@ def write_foxglove(run: Run, path: Path) -> None:
     topics += [_whole_path(path, store) for path in paths]
     slip = ({**plain(event), "x_m": event.east_m, "y_m": event.north_m} for event in run.document.events)
     topics += [_event_topic("/events", slip, store), _event_topic("/outages", _outages(run), store)]
-    about = {
-        "tool_version": __version__, "log": run.name, "robot": run.config.robot.name or "", "usable": str(run.usable),
-        "unusable_because": run.document.unusable_because or "",
-        "datum": "" if globe is None else " ".join(f"{value!r}" for value in globe),
-    }  # fmt: skip
+    about = {name: "" if value is None else str(value) for name, value in about_run(run).items()}
+    about["datum"] = "" if globe is None else " ".join(f"{value!r}" for value in globe)
     write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about, library=LIBRARY)
 
 
@@ -203,14 +200,14 @@ def _fixes(run: Run, rows: Ints, globe: Globe) -> tuple[TopicPlan, ...]:
     status = np.where(fixes.fix_class == FIXED_FIX, GBAS_FIX, PLAIN_FIX).astype(np.int8)
     body = np.full(len(rows), PLAIN_FIX, np.int8)
     used, rejected = np.flatnonzero(run.gnss.used), np.flatnonzero(run.gnss.rejected)
-    variances = fixes.var_east_m2, fixes.var_north_m2
-    plans = [
-        _fix_plan("/filter/fix", BODIES["filter"], table.stamp_ns[rows], (table.east_m[rows], table.north_m[rows]),
-                  (table.std_east_m[rows] ** 2, table.std_north_m[rows] ** 2), body, globe)
-    ]  # fmt: skip
+    place, variance = (
+        (table.east_m[rows], table.north_m[rows]),
+        (table.std_east_m[rows] ** 2, table.std_north_m[rows] ** 2),
+    )
+    plans = [_fix_plan("/filter/fix", BODIES["filter"], table.stamp_ns[rows], place, variance, body, globe)]
     for topic, chosen in (("/gnss/fix", used), ("/gnss/fix_rejected", rejected)):
         place = fixes.east_m[chosen], fixes.north_m[chosen]
-        variance = variances[0][chosen], variances[1][chosen]
+        variance = fixes.var_east_m2[chosen], fixes.var_north_m2[chosen]
         plans.append(_fix_plan(topic, "antenna", fixes.stamp_ns[chosen], place, variance, status[chosen], globe))
     return tuple(plans)
 

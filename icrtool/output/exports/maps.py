@@ -9,7 +9,6 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import orjson
 
-from icrtool import __version__
 from icrtool.alignment.sensors.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
@@ -20,6 +19,7 @@ from icrtool.output.exports.paths import (
     ExportPath,
     Globe,
     PathName,
+    about_run,
     find_globe,
     line_rows,
     outage_rows,
@@ -59,11 +59,7 @@ def format_geojson(run: Run) -> str:
         *_fix_features(run, globe),
         *event_features(run, globe),
     ]
-    about = {
-        "log": run.name, "robot": run.config.robot.name, "usable": run.usable,
-        "unusable_because": run.document.unusable_because, "tool_version": __version__,
-    }  # fmt: skip
-    document = {"type": "FeatureCollection", "name": run.name, "icrtool": about, "features": features}
+    document = {"type": "FeatureCollection", "name": run.name, "icrtool": about_run(run), "features": features}
     return orjson.dumps(plain(document)).decode()
 
 

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from icrtool import __version__
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats, Ints
@@ -91,6 +92,17 @@ def paths_of(run: Run) -> tuple[ExportPath, ...]:
     if run.smoothed is not None:
         paths.append(_of_states("smoothed", run.smoothed, momentary))
     return *paths, *(_of_odometry(name, run, icrs) for name, icrs in odometry_icrs(run).items())
+
+
+def about_run(run: Run) -> dict[str, str | bool | None]:
+    """Return what an export states of the run that it was made from."""
+    return {
+        "log": run.name,
+        "robot": run.config.robot.name,
+        "usable": run.usable,
+        "unusable_because": run.document.unusable_because,
+        "tool_version": __version__,
+    }
 
 
 def globe_of(run: Run) -> Globe | None:

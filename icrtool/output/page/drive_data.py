@@ -84,8 +84,8 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "headings": _headings_data(run),
         "half_width_m": None if run.track_width_m is None else run.track_width_m / 2,
         **_models_data(run, report, steps, origin),
-        "events": _events_data(run, origin),
-        "outages": [{"kind": one.kind, "begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
+        "events": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in run.document.events],
+        "outages": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
         "changes_s": list(run.changes_s),
         "errors": errors_data(report),
         "budgets_m": sorted({one.budget_m for one in report.budgets}),
@@ -148,9 +148,8 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
     found: dict[str, object] = {"top_m": scale_end_m(difference[run.gnss.used])}
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
         rows = _extreme_rows(difference, chosen)
-        found[name] = _differences(run.gnss, chosen, rows, difference) | {
-            "north": packed(fixes.north_m[rows] - origin[0]), "east": packed(fixes.east_m[rows] - origin[1]),
-        }  # fmt: skip
+        north, east = packed(fixes.north_m[rows] - origin[0]), packed(fixes.east_m[rows] - origin[1])
+        found[name] = _differences(run.gnss, chosen, rows, difference) | {"north": north, "east": east}
     return found
 
 
@@ -251,14 +250,6 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
             with suppress(DataError):
                 model = calibrated(stored_calibration(document), recording, with_gyro=turned)
                 yield one.name, predicted_path(recording, *model)(recording.track.t[rows])
-
-
-def _events_data(run: Run, origin: tuple[float, float]) -> list[dict[str, object]]:
-    return [
-        {"kind": one.kind, "begin_s": one.begin_s, "end_s": one.end_s, "severity": one.severity,
-         "north": one.north_m - origin[0], "east": one.east_m - origin[1]}
-        for one in run.document.events
-    ]  # fmt: skip
 
 
 def _spans(flags: Bools) -> list[list[int]]:

@@ -46,10 +46,8 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
         blocks.append(Section("Why logs failed", [table], name="failed"))
     if pictures := pictures_in(folder / PLOTS, folder):
         blocks.append(Section("All logs together", [Figure(tuple(pictures), folded=False)], name="pictures"))
-    return render(
-        ("fleet.js",), None, title=title, kind="Drive without GNSS: report of many logs", blocks=blocks,
-        pictures=pictures,
-    )  # fmt: skip
+    kind = "Drive without GNSS: report of many logs"
+    return render(("fleet.js",), None, title=title, kind=kind, blocks=blocks, pictures=pictures)
 
 
 def _counts_text(document: FleetDocument) -> str:
@@ -100,9 +98,8 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
         names = [getattr(log, key) for key in named]
         rows.append([Cell(log.log, link=_link(log.run, folder)), status, *names, *numbers])
         words = (log.log, log.status, log.robot, log.group, log.reason, *log.tags)
-        search.append({
-            "words": " ".join(words).casefold(), "status": log.status, "robot": log.robot, "group": log.group,
-        })  # fmt: skip
+        chosen = {key: getattr(log, key) for key in ("status", "robot", "group")}
+        search.append({"words": " ".join(words).casefold()} | chosen)
     caption = f"One line a log; its name opens its page. Errors: 95 % of the trials of {HORIZON_M:g} m stay below."
     head = ("log", "status", *named, *columns)
     return Table(f"ll{'l' * len(named)}r", rows, head, caption, search=search)

@@ -73,9 +73,7 @@ def write_page(
     write_file(Path(path), page, inside, ours=is_page if inside is not None else None)
 
 
-def run_page(
-    run: Run, report: DropoutDocument, pictures: Mapping[str, Picture], *, coordinates: bool = True
-) -> str:  # fmt: skip
+def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture], *, coordinates: bool = True) -> str:
     """Return the page of a run as HTML.
 
     Parameters
@@ -115,10 +113,8 @@ ABOUT = (
 
 def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
-    drive: list[Block] = [
-        Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive"), *events_section(summary),
-        *outage_blocks(report), Figure(("icr_clusters", "outages")),
-    ]  # fmt: skip
+    series, further = Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive"), ("icr_clusters", "outages")
+    drive: list[Block] = [series, *events_section(summary), *outage_blocks(report), Figure(further)]
     return [
         *unusable_lines(summary), *advice_blocks(summary),
         Section("Answer", answer_sections(summary, report), name="answer"),
@@ -236,6 +232,5 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[Run, DropoutDocume
         ),
         document=shown,
     )
-    return at_origin, changed(
-        report, worst=tuple(map(moved, report.worst)), examples=tuple(map(moved, report.examples))
-    )  # fmt: skip
+    worst, examples = tuple(map(moved, report.worst)), tuple(map(moved, report.examples))
+    return at_origin, changed(report, worst=worst, examples=examples)
