@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec.structs import asdict, replace
 
 from icrtool.kernels.arrays import Floats, Ints, rows_at_steps
 from icrtool.kernels.filter_records import REFERENCE_STEP_S
@@ -18,7 +18,7 @@ from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs
 from icrtool.records.plain_data import known
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, width_or_usual_m
-from icrtool.records.run_document import ExcitationDocument, Excited, IcrColumn, NumberByIcr, VerdictByIcr
+from icrtool.records.run_document import ExcitationDocument, Excited, NumberByIcr, VerdictByIcr
 from icrtool.records.tables import States
 
 WINDOW_M, WINDOW_IN_SEPARATIONS = 2.0, 3.0
@@ -201,50 +201,9 @@ SPIN_RATIO = 3.0
 """A turn counts as a spin where the sides differ by this many times their mean."""
 
 
-@dataclass(frozen=True, slots=True)
-class Excitation:
-    """What a drive could show.
-
-    Attributes
-    ----------
-    std_m : by ICR, the standard deviation that the drive's information allows (Cramer-Rao, constants, `SLIP_SHARE`)
-    verdicts : by ICR
-    turned_right_rad, turned_left_rad : heading changes summed to either side; spun_*: of these, on the spot
-    sentences : the verdict in words, and what to drive next; empty where all is shown
-    """
-
-    std_m: dict[str, float]
-    verdicts: dict[str, Excited]
-    turned_right_rad: float
-    turned_left_rad: float
-    spun_right_rad: float
-    spun_left_rad: float
-    sentences: tuple[str, ...]
-
-    @property
-    def shows_sides(self) -> bool:
-        """Whether both y ICRs are shown, at least weakly."""
-        return all(self.verdicts[name] != "not shown" for name in ICR_COLUMNS[:2])
-
-    @property
-    def not_shown(self) -> frozenset[IcrColumn]:
-        """The ICRs that are not shown."""
-        return frozenset(name for name in ICR_COLUMNS if self.verdicts[name] == "not shown")
-
-    def summary(self) -> ExcitationDocument:
-        """Return what run.json holds."""
-        return ExcitationDocument(
-            NumberByIcr(*(known(self.std_m[name]) for name in ICR_COLUMNS)),
-            VerdictByIcr(*(self.verdicts[name] for name in ICR_COLUMNS)),
-            math.degrees(self.turned_right_rad),
-            math.degrees(self.turned_left_rad),
-            math.degrees(self.spun_right_rad),
-            math.degrees(self.spun_left_rad),
-            self.sentences,
-        )
-
-
-def find_excitation(table: States, track: Track, track_width_m: float | None, windows: StateWindows) -> Excitation:
+def find_excitation(
+    table: States, track: Track, track_width_m: float | None, windows: StateWindows
+) -> ExcitationDocument:
     """Return which ICRs a drive could show.
 
     Parameters
@@ -253,10 +212,6 @@ def find_excitation(table: States, track: Track, track_width_m: float | None, wi
     track : the same as a track
     track_width_m : b, None where not known
     windows : of the drive, with `nominal_icrs`
-
-    Returns
-    -------
-    Excitation
 
     Notes
     -----
@@ -278,20 +233,16 @@ def find_excitation(table: States, track: Track, track_width_m: float | None, wi
     )  # fmt: skip
     stds: dict[str, float] = dict(zip(ICR_COLUMNS, (float(value) for value in std), strict=True))
     verdicts: dict[str, Excited] = {name: _verdict(value / width) for name, value in stds.items()}
-    return Excitation(
-        std_m=stds,
-        verdicts=verdicts,
-        turned_right_rad=right,
-        turned_left_rad=left,
-        spun_right_rad=spun_right,
-        spun_left_rad=spun_left,
-        sentences=_sentences(stds, verdicts, right, left, windows.distance_m, _turned_otherwise(table, windows)),
-    )
+    sentences = _sentences(stds, verdicts, right, left, windows.distance_m, _turned_otherwise(table, windows))
+    return ExcitationDocument(
+        NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(right),
+        math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), sentences,
+    )  # fmt: skip
 
 
 def withhold_unlearned(
-    found: Excitation, table: States, *, std_m: Floats, start_std_m: Floats, least_icr_m: float
-) -> Excitation:
+    found: ExcitationDocument, table: States, *, std_m: Floats, start_std_m: Floats, least_icr_m: float
+) -> ExcitationDocument:
     """Return the excitation with each final ICR "not shown" that the filter did not learn from the drive.
 
     Parameters
@@ -304,7 +255,7 @@ def withhold_unlearned(
     final = dict(zip(ICR_COLUMNS, table.icrs_at(-1), strict=True))
     filter_std = {name: float(getattr(table, f"std_{name}")[-1]) for name in ICR_COLUMNS}
     width = max(final["y_icr_right_m"] - final["y_icr_left_m"], MIN_ICR_SEPARATION_M)
-    verdicts, sentences = dict(found.verdicts), list(found.sentences)
+    verdicts, sentences = asdict(found.verdict), list(found.sentences)
     for name, std, start in zip(ICR_COLUMNS, std_m, start_std_m, strict=True):
         side = -1.0 if name == "y_icr_left_m" else 1.0
         if name != "x_icr_m" and side * final[name] <= AT_LIMIT * least_icr_m:
@@ -318,7 +269,7 @@ def withhold_unlearned(
         if verdicts[name] != "not shown":
             sentences.append(f"{ICR_WORDS[name]} is not shown: {why}")
         verdicts[name] = "not shown"
-    return replace(found, verdicts=verdicts, sentences=tuple(sentences))
+    return replace(found, verdict=VerdictByIcr(**verdicts), sentences=tuple(sentences))
 
 
 def nominal_icrs(table: States, track_width_m: float | None) -> Floats:

@@ -11,11 +11,11 @@ from icrtool.alignment.sensors.wheel_alignment import LARGEST_SCALE_CORRECTION, 
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
-from icrtool.estimation.observability import Excitation
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.filter_records import UNSEEN
 from icrtool.records.measurements import Finding
 from icrtool.records.run import ICR_WORDS, MeasurementOutcome
+from icrtool.records.run_document import ExcitationDocument
 from icrtool.records.tables import States
 
 SMALLEST_MULTIPLIER = 0.9
@@ -48,7 +48,7 @@ UNUSABLE_SHARE = 0.3
 
 
 def unusable_reasons(
-    excitation: Excitation,
+    excitation: ExcitationDocument,
     gnss: MeasurementOutcome,
     heading: MeasurementOutcome,
     noise: ProcessNoise,
@@ -70,7 +70,7 @@ def unusable_reasons(
     """
     if filtered:
         return [f"filtered or fused odometry ({filtered}); wheel speeds are needed: topics.wheels names their topic"]
-    hidden = [ICR_WORDS[name] for name, verdict in excitation.verdicts.items() if verdict == "not shown"]
+    hidden = [ICR_WORDS[name] for name in excitation.verdict.not_shown]
     why = "it turns too little, or its sensors disagree"
     reasons = [f"this drive does not show {', '.join(hidden)}: {why}"] if hidden else []
     reasons += ["the ICRs ended inverted: check sides and signs of the wheels"] if inverted and not hidden else []
@@ -150,7 +150,7 @@ def run_warnings(
     gnss: MeasurementOutcome,
     heading: MeasurementOutcome,
     multiplier: tuple[float, float] | None,
-    excitation: Excitation,
+    excitation: ExcitationDocument,
     findings: Mapping[str, Finding],
 ) -> list[str]:
     """Return what a user should know before trusting the numbers.
@@ -161,7 +161,7 @@ def run_warnings(
     findings : of the alignment
     """
     found = []
-    if multiplier is not None and excitation.shows_sides:
+    if multiplier is not None and excitation.verdict.shows_sides:
         found += _multiplier_warnings(*multiplier)
     if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
         found.append(

@@ -13,7 +13,6 @@ from icrtool import __version__
 from icrtool.alignment.sensors.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.observability import (
-    Excitation,
     cut_states,
     final_covariance,
     find_excitation,
@@ -42,6 +41,7 @@ from icrtool.records.run_document import (
     ClassDocument,
     EndErrorDocument,
     EventDocument,
+    ExcitationDocument,
     FilterDocument,
     GnssDocument,
     HeadingDocument,
@@ -99,7 +99,7 @@ def summarise(
         measurements.wheels.filtered or "" if field else "",
         inverted=bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]),
     )  # fmt: skip
-    hidden = frozenset() if config.filter.preset == "paper" else excitation.not_shown
+    hidden = () if config.filter.preset == "paper" else excitation.verdict.not_shown
     lag = measurements.findings["heading_delay_s"]
     start_ns = int(table.stamp_ns[0])
     return RunDocument(
@@ -135,13 +135,13 @@ def summarise(
         rtk_losses_ns=_spans(sensors.losses_ns),
         wheel_gaps_ns=_spans(table.stamp_ns[np.flatnonzero(filtered.in_gap)[:, None] + [0, 1]]),
         filter=filter_summary(measurements, filtered, config),
-        excitation=excitation.summary(),
+        excitation=excitation,
     )  # fmt: skip
 
 
 def _warnings(
-    measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None, excitation: Excitation,
-    changes_s: Sequence[float], covariance: Floats,
+    measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None,
+    excitation: ExcitationDocument, changes_s: Sequence[float], covariance: Floats,
 ) -> tuple[str, ...]:  # fmt: skip
     """Return the warnings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
     name, table, width = filtered.sensors.name, filtered.table, config.robot.track_width_m
@@ -152,7 +152,7 @@ def _warnings(
         *run_warnings(name, table, *filtered.in_use, apart, excitation, measurements.findings),
         *(
             []
-            if measurements.antenna_is_known or not excitation.shows_sides
+            if measurements.antenna_is_known or not excitation.verdict.shows_sides
             else antenna_warning(name, table, covariance)
         ),
         *(
@@ -205,7 +205,7 @@ def _spans(stamps_ns: Ints) -> Spans:
     return tuple((int(begin), int(end)) for begin, end in stamps_ns)
 
 
-def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, Excitation, float]:
+def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tuple[Floats, ExcitationDocument, float]:
     """Return the covariance (3, 3) of the final ICRs [m^2], what was shown, and the clocks' part of x_icr's std [m].
 
     Parameters
@@ -310,7 +310,7 @@ def _first_stay(until: Ints, inside: Bools) -> int | None:
 
 def icr_summary(
     table: States, convergence: dict[IcrColumn, tuple[float, float] | None], covariance: Floats, of_filter: Floats,
-    x_clock_std_m: float, track_width_m: float | None, hidden: Collection[IcrColumn],
+    x_clock_std_m: float, track_width_m: float | None, hidden: Collection[str],
 ) -> IcrDocument:  # fmt: skip
     """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did.
 

@@ -72,6 +72,16 @@ class VerdictByIcr(Record, frozen=True):
         """Whether each of the three is."""
         return self == VerdictByIcr("shown", "shown", "shown")
 
+    @property
+    def not_shown(self) -> tuple[str, ...]:
+        """The ICRs that are not shown."""
+        return tuple(name for name in self.__struct_fields__ if getattr(self, name) == "not shown")
+
+    @property
+    def shows_sides(self) -> bool:
+        """Whether both y ICRs are shown, at least weakly."""
+        return "not shown" not in (self.y_icr_right_m, self.y_icr_left_m)
+
 
 class DriveDocument(Record, frozen=True):
     """Duration, distance and speed."""
@@ -243,7 +253,14 @@ class FilterDocument(Record, frozen=True, kw_only=True):
 
 
 class ExcitationDocument(Record, frozen=True):
-    """What the drive could show of the ICRs."""
+    """What the drive could show of the ICRs.
+
+    Attributes
+    ----------
+    std_m : standard deviation that the drive's information allows (Cramer-Rao, constants, some slip)
+    turned_right_deg, turned_left_deg : heading changes summed to either side; spun_*: of these, on the spot
+    sentences : the verdict in words, and what to drive next; empty where all is shown
+    """
 
     std_m: NumberByIcr
     verdict: VerdictByIcr

@@ -14,12 +14,12 @@ from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.estimation.filter_setup import FIELD_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS
-from icrtool.estimation.observability import Excitation
 from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
 from icrtool.kernels.filter_records import GATED, UNSEEN, USED
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
 from icrtool.records.run import MeasurementOutcome, Run
+from icrtool.records.run_document import ExcitationDocument, VerdictByIcr
 from support.drives import make_log
 
 WIDTH = "robot.track_width_m=0.6"
@@ -74,8 +74,8 @@ def test_a_run_that_rejected_a_tenth_is_usable(stream: str) -> None:
 def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, words: str) -> None:
     code, none = np.full(4, USED, np.uint8), np.zeros(4)
     outcome = MeasurementOutcome(np.arange(4), none, none, code, none)
-    excitation = SimpleNamespace(verdicts={"y_icr_right_m": "shown"})
-    reasons = unusable_reasons(cast(Excitation, excitation), outcome, outcome, noise)
+    excitation = SimpleNamespace(verdict=VerdictByIcr("shown", "shown", "shown"))
+    reasons = unusable_reasons(cast(ExcitationDocument, excitation), outcome, outcome, noise)
     assert bool(reasons) is bool(words)
     assert words in " ".join(reasons)
 
