@@ -18,7 +18,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.error_statistics import Summary, error_summary, within_budget
 from icrtool.kernels.track import OpenLoopPath, Track
 from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
-from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, FittedModel, controller_model
+from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, controller_model
 from icrtool.motion.recording import (
     NO_CONSTANTS,
     Recording,
@@ -116,16 +116,6 @@ class HeldOut:
             return None
         recording = self.recordings[fold.recording]
         return controller_model(found[0], recording.lever, recording.width_m), found[1]
-
-    def whole(self, name: str, i: int) -> Prediction:
-        """Return what a row predicts of recording i, as fitted to everything."""
-        recording, fit = self.recordings[i], self.fits[name.replace(CONTROLLER, FIVE)]
-        fitted: FittedModel = fit.fitted
-        if name == NO_SLIP:
-            return fitted, NO_CONSTANTS
-        if name.removesuffix(GYRO) == CONTROLLER:
-            fitted = controller_model(fitted, recording.lever, recording.width_m)
-        return fitted, fit.constants(i)
 
     def errors(self, name: str, i: int, trials: Trials) -> TrialErrors:
         """Return the errors of a row in trials of recording i, each predicted without what it touches."""

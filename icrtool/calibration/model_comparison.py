@@ -7,7 +7,6 @@ the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -23,9 +22,7 @@ from icrtool.motion.models import NO_SLIP, FittedModel
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.run import Run, width_or_usual_m
-
-FILTER_LABELS = {"icr": "ICR, momentary", "icr_final": "ICR, final"}
+from icrtool.records.run import Run, no_slip_icrs, width_or_usual_m
 
 FITTED_TO = {"icr": "up to the start", "icr_final": "in sample", NO_SLIP: "not fitted"}
 """What a row's numbers were learned from; those of the others are held out."""
@@ -34,28 +31,18 @@ REST_OF_DRIVE = "the rest of the drive"
 """What the numbers of a row that is held out were learned from."""
 
 
-@dataclass(frozen=True, slots=True)
-class ModelComparison:
-    """How the rows of a report were tested that are not the filter's.
+class Model(NamedTuple):
+    """What predicts motion from wheel speeds: ICRs per start, or one triple.
 
     Attributes
     ----------
-    blocks : of distance, which a trial's own is left out with its neighbours
-    starts : trials start from so many states
-    fits : of all windows, by model name: what to use, not what was tested
-    width_m : track width b, or what stands for it
-    heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
-    notes : what was left out of the table and why, and what was corrected
-    calibration : what ``icrtool calibrate`` gives for this run alone; None where the track width is not known
+    knows : what its ICRs were learned from
     """
 
-    blocks: int
-    starts: int
-    fits: dict[str, FittedModel]
-    width_m: float
-    heading: str
-    notes: tuple[str, ...]
-    calibration: Calibration | None
+    name: str
+    label: str
+    icrs: FrozenIcrs
+    knows: str = REST_OF_DRIVE
 
 
 class ComparedRow(NamedTuple):
@@ -76,12 +63,28 @@ class ComparedRow(NamedTuple):
 
 
 class ComparedModels(NamedTuple):
-    """How models were compared, the rows, the trials that they are tested in, and the run's drive."""
+    """How the rows of a report were tested that are not the filter's.
 
-    table: ModelComparison
+    Attributes
+    ----------
+    trials : that they are tested in; track : the run's drive
+    blocks : of distance, which a trial's own is left out with its neighbours
+    fits : of all windows, by model name: what to use, not what was tested
+    width_m : track width b, or what stands for it
+    heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
+    notes : what was left out of the table and why, and what was corrected
+    calibration : what ``icrtool calibrate`` gives for this run alone; None where the track width is not known
+    """
+
     rows: tuple[ComparedRow, ...]
     trials: Trials
     track: Track
+    blocks: int
+    fits: dict[str, FittedModel]
+    width_m: float
+    heading: str
+    notes: tuple[str, ...]
+    calibration: Calibration | None
 
 
 def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> ComparedModels:
@@ -105,19 +108,17 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     recording, heading, notes = _with_heading(run, headings)
     found = hold_out([recording])
     give_back_freed()
-    (trials,) = found.trials
-    table = ModelComparison(
+    rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
+    return ComparedModels(
+        tuple(rows), found.trials[0],
+        recording.track._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps),
         blocks=len(found.folds),
-        starts=int(np.count_nonzero((trials.ends >= 0).any(axis=1))),
         fits={name: fit.fitted for name, fit in found.fits.items()},
         width_m=recording.width_m,
         heading=heading,
         notes=(*notes, *_lever_notes(recording)),
         calibration=_calibration(run, found),
-    )
-    track = recording.track._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
-    rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
-    return ComparedModels(table, tuple(rows), trials, track)
+    )  # fmt: skip
 
 
 def _calibration(run: Run, found: HeldOut) -> Calibration | None:
@@ -153,9 +154,10 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
     if found.has_gyro:
         (recording,) = found.recordings
         path = turned_path(run, recording)
-        for name, label in FILTER_LABELS.items():
-            errors_of = partial(_errors_along, path, recording.track, _icrs_of(run, name))
-            yield ComparedRow(f"{name}_{kind}", f"{label} + {kind}", errors_of)
+        for one in models_of(run):
+            if one.name != NO_SLIP:
+                errors_of = partial(_errors_along, path, recording.track, one.icrs)
+                yield ComparedRow(f"{one.name}_{kind}", f"{one.label} + {kind}", errors_of)
 
 
 def _lever_notes(recording: Recording) -> list[str]:
@@ -167,11 +169,15 @@ def _lever_notes(recording: Recording) -> list[str]:
     return [f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it"] if unknown else []
 
 
-def _icrs_of(run: Run, name: str) -> FrozenIcrs:
-    """Return the filter's ICRs, momentary or final."""
-    if name == "icr":
-        return FrozenIcrs(run.table.y_icr_right_m, run.table.y_icr_left_m, run.table.x_icr_m)
-    return FrozenIcrs.constant(*run.table.icrs_at(-1))
+def models_of(run: Run) -> tuple[Model, ...]:
+    """Return the filter's models: momentary ICRs, no slip where b is known, the run's final ICRs."""
+    table = run.table
+    momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
+    models = [Model("icr", "ICR, momentary", momentary, "the distance up to each start")]
+    if (width := run.track_width_m) is not None:
+        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(*no_slip_icrs(width)), "the track width"))
+    final = FrozenIcrs.constant(*table.icrs_at(-1))
+    return (*models, Model("icr_final", "ICR, final", final, "all of the drive, the trial too"))
 
 
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:

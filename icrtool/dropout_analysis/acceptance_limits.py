@@ -149,8 +149,8 @@ def _place(gate: Gate, report: OpenLoopErrors) -> int:
 def _before(gate: Gate, baseline: BaselineReport) -> tuple[float, BlockSums | None]:
     """Return the baseline's number, and its block sums."""
     if gate.budget_m is None:
-        row = baseline.row(gate)
-        return row.values_m[gate.metric], row.sums
+        row, sums = baseline.row(gate)
+        return float(column_of([row], METRICS[gate.metric])[0]), sums
     horizons_m, p95_m = baseline.p95_of(gate)
     reached = within_budget(horizons_m, p95_m, gate.budget_m)
     return (math.nan if reached is None else reached[0]), None

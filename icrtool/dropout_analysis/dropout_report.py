@@ -17,7 +17,7 @@ from icrtool.calibration.model_comparison import (
     FITTED_TO,
     ComparedModels,
     ComparedRow,
-    ModelComparison,
+    Model,
     compare_models,
 )
 from icrtool.calibration.pooled import predictor
@@ -26,16 +26,13 @@ from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate, verdict_on
 from icrtool.dropout_analysis.example_trials import example_trials, split_by_turning, worst_trials
 from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
-from icrtool.dropout_analysis.reference import with_smoothed_reference
 from icrtool.dropout_analysis.report import BaselineReport, DropoutReport, OpenLoopErrors
-from icrtool.dropout_analysis.starts import Starts
-from icrtool.dropout_analysis.trials import ErrorSink, Model, measure_errors
+from icrtool.dropout_analysis.starts import Starts, with_smoothed_reference
+from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
-from icrtool.kernels.arrays import Ints
 from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
 from icrtool.kernels.open_loop import TOLERANCE_M
-from icrtool.kernels.track import Track
 from icrtool.motion.models import FittedModel
 from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.dropout import DEFAULT_SEED, BudgetDistance, Gate, TurningSplit, UsedCalibration, Verdict
@@ -67,11 +64,8 @@ def dropout(
     *,
     starts: Starts = "moving",
     models: Sequence[Model] | None = None,
-    further: Sequence[ComparedRow] = (),
-    starts_of_further: Ints | None = None,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
-    track: Track | None = None,
 ) -> DropoutReport:
     """Return how far the predicted position is off after distances without GNSS (Pentzer 2014, Section 6.4).
 
@@ -81,11 +75,8 @@ def dropout(
     horizons_m : distances without GNSS, in any order; default those of the run's configuration
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
     models : what to predict with; default `models_of` of the run
-    further : models that are not the filter's, in addition
-    starts_of_further : states from which theirs, and all heading errors, are measured: nearer ones are copies
     seed : of what the reference's own error is drawn from
     sink : receives every single error (for ``--trials``)
-    track : `icrtool.records.run.track_of` the run, where it is at hand: of a long log it is large
 
     Returns
     -------
@@ -113,7 +104,7 @@ def dropout(
     check_type(run, Run, MAKE_RUN)
     errors = measure_errors(
         run, horizons_m if horizons_m is not None else run.config.dropout.horizons_m, starts=starts, seed=seed,
-        models=models, further=further, starts_of_further=starts_of_further, sink=sink, track=track,
+        models=models, sink=sink,
     )  # fmt: skip
     return _report(run, errors, starts=starts, seed=seed)
 
@@ -197,7 +188,7 @@ def dropout_report(
     return _report(
         compared, errors, starts=starts, seed=seed,
         with_events=cost,
-        comparison=found.table if found is not None else None,
+        compared_models=found,
         no_comparison=why,
         calibrations=used,
         smoothed=reference == "smoothed",
@@ -222,7 +213,7 @@ def _report(
     run: Run, errors: OpenLoopErrors, *, starts: Starts, seed: int, smoothed: bool = False, with_jumps: bool = False,
     with_events: OpenLoopErrors | None = None, calibrations: tuple[UsedCalibration, ...] = (),
     budgets: tuple[BudgetDistance, ...] = (), gates: tuple[Verdict, ...] = (),
-    by_turning: tuple[TurningSplit, ...] = (), comparison: ModelComparison | None = None, no_comparison: str = "",
+    by_turning: tuple[TurningSplit, ...] = (), compared_models: ComparedModels | None = None, no_comparison: str = "",
     worst: tuple[ExampleTrial, ...] = (), examples: tuple[ExampleTrial, ...] = (), outages: tuple[Outage, ...] = (),
     baseline: BaselineReport | None = None, usable: bool = True,
 ) -> DropoutReport:  # fmt: skip
@@ -233,7 +224,7 @@ def _report(
     errors : of its models
     with_events : errors of all trials, where those of `errors` cross no slip event
     """
-    made = None if comparison is None else comparison.calibration
+    made = None if compared_models is None else compared_models.calibration
     document = DropoutDocument(
         schema=DROPOUT_SCHEMA,
         tool_version=__version__,
@@ -265,7 +256,7 @@ def _report(
         recommended=None if made is None else msgspec.structs.replace(made, created=UNSET),
         budgets=budgets,
         by_turning=by_turning,
-        ladder=_ladder(errors, calibrations, comparison, no_comparison),
+        ladder=_ladder(errors, calibrations, compared_models, no_comparison),
         gates=gates,
         passed=all(one.passed for one in gates),
         baseline=None if baseline is None else baseline.compared_with(run.document),
@@ -275,7 +266,7 @@ def _report(
     )
     return DropoutReport(
         document, errors, run.directory, run.table.north_m, run.table.east_m, usable=usable, worst=worst,
-        examples=examples, outages=outages, comparison=comparison, baseline=baseline,
+        examples=examples, outages=outages, calibration=made, baseline=baseline,
     )  # fmt: skip
 
 
@@ -308,7 +299,7 @@ def _event_cost(run: Run, errors: OpenLoopErrors) -> EventCostDocument:
 
 
 def _ladder(
-    errors: OpenLoopErrors, calibrations: Sequence[UsedCalibration], found: ModelComparison | None, why_none: str
+    errors: OpenLoopErrors, calibrations: Sequence[UsedCalibration], found: ComparedModels | None, why_none: str
 ) -> LadderDocument:
     """Return how the models were compared; why there is no comparison where it was left out."""
     if found is None:
@@ -325,7 +316,7 @@ def _ladder(
     return LadderDocument(
         horizons_m=errors.horizons_m.tolist(),
         blocks=found.blocks,
-        starts=found.starts,
+        starts=int(np.count_nonzero((found.trials.ends >= 0).any(axis=1))),
         heading=found.heading or None,
         notes=list(found.notes),
         models=models,

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from icrtool.calibration.model_comparison import ComparedModels, ComparedRow
+from icrtool.calibration.model_comparison import ComparedModels, ComparedRow, Model, models_of
 from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
-from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.kernels.arrays import Floats, Ints, rows_of_cells
 from icrtool.kernels.open_loop import open_loop_errors, open_loop_path
 from icrtool.kernels.track import OpenLoopPath, Track, trial_ends

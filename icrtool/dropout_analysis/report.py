@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,12 +20,13 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import BlockSums
 from icrtool.kernels.track import TrialCounts
-from icrtool.records.dropout import METRICS, Gate
+from icrtool.records.dropout import Gate
 from icrtool.records.dropout_document import (
     BaselineDocument,
     BlocksDocument,
     DropoutDocument,
     EarlierReport,
+    ErrorRow,
     ExampleTrial,
     LearnedDocument,
     ModelResult,
@@ -41,7 +42,6 @@ from icrtool.records.text import escaped, listed
 if TYPE_CHECKING:
     import pandas as pd
 
-    from icrtool.calibration.model_comparison import ModelComparison
     from icrtool.calibration.record import Calibration
 
 
@@ -89,7 +89,7 @@ class DropoutReport:
     reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
     usable : distances and numbers may be used, or were asked for all the same
     worst, examples, outages : those of `document`, with their paths
-    comparison : the models on distance they were not fitted to; None where left out
+    calibration : of this run alone, which `recommended` stands for; None where it was left out
     baseline : an earlier report that this one is compared with
     """
 
@@ -102,7 +102,7 @@ class DropoutReport:
     worst: tuple[ExampleTrial, ...] = ()
     examples: tuple[ExampleTrial, ...] = ()
     outages: tuple[Outage, ...] = ()
-    comparison: ModelComparison | None = None
+    calibration: Calibration | None = None
     baseline: BaselineReport | None = None
 
     @property
@@ -124,11 +124,6 @@ class DropoutReport:
     def results(self) -> tuple[ModelResult, ...]:
         """The errors of each model."""
         return self.errors.results
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """The calibration of this run alone, which `recommended` stands for; None where it was left out."""
-        return self.comparison.calibration if self.comparison is not None else None
 
     @property
     def passed(self) -> bool:
@@ -183,13 +178,6 @@ class DropoutReport:
         return f"<pre>{escape(call_output('tables.dropout', 'format_dropout', self))}</pre>"
 
 
-class BaselineRow(NamedTuple):
-    """The numbers of one model and horizon by metric [m], and their block sums; None where the report has none."""
-
-    values_m: Mapping[str, float]
-    sums: BlockSums | None
-
-
 @dataclass(frozen=True, slots=True)
 class BaselineReport:
     """An earlier report.
@@ -198,13 +186,11 @@ class BaselineReport:
     ----------
     log : name of its log; path : of the report
     document : what it holds
-    rows : its numbers by model and horizon [m]
     """
 
     log: str
     path: str
     document: EarlierReport
-    rows: Mapping[tuple[str, float], BaselineRow]
 
     @property
     def sha256(self) -> tuple[str, ...]:
@@ -216,19 +202,27 @@ class BaselineReport:
         """Version that made it."""
         return escaped(self.document.tool_version)
 
-    def row(self, gate: Gate) -> BaselineRow:
-        """Return the row that a gate names.
+    def at(self, model: str, horizon_m: float) -> tuple[ErrorRow | None, BlockSums | None]:
+        """Return the numbers of a model at a horizon, and their block sums; None for what the report does not have."""
+        for one in self.document.models:
+            for row in one.by_horizon:
+                if one.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6):
+                    return row, next((_sums(sums) for sums in one.blocks if sums.horizon_m == row.horizon_m), None)
+        return None, None
+
+    def row(self, gate: Gate) -> tuple[ErrorRow, BlockSums | None]:
+        """Return what `at` does for the model and horizon that a gate names.
 
         Raises
         ------
         ConfigError
             The report has no such model or horizon.
         """
-        for (model, horizon_m), row in self.rows.items():
-            if model == gate.model and math.isclose(horizon_m, gate.horizon_m or math.nan, rel_tol=1e-6):
-                return row
-        what = f"no {gate.model} over {gate.horizon_m:g} m"
-        raise ConfigError(f"gate {gate.text!r}", f"{what} in the baseline {self.path}", "make the baseline again")
+        row, sums = self.at(gate.model, gate.horizon_m or math.nan)
+        if row is None:
+            what = f"no {gate.model} over {gate.horizon_m:g} m"
+            raise ConfigError(f"gate {gate.text!r}", f"{what} in the baseline {self.path}", "make the baseline again")
+        return row, sums
 
     def p95_of(self, gate: Gate) -> tuple[Floats, Floats]:
         """Return distances (h,) and p95 (h,) [m] of the model that a gate names.
@@ -238,11 +232,11 @@ class BaselineReport:
         ConfigError
             The report has no such model.
         """
-        found = sorted((at, row.values_m["p95"]) for (model, at), row in self.rows.items() if model == gate.model)
-        if not found:
+        rows = [row for one in self.document.models if one.name == gate.model for row in one.by_horizon]
+        if not rows:
             raise ConfigError(f"gate {gate.text!r}", f"no {gate.model} in the baseline {self.path}", "make it again")
-        horizons_m, p95_m = np.array(found).T
-        return horizons_m, p95_m
+        rows.sort(key=lambda row: row.horizon_m)
+        return column_of(rows, "horizon_m"), column_of(rows, "p95_m")
 
     def changes(self, run_document: RunDocument) -> tuple[str, ...]:
         """Return what differs beside the numbers: log, configuration, version; a sentence each."""
@@ -266,25 +260,10 @@ class BaselineReport:
         return bool(self.sha256) and self.sha256 == run_document.content
 
 
-def baseline_report(document: EarlierReport, path: str, log: str) -> BaselineReport:
-    """Return an earlier report; parameters as the fields."""
-    rows = {}
-    for model in document.models:
-        sums = {one.horizon_m: _sums(one) for one in model.blocks}
-        for row in model.by_horizon:
-            values = {metric: _number(getattr(row, column)) for metric, column in METRICS.items()}
-            rows[model.name, row.horizon_m] = BaselineRow(values, sums.get(row.horizon_m))
-    return BaselineReport(log, path, document, rows)
-
-
 def _sums(one: BlocksDocument) -> BlockSums:
     trials, p50, p95 = (np.array(column, np.int64) for column in (one.trials, one.above_p50, one.above_p95))
-    errors = np.array([_number(error) for error in one.errors_m])
-    return BlockSums(trials, errors, p50, p95, _number(one.p50_slope_m), _number(one.p95_slope_m))
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
+    growth = (float(column_of([one], name)[0]) for name in ("p50_slope_m", "p95_slope_m"))
+    return BlockSums(trials, np.array(one.errors_m, np.float64), p50, p95, *growth)
 
 
 def known_content(content: Iterable[str | None]) -> tuple[str, ...]:

@@ -1,15 +1,23 @@
-"""Which recorded states open-loop trials start from, and from which of them on the ICRs were learned."""
+"""Which recorded states open-loop trials start from, and what they are compared with.
+
+From which state on the ICRs were learned; the filter's estimate or the smoother's as the reference, and the error that
+it has itself.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from icrtool.errors import RunError
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.track import STANDING, Track, trial_ends
+from icrtool.records.dropout_document import ReferenceRow
+from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS, Run
 
 Starts = Literal["moving", "all"]
@@ -70,3 +78,95 @@ def first_learned(run: Run) -> int | None:
             continue
         learned &= std <= final + (1.0 - LEARNED_SHARE) * (first - final)
     return int(np.argmax(learned)) if learned.any() else None
+
+
+DRAWS = 20_000
+"""Errors drawn a horizon: p95 is then known to 1 %."""
+
+GNSS_NIS, HEADING_NIS = 2.0, 1.0
+"""Mean normalised innovation squared where the noise is right: the number of measured components."""
+
+
+def reference_error(
+    run: Run, track: Track, horizons_m: Floats, ends: NDArray[np.int32], seed: int
+) -> tuple[ReferenceRow, ...]:
+    """Return the error that the reference puts into the trials of each horizon.
+
+    Parameters
+    ----------
+    run : its standard deviations are those of the reference
+    track : its states
+    horizons_m : (h,)
+    ends : (h, n), the state at which the trial from each start ends, negative where there is none
+    seed : of the draws
+
+    Notes
+    -----
+    A trial starts at the reference pose (p_s, psi_s), adds the open-loop displacement and is compared with p_e. With
+    errors dp and dpsi of the reference, and D the displacement from start to end, a perfect model shows
+
+        e = dp_s - dp_e + dpsi_s J D,    J the turn by 90 degrees,
+
+    to first order, with the mean square var(p_s) + var(p_e) + var(psi_s) |D|^2. The variances are those of the filter
+    (or of the smoother, where it is the reference). They follow from the noise of the fixes that the alignment stated
+    or measured; where fixes or headings spread more than that, mean NIS / components > 1, the variances grow by that
+    factor (Birge 1932). Mean and 95th percentile are those of drawn normal errors. Errors of start and end count as
+    independent: what both share, an offset of all fixes, is in no trial, and what they share in part makes the result
+    an upper bound. A heading offset common to the whole log is not in the variances.
+    """
+    position, heading = _spread(run)
+    table = run.table
+    rows = []
+    rng = np.random.default_rng(seed)
+    for horizon_m, column in zip(horizons_m.tolist(), ends, strict=True):
+        start = np.flatnonzero(column >= 0)
+        if not len(start):
+            rows.append(ReferenceRow(horizon_m, None, None, None))
+            continue
+        start = start[np.linspace(0, len(start) - 1, DRAWS).astype(np.int64)]
+        end = column[start]
+        north, east = track.north[end] - track.north[start], track.east[end] - track.east[start]
+        north_std = [np.sqrt(position) * table.std_north_m[rows] for rows in (start, end)]
+        east_std = [np.sqrt(position) * table.std_east_m[rows] for rows in (start, end)]
+        std_heading = np.sqrt(heading) * table.std_heading_rad[start]
+        drawn = rng.standard_normal((5, DRAWS))
+        turned = std_heading * drawn[0]
+        off_north = north_std[0] * drawn[1] - north_std[1] * drawn[2] - turned * east
+        off_east = east_std[0] * drawn[3] - east_std[1] * drawn[4] + turned * north
+        error = np.hypot(off_north, off_east)
+        square = sum(std**2 for std in (*north_std, *east_std))
+        square = square + std_heading**2 * (north**2 + east**2)
+        of_error = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
+        rows.append(ReferenceRow(horizon_m, *(known(float(one)) for one in of_error)))
+    return tuple(rows)
+
+
+def _spread(run: Run) -> tuple[float, float]:
+    """Return the factors by which fixes and headings spread more than the filter assumes, in variance; at least 1."""
+    noise = run.document.filter
+    position, heading = noise.nis_gnss_mean, noise.nis_heading_mean
+    return max((position or 0.0) / GNSS_NIS, 1.0), max((heading or 0.0) / HEADING_NIS, 1.0)
+
+
+def with_smoothed_reference(run: Run) -> Run:
+    """Return a run whose positions and headings are the smoother's.
+
+    Raises
+    ------
+    RunError
+        The run has no smoothed states.
+
+    Notes
+    -----
+    Starts, their ICRs, the wheel speeds and the path length stay the filter's: only where a trial begins, where it
+    points, and what its end is compared with change.
+    """
+    smoothed = run.smoothed
+    if smoothed is None:
+        raise RunError(run.directory or run.name, "it has no smoothed states", "run icrtool fit --smooth")
+    table = replace(
+        run.table,
+        north_m=smoothed.north_m, east_m=smoothed.east_m, heading_rad=smoothed.heading_rad,
+        std_north_m=smoothed.std_north_m, std_east_m=smoothed.std_east_m, std_heading_rad=smoothed.std_heading_rad,
+    )  # fmt: skip
+    return replace(run, table=table)

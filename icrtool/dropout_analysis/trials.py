@@ -10,10 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.calibration.model_comparison import REST_OF_DRIVE, ComparedRow
-from icrtool.dropout_analysis.reference import reference_error
+from icrtool.calibration.model_comparison import ComparedRow, Model, models_of
 from icrtool.dropout_analysis.report import OpenLoopErrors
-from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out_standing, standing_states
+from icrtool.dropout_analysis.starts import (
+    Starts,
+    first_learned,
+    leave_out_standing,
+    reference_error,
+    standing_states,
+)
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.error_statistics import (
@@ -44,7 +49,7 @@ from icrtool.records.dropout_document import (
 )
 from icrtool.records.plain_data import known, plain
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.run import Run, no_slip_icrs, track_of
+from icrtool.records.run import Run, track_of
 
 LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
@@ -66,20 +71,6 @@ THREADS = 2
 """The kernels run beside each other; more threads would need more memory and find little more to do."""
 
 
-class Model(NamedTuple):
-    """What predicts motion from wheel speeds: ICRs per start, or one triple.
-
-    Attributes
-    ----------
-    knows : what its ICRs were learned from
-    """
-
-    name: str
-    label: str
-    icrs: FrozenIcrs
-    knows: str = REST_OF_DRIVE
-
-
 ErrorSink = Callable[[str, Floats, Floats], None]
 """Called with a model's name, horizons (h,) [m] and errors (n, h) [m], NaN where there is no trial."""
 
@@ -96,7 +87,14 @@ def measure_errors(
     sink: ErrorSink | None = None,
     track: Track | None = None,
 ) -> OpenLoopErrors:
-    """Return the errors of all models; parameters and errors are those of `icrtool.dropout`."""
+    """Return the errors of all models; parameters and errors are those of `icrtool.dropout`, and more.
+
+    Parameters
+    ----------
+    further : models that are not the filter's, in addition
+    starts_of_further : states from which theirs, and all heading errors, are measured: nearer ones are copies
+    track : `icrtool.records.run.track_of` the run, where it is at hand: of a long log it is large
+    """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
     horizons = check_horizons(horizons_m)
@@ -259,17 +257,6 @@ def load_kernels() -> None:
     icrs = FrozenIcrs.constant(1.0, -1.0, 0.0)
     ends = trial_ends(track, np.array([1.0]))
     open_loop_errors(track, icrs, ends)
-
-
-def models_of(run: Run) -> tuple[Model, ...]:
-    """Return the filter's models: momentary ICRs, no slip where b is known, the run's final ICRs."""
-    table = run.table
-    momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    models = [Model("icr", "ICR, momentary", momentary, "the distance up to each start")]
-    if (width := run.track_width_m) is not None:
-        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(*no_slip_icrs(width)), "the track width"))
-    final = FrozenIcrs.constant(*table.icrs_at(-1))
-    return (*models, Model("icr_final", "ICR, final", final, "all of the drive, the trial too"))
 
 
 def sparse_starts(track: Track) -> Ints:

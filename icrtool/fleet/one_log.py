@@ -399,10 +399,10 @@ def _within_name(one: BudgetDistance) -> str:
 
 def _baseline_numbers(report: DropoutReport) -> dict[str, float | None]:
     """Return the baseline's p95 and expected errors under the names of `_errors`."""
-    rows = report.baseline.rows if report.baseline is not None else {}
+    models = report.baseline.document.models if report.baseline is not None else ()
     return {
-        f"{model}_{metric}_{horizon_m:g}m_m": plain(row.values_m[metric])
-        for (model, horizon_m), row in rows.items()
-        if horizon_m in HORIZONS_M and report.result(model) is not None
-        for metric in ("p95", "expected")
-    }
+        f"{one.name}_{metric}_{row.horizon_m:g}m_m": number
+        for one in models if report.result(one.name) is not None
+        for row in one.by_horizon if row.horizon_m in HORIZONS_M
+        for metric, number in (("p95", row.p95_m), ("expected", row.expected_error_m))
+    }  # fmt: skip

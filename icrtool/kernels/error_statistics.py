@@ -32,18 +32,6 @@ class Summary(NamedTuple):
     largest: Floats
 
 
-class Intervals(NamedTuple):
-    """Confidence intervals of the expected error and of p95, per horizon; float64 (n_horizons,) [m] each.
-
-    NaN where the path with trials is shorter than `FEWEST_BLOCKS` times two horizons.
-    """
-
-    expected_low: Floats
-    expected_high: Floats
-    p95_low: Floats
-    p95_high: Floats
-
-
 class Histogram(NamedTuple):
     """Share of trials by error: float64 (n_bins,) each, bins ``[left, right)`` [m] from zero on, percent of all."""
 

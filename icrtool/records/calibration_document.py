@@ -333,18 +333,6 @@ class GroupComparison(Record, frozen=True, kw_only=True):
     transfer: tuple[TransferCell, ...]
     costs: tuple[TransferCost, ...] = ()
 
-    def cell(self, calibrated_on: str, tested_on: str, horizon_m: float) -> TransferCell:
-        """Return a cell of the matrix."""
-        return next(one for one in self.transfer if _place(one) == (calibrated_on, tested_on, horizon_m))
-
-    def cost(self, calibrated_on: str, tested_on: str, horizon_m: float) -> TransferCost | None:
-        """Return the cost of a cell; None on the diagonal."""
-        return next((one for one in self.costs if _place(one) == (calibrated_on, tested_on, horizon_m)), None)
-
-
-def _place(one: TransferCost) -> tuple[str, str, float]:
-    return one.calibrated_on, one.tested_on, one.horizon_m
-
 
 class ForecastSource(Record, frozen=True):
     """The calibration that a forecast was made with."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from icrtool.dropout_analysis.report import BaselineReport, baseline_report, known_content
+from icrtool.dropout_analysis.report import BaselineReport, known_content
 from icrtool.errors import ConfigError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
 from icrtool.output.files.formats import logs_of_fleet, read_document
@@ -109,7 +109,7 @@ def read_report(path: Path, log: str = "", inside: Path | None = None) -> Baseli
         document = read_document(path, EarlierReport, inside, escape=False)
         if not document.schema.startswith(SCHEMA_FAMILY):
             raise ValueError(document.schema)
-        return baseline_report(document, str(path), escaped(log or document.run.log))
+        return BaselineReport(escaped(log or document.run.log), str(path), document)
     except OSError as err:
         raise ConfigError(f"--baseline {path}", "cannot be read", err.strerror or str(err)) from err
     except (ValueError, RecursionError) as err:

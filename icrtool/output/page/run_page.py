@@ -12,8 +12,8 @@ from typing import TypeVar
 
 import msgspec
 
-from icrtool.dropout_analysis.reference import with_smoothed_reference
 from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.starts import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
 from icrtool.output.files.atomic import is_page, write_file

@@ -12,8 +12,8 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import difference_half_width
 from icrtool.output.text_blocks import VERBOSE, Block, Cell, Figure, Items, Section, Table
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text
-from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.dropout_document import DropoutDocument, ErrorRow, ModelDocument
+from icrtool.records.dropout import CHOICE_HORIZON_M, METRICS
+from icrtool.records.dropout_document import DropoutDocument, ErrorRow, ModelDocument, column_of
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
@@ -271,14 +271,12 @@ def baseline_sections(report: DropoutReport) -> Iterator[Section]:
         return
     shown, same, rows = shown_horizons(report.horizons_m), baseline.is_of(report.run_document), []
     for result in report.results:
-        for label, metric, column in (
-            ("95 %", "p95", result.column("p95_m")), ("expected", "expected", result.column("expected_error_m")),
-        ):  # fmt: skip
-            cells = []
+        for label, metric in (("95 %", "p95"), ("expected", "expected")):
+            cells, name = [], METRICS[metric]
+            column = result.column(name)
             for h in shown:
-                row = baseline.rows.get((result.name, float(report.horizons_m[h])))
-                before, theirs = (row.values_m[metric], row.sums) if row is not None else (math.nan, None)
-                difference = float(column[h]) - before
+                row, theirs = baseline.at(result.name, float(report.horizons_m[h]))
+                difference = float(column[h]) - (math.nan if row is None else column_of([row], name)[0])
                 sums = result.block_sums[h] if result.block_sums else None
                 half = difference_half_width(sums, theirs, metric, 1.0, paired=same)
                 interval = f" ± {error_text(half)}" if math.isfinite(half) else ""

@@ -67,10 +67,10 @@ def test_a_gyro_is_scaled_and_refused_where_it_does_not_turn(run: Run) -> None:
     gyro = MeasuredHeading("gyro", 0.97 * heading + 0.01 * run.table.t_s)
     _, exact = compared_errors(run, [MeasuredHeading("gyro", heading.copy())])
     found, scaled = compared_errors(run, [gyro])
-    assert found.table.heading == "gyro"
+    assert found.heading == "gyro"
     p95 = [np.nanpercentile(errors["icr_final_gyro"][:, 1], 95) for errors in (exact, scaled)]
     assert p95[1] == pytest.approx(p95[0], abs=0.01)
-    other = compare_models(run, [MeasuredHeading("gyro", 0.1 * heading)]).table
+    other = compare_models(run, [MeasuredHeading("gyro", 0.1 * heading)])
     assert other.heading == ""
     assert "does not turn with the robot" in other.notes[0]
 
@@ -78,8 +78,8 @@ def test_a_gyro_is_scaled_and_refused_where_it_does_not_turn(run: Run) -> None:
 def test_a_gyro_of_the_other_sign_is_turned_and_reported(run: Run) -> None:
     angle = 0.97 * run.table.heading_rad + 0.01 * run.table.t_s
     usual, turned = (compared_errors(run, [MeasuredHeading("gyro", sign * angle)]) for sign in (1, -1))
-    known = set(usual[0].table.notes)
-    assert set(turned[0].table.notes) - known == {"the gyro counts turns in the other direction: its sign was changed"}
+    known = set(usual[0].notes)
+    assert set(turned[0].notes) - known == {"the gyro counts turns in the other direction: its sign was changed"}
     for name, errors in usual[1].items():
         assert np.allclose(errors, turned[1][name], atol=ROUNDING_M, equal_nan=True)
 
@@ -116,12 +116,12 @@ def test_the_whole_model_predicts_better_than_the_momentary_icrs(run: Run) -> No
 
 
 def test_where_the_place_of_the_position_is_not_known_a_note_states_it(run: Run) -> None:
-    notes = " ".join(compare_models(run).table.notes)
+    notes = " ".join(compare_models(run).notes)
     assert "ahead of and to the right of the body's origin" in notes
     frames = {"antenna_forward_m": 0.2, "antenna_right_m": 0.0}
     config = parse_config({"robot": {"track_width_m": 0.6}, "frames": frames})
     placed = fit(make_log(0, 180.0, rate=20.0), config)
-    assert "body's origin" not in " ".join(compare_models(placed).table.notes)
+    assert "body's origin" not in " ".join(compare_models(placed).notes)
 
 
 def test_too_short_a_drive_is_refused() -> None:

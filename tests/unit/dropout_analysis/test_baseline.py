@@ -135,7 +135,7 @@ def test_a_report_equals_its_own_baseline(report: DropoutReport, written: Path) 
         assert verdict.baseline_m == result.column("p95_m")[1]
     held_out = "controller"
     assert check_gate(parse_gate(f"{held_out}.p95@5m <= baseline"), report.errors, baseline).margin_m == 0.0
-    stored, made = baseline.rows["icr", 2.0].sums, report.result("icr").block_sums[1]
+    stored, made = baseline.at("icr", 2.0)[1], report.result("icr").block_sums[1]
     for name, column in made._asdict().items():
         np.testing.assert_allclose(getattr(stored, name), column, rtol=1e-5)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import icrtool
+from icrtool.calibration.model_comparison import models_of
 from icrtool.dropout_analysis.dropout_report import dropout
-from icrtool.dropout_analysis.trials import models_of
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import SHORT, trial_ends
 from icrtool.records.run import track_of

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from icrtool.calibration.model_comparison import models_of
 from icrtool.config import parse_config
 from icrtool.dropout_analysis.dropout_report import dropout
-from icrtool.dropout_analysis.reference import with_smoothed_reference
-from icrtool.dropout_analysis.trials import models_of
+from icrtool.dropout_analysis.starts import with_smoothed_reference
 from icrtool.estimation.filter_setup import MIDDLE_OF_THE_TURN
 from icrtool.estimation.fit import fit
 from icrtool.records.run import Run

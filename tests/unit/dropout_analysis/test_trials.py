@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import icrtool
+from icrtool.calibration.model_comparison import Model, models_of
 from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.starts import first_learned
-from icrtool.dropout_analysis.trials import Model, models_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import FrozenIcrs, trial_ends

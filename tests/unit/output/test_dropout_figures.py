@@ -14,12 +14,12 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from icrtool.calibration.model_comparison import models_of
 from icrtool.dropout_analysis.acceptance_limits import budget_distances
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
 from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.dropout_analysis.trials import models_of
 from icrtool.output.figure_catalogue import draw_figures
 from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_histograms, dropout_summary
 from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
