@@ -8,7 +8,8 @@ error).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -71,14 +72,14 @@ class HeldOutRow:
         return float(values.max()) if len(values) else float("nan")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class HeldOut:
     """Fits of the motion models to recordings, and what each predicts without a fold.
 
     Attributes
     ----------
     folds : recordings or, of a single one, blocks of distance
-    trials : by recording; scores : of these, a row a model
+    trials : by recording
     fits : of everything, by model name
     """
 
@@ -88,7 +89,19 @@ class HeldOut:
     trials: tuple[Trials, ...]
     fits: dict[str, PooledFit]
     steps: tuple[Track, ...]
-    scores: tuple[HeldOutRow, ...] = ()
+
+    @cached_property
+    def scores(self) -> tuple[HeldOutRow, ...]:
+        """Errors in the trials of all recordings, a row a model."""
+        of_recordings = enumerate(zip(self.trials, self.recordings, strict=True))
+        fold_of = np.concatenate([_fold_of(self.folds, i, *one) for i, one in of_recordings])
+        first = np.searchsorted(fold_of, np.arange(1, len(self.folds)))
+        scores = []
+        for name, label in self.rows.items():
+            errors = np.concatenate([self.errors(name, i, one).position for i, one in enumerate(self.trials)])
+            by_fold = tuple(error_summary(some) for some in np.split(errors, first))
+            scores.append(HeldOutRow(name, label, by_fold, error_summary(errors)))
+        return tuple(scores)
 
     @property
     def has_gyro(self) -> bool:
@@ -238,23 +251,6 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
     return Fits(fits, tuple(one.steps for one in windows), pool)
 
 
-def plan_held_out(recordings: Sequence[Recording]) -> HeldOut:
-    """Fit the motion models, and plan what each is tested without; no row is scored.
-
-    Raises
-    ------
-    DataError
-        Too short a drive, or too little left beside a fold.
-    """
-    folds = plan_folds(recordings)
-    fits, steps, pool = fit_models(recordings)
-    for fold in folds:
-        if np.count_nonzero(pool.clear_of(fold)) < FEWEST_RESIDUALS:
-            why = "too short to fit on one part and test on another"
-            raise DataError(fold.name, "too few windows beside it", why)
-    return HeldOut(tuple(recordings), (), folds, (), fits, steps)
-
-
 def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HORIZONS_M) -> HeldOut:
     """Fit the motion models, and test each on what it was not fitted to.
 
@@ -267,16 +263,15 @@ def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HORI
     DataError
         Too short a drive, or too little left beside a fold.
     """
-    plan, pooled = plan_held_out(recordings), totals_of(*recordings)
+    folds = plan_folds(recordings)
+    fits, steps, pool = fit_models(recordings)
+    for fold in folds:
+        if np.count_nonzero(pool.clear_of(fold)) < FEWEST_RESIDUALS:
+            why = "too short to fit on one part and test on another"
+            raise DataError(fold.name, "too few windows beside it", why)
+    pooled = totals_of(*recordings)
     trials = tuple(cut_trials(one, horizons_m, pooled) for one in recordings)
-    fold_of = np.concatenate([_fold_of(plan.folds, i, one, recordings[i]) for i, one in enumerate(trials)])
-    first = np.searchsorted(fold_of, np.arange(1, len(plan.folds)))
-    scores = []
-    for name, label in plan.rows.items():
-        errors = np.concatenate([plan.errors(name, i, one).position for i, one in enumerate(trials)])
-        by_fold = tuple(error_summary(some) for some in np.split(errors, first))
-        scores.append(HeldOutRow(name, label, by_fold, error_summary(errors)))
-    return replace(plan, horizons_m=tuple(horizons_m), trials=trials, scores=tuple(scores))
+    return HeldOut(tuple(recordings), tuple(horizons_m), folds, trials, fits, steps)
 
 
 def _fold_of(folds: Sequence[Fold], i: int, trials: Trials, recording: Recording) -> Ints:

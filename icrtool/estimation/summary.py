@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from itertools import pairwise
-from typing import Any
 
-import msgspec
 import numpy as np
+from msgspec.structs import asdict
 
 from icrtool import __version__
 from icrtool.alignment.sensors.gnss_quality import CLASSES
@@ -125,12 +124,14 @@ def summarise(
         segments=segment_summary(table, changes_s),
         gnss=gnss_summary(datum, rejected_fixes, filtered.gnss, sensors.fixes, measurements),
         heading=HeadingDocument(
-            **msgspec.structs.asdict(measurements.heading), delay_s=lag.value, delay_std_s=lag.std,
+            **asdict(measurements.heading), delay_s=lag.value, delay_std_s=lag.std,
             applied_delay_s=lag.applied, used=_count(filtered.heading.used), rejected=_count(filtered.heading.rejected),
         ),
         wheels=measurements.wheels,
-        events=tuple(EventDocument(**_with_seconds(one, start_ns)) for one in sensors.events),
-        reference_jumps=tuple(ReferenceJumpDocument(**_with_seconds(one, start_ns)) for one in sensors.jumps),
+        events=tuple(EventDocument(**(one._asdict() | _seconds(one, start_ns))) for one in sensors.events),
+        reference_jumps=tuple(
+            ReferenceJumpDocument(**(asdict(one) | _seconds(one, start_ns))) for one in sensors.jumps
+        ),
         outages_ns=_spans(filtered.outages_ns),
         rtk_losses_ns=_spans(sensors.losses_ns),
         wheel_gaps_ns=_spans(table.stamp_ns[np.flatnonzero(filtered.in_gap)[:, None] + [0, 1]]),
@@ -241,10 +242,9 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     return covariance + np.diag([0.0, 0.0, x_clock_std_m**2]), excitation, x_clock_std_m
 
 
-def _with_seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, Any]:
-    """Return a span with begin and end also in seconds since the first recorded state, of stamp `start_ns`."""
-    own = msgspec.structs.asdict(span) if isinstance(span, ReferenceJump) else span._asdict()
-    return own | {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
+def _seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, float]:
+    """Return begin and end of a span in seconds since the first recorded state, of stamp `start_ns`."""
+    return {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
 
 
 def _end_error(table: States, in_gap: Bools, icrs: Icrs) -> EndErrorDocument:
