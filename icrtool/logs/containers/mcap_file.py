@@ -7,12 +7,9 @@ import zlib
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.records import Channel as McapChannel
-from mcap.records import Schema, Statistics
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
@@ -22,6 +19,10 @@ from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, Decompressio
 from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, Part, scan_mcap
 from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
+
+if TYPE_CHECKING:
+    from mcap.records import Channel as McapChannel
+    from mcap.records import Schema, Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 PIECE_BYTES = 1 << 22
@@ -108,17 +109,15 @@ class McapFile(ChunkedFile):
         channels: dict[int, McapChannel] = {}
         statistics: Statistics | None = None
         for opcode, content in self._summary_records():
-            match _chunk_of_index(content) if opcode == _CHUNK_INDEX else _parse(opcode, content):
-                case Schema() as schema:
-                    schemas[schema.id] = schema
-                case McapChannel() as channel:
-                    channels[channel.id] = channel
-                case Statistics() as found:
-                    statistics = found
-                case Chunk() as chunk:
-                    chunks.append(chunk)
-                case None:
-                    return None
+            record: Any = _chunk_of_index(content) if opcode == _CHUNK_INDEX else _parse(opcode, content)
+            if record is None:
+                return None
+            if opcode == _CHUNK_INDEX:
+                chunks.append(record)
+            elif opcode == _STATISTICS:
+                statistics = record
+            else:
+                (schemas if opcode == MCAP_SCHEMA else channels)[record.id] = record
         if statistics is None or not chunks or len(chunks) != statistics.chunk_count:
             return None
         if len(schemas) < statistics.schema_count or len(channels) < statistics.channel_count:
@@ -244,13 +243,11 @@ class McapFile(ChunkedFile):
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         code, _, start, end = record
         described = _parse(code, bytes(data[start:end]))
-        if isinstance(described, Schema):
-            known = self._schemas.setdefault(described.id, described) == described
-        elif isinstance(described, McapChannel):
-            known = self._channels.setdefault(described.id, described) == described
-        else:
+        if described is None:
             self.report("a schema or channel that cannot be read was left out")
             return
+        before: dict[int, Any] = self._schemas if code == MCAP_SCHEMA else self._channels
+        known = before.setdefault(described.id, described) == described
         if not known:
             what = f"{type(described).__name__.lower()} {described.id}"
             self.report(f"{what} is described twice, differently; the first description was used")
@@ -271,11 +268,14 @@ def _chunk_of_index(content: bytes) -> Chunk | None:
     return Chunk(at, length, channels or None, begin_ns, end_ns, index_length, size, compression)
 
 
-def _parse(opcode: int, content: bytes) -> Schema | McapChannel | Statistics | None:
+def _parse(opcode: int, content: bytes) -> Any:  # noqa: ANN401 - a record of the library, by the operation code
     """Return a schema, channel or statistics record, None where it is damaged."""
-    kinds = {MCAP_SCHEMA: Schema.read, MCAP_CHANNEL: McapChannel.read, _STATISTICS: Statistics.read}
+    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import McapError
+    from mcap.records import Channel, Schema, Statistics
+
+    kinds = {MCAP_SCHEMA: Schema.read, MCAP_CHANNEL: Channel.read, _STATISTICS: Statistics.read}
     try:
-        record: Schema | McapChannel | Statistics = kinds[opcode](ReadDataStream(BytesIO(content)))
+        return kinds[opcode](ReadDataStream(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError, MemoryError):
         return None
-    return record
