@@ -14,7 +14,7 @@ from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.track import Track
 from icrtool.kernels.window_residuals import OMEGA, VX
 from icrtool.motion.models import FittedModel, wheel_motion
-from icrtool.motion.recording import Recording, Trials, steps_of
+from icrtool.motion.recording import Recording, steps_of
 
 STEP_M = 0.1
 """A planned path is driven in steps of this length."""
@@ -97,19 +97,6 @@ def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro:
     return _along(calibration, recording.track, steps_of(recording), with_gyro=with_gyro)
 
 
-def forecast_trials(
-    calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
-) -> tuple[Floats, Floats]:
-    """Return expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
-    steps = steps_of(recording)
-    some, t = trials.ends >= 0, recording.track.t
-    begin = np.broadcast_to(t[trials.starts][:, None], some.shape)[some]
-    _, expected, p95 = _errors(calibration, steps, begin, t[trials.ends[some]], with_gyro=with_gyro)
-    found = np.full((2, *trials.ends.shape), np.nan)
-    found[0][some], found[1][some] = expected, p95
-    return found[0], found[1]
-
-
 def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
     """Return the speeds of the sides (n,) [m/s] that make a speed ahead [m/s] and a turn rate [rad/s] by a model.
 
@@ -157,7 +144,7 @@ def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: b
     if not len(metres):
         raise DataError("path", f"{track.distance[-1]:.2f} m long", "a forecast needs a metre at least")
     rows = np.searchsorted(track.distance, metres)
-    spread, expected, p95 = _errors(calibration, steps, np.full(len(rows), t[0]), t[rows], with_gyro=with_gyro)
+    spread, expected, p95 = forecast_errors(calibration, steps, np.full(len(rows), t[0]), t[rows], with_gyro=with_gyro)
     c, s = np.cos(track.heading[0]), np.sin(track.heading[0])
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
@@ -168,10 +155,10 @@ def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: b
     )  # fmt: skip
 
 
-def _errors(
+def forecast_errors(
     calibration: Calibration, steps: Track, begin_s: Floats, end_s: Floats, *, with_gyro: bool
 ) -> tuple[Spread, Floats, Floats]:
-    """Return moments, expected and 95 % error of windows from and to times (w,)."""
+    """Return moments, expected and 95 % error (w,) [m] of windows of a drive from and to times (w,)."""
     fitted, sources = calibration.fitted, calibration.error_sources
     if with_gyro and calibration.gyro is not None and (turned := calibration.fitted_with_gyro) is not None:
         fitted, sources = turned, calibration.gyro.error_sources

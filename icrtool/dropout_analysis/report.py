@@ -7,7 +7,7 @@ it is here, and no kernel: a process that only draws it need not load numba.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -36,7 +36,7 @@ from icrtool.records.dropout_document import (
     column_of,
 )
 from icrtool.records.run import FigureSet, call_output
-from icrtool.records.run_document import RunDocument
+from icrtool.records.run_document import RunDocument, known_content
 from icrtool.records.text import escaped, listed
 
 if TYPE_CHECKING:
@@ -264,12 +264,6 @@ def _sums(one: BlocksDocument) -> BlockSums:
     trials, p50, p95 = (np.array(column, np.int64) for column in (one.trials, one.above_p50, one.above_p95))
     growth = (float(column_of([one], name)[0]) for name in ("p50_slope_m", "p95_slope_m"))
     return BlockSums(trials, np.array(one.errors_m, np.float64), p50, p95, *growth)
-
-
-def known_content(content: Iterable[str | None]) -> tuple[str, ...]:
-    """Return the SHA-256 of the files of a log; none where one is not known."""
-    found = tuple(content)
-    return () if None in found else tuple(map(str, found))
 
 
 def _different_keys(before: Mapping[str, object], now: Mapping[str, object], prefix: str = "") -> Iterator[str]:

@@ -5,6 +5,7 @@ A key that a later version adds has a default, so that older runs can still be r
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import msgspec
@@ -34,6 +35,12 @@ def check_together(one: object, *names: str) -> None:
     """
     if len({getattr(one, name) is None for name in names}) > 1:
         raise ValueError(f"only some of {', '.join(names)} are known")
+
+
+def known_content(content: Iterable[str | None]) -> tuple[str, ...]:
+    """Return the SHA-256 of the files of a log; none where one is not known."""
+    found = tuple(content)
+    return () if None in found else tuple(map(str, found))
 
 
 class NumberByIcr(Record, frozen=True):
@@ -361,8 +368,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
     @property
     def content(self) -> tuple[str, ...]:
         """SHA-256 of each file of the log; none where one is not known: it is not known to be a copy of another."""
-        known = tuple(file.sha256 for file in self.inputs if file.sha256 is not None)
-        return known if len(known) == len(self.inputs) else ()
+        return known_content(file.sha256 for file in self.inputs)
 
     def icr_of_drive(self, column: IcrColumn) -> tuple[float, float] | None:
         """Return an ICR of `geometry` and its standard deviation, None where it is not shown."""

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from icrtool.dropout_analysis.report import BaselineReport, known_content
+from icrtool.dropout_analysis.report import BaselineReport
 from icrtool.errors import ConfigError
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE, SCHEMA_FAMILY
 from icrtool.output.files.formats import logs_of_fleet, read_document
 from icrtool.records.dropout_document import EarlierReport
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
+from icrtool.records.run_document import known_content
 from icrtool.records.text import escaped
 
 ADVICE = "name a report.json, a run with a dropout report, or the folder of a batch"

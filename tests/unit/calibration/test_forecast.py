@@ -13,12 +13,12 @@ import pytest
 from scipy.optimize import nnls
 
 from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonnegative, radius
-from icrtool.calibration.forecast import forecast_drive, forecast_plan, forecast_trials, wheel_speeds
+from icrtool.calibration.forecast import forecast_drive, forecast_errors, forecast_plan, wheel_speeds
 from icrtool.calibration.pooled import calibrate_recordings, predictor
 from icrtool.calibration.record import Calibration, parameter_documents
 from icrtool.errors import DataError, IcrToolError
 from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
-from icrtool.motion.recording import cut_trials
+from icrtool.motion.recording import Recording, Trials, cut_trials, steps_of
 from icrtool.output.files.formats import read_numbers
 from icrtool.output.tables.calibration import forecast_csv, reach
 from icrtool.records.calibration_document import ErrorSources
@@ -54,6 +54,18 @@ def only(calibration: Calibration, **variances: float) -> Calibration:
     return msgspec.structs.replace(
         calibration, terms=terms, parameters=parameters, covariance=covariance, error_sources=sources
     )
+
+
+def forecast_trials(
+    calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
+    some, t = trials.ends >= 0, recording.track.t
+    begin = np.broadcast_to(t[trials.starts][:, None], some.shape)[some]
+    _, *forecast = forecast_errors(calibration, steps_of(recording), begin, t[trials.ends[some]], with_gyro=with_gyro)
+    found = np.full((2, *trials.ends.shape), np.nan)
+    found[:, some] = forecast
+    return found[0], found[1]
 
 
 def test_the_95_percent_error_holds_on_drives_that_were_not_calibrated_with() -> None:
