@@ -38,6 +38,14 @@ def format_configuration(config: Config) -> str:
     return "".join(parts)
 
 
+def format_settings(config: Config) -> str:
+    """Return the keys that have a value as TOML, a key a line."""
+    lines = []
+    for section, keys in config.effective().items():
+        lines += [f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in keys.items() if value is not None), ""]
+    return "\n".join(lines)
+
+
 def _toml(value: object) -> str:
     """Return a value of the configuration as TOML: JSON values are the same there, except the escapes of a text."""
     if isinstance(value, list):

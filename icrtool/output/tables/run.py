@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Iterator, Sequence
 
@@ -11,6 +10,7 @@ import numpy as np
 from icrtool.alignment.corrections import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.observability import lacking_turns
+from icrtool.output.tables.configuration import format_settings
 from icrtool.output.text_blocks import (
     BRIEF_WIDTH,
     PAGE,
@@ -308,7 +308,7 @@ def log_sections(summary: RunDocument) -> list[Block]:
     return [
         Section("Streams, filter", [*tables, *_terrain_table(summary)], VERBOSE),
         Section("Why these streams, and what was found of them", [_why_facts(summary), *_alignment(summary)], PAGE),
-        Section("Configuration that the run was made with", [Line(_configuration(summary), "as is")], PAGE),
+        Section("Configuration that the run was made with", [Line(format_settings(summary.config), "as is")], PAGE),
     ]
 
 
@@ -367,15 +367,6 @@ def _alignment(summary: RunDocument) -> Iterator[Table]:
     if rows:
         head = ("estimate", "value ± σ", "applied", "why")
         yield Table("lrrl", rows, head, "Alignment of the streams: what was found and corrected")
-
-
-def _configuration(summary: RunDocument) -> str:
-    """Return the configuration a key a line, in the form of a configuration file."""
-    lines = []
-    for section, keys in summary.config.effective().items():
-        lines += [f"[{section}]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None)]
-        lines.append("")
-    return "\n".join(lines)
 
 
 def warnings_section(summary: RunDocument) -> Section:
