@@ -91,10 +91,7 @@ def _joined(
     def add(command: Command) -> Command:
         @wraps(command)
         def call(**given: Any) -> object:
-            record = home
-            if isinstance(record, str):
-                module, _, attribute = record.partition(":")
-                record = getattr(import_module(module), attribute)
+            record = _imported(home) if isinstance(home, str) else home
             values = {one: given.pop(one) for one in known.intersection(signature(record).parameters, given)}
             made = make(record, {one: value for one, value in values.items() if value is not None})
             return command(**{name: made}, **given)
@@ -103,6 +100,13 @@ def _joined(
         return add_options(call, *options)
 
     return add
+
+
+def _imported(home: str) -> Callable[..., object]:
+    """Return what is at ``module:name``."""
+    module, _, name = home.partition(":")
+    found: Callable[..., object] = getattr(import_module(module), name)
+    return found
 
 
 def _names(command: Command) -> set[str]:
@@ -117,61 +121,37 @@ def add_options(command: Command, *options: Option) -> Command:
     return command
 
 
-class _Place(click.Path):
-    """A log, or a place of results, as a path or an address.
-
-    Not checked by click: the reader reports an unreadable log with its own message and exit status 1.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(path_type=Path, readable=False)
-
-    def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path."""
-        place = place_of(os.fspath(value))
-        # click's own would lose a slash, and what stands behind a question mark.
-        return place if isinstance(place, UrlPath) else cast("Path", super().convert(value, param, ctx))
-
-
-LOG = PLACE = _Place()
-LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
-
-
-class _File(click.Path):
-    """A file or directory on disk.
+class _Path(click.Path):
+    """A place on disk, or also an address.
 
     Parameters
     ----------
-    check : refuses a place that cannot be written, before any work is done
+    addresses : they are taken, and what click checks of a log is left to its reader, which has its own message
+    check : where the function is that refuses a place that cannot be written, before any work is done
     """
 
-    def __init__(self, check: Callable[[Path], None] | None = None) -> None:
-        super().__init__(path_type=Path)
-        self._check = check
+    def __init__(self, *, addresses: bool = False, check: str = "") -> None:
+        super().__init__(path_type=Path, readable=not addresses)
+        self._addresses, self._check = addresses, check
 
     def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path; refuse an address."""
-        if isinstance(address := place_of(os.fspath(value)), UrlPath):
-            self.fail(f"{escaped(str(address))}: an address is not taken here; name a place on disk", param, ctx)
+        """Return the path."""
+        address = place_of(os.fspath(value))
+        if isinstance(address, UrlPath):
+            if not self._addresses:
+                self.fail(f"{escaped(str(address))}: an address is not taken here; name a place on disk", param, ctx)
+            # click's own would lose a slash, and what stands behind a question mark.
+            return address
         path = cast("Path", super().convert(value, param, ctx))
-        if self._check is not None:
-            self._check(path)
+        if self._check:
+            _imported(self._check)(path)
         return path
 
 
-def _check_file(path: Path) -> None:
-    from icrtool.output.files.atomic import check_place
-
-    check_place(path)
-
-
-def _check_picture(path: Path) -> None:
-    from icrtool.output.files.formats import check_picture
-
-    check_picture(path)
-
-
-FILE, NEW_FILE, NEW_PICTURE = _File(), _File(_check_file), _File(_check_picture)
+LOG = PLACE = _Path(addresses=True)
+LOGS = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+FILE, NEW_FILE = _Path(), _Path(check="icrtool.output.files.atomic:check_place")
+NEW_PICTURE = _Path(check="icrtool.output.files.formats:check_picture")
 
 
 def numbers(text: str, form: str, count: int | None = None) -> tuple[float, ...]:

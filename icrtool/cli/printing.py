@@ -108,22 +108,6 @@ def _rich_table(table: Table, shown: RichTable) -> RichTable:
     return shown
 
 
-def print_json(command: str, document: msgspec.Struct | Mapping[str, object]) -> None:
-    """Print the document of a command; its schema is ``icrtool/<command>/1``, whatever `document` states.
-
-    Parameters
-    ----------
-    command : its name on the command line
-    document : a record, or plain data and numpy's; numbers that are not finite become null
-    """
-    from icrtool import __version__
-    from icrtool.output.files.formats import json_bytes
-    from icrtool.records.plain_data import plain
-
-    own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
-    click.echo(json_bytes(own | {key: value for key, value in plain(document).items() if key not in own}), nl=False)
-
-
 def write_or_print(text: str, output: Path | None) -> None:
     """Write a text to its file, or print it where none is named."""
     if output is None:
@@ -170,9 +154,21 @@ class Printer(NamedTuple):
             click.echo(text)
 
     def json(self, command: str, document: msgspec.Struct | Mapping[str, object]) -> None:
-        """Print the document of a command, with --json; parameters as of `print_json`."""
-        if self.as_json:
-            print_json(command, document)
+        """Print the document of a command, with --json; its schema is ``icrtool/<command>/1``, whatever it states.
+
+        Parameters
+        ----------
+        command : its name on the command line
+        document : a record, or plain data and numpy's; numbers that are not finite become null
+        """
+        if not self.as_json:
+            return
+        from icrtool import __version__
+        from icrtool.output.files.formats import json_bytes
+        from icrtool.records.plain_data import plain
+
+        own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
+        click.echo(json_bytes(own | {key: value for key, value in plain(document).items() if key not in own}), nl=False)
 
     def detail(self, text: str) -> None:
         """Print a line on standard error, with -v."""
