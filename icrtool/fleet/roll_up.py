@@ -101,16 +101,14 @@ def _pooled(
     total_s = sum(row.duration_s or 0.0 for row in ordered)
     count = math.ceil(len(ordered) * min(1.0, MOST_POOLED_S / max(total_s, 1.0)))
     spaced = {ordered[i].log for i in np.linspace(0, len(ordered) - 1, count).round().astype(int)}
-    used: list[str] = []
     file = f"{CALIBRATIONS}/{name}.json"
-    opened: list[str] = []
+    opened: dict[str, str] = {}
 
     def usable() -> Iterator[Run]:
         for row in members:
             if row.log in spaced and (row.usable or allow_unusable):
                 run = open_run(place / row.run)
-                used.append(row.log)
-                opened.append(run.name)
+                opened[row.log] = run.name
                 yield run
 
     try:
@@ -118,15 +116,15 @@ def _pooled(
         make_folders(directory / CALIBRATIONS, directory)
         write_calibration(result.calibration, directory / file, directory)
     except IcrToolError as err:
-        left_out = tuple(log for log in one.logs if log not in used)
+        left_out = tuple(log for log in one.logs if log not in opened)
         return replace(one, left_out=left_out, reason=str(err))
     numbers = result.calibration.controller
     table = format_blocks(held_out_blocks(result.table))
     reached = result.table.score("recommended").within(result.table.horizons_m, BUDGET_M)
     short = {name for name, _ in result.left_out}
-    used = [log for log, logged in zip(used, opened, strict=True) if logged not in short]
+    used = tuple(log for log, run_name in opened.items() if run_name not in short)
     return replace(
-        one, logs=tuple(used), left_out=tuple(log for log in one.logs if log not in used), file=file,
+        one, logs=used, left_out=tuple(log for log in one.logs if log not in used), file=file,
         recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),
         multiplier_std=float(numbers.multiplier_std), table=table,
         icrs_m=tuple(result.calibration.geometry[name] for name in ICR_COLUMNS),
