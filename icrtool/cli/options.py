@@ -86,12 +86,11 @@ def _joined(
     make: Callable[[Callable[..., object], dict[str, object]], object],
     options: Sequence[Option],
 ) -> Option:
-    known = _names(add_options(lambda: None, *options))
-
     def add(command: Command) -> Command:
         @wraps(command)
         def call(**given: Any) -> object:
             record = _imported(home) if isinstance(home, str) else home
+            known = _names(add_options(lambda: None, *options))
             values = {one: given.pop(one) for one in known.intersection(signature(record).parameters, given)}
             made = make(record, {one: value for one, value in values.items() if value is not None})
             return command(**{name: made}, **given)
