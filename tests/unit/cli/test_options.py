@@ -1,0 +1,61 @@
+"""Options that reach a command as one argument (`icrtool.cli.options.together`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from icrtool.cli.commands import icrtool as command_line
+from icrtool.cli.options import changes, flag, option, together
+
+COMMANDS = command_line.list_commands(click.Context(command_line))
+
+
+@dataclass(frozen=True)
+class Pair:
+    left: float = 1.0
+    right: float = 2.0
+
+
+LEFT, RIGHT, OTHER = (
+    option("--left", "M", float, "Left."),
+    option("--right", "M", float, "Right."),
+    flag("--other", "No."),
+)
+
+
+def call(*arguments: str, kind=together) -> dict[str, object]:
+    """Return what a command gets."""
+    found: dict[str, object] = {}
+
+    @click.command()
+    @kind("pair", f"{__name__}:Pair" if kind is changes else Pair, LEFT, RIGHT, OTHER)
+    def command(**given: object) -> None:
+        found.update(given)
+
+    assert CliRunner().invoke(command, list(arguments), catch_exceptions=False).exit_code == 0
+    return found
+
+
+def test_options_become_a_record_that_keeps_its_defaults_and_the_others_stay() -> None:
+    assert call() == {"pair": Pair(), "other": False}
+    assert call("--right", "5", "--other") == {"pair": Pair(1.0, 5.0), "other": True}
+
+
+def test_a_change_replaces_what_is_given_of_another_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("icrtool.cli.options.import_module", lambda _: SimpleNamespace(Pair=Pair))
+    change = call("--left", "-3", kind=changes)["pair"]
+    assert callable(change)
+    assert change(Pair(7.0, 8.0)) == Pair(-3.0, 8.0)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_record_of_a_command_has_the_name_of_one_of_its_options(name: str) -> None:
+    command = command_line.get_command(click.Context(command_line), name)
+    assert command is not None
+    made: set[str] = getattr(command.callback, "made", set())
+    assert made.isdisjoint(one.name for one in command.params if one.name is not None)
