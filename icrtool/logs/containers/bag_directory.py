@@ -54,7 +54,7 @@ class BagDirectory(Container):
 
     def __init__(
         self, path: Path, files: Sequence[Path] = (), distant: Mapping[str, RemoteFile] = MappingProxyType({})
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(path)
         self._distant = distant
         self._scratch: ScratchFolder | None = None

@@ -98,9 +98,7 @@ class _Run:
     def __init__(self, layout: Layout, message: bytes) -> None:
         self._message, self._stop, self._cdr = message, len(message), layout.cdr
         self._base = self._at = 4 if layout.cdr else 0
-        self._steps_left = min(
-            _STEPS_PER_BYTE * len(message) + _LEAST_STEPS + 2 * len(layout.program), _MOST_STEPS
-        )  # fmt: skip
+        self._steps_left = min(_STEPS_PER_BYTE * len(message) + _LEAST_STEPS + 2 * len(layout.program), _MOST_STEPS)
         self._lengths: list[int] = []
         self._taken: list[list[Any]] = [[] for _ in range(layout.taken)]
         self._big, readable = False, True

@@ -235,7 +235,8 @@ def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: s
 def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bool]:
     """Return left, right, their unit, and whether they are positions."""
     if motion.twist is not None:
-        width = _twist_width_m(config)
+        given = config.wheels.twist_width_m
+        width = given if given is not None else config.robot.track_width_m
         if width is None:
             raise ConfigError(
                 "robot.track_width_m",
@@ -256,11 +257,6 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
         raise ConfigError("wheels.quantity", f"{motion.topic} has no velocity of both sides", "leave it on auto")
     unit: Unit = "counts" if wanted == "counts" else motion.unit
     return *positions, unit, True
-
-
-def _twist_width_m(config: Config) -> float | None:
-    given = config.wheels.twist_width_m
-    return given if given is not None else config.robot.track_width_m
 
 
 def _assumptions(motion: WheelMotion, config: Config) -> list[str]:

@@ -104,7 +104,13 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
     metric = best.topic if best is not None and best.metric is not None else ""
     others -= {_namespace(metric)} if metric else set()
     heading = _ranked(heading, topics.heading, near, others, metric)
-    return Candidates(tuple(wheels), tuple(gnss), tuple(heading), unread | _empty_topics(tables))
+    lost = "none of its {} messages fits its message type"
+    empty: dict[str, str] = {
+        table.topic: lost.format(table.unreadable) if table.unreadable else "no message"
+        for table in tables
+        if not len(table)
+    }
+    return Candidates(tuple(wheels), tuple(gnss), tuple(heading), unread | empty)
 
 
 def _read_all(tables: Sequence[TopicTable], role: Role, config: Config, kind: type[Kind]) -> list[Kind]:
@@ -121,17 +127,6 @@ def _read_all(tables: Sequence[TopicTable], role: Role, config: Config, kind: ty
             except DefinitionError as err:
                 sources.append(kind(**of_topic(table), problem=err.why))
     return sources
-
-
-def _empty_topics(tables: Sequence[TopicTable]) -> dict[str, str]:
-    """Return, for each topic without a usable message, a text: no message, or none that can be read."""
-    return {
-        table.topic: f"none of its {table.unreadable} messages fits its message type"
-        if table.unreadable
-        else "no message"
-        for table in tables
-        if not len(table)
-    }
 
 
 def _independent(source: PositionSource, wheels: Sequence[WheelMotion], topics: TopicsConfig) -> PositionSource:

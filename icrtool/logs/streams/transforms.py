@@ -27,10 +27,11 @@ LARGEST_TRANSLATION_M = 1e9
 
 _PREFIX = "transforms[*]."
 FIELDS = (
-    f"{_PREFIX}header.frame_id", f"{_PREFIX}child_frame_id",
+    f"{_PREFIX}header.frame_id",
+    f"{_PREFIX}child_frame_id",
     *(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz"),
     *(f"{_PREFIX}transform.rotation.{axis}" for axis in "xyzw"),
-)  # fmt: skip
+)
 """Of a transform: parent, child, translation, rotation."""
 
 Transforms = dict[str, tuple[str, Floats, Floats]]

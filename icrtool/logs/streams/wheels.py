@@ -257,9 +257,10 @@ class FixedWheels:
 
 _HALF_COUNTER = 1 << 31
 TICK_FIELDS = (
-    "wheel_tick_factor", "valid_wheels",
+    "wheel_tick_factor",
+    "valid_wheels",
     *(f"wheel_{what}_{place}" for what in ("ticks", "direction") for place in ("fl", "fr", "rl", "rr")),
-)  # fmt: skip
+)
 
 
 def read_ticks(table: TopicTable, _: Config) -> WheelMotion:
