@@ -262,7 +262,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
             scatter = fit.heading_scatter if fit is not None and config.frames.heading == "auto" else 0.0
             if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
                 return align_streams(bare, config)
-            refuse_unexplained(log, fit)
+            refuse_unexplained(log, fit, course)
         derived = fuse_heading(log, windows.track) if free and config.frames.heading == "auto" else None
         heading = align_heading(log, config, (fit, course, convention), derived)
         if derived is not None:

@@ -296,9 +296,12 @@ def _significant(offset: float, std: float) -> bool:
     return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * std)
 
 
-def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None) -> None:
-    """Raise where no convention and no offset makes the heading follow the motion of wheels and fixes."""
-    if fit is not None and fit.heading_scatter > UNEXPLAINED_RAD:
+def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseComparison) -> None:
+    """Raise where no convention and no offset makes the heading follow the motion of wheels and fixes.
+
+    A heading of the other convention that the configuration keeps scatters, too, and is used with its warning.
+    """
+    if fit is not None and fit.heading_scatter > UNEXPLAINED_RAD and not course.mirrored_agreement > EXPLAINED:
         spread = min(math.degrees(fit.heading_scatter), 180.0)
         tried = f"with ENU, NED and any offset it scatters by {spread:.0f}° ({len(fit.windows.begin)} windows)"
         raise _no_heading(log, "does not follow the course over ground", tried)

@@ -21,9 +21,10 @@ from icrtool.alignment.heading.turn_rates import TurnRate, gyro_rate, wheel_rate
 from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensors.sensor_noise import is_hole
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats
+from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
+from icrtool.motion.turns import compare_turns
 from icrtool.records.samples import (
     NO_HEADINGS,
     GyroAxes,
@@ -102,6 +103,10 @@ LARGEST_START_STD_RAD = math.radians(5.0)
 LARGEST_DRIFT = math.radians(10.0)
 """A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
 
+COMPARED_S, LEFT_SHARE, LEAST_GAIN, LARGEST_GAIN = 1.0, 0.3, 0.15, 1.3
+"""A gyro whose turns within a second are those of the wheels but for this share, with such a gain, turns with the
+robot: what contradicts it contradicts the wheels as much, and it is the fixes that err."""
+
 NOISY_SCATTER_RAD = math.radians(6.0)
 """Scatter about the course over ground above which a heading is no attitude sensor's: it drifts, or is noise."""
 
@@ -159,7 +164,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         )
     track = track_of_log(log)
     found = _with_gyro(log, track, None)
-    if found is not None and _is_alive(found.estimate):
+    if found is not None and (_is_alive(found.estimate) or _follows_wheels(found, track, width_m, log)):
         return found
     turn = wheel_rate(track, width_m)
     pair, length = _pair(log, turn)
@@ -202,6 +207,18 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
 def _is_alive(estimate: HeadingEstimate) -> bool:
     """Return whether the turn rate of an estimate turns with the robot."""
     return estimate.noises["angle"] < LARGEST_DRIFT
+
+
+def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: RobotLog) -> bool:
+    """Return whether a gyro turns as the wheels of a robot that may slip do, in windows of time."""
+    gyro = derived.gyro
+    if gyro is None:
+        return False
+    t = (gyro.stamp_ns - int(log.wheels.stamp_ns[0])) / 1e9
+    found = compare_turns(track._replace(heading_t=t, heading=trapezoids(t, gyro.rate_radps)), width_m, 0.0, COMPARED_S)
+    if found is None:
+        return False
+    return found.left_rad < LEFT_SHARE * found.turn_rad and LEAST_GAIN < found.ratio < LARGEST_GAIN
 
 
 def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> DerivedHeading | None:
