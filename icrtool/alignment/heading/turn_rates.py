@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensors.sensor_noise import OUTLIER_SIGMAS, is_hole
+from icrtool.alignment.sensors.sensor_noise import JUMP_SIGMAS, is_hole
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
-from icrtool.kernels.robust import mad_std, robust_regression
+from icrtool.kernels.robust import mad_std, robust_regression, soft_l1_weights
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.samples import GyroAxes
@@ -36,8 +36,8 @@ LARGEST_TURN_ERROR_RAD = 2.0
 FIXES_A_WINDOW = 5
 """Windows share no fix, so that their errors are independent; with fewer fixes, most of the distance would be lost."""
 
-MIDDLE_STD = 0.2
-"""The antenna's speed grows by about so much of half the difference of the sides."""
+MIDDLE_NOISE = 0.01
+"""Turns that change the sides' speeds by less than this show no middle, however exact the courses are."""
 
 LONGEST_STRETCH_S = 60.0
 """Displacements that take longer, or are further apart, are not compared without a turn rate."""
@@ -177,8 +177,15 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
 
 def fit_middle(courses: Courses, guess: Guess) -> float:
     """Return `Guess.middle` by the lengths of the courses: robust regression on the difference of the sides."""
-    columns = np.column_stack([courses.of_middle, np.ones(len(courses.length))])
-    return guess.middle + float(robust_regression(columns, courses.length, np.array([MIDDLE_STD, math.inf])).x[0])
+    x, y = courses.of_middle, courses.length
+    slope, weights = 0.0, np.ones(len(x))
+    for _ in range(3):
+        mean_x, mean_y = np.average(x, weights=weights), np.average(y, weights=weights)
+        spread = float((weights * (x - mean_x) ** 2).sum())
+        slope = float((weights * (x - mean_x) * (y - mean_y)).sum()) / (spread + len(x) * MIDDLE_NOISE**2)
+        left = y - mean_y - slope * (x - mean_x)
+        weights = soft_l1_weights(left / max(mad_std(left, 0.0), 1e-6))
+    return guess.middle + slope
 
 
 def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
@@ -224,7 +231,7 @@ def _without_spikes(track: Track, first: float, last: float) -> tuple[Floats, Co
     if len(rows) < 3:
         return t, place
     bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
-    far = bend > OUTLIER_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
+    far = bend > JUMP_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
     # the neighbours of a spike bend by half as much
     spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
     kept = np.concatenate([[True], ~spike, [True]])

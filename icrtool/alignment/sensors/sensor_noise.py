@@ -25,6 +25,9 @@ MEDIAN_OF_RAYLEIGH = 1.1774
 OUTLIER_SIGMAS = 6.0
 """A step this many robust deviations out of the usual is no noise."""
 
+JUMP_SIGMAS = 8.0
+"""... and this many it is a jump or a spike, by itself."""
+
 SMALLEST_JUMP_M = 0.1
 PERSISTS_S = 1.0
 PERSISTS_SHARE = 0.5
@@ -131,7 +134,7 @@ def _jump_rows(step: Complexes, scale: float, span: int) -> Ints:
     """Return the first row after each jump."""
     count = len(step)
     with np.errstate(invalid="ignore"):
-        found = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, OUTLIER_SIGMAS * scale))
+        found = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, JUMP_SIGMAS * scale))
     found = found[(found >= span) & (found + span < count)]
     if not len(found):
         return np.empty(0, np.int64)
