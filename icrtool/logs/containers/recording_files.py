@@ -195,7 +195,7 @@ def split_files(path: Path) -> list[Path]:
     first, last = (numbered_file(path.with_name(f"{match[1]}{number}{match[4]}")) for number in (match[2], match[3]))
     if first is None or last is None:
         return []
-    beside = filter(None, map(numbered_file, path.parent.iterdir()))
+    beside = filter(None, (numbered_file(file) for file in path.parent.iterdir() if file.name.startswith(match[1])))
     between = (one for one in beside if one.series == first.series and first.order <= one.order <= last.order)
     return [one.path for one in sorted(between, key=lambda one: (one.order, one.number))]
 

@@ -120,3 +120,9 @@ def test_a_damaged_file_of_a_series_stays_a_log_of_its_own(tmp_path: Path) -> No
     write(tmp_path / "drive_1.bag", 10, 20)
     (tmp_path / "drive_2.bag").write_bytes(b"#ROSBAG V2.0\n")
     assert logs(tmp_path) == ["drive_2.bag", "drive_{0..1}.bag"]
+
+
+def test_a_range_names_only_files_that_begin_as_it_does(tmp_path: Path) -> None:
+    for name in ("drive_20.bag", "drive_21.bag", "drive_0021.bag"):
+        (tmp_path / name).touch()
+    assert [file.name for file in split_files(tmp_path / "drive_2{0..3}.bag")] == ["drive_20.bag", "drive_21.bag"]
