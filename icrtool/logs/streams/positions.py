@@ -21,9 +21,6 @@ from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX,
 GBAS = 2
 """NavSatStatus: 2 is fixed or float, drivers differ. A log without any of these states nothing about the solution."""
 
-STATUS_UNKNOWN = -2
-"""NavSatStatus of ROS 2, which has it as the default."""
-
 GPSFIX_STATUS = {
     0: OTHER_FIX, 1: OTHER_FIX, GBAS: RTK_FIX, 18: OTHER_FIX, 19: FIXED_FIX, 20: FLOAT_FIX, 33: OTHER_FIX,
 }  # fmt: skip
