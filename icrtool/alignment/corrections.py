@@ -23,7 +23,7 @@ from icrtool.alignment.conventions import (
     senses_by_distance,
 )
 from icrtool.alignment.estimator import PRIOR_STD, TP, AlignmentFit, estimate_alignment
-from icrtool.alignment.heading.heading_alignment import (
+from icrtool.alignment.heading_alignment import (
     OPPOSITE_SENSE,
     HeadingAlignment,
     align_heading,
@@ -31,7 +31,7 @@ from icrtool.alignment.heading.heading_alignment import (
     refuse_stuck,
     refuse_unexplained,
 )
-from icrtool.alignment.heading.heading_choice import (
+from icrtool.alignment.heading_choice import (
     DerivedHeading,
     as_turn_rate,
     derive_heading,
@@ -39,8 +39,8 @@ from icrtool.alignment.heading.heading_choice import (
     without_heading,
 )
 from icrtool.alignment.log_track import DriveWindows, check_streams, track_of_log, windows_of_log
-from icrtool.alignment.sensors.sensor_noise import FixSteps, measure_steps
-from icrtool.alignment.sensors.wheel_alignment import (
+from icrtool.alignment.sensor_noise import FixSteps, measure_steps
+from icrtool.alignment.wheel_alignment import (
     WheelAlignment,
     align_wheels,
     configured_scales,
@@ -48,7 +48,7 @@ from icrtool.alignment.sensors.wheel_alignment import (
     refuse_standing,
     scaled,
 )
-from icrtool.alignment.sensors.wheel_units import refuse_parked
+from icrtool.alignment.wheel_units import refuse_parked
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.track import Track

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensors.sensor_noise import NOISIER, USUAL_POSITION_STD_M, bend_std_m, unbroken
+from icrtool.alignment.sensor_noise import NOISIER, USUAL_POSITION_STD_M, bend_std_m, unbroken
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.track import Track, cut

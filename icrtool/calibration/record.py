@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.motion.models import (

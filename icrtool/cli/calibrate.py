@@ -116,7 +116,7 @@ def _draw(source: Path, run: Run, plot: Path) -> None:
     from icrtool.alignment.align import choose_reference
     from icrtool.alignment.corrections import align_streams
     from icrtool.alignment.estimator import residuals_by_estimate
-    from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
+    from icrtool.alignment.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import read_log
     from icrtool.output.figures.calibrations import residuals_figure
     from icrtool.output.files.formats import save_picture

@@ -102,7 +102,7 @@ def _examine(found: Found, config: Config, part: Span, stages: Stages) -> None:
     IcrToolError
         The log cannot be fitted.
     """
-    from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
+    from icrtool.alignment.wheel_units import with_wheel_speeds
     from icrtool.logs.read_log import is_table, read_log, survey_log
     from icrtool.logs.streams.assembly import assemble
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from icrtool.alignment.sensors.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
+from icrtool.alignment.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from icrtool import __version__
-from icrtool.alignment.sensors.gnss_quality import CLASSES
+from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.config import Config
 from icrtool.estimation.observability import (
     cut_states,

@@ -48,7 +48,7 @@ class Fixes(Samples):
     stamp_ns : int64 (m,), non-decreasing, of the wheels' clock
     north_m, east_m : float64 (m,)
     var_north_m2, var_east_m2 : float64 (m,), finite
-    fix_class : uint8 (m,), keys of `icrtool.alignment.sensors.gnss_quality.CLASSES`
+    fix_class : uint8 (m,), keys of `icrtool.alignment.gnss_quality.CLASSES`
     misreported : bool (m,), reported as RTK-fixed, but not a fixed solution
     down_weighted : bool (m,), given a larger variance for their class
     """

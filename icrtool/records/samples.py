@@ -61,7 +61,7 @@ class WheelSamples(Samples):
     stamp_ns : int64 (n,), strictly increasing
     left, right : float64 (n,), forward positive, each held over [k, k+1); [m/s], or in `unit` per second
     unit : ``mps``: speeds that are ready to use; else as the log sends them, in this unit per second, without the
-        configured scales, until `icrtool.alignment.sensors.wheel_units` has made speeds of them
+        configured scales, until `icrtool.alignment.wheel_units` has made speeds of them
     from_position : the log sends positions, of which these are the mean speeds to the next sample
     """
 

@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import orjson
 
-from icrtool.alignment.sensors.gnss_quality import CLASSES
+from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import GATED, UNSEEN

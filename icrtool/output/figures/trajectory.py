@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from icrtool.alignment.sensors.gnss_quality import CLASSES, REFERENCE
+from icrtool.alignment.gnss_quality import CLASSES, REFERENCE
 from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.sensors.wheel_units import reference_scale
+from icrtool.alignment.wheel_units import reference_scale
 from icrtool.config import load_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit

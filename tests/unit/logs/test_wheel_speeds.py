@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.sensors.gnss_quality import grade_fixes
-from icrtool.alignment.sensors.sensor_noise import without_frozen
+from icrtool.alignment.gnss_quality import grade_fixes
+from icrtool.alignment.sensor_noise import without_frozen
 from icrtool.config import load_config
 from icrtool.dropout_analysis.outages import real_outages
 from icrtool.estimation.fit import fit

@@ -6,13 +6,14 @@ speeds are integrated along the measured heading for the place, and by themselve
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import cut_windows, track_of_streams, window_length
-from icrtool.alignment.sensors.sensor_noise import FEWEST_FIXES, USUAL_POSITION_STD_M, is_hole
+from icrtool.alignment.sensor_noise import FEWEST_FIXES, MOVES_MPS, USUAL_POSITION_STD_M, is_hole
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapezoids
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
@@ -35,6 +36,23 @@ WINDOW_M = 1.0
 """The motion is estimated over shorter windows than the alignment: events disturb fewer of them."""
 
 LEAST_TURN_GAIN = 1e-3
+
+WINDOWS_S = (0.5, 1.0, 2.0)
+LONGEST_WINDOW_S = 16.0
+"""Windows are doubled to this where the fixes are too noisy for shorter ones."""
+
+LEAST_DISTANCE2 = 36.0
+"""Squared Mahalanobis distance of a window in which an event is seen."""
+
+LEAST_MODEL_ERROR = 0.03
+FIRST_QUANTILE, LATER_QUANTILE = 0.7, 0.95
+"""The model's error is what this share of the windows stays within: the first time events are still among them."""
+
+NORMAL_QUANTILE = {FIRST_QUANTILE: 1.0364, LATER_QUANTILE: 1.9600}
+"""Of the absolute value of a standard normal."""
+
+MOVING_SHARE = 0.2
+"""Windows in which the wheels do less than this part of the usual show nothing of the model's error."""
 
 
 class Knots(NamedTuple):
@@ -75,13 +93,6 @@ class Knots(NamedTuple):
     def place(self) -> Complexes:
         """Fixes (m,), north + j east [m]."""
         return self.track.place
-
-    def rows(self, kept: Bools) -> Knots:
-        """Return the knots marked in `kept` (m,)."""
-        columns: dict[str, Any] = {
-            name: value[kept] for name, value in self._asdict().items() if isinstance(value, np.ndarray)
-        }
-        return self._replace(track=self.track.places(kept), **columns)
 
 
 class Motion(NamedTuple):
@@ -151,22 +162,31 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     track = track_of_streams(wheels, fixes, headings, same_clock=sensors.heading_from_position)
     left, right = track.v_left, track.v_right
     begin, end = (pick(track.t[at], track.heading_t[at]) for pick, at in ((max, 0), (min, -1)))
-    rows = _thinned(track.place_t, begin, end)
+    rows = np.flatnonzero((track.place_t >= begin) & (track.place_t <= end))
+    if len(rows) > 1:
+        usual = float(np.median(np.diff(track.place_t[rows])))
+        rows = rows[:: max(1, round(KNOT_S / usual))] if usual > 0 else rows
+        rows = rows[np.diff(track.place_t[rows], prepend=-np.inf) > KNOT_S / 10]
     if len(rows) < FEWEST_FIXES:
         return None
     track = track.places(rows)
     t = track.place_t
-    ahead, behind = (track._replace(place_t=t + shift_s) for shift_s in (SPEED_S / 2, -SPEED_S / 2))
-    speeds = [(ahead.at_places(speed) - behind.at_places(speed)) / SPEED_S for speed in (left, right)]
+    v_left, v_right = (
+        (np.interp(t + SPEED_S / 2, track.t, gone) - np.interp(t - SPEED_S / 2, track.t, gone)) / SPEED_S
+        for gone in (track.cumulate(left), track.cumulate(right))
+    )
     heading = track.heading_at(t)
+    holes = np.zeros(len(t), np.int64)
+    for sampled in (track.t, track.heading_t, t):
+        holes += np.searchsorted(sampled[:-1][is_hole(np.diff(sampled), LONGEST_HOLE_S)], t)
     return Knots(
         epoch_ns=int(wheels.stamp_ns[0]), track=track,
         variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2)[rows] / 2, USUAL_POSITION_STD_M**2),
-        heading=heading, turn_variance=_white_variance(heading),
-        velocity=(speeds[0] + speeds[1]) / 2 * np.exp(1j * heading), apart=speeds[0] - speeds[1],
+        # at most this is noise
+        heading=heading, turn_variance=mad_std(np.diff(heading, 2), 0.0) ** 2 / 6,
+        velocity=(v_left + v_right) / 2 * np.exp(1j * heading), apart=v_left - v_right,
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
-        holes=sum((_holes(t, sampled) for sampled in (track.t, track.heading_t, t)), np.zeros(len(t), np.int64)),
-        fix_class=fixes.fix_class[rows], turn_follows_place=sensors.heading_is_estimated,
+        holes=holes, fix_class=fixes.fix_class[rows], turn_follows_place=sensors.heading_is_estimated,
         gyro=_turn_by_gyro(sensors, t, heading),
     )  # fmt: skip
 
@@ -180,6 +200,20 @@ def _turn_by_gyro(sensors: SensorData, t: Floats, heading: Floats) -> Floats | N
     turned = trapezoids(at, gyro.rate_radps)
     line = fit_gyro_line(at, gyro.rate_radps, turned, t, heading)
     return line.scale * np.interp(t + line.lead_s, at, turned) + line.bias_radps * t if line.is_yaw else None
+
+
+def window_durations(knots: Knots) -> list[float]:
+    """Return the durations of the windows: doubled until the usual distance stands out of the noise of the fixes."""
+    path, dt = np.diff(knots.track.distance), np.diff(knots.t)
+    moving = path > MOVES_MPS * dt
+    if not moving.any():
+        return list(WINDOWS_S)
+    speed = float(np.median(path[moving] / dt[moving]))
+    needed = math.sqrt(2 * LEAST_DISTANCE2 * float(np.median(knots.variance)))
+    durations = list(WINDOWS_S)
+    while speed * durations[-1] < needed and durations[-1] < LONGEST_WINDOW_S:
+        durations.append(2 * durations[-1])
+    return durations
 
 
 def spans_of(knots: Knots, duration_s: float) -> tuple[Ints, Ints]:
@@ -201,15 +235,12 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     """
     windows = cut_windows(knots.track, window_length(knots.track, WINDOW_M))
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
-
-    def clear(begin: Ints, end: Ints) -> Bools:
-        return np.asarray((disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin]))
-
-    kept = clear(windows.begin, windows.end)
-    turns = [
-        np.searchsorted(knots.t, edge).clip(0, len(knots.t) - 1) for edge in (windows.turn_begin, windows.turn_end)
-    ]
-    fit = estimate_alignment(windows.rows(kept, clear(turns[0], turns[1])), width_m)
+    turns = np.searchsorted(knots.t, [windows.turn_begin, windows.turn_end]).clip(0, len(knots.t) - 1)
+    kept, turns_kept = (
+        (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])
+        for begin, end in ((windows.begin, windows.end), turns)
+    )
+    fit = estimate_alignment(windows.rows(kept, turns_kept), width_m)
     if fit is None:
         return None
     place, turn = fit.expected_motion()
@@ -242,27 +273,6 @@ def compare(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: f
     )  # fmt: skip
 
 
-def _thinned(t: Floats, begin: float, end: float) -> Ints:
-    """Return rows of fixes between two times, about `KNOT_S` apart or more."""
-    rows = np.flatnonzero((t >= begin) & (t <= end))
-    if len(rows) < 2:
-        return rows
-    usual = float(np.median(np.diff(t[rows])))
-    rows = rows[:: max(1, round(KNOT_S / usual))] if usual > 0 else rows
-    later = np.concatenate([[True], np.diff(t[rows]) > KNOT_S / 10])
-    return np.asarray(rows[later])
-
-
-def _holes(t: Floats, sampled: Floats) -> Ints:
-    """Return the number of holes of a stream before each time (m,)."""
-    return np.searchsorted(sampled[:-1][is_hole(np.diff(sampled), LONGEST_HOLE_S)], t)
-
-
-def _white_variance(values: Floats) -> float:
-    """Return the variance of values (m,) from their second differences: at most this is noise."""
-    return mad_std(np.diff(values, 2), 0.0) ** 2 / 6 if len(values) > 2 else 0.0
-
-
 def _held_variance(t: Floats, v_left: Floats, v_right: Floats) -> Floats:
     """Return the summed variance (n,) of a side's distance by held values.
 
@@ -276,3 +286,19 @@ def _held_variance(t: Floats, v_left: Floats, v_right: Floats) -> Floats:
     variance = np.zeros(len(t))
     variance[changed] = (change[changed - 1] * held) ** 2 / 12
     return np.cumsum(variance)
+
+
+def model_error(windows: ComparedWindows, quiet: Bools, quantile: float) -> Floats:
+    """Return the standard deviation of the model's error (3,), a share of the wheels' motion.
+
+    Sensor noise s and model error k p leave a share q of the residuals r within n standard deviations where k is the
+    q-quantile of sqrt(r^2 / n^2 - s^2) / p.
+    """
+    disturbed = np.concatenate([[0], np.cumsum(~quiet)])
+    used = disturbed[windows.end + 1] == disturbed[windows.begin]
+    used &= windows.path_m > MOVING_SHARE * (float(np.quantile(windows.path_m, 0.9)) if len(used) else 0.0)
+    if not used.any():
+        return np.full(3, LEAST_MODEL_ERROR)
+    excess = (windows.residual[used] / NORMAL_QUANTILE[quantile]) ** 2 - windows.sensor[used]
+    square = np.quantile(excess / windows.path_m[used, None] ** 2, quantile, axis=0)
+    return np.asarray(np.sqrt(np.maximum(square, LEAST_MODEL_ERROR**2)))

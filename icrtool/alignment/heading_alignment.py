@@ -10,9 +10,9 @@ import numpy as np
 
 from icrtool.alignment.conventions import Convention
 from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
-from icrtool.alignment.heading.heading_choice import NOISY_SCATTER_RAD, DerivedHeading, stated_source
+from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading, stated_source
 from icrtool.alignment.log_track import FEWEST_WINDOWS, STARTS_A_WINDOW, DriveWindows
-from icrtool.alignment.sensors.sensor_noise import unbroken
+from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.sensors.wheel_alignment import bridged
+from icrtool.alignment.wheel_alignment import bridged
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import DataError

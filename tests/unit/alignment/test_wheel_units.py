@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import load_config
 from support.drives import make_log
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from icrtool.alignment.heading.heading_alignment import name_offset, utm_convergence_deg
+from icrtool.alignment.heading_alignment import name_offset, utm_convergence_deg
 from icrtool.records.samples import Datum
 
 SIGMA_RAD = math.radians(0.1)

@@ -15,7 +15,7 @@ import numpy as np
 
 from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
 from icrtool.alignment.log_track import FEWEST_WINDOWS, DriveWindows
-from icrtool.alignment.sensors.sensor_noise import unbroken
+from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, rows_at_steps

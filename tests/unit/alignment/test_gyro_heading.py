@@ -12,11 +12,11 @@ from scipy.signal import lfilter
 
 import icrtool
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.heading.gyro_heading import estimate_heading
-from icrtool.alignment.heading.heading_choice import DerivedHeading, derive_heading, fuse_heading
-from icrtool.alignment.heading.turn_rates import TurnRate
+from icrtool.alignment.gyro_heading import estimate_heading
+from icrtool.alignment.heading_choice import DerivedHeading, derive_heading, fuse_heading
 from icrtool.alignment.log_track import track_of_log
-from icrtool.alignment.sensors.wheel_units import with_wheel_speeds
+from icrtool.alignment.turn_rates import TurnRate
+from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.estimation.fit import fit
 from icrtool.records.samples import NO_HEADINGS, GyroAxes, HeadingSamples, OtherReceiver
 from icrtool.records.tables import RobotLog

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from icrtool.alignment.estimator import ATTITUDE_STD_RAD
-from icrtool.alignment.heading.gyro_heading import (
+from icrtool.alignment.gyro_heading import (
     LAG,
     OFFSET,
     WANDERS,
@@ -17,9 +17,9 @@ from icrtool.alignment.heading.gyro_heading import (
     HeadingEstimate,
     estimate_heading,
 )
-from icrtool.alignment.heading.turn_rates import TurnRate, gyro_rate, wheel_rate
 from icrtool.alignment.log_track import fix_std_m, track_of_log
-from icrtool.alignment.sensors.sensor_noise import is_hole
+from icrtool.alignment.sensor_noise import is_hole
+from icrtool.alignment.turn_rates import TurnRate, gyro_rate, wheel_rate
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import mad_std

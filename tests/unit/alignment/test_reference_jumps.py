@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.slip.slip_events import find_disagreements
+from icrtool.alignment.slip_events import find_disagreements
 from icrtool.kernels.arrays import Floats
 from icrtool.records.measurements import ReferenceJump, SensorData
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensors.sensor_noise import (
+from icrtool.alignment.sensor_noise import (
     FEWEST_STEPS,
     LARGEST_SANE_GNSS_STD_M,
     NOISIER,

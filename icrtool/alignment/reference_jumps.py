@@ -9,12 +9,13 @@ shows stays undecided, and is the robot's.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
-from icrtool.alignment.sensors.sensor_noise import OUTLIER_SIGMAS
-from icrtool.alignment.slip.slip_windows import ComparedWindows, Knots, Motion, compare
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.alignment.sensor_noise import OUTLIER_SIGMAS
+from icrtool.alignment.slip_windows import Knots, Motion, compare
+from icrtool.kernels.arrays import Bools, Ints
 from icrtool.records.measurements import ReferenceJump
 
 JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3
@@ -34,7 +35,10 @@ def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Ints]:
     step, over = _beyond(knots, row[:-1], row[1:], width_m), _beyond(knots, row[:-2], row[2:], width_m)
     kept = np.ones(len(row), np.bool_)
     kept[1:-1] = ~(step[:-1] & step[1:] & ~over)
-    knots = knots.rows(kept)
+    columns: dict[str, Any] = {
+        name: value[kept] for name, value in knots._asdict().items() if isinstance(value, np.ndarray)
+    }
+    knots = knots._replace(track=knots.track.places(kept), **columns)
     row = row[: len(knots.t)]
     first = np.flatnonzero(_beyond(knots, row[:-1], row[1:], width_m))
     holes = np.searchsorted(first, row - 1, side="right")
@@ -68,74 +72,51 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     speed = np.diff(knots.track.distance) / np.diff(knots.t)
     # how fast the wheels drive the robot at most, but for single samples
     slide = (SLIDE_MPS + motion.scale * float(np.quantile(speed, 0.99))) * duration
-    along, turns = motion.scale * knots.track.distance, motion.lever_m * motion.turn
-    jitter, spin = (_by_jitter(knots, one, first) for one in (along, turns))
+    # what the wheels do in the time by which stamps are wrong, before and after each step
+    reach = (knots.t[last] + 3 * STAMP_STD_S, knots.t[first] - 3 * STAMP_STD_S)
+    jitter, spin = (
+        np.abs(np.interp(reach[0], knots.t, along) - np.interp(reach[1], knots.t, along) - (along[last] - along[first]))
+        for along in (motion.scale * knots.track.distance, motion.lever_m * motion.turn)
+    )
     noise = OUTLIER_SIGMAS * np.sqrt(windows.sensor)
     ahead = np.maximum(np.abs(windows.ahead) - jitter, 0.0)
     moved = np.hypot(ahead, windows.aside) - noise[:, :2].max(axis=1)
     turned = np.maximum(np.abs(windows.turned) - spin, 0.0) - noise[:, 2]
     turned = np.where(knots.turn_follows_place, 0.0, turned)
-    restated = knots.fix_class[first] != knots.fix_class[last]
-    shown = (moved > JUMP_MPS * duration) | (turned > JUMP_MPS * duration)
-    alone = (turned > JUMP_MPS * duration) & _turn_with_wheels(knots, motion, windows, duration)
-    return tuple(
-        _jump(
-            knots, motion, windows, row,
-            _cause(
-                far=bool(moved[row] > slide[row]), turn=bool(turned[row] > slide[row]), stated=bool(restated[row]),
-                alone=bool(alone[row]),
-            ),
-        )
-        for row in np.flatnonzero(shown).tolist()
-    )  # fmt: skip
-
-
-def _turn_with_wheels(knots: Knots, motion: Motion, windows: ComparedWindows, duration: Floats) -> Bools:
-    """Return whether a gyro turns as the wheels do (s,), nearer to them than to the reference."""
+    alone = turned > JUMP_MPS * duration
+    shown = (moved > JUMP_MPS * duration) | alone
     if knots.gyro is None:
-        return np.zeros(len(duration), np.bool_)
-    by_gyro = motion.lever_m * (knots.gyro[windows.end] - knots.gyro[windows.begin])
-    slipped = np.abs(by_gyro - windows.model_turned)
-    return np.asarray(slipped < np.minimum(JUMP_MPS * duration, np.abs(windows.turned) / 2))
-
-
-def _by_jitter(knots: Knots, along: Floats, first: Ints) -> Floats:
-    """Return the motion of the wheels (s,) in the time by which stamps are wrong, before and after each step.
-
-    Parameters
-    ----------
-    along : (m,) the wheels' motion until each knot
-    """
-    off, last = 3 * STAMP_STD_S, first + 1
-    reach = np.interp(knots.t[last] + off, knots.t, along) - np.interp(knots.t[first] - off, knots.t, along)
-    return np.abs(np.asarray(reach - (along[last] - along[first])))
-
-
-def _cause(*, far: bool, turn: bool, stated: bool, alone: bool) -> str:
-    """Return why a step is no motion of the robot; empty where it may be."""
-    if stated:
-        return "the receiver changes its solution there"
-    if alone:
-        return "gyro and wheels do not turn with it"
-    return "faster than any slide" if far else "turns faster than any robot" if turn else ""
-
-
-def _jump(knots: Knots, motion: Motion, windows: ComparedWindows, row: int, why: str) -> ReferenceJump:
-    first, last = int(windows.begin[row]), int(windows.end[row])
+        alone[:] = False
+    else:
+        # a gyro turns as the wheels do, nearer to them than to the reference
+        by_gyro = motion.lever_m * (knots.gyro[last] - knots.gyro[first])
+        slipped = np.abs(by_gyro - windows.model_turned)
+        alone &= slipped < np.minimum(JUMP_MPS * duration, np.abs(windows.turned) / 2)
+    restated = knots.fix_class[first] != knots.fix_class[last]
+    causes = {
+        "the receiver changes its solution there": restated,
+        "gyro and wheels do not turn with it": alone,
+        "faster than any slide": moved > slide,
+        "turns faster than any robot": turned > slide,
+    }
+    why = np.select(list(causes.values()), list(causes), "")
     level = np.exp(0.5j * (knots.heading[first] + knots.heading[last]))
-    moved = complex((windows.ahead[row] + 1j * windows.aside[row]) * level)
-    turned = 0.0 if knots.turn_follows_place else float(windows.turned[row]) / motion.lever_m
-    place = complex(knots.place[first])
-    return ReferenceJump(
-        kind="heading" if abs(turned) * motion.lever_m > abs(moved) else "position",
-        begin_ns=knots.epoch_ns + round(float(knots.t[first]) * 1e9),
-        end_ns=knots.epoch_ns + round(float(knots.t[last]) * 1e9),
-        north_m=place.real,
-        east_m=place.imag,
-        size_m=abs(moved),
-        turn_deg=math.degrees(turned),
-        moved_north_m=moved.real,
-        moved_east_m=moved.imag,
-        why=why or "may be slip: cause undecided",
-        undecided=not why,
+    by = (windows.ahead + 1j * windows.aside) * level
+    turn = np.zeros(len(first)) if knots.turn_follows_place else windows.turned / motion.lever_m
+    stamps, place = knots.epoch_ns + np.rint(knots.t * 1e9).astype(np.int64), knots.place
+    return tuple(
+        ReferenceJump(
+            kind="heading" if abs(turn[row]) * motion.lever_m > abs(by[row]) else "position",
+            begin_ns=int(stamps[first[row]]),
+            end_ns=int(stamps[last[row]]),
+            north_m=float(place[first[row]].real),
+            east_m=float(place[first[row]].imag),
+            size_m=float(abs(by[row])),
+            turn_deg=math.degrees(turn[row]),
+            moved_north_m=float(by[row].real),
+            moved_east_m=float(by[row].imag),
+            why=str(why[row]) or "may be slip: cause undecided",
+            undecided=not why[row],
+        )
+        for row in np.flatnonzero(shown)
     )

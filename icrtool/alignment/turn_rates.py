@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensors.sensor_noise import JUMP_SIGMAS, is_hole
+from icrtool.alignment.sensor_noise import JUMP_SIGMAS, is_hole
 from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import mad_std, robust_regression, soft_l1_weights
 from icrtool.kernels.track import Track

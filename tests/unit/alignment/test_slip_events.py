@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.slip.slip_events import find_disagreements
+from icrtool.alignment.slip_events import find_disagreements
 from icrtool.kernels.arrays import Floats
 from icrtool.records.measurements import Fixes, SensorData, SlipEvent
 from icrtool.records.samples import HeadingSamples, WheelSamples

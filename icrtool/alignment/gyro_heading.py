@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS
-from icrtool.alignment.heading.turn_rates import Guess, TurnRate, fit_middle, measure_courses
 from icrtool.alignment.log_track import FEWEST_WINDOWS
+from icrtool.alignment.turn_rates import Guess, TurnRate, fit_middle, measure_courses
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.robust import long_run_factor
 from icrtool.kernels.track import Track

@@ -1,1 +1,0 @@
-"""Heading of the robot: which source, how it is made, what offset it has."""

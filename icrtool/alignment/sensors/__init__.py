@@ -1,1 +1,0 @@
-"""Wheels and positions, each by itself: units, scales, quality and noise."""

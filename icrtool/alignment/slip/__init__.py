@@ -1,1 +1,0 @@
-"""Slip events: where wheels and motion disagree."""

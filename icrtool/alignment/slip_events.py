@@ -1,0 +1,414 @@
+"""Where wheels and reference disagree beyond what motion model and noise of the sensors allow: slip events, and jumps.
+
+Pentzer 2014, Sections 2 and 7: ICRs that grow without bound mean pure slip or a robot that is stuck. Here it is found
+from the aligned measurements, before any filter, by a test over windows of half a second and more.
+
+A step between two fixes shows little, and a sum of them much: the log likelihood ratio of "this share of each side's
+motion is missing" over "none is" grows through an event and falls outside it (Page 1954). That gives begin and end.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.alignment.reference_jumps import decide_jumps, without_jumps
+from icrtool.alignment.sensor_noise import MOVES_MPS
+from icrtool.alignment.slip_windows import (
+    FIRST_QUANTILE,
+    LATER_QUANTILE,
+    LEAST_DISTANCE2,
+    LEAST_MODEL_ERROR,
+    WINDOWS_S,
+    ComparedWindows,
+    Knots,
+    Motion,
+    compare,
+    fit_motion,
+    lay_knots,
+    model_error,
+    spans_of,
+    window_durations,
+)
+from icrtool.kernels.arrays import Bools, Floats
+from icrtool.records.measurements import RESPONSE_S, ReferenceJump, SensorData, SlipEvent, SlipKind
+
+LEAST_SHARE = 0.3
+"""... and the least share of the wheels' motion that the robot does not make, or makes sideways."""
+
+LEAST_OF_SIDE = 0.12
+"""... where the robot drives and one side keeps to its wheels. In a spin a side slips by its own share."""
+
+STUCK_SHARE = 0.2
+"""Robot that moves and turns less than this share of what its wheels do: immobilised."""
+
+FEWEST_INTERVALS = 2
+"""An event is seen in at least so many intervals between fixes: one alone may be a jump."""
+
+KEEPING_SHARE = 1 / 3
+"""A side that disagrees by less than this part of what the other does keeps to its wheels."""
+
+STEADY_SHARE = 0.8
+"""... and what the other lacks has the same sign, but for this."""
+
+LONGEST_STAMP_ERROR_S = 1.0
+"""For longer no reference lags by a wrong stamp."""
+
+MOST_FALSE = 0.25
+"""Most windows that show what slip cannot do, for each that shows slip as clearly."""
+
+RETURN_S, RETURNED_SHARE, RETURN_SIGMAS = 5.0, 0.5, 5.0
+"""A reference that comes back by this share within this time was wrong; what is missed must stand out of its noise."""
+
+SHORTEST_EVENT_S = 0.5
+FEWEST_STEPS = 2
+
+MOST_EVIDENCE = 4.0
+"""One step counts no more than this for an event or against it: a jump is not one."""
+
+LOST_EVIDENCE = 8.0
+"""An event has ended where this much of its evidence is lost again."""
+
+CLEAR_STEP = 2.0
+"""A step whose missing motion is so many standard deviations shows where in it an event begins."""
+
+CHUNK = 64
+"""Steps that are evaluated together while an event grows."""
+
+
+class Disagreements(NamedTuple):
+    """Where the reference does not do what the wheels do: by the robot, or by an error of its own; in order of time."""
+
+    events: tuple[SlipEvent, ...] = ()
+    jumps: tuple[ReferenceJump, ...] = ()
+
+
+def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
+    """Find the spans in which the robot did not do what its wheels did, and those in which the reference jumps.
+
+    Parameters
+    ----------
+    sensors : aligned: sides, signs, scale, conventions and delays corrected
+    width_m : distance b between the track centre lines, or what stands for it
+
+    Returns
+    -------
+    Disagreements
+        None where the motion model cannot be fitted.
+
+    Notes
+    -----
+    Windows of 0.5 to 2 s (longer where the fixes are noisy): displacement ahead and aside and turn, reference minus
+    model, over their standard deviations: noise of fixes and heading, wheel values held by the recorder, response time
+    at changes of speed, and the model's own error, a share of the distance, which is estimated from the log. The
+    squared Mahalanobis distance is chi-squared with 3 degrees of freedom.
+
+    A reference that is worse than it states makes the robot do too much as often as too little. Windows in which a side
+    does more than its wheels, which no slip can cause, are counted: where there are many, the others are not used
+    (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
+
+    Steps from fix to fix that may be jumps (`icrtool.alignment.reference_jumps`) are in no window.
+    """
+    # exact data, or intervals of very different lengths, may not separate the parameters of the motion
+    with suppress(np.linalg.LinAlgError):
+        knots = lay_knots(sensors)
+        if knots is None:
+            return Disagreements()
+        knots, steps = without_jumps(knots, width_m)
+        motion = fit_motion(knots, width_m, np.ones(len(knots.t), np.bool_))
+        if motion is None:
+            return Disagreements()
+        _, quiet = _find_events(knots, motion, np.ones(len(knots.t), np.bool_), FIRST_QUANTILE)
+        motion = motion if quiet.all() else fit_motion(knots, width_m, quiet)
+        if motion is None:
+            return Disagreements()
+        events, _ = _find_events(knots, motion, quiet, LATER_QUANTILE)
+        return Disagreements(tuple(events), decide_jumps(knots, motion, steps))
+    return Disagreements()
+
+
+def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple[list[SlipEvent], Bools]:
+    """Return the events, which do not overlap, and the knots (m,) outside of them.
+
+    Parameters
+    ----------
+    quiet : (m,) knots that the model's error is taken from; it is this quantile of what they show
+    """
+    windows, distance2, false_rate, error = _weigh(knots, motion, quiet, quantile)
+    row = np.arange(len(knots.t))
+    steps = compare(knots, motion, row[:-1], row[1:], RESPONSE_S)
+    whole = knots.holes[1:] == knots.holes[:-1]
+    free, quiet, events = whole.copy(), np.ones(len(knots.t), np.bool_), list[SlipEvent]()
+    tests = max(1.0, float(knots.t[-1] - knots.t[0]) / WINDOWS_S[0])
+    # the clearest first
+    for at in np.argsort(-distance2, kind="stable"):
+        core = slice(int(windows.begin[at]), int(windows.end[at]))
+        if false_rate[at] > MOST_FALSE or not free[core].all():
+            continue
+        extent = _find_extent(knots.t, steps, error, whole & free, core)
+        if extent is None or not _is_slip(knots, steps, extent):
+            continue
+        free[extent.first : extent.last] = False
+        quiet[max(extent.first - 1, 0) : extent.last + 2] = False
+        place, far = complex(knots.place[extent.first]), float(distance2[at])
+        # the probability that chi-squared with 3 degrees of freedom is larger
+        tail = math.erfc(math.sqrt(far / 2)) + math.sqrt(2 * far / math.pi) * math.exp(-far / 2)
+        events.append(
+            SlipEvent(
+                kind=extent.kind,
+                begin_ns=knots.epoch_ns + round(extent.begin_s * 1e9),
+                end_ns=knots.epoch_ns + round(extent.end_s * 1e9),
+                north_m=place.real,
+                east_m=place.imag,
+                distance_m=extent.distance_m,
+                severity=extent.severity,
+                confidence=(1.0 - float(false_rate[at])) * max(0.0, 1.0 - tests * tail),
+            )
+        )
+    return sorted(events, key=lambda event: event.begin_ns), quiet
+
+
+def _weigh(
+    knots: Knots, motion: Motion, quiet: Bools, quantile: float
+) -> tuple[ComparedWindows, Floats, Floats, Floats]:
+    """Return the windows (w,) of all durations that disagree with the model, and how surely.
+
+    Returns
+    -------
+    the windows; their squared Mahalanobis distance (w,); the share of errors (w,) that is expected among windows as
+    clear as each, inf where slip cannot be the cause; the model's error (3,) over the shortest of all windows
+    """
+    shown: list[tuple[ComparedWindows, Floats]] = []
+    error = np.full(3, LEAST_MODEL_ERROR)
+    for duration in reversed(window_durations(knots)):
+        first, last = spans_of(knots, duration)
+        long = last - first >= FEWEST_INTERVALS
+        windows = compare(knots, motion, first[long], last[long], RESPONSE_S)
+        error = model_error(windows, quiet, quantile)
+        # while the robot parks, sensors without noise leave no variance to divide by
+        windows = windows.rows(windows.path_m > MOVES_MPS * duration)
+        square = (windows.residual**2 / (windows.sensor + (error * windows.path_m[:, None]) ** 2)).sum(axis=1)
+        missed = np.hypot(np.hypot(windows.ahead, windows.turned), windows.aside)
+        drives = np.abs(windows.model_ahead) > np.abs(windows.model_turned)
+        least = np.where(_of_one_side(windows) & drives, LEAST_OF_SIDE, LEAST_SHARE)
+        shows = (square > LEAST_DISTANCE2) & (missed > least * windows.path_m)
+        shown.append((windows.rows(shows), square[shows]))
+    windows = ComparedWindows._make(map(np.concatenate, zip(*(one for one, _ in shown), strict=True)))
+    square, beyond = np.concatenate([one for _, one in shown]), _exceeds(windows)
+    # what stands still is rarer than any slip, and so is its opposite: twice the motion of the wheels
+    doubled = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
+    doubled = np.maximum(doubled, np.abs(windows.turned - windows.model_turned))
+    still, twice = (far < STUCK_SHARE * windows.path_m for far in (windows.made, doubled))
+    of_stuck = _false_rate(windows, square, still, twice)
+    of_others = _false_rate(windows, square, ~beyond & ~still, beyond)
+    return windows, square, np.where(still, of_stuck, np.where(beyond, np.inf, of_others)), error
+
+
+def _exceeds(windows: ComparedWindows) -> Bools:
+    """Return which windows show more motion than the wheels', of a side and of distance or turn, or the opposite.
+
+    A side without grip turns the robot more than both sides would; a robot in a rut drags the slower side along.
+    """
+    least = LEAST_SHARE * windows.path_m
+
+    def beyond(model: Floats, residual: Floats) -> Bools:
+        missed = -np.sign(model) * residual
+        return np.asarray((missed < -least) | (missed > np.abs(model) + least))
+
+    of_side = beyond(windows.model_sides, windows.of_sides).any(axis=0)
+    of_all = beyond(windows.model_ahead, windows.ahead) | beyond(windows.model_turned, windows.turned)
+    return of_side & of_all & ~_of_one_side(windows)
+
+
+def _of_one_side(windows: ComparedWindows) -> Bools:
+    """Return in which windows one side keeps to its wheels: the other has no grip, and may be dragged along."""
+    sides = np.abs(windows.of_sides)
+    return np.asarray(sides.min(axis=0) < KEEPING_SHARE * sides.max(axis=0))
+
+
+def _false_rate(windows: ComparedWindows, distance2: Floats, targets: Bools, decoys: Bools) -> Floats:
+    """Return, for each window, the decoys over the targets among those as clear as it or clearer (w,).
+
+    Windows that overlap are one run, as clear as the clearest of them.
+    """
+    beyond = []
+    for kind in (decoys, targets):
+        order = np.flatnonzero(kind)[np.argsort(windows.begin[kind], kind="stable")]
+        apart = windows.begin[order][1:] >= np.maximum.accumulate(windows.end[order])[:-1]
+        runs = np.flatnonzero(np.append(True, apart)[: len(order)])
+        clearest = np.sort(np.maximum.reduceat(distance2[order], runs)) if len(order) else np.empty(0)
+        beyond.append(len(clearest) - np.searchsorted(clearest, distance2))
+    return np.asarray(beyond[0] / np.maximum(beyond[1], 1))
+
+
+def _is_slip(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
+    """Return whether an event is severe enough, and no error of the reference.
+
+    No error of a position or of a heading makes one side do what its wheels do, and the other lack a steady part of it,
+    except that of a stamp while the robot turns about a side: it is short, or comes and goes. Of a side without grip
+    the severity counts as the root mean square over both sides.
+    """
+    inside = steps.rows(slice(extent.first, extent.last))
+    sides, noise2 = inside.of_sides, inside.sensor[:, 0] + inside.sensor[:, 2]
+    total, each = np.abs(sides.sum(axis=1)), np.sqrt(np.maximum(sides**2 - noise2, 0.0)).sum(axis=1)
+    keeping, missing = np.argsort(total)
+    steady = total[missing] > STEADY_SHARE * each[missing] and total[keeping] < KEEPING_SHARE * total[missing]
+    if steady and extent.end_s - extent.begin_s > LONGEST_STAMP_ERROR_S:
+        return extent.severity >= LEAST_OF_SIDE * math.sqrt(0.5)
+    return extent.severity >= LEAST_SHARE and not _returns(knots, steps, extent)
+
+
+def _returns(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
+    """Return whether the reference makes up, shortly before or after, for the motion that is missing in the event.
+
+    A reference that is wrong for a while comes back; distance and turn lost by slip do not.
+    """
+    middle = (knots.heading[1:] + knots.heading[:-1]) / 2
+    low, high = np.searchsorted(knots.t, [extent.begin_s - RETURN_S, extent.end_s + RETURN_S])
+    rows = np.arange(max(int(low), 0), min(int(high), len(steps.begin)))
+    place = (steps.ahead[rows] + 1j * steps.aside[rows]) * np.exp(1j * middle[rows])
+    step = np.column_stack([place.real, place.imag, steps.turned[rows]])
+    missed = step[(rows >= extent.first) & (rows < extent.last)].sum(axis=0)
+    square = float(missed @ missed)
+    if square < RETURN_SIGMAS**2 * float(knots.variance[extent.first] + knots.variance[extent.last]):
+        return False
+    made_up = -(step @ missed) / square
+    after, before = np.cumsum(made_up[rows >= extent.last]), np.cumsum(made_up[rows < extent.first][::-1])
+    return float(max(after.max(initial=0.0), before.max(initial=0.0))) > RETURNED_SHARE
+
+
+class Extent(NamedTuple):
+    """One event.
+
+    Attributes
+    ----------
+    first, last : rows of the knots about it
+    begin_s, end_s : within a step of those
+    kind : immobilised; else slip, skid or spin: the largest part of what is missed
+    severity : share of the motion of both sides that is missed, or made sideways if that is more; at most 1
+    distance_m : the robot's path through the event
+    """
+
+    first: int
+    last: int
+    begin_s: float
+    end_s: float
+    kind: SlipKind
+    severity: float
+    distance_m: float
+
+
+def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools, core: slice) -> Extent | None:
+    """Return the event about a window that shows one; None where none of its own is left.
+
+    First the part of the window with the largest sum of evidence, then outwards as long as the evidence grows.
+
+    Parameters
+    ----------
+    t : (m,) [s] of the knots
+    steps : (m - 1,) windows between neighbouring knots
+    error : (3,) of the motion model, a share of the wheels' motion
+    usable : (m - 1,) steps that no hole and no other event takes
+    core : rows of the steps of the window
+    """
+    span = core
+    shares = _missed_shares(steps.rows(core))
+    for _ in range(2):
+        evidence = np.where(usable[core], _evidence(steps.rows(core), error, shares), -MOST_EVIDENCE)
+        sums = np.concatenate([[0.0], np.cumsum(evidence)])
+        grown = sums[1:] - np.minimum.accumulate(sums[:-1])
+        last = int(np.argmax(grown)) + 1
+        if grown[last - 1] <= 0.0:
+            return None
+        # the shortest part with that sum
+        first = core.start + last - 1 - int(np.argmin(sums[:last][::-1]))
+        last += core.start
+        last += _growth(steps, error, shares, usable, range(last, len(usable)))
+        first -= _growth(steps, error, shares, usable, range(first - 1, -1, -1))
+        span = slice(first, last)
+        shares = _missed_shares(steps.rows(span))
+
+    def time_in(row: int, default: float) -> float:
+        """Return how much of a step lies in the event [s]; a default part where its fixes are too noisy to show it."""
+        if not 0 <= row < len(usable) or not usable[row]:
+            return 0.0
+        one = steps.rows(slice(row, row + 1))
+        deviation = np.sqrt(one.sensor + (error * one.path_m) ** 2)[0]
+        expected, seen = _expected(one, shares)[0] / deviation, one.residual[0] / deviation
+        size2 = float(expected @ expected)
+        part = float(np.clip(expected @ seen / size2, 0.0, 1.0)) if size2 > CLEAR_STEP**2 else default
+        return part * float(t[row + 1] - t[row])
+
+    begin_s = float(t[span.start + 1]) - time_in(span.start, 1.0) - time_in(span.start - 1, 0.0)
+    end_s = float(t[span.stop - 1]) + time_in(span.stop - 1, 1.0) + time_in(span.stop, 0.0)
+    if end_s - begin_s < SHORTEST_EVENT_S or span.stop - span.start < FEWEST_STEPS:
+        return None
+    return _measured(steps.rows(span), span, shares, begin_s, end_s)
+
+
+def _missed_shares(steps: ComparedWindows) -> Floats:
+    """Return the shares that the left and the right side miss of their motion, and that the robot moves aside (3,).
+
+    Sums, and no least squares over steps: the noise of the fixes cancels except that of the first and the last.
+    """
+    moved = np.concatenate([steps.model_sides, [steps.path_m]])
+    missed = -np.concatenate([steps.of_sides, [steps.aside]])
+    size, noise = np.abs(moved).sum(axis=1), steps.sensor.sum(axis=1).mean()
+    shares: Floats = (np.sign(moved) * missed).sum(axis=1) * size / (size**2 + noise)
+    return shares
+
+
+def _measured(steps: ComparedWindows, span: slice, shares: Floats, begin_s: float, end_s: float) -> Extent:
+    sides, path = steps.model_sides, float(steps.path_m.sum())
+    missed = shares[:2, None] * sides
+    aside = abs(float(shares[2])) * path
+    kinds: dict[SlipKind, float] = {
+        "slip": float(np.abs(missed.sum(axis=0)).sum()) / 2,
+        "spin": float(np.abs(missed[0] - missed[1]).sum()) / 2,
+        "skid": aside,
+    }
+    made = float(np.abs(sides - missed).sum()) / 2
+    stuck = max(made, aside) / path < STUCK_SHARE
+    return Extent(
+        span.start,
+        span.stop,
+        begin_s,
+        end_s,
+        kind="immobilised" if stuck else max(kinds, key=lambda kind: kinds[kind]),
+        severity=min(1.0, max(float(np.abs(missed).sum()) / 2, aside) / path),
+        distance_m=math.hypot(float(np.abs((sides - missed).sum(axis=0)).sum()) / 2, aside),
+    )
+
+
+def _expected(steps: ComparedWindows, shares: Floats) -> Floats:
+    """Return the residual of steps that miss these shares (k, 3) [m]."""
+    left, right = shares[:2, None] * steps.model_sides
+    return -np.column_stack([(left + right) / 2, shares[2] * steps.path_m, (left - right) / 2])
+
+
+def _evidence(steps: ComparedWindows, error: Floats, shares: Floats) -> Floats:
+    """Return the log likelihood ratio of steps (k,): missing these shares over missing none; bounded."""
+    seen = steps.residual
+    # while the robot parks, sensors without noise leave no variance, and nothing is expected
+    variance = np.maximum(steps.sensor + (error * steps.path_m[:, None]) ** 2, np.finfo(np.float64).tiny)
+    ratio = ((seen**2 - (seen - _expected(steps, shares)) ** 2) / (2 * variance)).sum(axis=1)
+    return np.asarray(np.clip(ratio, -MOST_EVIDENCE, MOST_EVIDENCE))
+
+
+def _growth(steps: ComparedWindows, error: Floats, shares: Floats, usable: Bools, rows: range) -> int:
+    """Return how many of the rows belong to the event: up to the largest sum of evidence before it is lost again."""
+    total, best, count, done = 0.0, 0.0, 0, 0
+    while done < len(rows):
+        chunk = rows[done : done + CHUNK]
+        low, high = min(chunk), max(chunk) + 1
+        values = _evidence(steps.rows(slice(low, high)), error, shares)[:: rows.step]
+        for value, fine in zip(values, usable[low:high][:: rows.step], strict=True):
+            total, done = total + float(value), done + 1
+            if not fine or total < best - LOST_EVIDENCE:
+                return count
+            if total > best:
+                best, count = total, done
+    return count
