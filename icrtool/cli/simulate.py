@@ -16,7 +16,7 @@ from icrtool.cli.printing import Printer
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
-    from icrtool.logs.written_messages import WheelMessages, WriteOptions
+    from icrtool.logs.write_log import WheelMessages, WriteOptions
     from icrtool.records.tables import Icrs
     from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
     from icrtool.simulation.record import TruthTable
@@ -228,7 +228,7 @@ def _write_options(
     log: Path, config: Config, sensors: Sensors, wheels: WheelMessages, heading: Literal["enu", "ned"], counts: float
 ) -> WriteOptions:
     from icrtool.errors import ConfigError
-    from icrtool.logs.written_messages import WriteOptions
+    from icrtool.logs.write_log import WriteOptions
 
     if log.suffix not in ("", ".mcap", ".bag"):
         raise ConfigError(

@@ -1,34 +1,295 @@
-"""Write a robot log from columns; used by `icrtool simulate`, the sample logs and the tests."""
+"""Write a robot log from columns: the options, the messages of each topic, and the file that holds them.
+
+Used by `icrtool simulate`, the exports, the sample logs and the tests.
+"""
 
 from __future__ import annotations
 
 import os
 import sqlite3
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
-from icrtool.errors import OutputError
-from icrtool.logs.written_messages import (
-    Compression,
-    Container,
-    WheelMessages,
-    WriteOptions,
-    load_typestore,
-    serialise_topics,
-)
+from icrtool.errors import ConfigError, OutputError
+from icrtool.logs.messages.definitions import bundled_definitions
 from icrtool.records.process_resources import unfinished
 from icrtool.records.samples import SensorColumns
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from rosbags.typesys.store import Typestore
 
-    from icrtool.logs.written_messages import TopicMessages
+    from icrtool.kernels.arrays import Ints
 
-ROSBAG2_VERSION: Final = 9
+Container = Literal["mcap", "bag", "db3"]
+WheelMessages = Literal["joint_states", "odometry", "float64_pair", "ticks", "jackal_feedback", "twist_stamped"]
+Compression = Literal["none", "bz2", "lz4", "zstd", "zstd-file"]
+
+COMPRESSIONS: dict[Container, tuple[Compression, ...]] = {
+    "mcap": ("none", "lz4", "zstd"),
+    "bag": ("none", "bz2", "lz4"),
+    "db3": ("none", "zstd", "zstd-file"),
+}
+"""Compressions of each container. For db3, ``zstd`` compresses message by message, ``zstd-file`` the closed file."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WriteOptions:
+    """How a log is recorded: container, message types and conventions.
+
+    Attributes
+    ----------
+    container : ``mcap`` (one ROS 2 file), ``bag`` (one ROS 1 file) or ``db3`` (a ROS 2 directory, sqlite3 storage)
+    wheels : message type of the wheels. ``float64_pair`` [m/s] and ``ticks`` (Int32, wraps) are pairs without header
+    heading : convention of the Imu. ``enu``: REP-103. ``ned``: yaw is the compass heading, body z down, and the frame
+        is ``imu_link_ned`` (REP-145)
+    namespace : put before every topic (``/j100_0042``)
+    compression : one of `COMPRESSIONS` of the container
+    wheel_radius_m : converts metres to radians and counts
+    track_width_m : b, by which a wheel controller divides for its angular velocity [m]
+    counts_per_rev : encoder counts of one wheel revolution
+    heading_std_deg : written as the orientation's covariance
+    definitions : False: only the names of the types are written, as in ROS 2 Humble and older (not in a ROS 1 bag)
+    """
+
+    container: Container = "mcap"
+    wheels: WheelMessages = "joint_states"
+    heading: Literal["enu", "ned"] = "enu"
+    namespace: str = ""
+    compression: Compression = "none"
+    wheel_radius_m: float
+    track_width_m: float
+    counts_per_rev: float = 8192.0
+    heading_std_deg: float = 1.0
+    definitions: bool = True
+
+    def __post_init__(self) -> None:
+        offered = COMPRESSIONS[self.container]
+        if self.compression not in offered:
+            why = f"{self.compression} does not exist in a {self.container} log"
+            raise ConfigError("compression", why, f"choose {', '.join(offered)}")
+        if not self.definitions and self.container == "bag":
+            raise ConfigError("definitions", "a ROS 1 bag always carries them", "choose mcap or db3 to leave them out")
+        for name in ("wheel_radius_m", "track_width_m", "counts_per_rev"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(name, f"{getattr(self, name)} is not a positive number")
+
+
+GRAVITY_MPS2 = 9.81
+HEIGHT_STD_RATIO = 2.0
+"""Vertical over horizontal GNSS noise, a rule of thumb of GNSS geometry."""
+
+JACKAL_TYPES = ("jackal_msgs/msg/DriveFeedback", "jackal_msgs/msg/Feedback")
+ROS1_JACKAL_FEEDBACK = (
+    "std_msgs/Header header\njackal_msgs/DriveFeedback[2] drivers\nfloat32 pcb_temperature\n"
+    "float32 mcu_temperature\nint8 commanded_mode\nint8 actual_mode\n"
+)
+"""The ROS 1 form has two temperatures that the ROS 2 form, which is bundled, does not have (docs.ros.org/en/api)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessages:
+    """All messages of a topic, serialised.
+
+    Attributes
+    ----------
+    stamp_ns : int64 (n,)
+    payload : uint8 (n, size), one message a row; or the messages, where their sizes differ
+    """
+
+    topic: str
+    message_type: str
+    stamp_ns: Ints
+    payload: NDArray[np.uint8] | Sequence[bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class TopicPlan:
+    """One topic: `fixed` values and per-message `columns`, both by dotted path (``drivers.0.measured_travel``).
+
+    `stamp_ns` (n,) and each column (n,) have a row for each message. A field of neither is zero or empty.
+    """
+
+    topic: str
+    message_type: str
+    stamp_ns: Ints
+    fixed: dict[str, object]
+    columns: dict[str, NDArray[Any]]
+
+
+@cache
+def load_typestore(*, ros1: bool) -> Typestore:
+    """Return the message types of ROS Noetic or of ROS 2 Jazzy, with those of jackal_msgs."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+    types = {name: bundled_definitions()[name] for name in JACKAL_TYPES}
+    if ros1:
+        types |= get_types_from_msg(ROS1_JACKAL_FEEDBACK, "jackal_msgs/msg/Feedback")
+    store.register(types)
+    return store
+
+
+def topic_plans(columns: SensorColumns, options: WriteOptions) -> tuple[TopicPlan, ...]:
+    """Return the topics of a log, in the order wheels, position, heading: messages of one stamp are written so."""
+    known, enu = np.isfinite(columns.gnss_std_m), options.heading == "enu"
+    variance = np.where(known, columns.gnss_std_m, 0.0) ** 2
+    place = header_stamps(columns.gnss_stamp_ns) | {
+        "status.status": columns.gnss_status.astype(np.int8),
+        "latitude": columns.latitude_deg,
+        "longitude": columns.longitude_deg,
+        "altitude": columns.height_m,
+        "position_covariance.0": variance,
+        "position_covariance.4": variance,
+        "position_covariance.8": variance * HEIGHT_STD_RATIO**2,
+        "position_covariance_type": np.where(known, 2, 0).astype(np.uint8),
+    }
+    receiver: dict[str, object] = {"header.frame_id": "gps_link", "status.service": 1}
+    # World and body frame change together: in ENU the body's z is up, in NED it is down (REP-145).
+    yaw = np.pi / 2 - columns.heading_rad if enu else columns.heading_rad
+    turned = header_stamps(columns.heading_stamp_ns) | {
+        "orientation.z": np.sin(yaw / 2),
+        "orientation.w": np.cos(yaw / 2),
+        "angular_velocity.z": -columns.yaw_rate_radps if enu else columns.yaw_rate_radps,
+    }
+    imu: dict[str, object] = {
+        "header.frame_id": "imu_link" if enu else "imu_link_ned",
+        "orientation_covariance": np.diag([np.radians(options.heading_std_deg) ** 2] * 3).ravel(),
+        "linear_acceleration.z": GRAVITY_MPS2 if enu else -GRAVITY_MPS2,
+    }
+    return (
+        *_wheel_plans(columns, options),
+        TopicPlan("/gps/fix", "sensor_msgs/msg/NavSatFix", columns.gnss_stamp_ns, receiver, place),
+        TopicPlan("/imu/data", "sensor_msgs/msg/Imu", columns.heading_stamp_ns, imu, turned),
+    )
+
+
+def _wheel_plans(columns: SensorColumns, options: WriteOptions) -> Iterator[TopicPlan]:
+    stamps, radius = columns.wheel_stamp_ns, options.wheel_radius_m
+    travel = {"left": columns.wheel_position_left_m, "right": columns.wheel_position_right_m}
+    speed = {"left": columns.wheel_v_left_mps, "right": columns.wheel_v_right_mps}
+    # As wheel controllers report it: no slip, body x forward and y left (REP-103).
+    forward, turn = (speed["right"] + speed["left"]) / 2, (speed["right"] - speed["left"]) / options.track_width_m
+    changing, fixed = header_stamps(stamps), dict[str, object]()
+    match options.wheels:
+        case "joint_states":
+            joints = {f"{end}_{side}_wheel_joint": side for end in ("front", "rear") for side in travel}
+            for joint, side in enumerate(joints.values()):
+                changing |= {f"position.{joint}": travel[side] / radius, f"velocity.{joint}": speed[side] / radius}
+            fixed = {"name": list(joints), "position": np.zeros(4), "velocity": np.zeros(4)}
+            yield TopicPlan("/joint_states", "sensor_msgs/msg/JointState", stamps, fixed, changing)
+        case "odometry":
+            changing |= {"twist.twist.linear.x": forward, "twist.twist.angular.z": turn}
+            fixed = {"header.frame_id": "odom", "child_frame_id": "base_link", "pose.pose.orientation.w": 1.0}
+            yield TopicPlan("/wheel_controller/odom", "nav_msgs/msg/Odometry", stamps, fixed, changing)
+        case "twist_stamped":
+            changing |= {"twist.linear.x": forward, "twist.angular.z": turn}
+            fixed = {"header.frame_id": "base_link"}
+            yield TopicPlan("/wheel_controller/twist", "geometry_msgs/msg/TwistStamped", stamps, fixed, changing)
+        case "jackal_feedback":
+            for driver, side in enumerate(travel):
+                changing[f"drivers.{driver}.measured_travel"] = (travel[side] / radius).astype(np.float32)
+                changing[f"drivers.{driver}.measured_velocity"] = (speed[side] / radius).astype(np.float32)
+            yield TopicPlan("/feedback", "jackal_msgs/msg/Feedback", stamps, {}, changing)
+        case "ticks":
+            per_metre = options.counts_per_rev / (2 * np.pi * radius)
+            for side, travelled in travel.items():
+                # An Int32 counter wraps around, as numpy's narrowing cast of an integer does.
+                counts = np.rint(travelled * per_metre).astype(np.int64).astype(np.int32)
+                yield TopicPlan(f"/{side[0]}wheel_ticks", "std_msgs/msg/Int32", stamps, {}, {"data": counts})
+        case "float64_pair":
+            for side, values in speed.items():
+                yield TopicPlan(f"/{side}_drive/velocity", "std_msgs/msg/Float64", stamps, {}, {"data": values})
+
+
+def header_stamps(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
+    """Return the columns of a message's header that hold its stamp."""
+    return {
+        "header.stamp.sec": (stamp_ns // 1_000_000_000).astype(np.uint32),
+        "header.stamp.nanosec": (stamp_ns % 1_000_000_000).astype(np.uint32),
+    }
+
+
+def serialise_topic(plan: TopicPlan, store: Typestore, *, prefix: str = "", ros1: bool = False) -> TopicMessages:
+    """Return the messages of one topic.
+
+    Parameters
+    ----------
+    plan : its values
+    store : holds the definition of its message type
+    prefix : put before the topic
+    ros1 : serialise as ROS 1 does, else as CDR
+    """
+    message = blank_message(store, plan.message_type)
+    for path, value in plan.fixed.items():
+        _put(message, path, value)
+
+    def encode() -> NDArray[np.uint8]:
+        encoder = store.serialize_ros1 if ros1 else store.serialize_cdr
+        return np.frombuffer(encoder(message, plan.message_type), dtype=np.uint8).copy()
+
+    payload = np.tile(encode(), (len(plan.stamp_ns), 1))
+    for path, values in plan.columns.items():
+        slot = _find_slot(encode, message, path, values.dtype)
+        little_endian = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+        payload[:, slot] = little_endian.view(np.uint8).reshape(len(values), -1)
+    return TopicMessages(prefix + plan.topic, plan.message_type, plan.stamp_ns, payload)
+
+
+def blank_message(store: Typestore, message_type: str) -> object:
+    """Return a message of zeros, empty strings and empty sequences."""
+    from rosbags.interfaces import Nodetype
+
+    values: dict[str, Any] = {}
+    for name, (kind, detail) in cast("list[tuple[str, tuple[Any, Any]]]", store.fielddefs[message_type][1]):
+        if kind == Nodetype.NAME:
+            values[name] = blank_message(store, detail)
+        elif kind == Nodetype.BASE:
+            values[name] = "" if detail[0] == "string" else np.zeros((), dtype=detail[0])[()]
+        else:
+            (element_kind, element), length = detail
+            length = length if kind == Nodetype.ARRAY else 0
+            if element_kind == Nodetype.NAME:
+                values[name] = [blank_message(store, element) for _ in range(length)]
+            else:
+                values[name] = [""] * length if element[0] == "string" else np.zeros(length, dtype=element[0])
+    return store.types[message_type](**values)
+
+
+def _put(message: object, path: str, value: object) -> None:
+    *parents, last = path.split(".")
+    for step in parents:
+        message = message[int(step)] if isinstance(message, list) else getattr(message, step)
+    if isinstance(message, np.ndarray):
+        message[int(last)] = value
+    else:
+        setattr(message, last, value)
+
+
+def _find_slot(encode: Callable[[], NDArray[np.uint8]], message: object, path: str, dtype: np.dtype[Any]) -> slice:
+    """Return the byte range of the scalar at `path`, which is zero before and after: the bytes that change with it."""
+    blank = encode()
+    _put(message, path, np.frombuffer(b"\x11" * dtype.itemsize, dtype=dtype)[0])
+    changed = np.flatnonzero(encode() != blank)
+    _put(message, path, dtype.type(0))
+    if len(changed) != dtype.itemsize or changed[-1] - changed[0] != dtype.itemsize - 1:
+        raise ValueError(f"{path} is not a {dtype} field of {type(message).__name__}")
+    return slice(int(changed[0]), int(changed[-1]) + 1)
+
+
+_TO_SCHEMA_3 = """
+    DROP TABLE message_definitions;
+    ALTER TABLE topics DROP COLUMN type_description_hash;
+    UPDATE schema SET schema_version = 3, ros_distro = 'humble';
+"""
+"""Of a database of rosbag2: that of ROS 2 Humble, the last one without message definitions."""
 
 
 def write_mcap(
@@ -50,9 +311,8 @@ def write_mcap(
     """
     from mcap.writer import CompressionType, Writer
 
-    kind = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}[compression]
     with path.open("wb") as stream:
-        writer: Any = Writer(stream, compression=kind)
+        writer: Any = Writer(stream, compression=CompressionType[compression.upper()])
         writer.start(profile="ros2", library=library)
         channels = []
         for topic in topics:
@@ -66,50 +326,29 @@ def write_mcap(
         writer.finish()
 
 
-def write_bag(path: Path, topics: Sequence[TopicMessages], store: Typestore, *, compression: Compression) -> None:
-    """Write one ROS 1 bag."""
-    from rosbags.rosbag1 import Writer
-
-    bag = Writer(path)
-    if compression != "none":
-        bag.set_compression(Writer.CompressionFormat[compression.upper()])
-    with bag:
-        connections = [bag.add_connection(topic.topic, topic.message_type, typestore=store) for topic in topics]
-        for index, stamp_ns, data in _in_time_order(topics):
-            bag.write(connections[index], stamp_ns, data)
-
-
-def write_db3(
-    path: Path, topics: Sequence[TopicMessages], store: Typestore, *, compression: Compression, definitions: bool
+def write_rosbag(
+    path: Path, topics: Sequence[TopicMessages], store: Typestore, *, ros1: bool, compression: str, definitions: bool
 ) -> None:
-    """Write a ROS 2 bag directory with sqlite3 storage."""
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    """Write one ROS 1 bag, or a ROS 2 bag directory with sqlite3 storage."""
+    from rosbags import rosbag1, rosbag2
 
-    bag = Writer(path, version=ROSBAG2_VERSION, storage_plugin=StoragePlugin.SQLITE3)
-    if compression != "none":
-        mode = CompressionMode.MESSAGE if compression == "zstd" else CompressionMode.FILE
-        bag.set_compression(mode, CompressionFormat.ZSTD)
+    bag: Any
+    if ros1:
+        bag = rosbag1.Writer(path)
+        if compression != "none":
+            bag.set_compression(rosbag1.Writer.CompressionFormat[compression.upper()])
+    else:
+        bag = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
+        if compression != "none":
+            mode = rosbag2.CompressionMode.MESSAGE if compression == "zstd" else rosbag2.CompressionMode.FILE
+            bag.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
     with bag:
         connections = [bag.add_connection(topic.topic, topic.message_type, typestore=store) for topic in topics]
         for index, stamp_ns, data in _in_time_order(topics):
             bag.write(connections[index], stamp_ns, data)
     if not definitions:
-        _drop_definitions(path / f"{path.name}.db3")
-
-
-def _drop_definitions(database: Path) -> None:
-    """Convert a database to schema 3 of rosbag2 (ROS 2 Humble), the last one without message definitions."""
-    connection = sqlite3.connect(database)
-    try:
-        connection.executescript(
-            """
-            DROP TABLE message_definitions;
-            ALTER TABLE topics DROP COLUMN type_description_hash;
-            UPDATE schema SET schema_version = 3, ros_distro = 'humble';
-            """
-        )
-    finally:
-        connection.close()
+        with closing(sqlite3.connect(path / f"{path.name}.db3")) as database:
+            database.executescript(_TO_SCHEMA_3)
 
 
 def _in_time_order(topics: Sequence[TopicMessages]) -> Iterator[tuple[int, int, bytes]]:
@@ -123,9 +362,6 @@ def _in_time_order(topics: Sequence[TopicMessages]) -> Iterator[tuple[int, int, 
     payloads = [topic.payload for topic in topics]
     for index, stamp_ns, row in zip(indices[order].tolist(), stamps[order].tolist(), rows[order].tolist(), strict=True):
         yield index, stamp_ns, bytes(payloads[index][row])
-
-
-__all__ = ["Compression", "Container", "SensorColumns", "WheelMessages", "WriteOptions", "write_log"]
 
 
 def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -> Path:
@@ -156,20 +392,21 @@ def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -
     path = Path(path)
     if os.path.lexists(path):
         raise OutputError(path, "exists already", "remove it or choose another name")
-    store = load_typestore(ros1=options.container == "bag")
-    topics = serialise_topics(columns, options, store)
+    ros1 = options.container == "bag"
+    store = load_typestore(ros1=ros1)
+    prefix = "/" + options.namespace.strip("/") if options.namespace.strip("/") else ""
+    plans = [plan for plan in topic_plans(columns, options) if len(plan.stamp_ns)]
+    topics = [serialise_topic(plan, store, prefix=prefix, ros1=ros1) for plan in plans]
     try:
         with (
             tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch,
             unfinished(Path(scratch)),
         ):
-            partial = Path(scratch) / path.name
+            partial, compression, definitions = Path(scratch) / path.name, options.compression, options.definitions
             if options.container == "mcap":
-                write_mcap(partial, topics, store, compression=options.compression, definitions=options.definitions)
-            elif options.container == "bag":
-                write_bag(partial, topics, store, compression=options.compression)
+                write_mcap(partial, topics, store, compression=compression, definitions=definitions)
             else:
-                write_db3(partial, topics, store, compression=options.compression, definitions=options.definitions)
+                write_rosbag(partial, topics, store, ros1=ros1, compression=compression, definitions=definitions)
             partial.rename(path)
     except (OSError, sqlite3.Error) as err:
         reason = err.strerror if isinstance(err, OSError) and err.strerror else str(err)

@@ -20,16 +20,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icrtool.logs.write_log import write_bag, write_db3, write_mcap
-from icrtool.logs.written_messages import (
+from icrtool.logs.write_log import (
     TopicMessages,
     WriteOptions,
-    _plan_heading,
-    _plan_joint_states,
-    _plan_position,
     header_stamps,
     load_typestore,
     serialise_topic,
+    topic_plans,
+    write_mcap,
+    write_rosbag,
 )
 from tests.e2e.test_bad_input import OPTIONS, drive
 
@@ -49,8 +48,7 @@ def messages(options: WriteOptions, container: str) -> tuple[TopicMessages, ...]
     """The messages of a short drive with hostile names in all texts; a string topic, and a second receiver."""
     columns, ros1 = drive(20.0), container == "bag"
     store = load_typestore(ros1=ros1)
-    (wheels,) = _plan_joint_states(columns, options)
-    position, heading = _plan_position(columns), _plan_heading(columns, options)
+    wheels, position, heading = topic_plans(columns, options)
     joints = [f"{name}{HOSTILE}" for name in wheels.fixed["name"]]
     joints[0] += LONG
     frames = {"header.frame_id": f"base_link{HOSTILE}"}
@@ -77,13 +75,17 @@ def mcap(folder: Path) -> Path:
 
 def bag(folder: Path) -> Path:
     path = folder / "\x1b[2J\n\u202e$^{<script>.bag"
-    write_bag(path, messages(OPTIONS, "bag"), load_typestore(ros1=True), compression="none")
+    write_rosbag(
+        path, messages(OPTIONS, "bag"), load_typestore(ros1=True), ros1=True, compression="none", definitions=True
+    )
     return path
 
 
 def db3(folder: Path) -> Path:
     path = folder / "log"
-    write_db3(path, messages(OPTIONS, "db3"), load_typestore(ros1=False), compression="none", definitions=True)
+    write_rosbag(
+        path, messages(OPTIONS, "db3"), load_typestore(ros1=False), ros1=False, compression="none", definitions=True
+    )
     with sqlite3.connect(path / "log.db3") as database:
         database.execute("INSERT INTO topics SELECT 99, name || ?, ?, ?, '', '' FROM topics LIMIT 1", (HOSTILE,) * 3)
     database.close()

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.kinematics import body_velocity
-from icrtool.logs.write_log import write_mcap
-from icrtool.logs.written_messages import (
+from icrtool.logs.write_log import (
     TopicMessages,
     TopicPlan,
     blank_message,
     header_stamps,
     load_typestore,
     serialise_topic,
+    write_mcap,
 )
 from icrtool.output.exports.paths import (
     ERROR_HORIZON_M,

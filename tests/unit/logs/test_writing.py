@@ -16,8 +16,7 @@ from icrtool.errors import ConfigError, OutputError
 from icrtool.logs import write_log as writing_log
 from icrtool.logs.messages.definitions import bundled_definitions, standard_definitions
 from icrtool.logs.read_log import read_log
-from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
-from icrtool.logs.written_messages import load_typestore, serialise_topics
+from icrtool.logs.write_log import SensorColumns, WriteOptions, load_typestore, topic_plans, write_log
 
 START_NS = 1_760_000_000_000_000_000
 RADIUS_M = 0.27
@@ -375,10 +374,8 @@ def test_columns_of_one_sensor_have_one_length():
 @pytest.mark.parametrize("wheels", WHEELS)
 def test_ros_2_types_are_those_a_log_without_definitions_is_read_with(wheels):
     store, known = load_typestore(ros1=False), {**standard_definitions(), **bundled_definitions()}
-    topics = serialise_topics(make_columns(), replace(OPTIONS, wheels=wheels), store)
-    assert {topic.message_type: store.fielddefs[topic.message_type][1] for topic in topics} == {
-        topic.message_type: known[topic.message_type][1] for topic in topics
-    }
+    types = {plan.message_type for plan in topic_plans(make_columns(), replace(OPTIONS, wheels=wheels))}
+    assert {name: store.fielddefs[name][1] for name in types} == {name: known[name][1] for name in types}
 
 
 def test_the_ros_1_feedback_of_a_jackal_has_two_more_fields():
