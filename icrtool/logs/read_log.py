@@ -1,6 +1,6 @@
 """Read a log: open it, read the columns of all candidates in one pass, choose, convert to the frames of `icrtool`.
 
-A log may also be one CSV file (columns: `icrtool.records.frames`).
+A log may also be one CSV file (columns: `icrtool.RobotLog.from_frames`).
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def read_log(
     ----------
     path : ``.mcap``, ROS 1 ``.bag``, ROS 2 bag directory or ``.db3``, each also compressed or in an archive; ``-`` for
         standard input; an address (``s3://bucket/drive.mcap``); ``drive_{0..3}.bag`` for the files of a split
-        recording; or a ``.csv`` of `icrtool.records.frames`, also compressed
+        recording; or a ``.csv`` with the columns of `icrtool.RobotLog.from_frames`, also compressed
     config : topics, robot and frames; default: all found by type and content
     progress : called with the share of the bytes that are read, 0 to 1
     start, end : read messages logged in [start, end) only: seconds since the log's first message, or a time of day:
