@@ -16,8 +16,8 @@ from icrtool.calibration.forecast import forecast_drive
 from icrtool.calibration.pooled import calibrate
 from icrtool.calibration.run_recording import recording_of
 from icrtool.calibration.transfer import compare_groups
-from icrtool.dropout_analysis.acceptance_limits import parse_gate, verdict_on
 from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.report import parse_gate, verdict_on
 from icrtool.estimation.fit import fit
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.output.files.formats import json_bytes

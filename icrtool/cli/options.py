@@ -288,7 +288,7 @@ REPORT = together("exports", Exports, together(
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
     """Find the reports of --baseline; refuse gates that cannot be read, or need one where there is none."""
-    from icrtool.dropout_analysis.acceptance_limits import parse_gate
+    from icrtool.dropout_analysis.report import parse_gate
     from icrtool.errors import ConfigError
 
     relative = [gate.text for gate in map(parse_gate, gates) if gate.baseline_factor]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Literal
 
 import msgspec
@@ -13,31 +13,37 @@ from msgspec import UNSET
 from msgspec.structs import astuple
 
 from icrtool import __version__
-from icrtool.calibration.model_comparison import (
-    FITTED_TO,
-    ComparedModels,
-    ComparedRow,
-    Model,
-    compare_models,
-)
+from icrtool.calibration.model_comparison import FITTED_TO, ComparedModels, ComparedRow, Model, compare_models
 from icrtool.calibration.pooled import predictor
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_recording import turning_recording_of
-from icrtool.dropout_analysis.acceptance_limits import budget_distances, check_gate, parse_gate, verdict_on
-from icrtool.dropout_analysis.example_trials import example_trials, split_by_turning, worst_trials
-from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
-from icrtool.dropout_analysis.report import BaselineReport, DropoutReport, OpenLoopErrors
-from icrtool.dropout_analysis.starts import Starts, with_smoothed_reference
+from icrtool.dropout_analysis.report import (
+    BaselineReport,
+    DropoutReport,
+    OpenLoopErrors,
+    budget_distances,
+    check_gate,
+    parse_gate,
+    verdict_on,
+)
+from icrtool.dropout_analysis.shown_paths import (
+    example_trials,
+    force_outages,
+    plan_outages,
+    real_outages,
+    worst_trials,
+)
+from icrtool.dropout_analysis.starts import Starts, split_by_turning, with_smoothed_reference
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
 from icrtool.kernels.open_loop import TOLERANCE_M
-from icrtool.motion.models import FittedModel
 from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.dropout import DEFAULT_SEED, BudgetDistance, Gate, TurningSplit, UsedCalibration, Verdict
 from icrtool.records.dropout_document import (
     DROPOUT_SCHEMA,
+    BaselineDocument,
     CountDocument,
     DropoutDocument,
     ErrorRow,
@@ -166,16 +172,30 @@ def dropout_report(
     if with_jumps:
         run = replace(run, sensors=replace(run.sensors, jumps=()))
     whole = run
-    run = leave_out_events(run) if without_events else run
+    if without_events:
+        # A gap in place of each slip event: no trial, window or forced outage crosses a gap.
+        run = replace(run, in_gap=run.in_gap | run.slipping)
     limits = [gate if isinstance(gate, Gate) else parse_gate(gate) for gate in gates]
-    forced = _force(run, outage_s, outage_at_s)
+    lengths_s = forced_lengths_s(run, outage_s)
+    if outage_at_s and not lengths_s:
+        raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
+    plans = [plan_outages(run, length, outage_at_s) for length in lengths_s]
+    forced = [outage for plan in plans for outage in force_outages(run, plan)]
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
     unusable = "" if run.usable or allow_unusable else str(run.document.unusable_because)
     used, further = _calibration_rows(compared, () if unusable else calibrations)
-    found, why = _compare(compared, run) if comparison and not unusable else (None, unusable)
+    found, why = None, unusable
+    if comparison and not unusable:
+        try:
+            found = compare_models(compared, measured_headings(run))
+        except DataError as err:
+            why = f"{err.why}, {err.advice}"
     give_back_freed()
     rows = found.rows if found is not None else ()
-    horizons = _horizons(horizons_m if horizons_m is not None else run.config.dropout.horizons_m, limits)
+    horizons = list(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
+    for at_m in (gate.horizon_m for gate in limits):
+        if at_m is not None and not any(math.isclose(at_m, horizon, rel_tol=1e-9) for horizon in horizons):
+            horizons.append(at_m)
     errors = measure_errors(
         compared, horizons, further=[*rows, *further], starts=starts, seed=seed, sink=sink,
         starts_of_further=None if found is None else found.trials.starts, track=None if found is None else found.track,
@@ -225,6 +245,15 @@ def _report(
     with_events : errors of all trials, where those of `errors` cross no slip event
     """
     made = None if compared_models is None else compared_models.calibration
+    cost = None
+    if with_events is not None:
+        all_rows = {one.name: one.document.by_horizon for one in with_events.results}
+        numbers = {name: [ErrorRow(*astuple(row)[:ERRORS]) for row in found] for name, found in all_rows.items()}
+        cost = EventCostDocument(len(run.sensors.events), numbers)
+    earlier = None
+    if baseline is not None:
+        same, changes = baseline.is_of(run.document), baseline.changes(run.document)
+        earlier = BaselineDocument(baseline.path, baseline.log, baseline.tool_version, same, changes)
     document = DropoutDocument(
         schema=DROPOUT_SCHEMA,
         tool_version=__version__,
@@ -237,7 +266,7 @@ def _report(
         starts_counted=starts,
         starts_standing=errors.standing,
         with_jumps=with_jumps,
-        without_events=None if with_events is None else _event_cost(run, with_events),
+        without_events=cost,
         tolerance_m=TOLERANCE_M,
         # the key and its parts keep their names; nothing is resampled
         bootstrap=IntervalsDocument(
@@ -259,14 +288,15 @@ def _report(
         ladder=_ladder(errors, calibrations, compared_models, no_comparison),
         gates=gates,
         passed=all(one.passed for one in gates),
-        baseline=None if baseline is None else baseline.compared_with(run.document),
+        baseline=earlier,
         outages=tuple(one.document for one in outages),
         worst=tuple(one.document for one in worst),
         examples=tuple(one.document for one in examples),
     )
     return DropoutReport(
-        document, errors, run.directory, run.table.north_m, run.table.east_m, usable=usable, worst=worst,
-        examples=examples, outages=outages, calibration=made, baseline=baseline,
+        **{field.name: getattr(errors, field.name) for field in fields(errors)}, document=document,
+        run_directory=run.directory, reference_north_m=run.table.north_m, reference_east_m=run.table.east_m,
+        usable=usable, worst=worst, examples=examples, outages=outages, calibration=made, baseline=baseline,
     )  # fmt: skip
 
 
@@ -275,7 +305,7 @@ def _counts(errors: OpenLoopErrors, with_events: OpenLoopErrors | None) -> Itera
     # starts at a gap, at an outage or at a standstill are counted as without the option
     counts = (with_events or errors).counts
     crossing = counts.trials - errors.counts.trials
-    driven = distance_text(errors.run.drive.distance_m)
+    driven = distance_text(errors.run_document.drive.distance_m)
     reasons = {
         "too_little_way_left": (f"less than that is left of the {driven} driven", counts.short),
         "across_wheel_gap": ("the path crosses a gap in the wheel data", counts.gap),
@@ -290,12 +320,6 @@ def _counts(errors: OpenLoopErrors, with_events: OpenLoopErrors | None) -> Itera
         if starts["too_little_way_left"] == errors.states:
             why = reasons["too_little_way_left"][0]
         yield CountDocument(horizon_m, trials, starts, None if trials else why)
-
-
-def _event_cost(run: Run, errors: OpenLoopErrors) -> EventCostDocument:
-    """Return what slip events cost, from the errors of all trials."""
-    rows = {one.name: [ErrorRow(*astuple(row)[:ERRORS]) for row in one.document.by_horizon] for one in errors.results}
-    return EventCostDocument(len(run.sensors.events), rows)
 
 
 def _ladder(
@@ -313,6 +337,10 @@ def _ladder(
             rows = [astuple(row)[1:ERRORS] for row in one.document.by_horizon]
             heading = found.heading if with_heading else "wheels"
             models.append(ScoreDocument(one.name, one.label, fitted, heading, *map(list, zip(*rows, strict=True))))
+    fits = {}
+    for name, fit in found.fits.items():
+        columns = (fit.parameters, fit.std)
+        fits[name] = FitDocument(*(plain(dict(zip(fit.model.terms, column, strict=True))) for column in columns))
     return LadderDocument(
         horizons_m=errors.horizons_m.tolist(),
         blocks=found.blocks,
@@ -321,14 +349,8 @@ def _ladder(
         notes=list(found.notes),
         models=models,
         width_m=found.width_m,
-        fits={name: _fit(fit) for name, fit in found.fits.items()},
+        fits=fits,
     )
-
-
-def _fit(fit: FittedModel) -> FitDocument:
-    """Return the parameters of a fit with one standard deviation."""
-    columns = (fit.parameters, np.sqrt(np.diag(fit.covariance)))
-    return FitDocument(*(plain(dict(zip(fit.model.terms, column, strict=True))) for column in columns))
 
 
 def forced_lengths_s(run: Run, outage_s: Sequence[float] | None) -> Sequence[float]:
@@ -336,38 +358,21 @@ def forced_lengths_s(run: Run, outage_s: Sequence[float] | None) -> Sequence[flo
     return outage_s if outage_s is not None else run.config.dropout.forced_outage_s
 
 
-def _force(run: Run, outage_s: Sequence[float] | None, outage_at_s: Sequence[float]) -> list[Outage]:
-    lengths = forced_lengths_s(run, outage_s)
-    if outage_at_s and not lengths:
-        raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
-    plans = [plan_outages(run, length, outage_at_s) for length in lengths]
-    return [outage for plan in plans for outage in force_outages(run, plan)]
-
-
-def _horizons(horizons_m: Sequence[float], gates: Sequence[Gate]) -> list[float]:
-    """Return the horizons asked for, and those that acceptance limits name."""
-    horizons = list(horizons_m)
-    for gate in gates:
-        at = gate.horizon_m
-        if at is not None and not any(math.isclose(at, horizon, rel_tol=1e-9) for horizon in horizons):
-            horizons.append(at)
-    return horizons
-
-
 def _calibration_rows(
     run: Run, calibrations: Sequence[Calibration]
 ) -> tuple[tuple[UsedCalibration, ...], list[ComparedRow]]:
     """Return what is known of each calibration, and the model of its row."""
     used, models = [], []
-    recording = turning_recording_of(run) if calibrations else None
+    if not calibrations:
+        return (), []
+    recording = turning_recording_of(run)
     for number, one in enumerate(calibrations, start=1):
-        stem = one.name or str(number)
-        if sum(other.name == one.name for other in calibrations) > 1:
-            stem = f"{stem}-{number}" if one.name else stem
-        name = "calibration" if len(calibrations) == 1 else f"calibration:{stem}"
-        label = "calibration" if len(calibrations) == 1 else stem
-        if recording is None:
-            continue
+        name = label = "calibration"
+        if len(calibrations) > 1:
+            label = one.name or str(number)
+            if one.name and sum(other.name == one.name for other in calibrations) > 1:
+                label = f"{label}-{number}"
+            name = f"calibration:{label}"
         created = one.created or ""
         of_sensors = dict.fromkeys(CalibrationFile.__struct_fields__[1:], UNSET)
         kept = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
@@ -381,16 +386,3 @@ def _calibration_rows(
             models.append(ComparedRow(name, label, errors_of, knows=fitted))
             used.append(UsedCalibration(name, label, model, len(one.logs), seen, created, with_gyro, kept, fitted))
     return tuple(used), models
-
-
-def _compare(compared: Run, run: Run) -> tuple[ComparedModels | None, str]:
-    """Compare the models of a run; where that cannot be, None and why."""
-    try:
-        return compare_models(compared, measured_headings(run)), ""
-    except DataError as err:
-        return None, f"{err.why}, {err.advice}"
-
-
-def leave_out_events(run: Run) -> Run:
-    """Return the run with a gap in place of each slip event: no trial, window or forced outage crosses a gap."""
-    return replace(run, in_gap=run.in_gap | run.slipping)

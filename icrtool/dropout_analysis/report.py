@@ -1,29 +1,32 @@
-"""The dropout report: the record that `icrtool.dropout` and `icrtool.dropout_report` return.
+"""The dropout report, and what it is compared with: budgets, acceptance limits for CI, an earlier report.
 
-It stands here and not among the records because it holds a model comparison, which is made of fits. No code that makes
-it is here, and no kernel: a process that only draws it need not load numba.
+`DropoutReport` is what `icrtool.dropout` and `icrtool.dropout_report` return. It stands here and not among the records
+because it holds a calibration, which is made of fits. No code that makes it is here, and no kernel: a process that only
+draws it need not load numba.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import operator
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import astuple, replace
 
 from icrtool import __version__
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import BlockSums
+from icrtool.kernels.error_statistics import BlockSums, difference_half_width, within_budget
 from icrtool.kernels.track import TrialCounts
-from icrtool.records.dropout import Gate
+from icrtool.motion.models import FAMILY
+from icrtool.records.dropout import METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.dropout_document import (
-    BaselineDocument,
-    BlocksDocument,
     DropoutDocument,
     EarlierReport,
     ErrorRow,
@@ -35,6 +38,7 @@ from icrtool.records.dropout_document import (
     SummaryRow,
     column_of,
 )
+from icrtool.records.plain_data import plain
 from icrtool.records.run import FigureSet, call_output
 from icrtool.records.run_document import RunDocument, known_content
 from icrtool.records.text import escaped, listed
@@ -44,6 +48,19 @@ if TYPE_CHECKING:
 
     from icrtool.calibration.record import Calibration
 
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_FORM = re.compile(
+    r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max|within)@(?P<at>\d+(?:\.\d+)?)\s*m?\s*"
+    rf"(?P<relation><=|>=|<|>)\s*(?:(?P<bound>[+-]?{_NUMBER})\s*m?|"
+    rf"(?:(?P<factor>{_NUMBER})\s*\*\s*)?(?P<baseline>baseline)(?:\s*(?P<offset>[+-]\s*{_NUMBER})\s*m?)?)\s*$"
+)
+_RELATIONS: dict[str, Callable[[float, float], bool]] = {
+    "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
+}  # fmt: skip
+
+FORMER_ROWS = {"multiplier", "window", "extended", *FAMILY} - {"no_slip", "controller", "recommended", "icr"}
+"""Rows that reports of earlier versions had."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenLoopErrors:
@@ -51,7 +68,7 @@ class OpenLoopErrors:
 
     Attributes
     ----------
-    run : document of the run
+    run_document : what run.json of the run holds
     horizons_m : (h,) ascending
     results : one per model
     counts : trials, and starts without a trial, by horizon; the same for every model
@@ -61,7 +78,7 @@ class OpenLoopErrors:
     by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
     """
 
-    run: RunDocument
+    run_document: RunDocument
     horizons_m: Floats
     results: tuple[ModelResult, ...]
     counts: TrialCounts
@@ -76,7 +93,7 @@ class OpenLoopErrors:
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
-class DropoutReport:
+class DropoutReport(OpenLoopErrors):
     """Open-loop errors by model and horizon, and what else was asked for.
 
     `icrtool.dropout` gives the errors alone, `icrtool.dropout_report` all of it.
@@ -84,7 +101,6 @@ class DropoutReport:
     Attributes
     ----------
     document : what report.json holds
-    errors : the errors with their histograms
     run_directory : where the run was read from, None for one just made
     reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
     usable : distances and numbers may be used, or were asked for all the same
@@ -94,7 +110,6 @@ class DropoutReport:
     """
 
     document: DropoutDocument
-    errors: OpenLoopErrors
     run_directory: Path | None
     reference_north_m: Floats
     reference_east_m: Floats
@@ -111,28 +126,9 @@ class DropoutReport:
         return self.document.run.log
 
     @property
-    def run_document(self) -> RunDocument:
-        """What run.json of the run holds."""
-        return self.errors.run
-
-    @property
-    def horizons_m(self) -> Floats:
-        """Distances without GNSS (h,), ascending."""
-        return self.errors.horizons_m
-
-    @property
-    def results(self) -> tuple[ModelResult, ...]:
-        """The errors of each model."""
-        return self.errors.results
-
-    @property
     def passed(self) -> bool:
         """Whether every acceptance limit is met."""
         return self.document.passed
-
-    def result(self, model: str) -> ModelResult | None:
-        """Return the result of a model, None when it was not computed."""
-        return self.errors.result(model)
 
     @property
     def summary(self) -> pd.DataFrame:
@@ -207,36 +203,35 @@ class BaselineReport:
         for one in self.document.models:
             for row in one.by_horizon:
                 if one.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6):
-                    return row, next((_sums(sums) for sums in one.blocks if sums.horizon_m == row.horizon_m), None)
+                    found = next((sums for sums in one.blocks if sums.horizon_m == row.horizon_m), None)
+                    if found is None:
+                        return row, None
+                    counts = (np.array(column, np.int64) for column in (found.trials, found.above_p50, found.above_p95))
+                    trials, above_p50, above_p95 = counts
+                    growth = (float(column_of([found], name)[0]) for name in ("p50_slope_m", "p95_slope_m"))
+                    return row, BlockSums(trials, np.array(found.errors_m, np.float64), above_p50, above_p95, *growth)
         return None, None
 
-    def row(self, gate: Gate) -> tuple[ErrorRow, BlockSums | None]:
-        """Return what `at` does for the model and horizon that a gate names.
+    def number_for(self, gate: Gate) -> tuple[float, BlockSums | None]:
+        """Return the number [m] that a limit is about, NaN where there is none, and its block sums.
 
         Raises
         ------
         ConfigError
             The report has no such model or horizon.
         """
-        row, sums = self.at(gate.model, gate.horizon_m or math.nan)
-        if row is None:
-            what = f"no {gate.model} over {gate.horizon_m:g} m"
-            raise ConfigError(f"gate {gate.text!r}", f"{what} in the baseline {self.path}", "make the baseline again")
-        return row, sums
-
-    def p95_of(self, gate: Gate) -> tuple[Floats, Floats]:
-        """Return distances (h,) and p95 (h,) [m] of the model that a gate names.
-
-        Raises
-        ------
-        ConfigError
-            The report has no such model.
-        """
+        if gate.budget_m is None:
+            row, sums = self.at(gate.model, gate.horizon_m or math.nan)
+            if row is None:
+                what = f"no {gate.model} over {gate.horizon_m:g} m in the baseline {self.path}"
+                raise ConfigError(f"gate {gate.text!r}", what, "make the baseline again")
+            return float(column_of([row], METRICS[gate.metric])[0]), sums
         rows = [row for one in self.document.models if one.name == gate.model for row in one.by_horizon]
         if not rows:
             raise ConfigError(f"gate {gate.text!r}", f"no {gate.model} in the baseline {self.path}", "make it again")
         rows.sort(key=lambda row: row.horizon_m)
-        return column_of(rows, "horizon_m"), column_of(rows, "p95_m")
+        reached = within_budget(column_of(rows, "horizon_m"), column_of(rows, "p95_m"), gate.budget_m)
+        return (math.nan if reached is None else reached[0]), None
 
     def changes(self, run_document: RunDocument) -> tuple[str, ...]:
         """Return what differs beside the numbers: log, configuration, version; a sentence each."""
@@ -250,20 +245,9 @@ class BaselineReport:
             found.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
         return tuple(found)
 
-    def compared_with(self, run_document: RunDocument) -> BaselineDocument:
-        """Return what a report of a run holds of this one."""
-        same, changes = self.is_of(run_document), self.changes(run_document)
-        return BaselineDocument(self.path, self.log, self.tool_version, same, changes)
-
     def is_of(self, run_document: RunDocument) -> bool:
         """Return whether the report was made of the same recording as a run."""
         return bool(self.sha256) and self.sha256 == run_document.content
-
-
-def _sums(one: BlocksDocument) -> BlockSums:
-    trials, p50, p95 = (np.array(column, np.int64) for column in (one.trials, one.above_p50, one.above_p95))
-    growth = (float(column_of([one], name)[0]) for name in ("p50_slope_m", "p95_slope_m"))
-    return BlockSums(trials, np.array(one.errors_m, np.float64), p50, p95, *growth)
 
 
 def _different_keys(before: Mapping[str, object], now: Mapping[str, object], prefix: str = "") -> Iterator[str]:
@@ -273,3 +257,114 @@ def _different_keys(before: Mapping[str, object], now: Mapping[str, object], pre
             yield from _different_keys(old, new, f"{prefix}{key}.")
         elif old != new:
             yield f"{prefix}{key}"
+
+
+def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDistance, ...]:
+    """Return how far the 95th percentile of each model stays within a budget [m]; models without trials are left out.
+
+    Raises
+    ------
+    ConfigError
+        The budget is no length.
+    """
+    if not (math.isfinite(budget_m) and budget_m > 0):
+        raise ConfigError("budget", f"{budget_m:g} m is no length", "give positive metres")
+    found = []
+    for result in report.results:
+        reached = within_budget(report.horizons_m, result.column("p95_m"), budget_m)
+        if reached is not None:
+            ends = (
+                within_budget(report.horizons_m, result.column(name), budget_m) for name in ("p95_high_m", "p95_low_m")
+            )
+            # An end that stays within the budget as far as there are intervals has no such distance.
+            low, high = (None if end is None or end[1] else end[0] for end in ends)
+            quiet = column_of(result.without_events, "p95_m")
+            free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
+            without = (None, False) if free is None else free[:2]
+            found.append(BudgetDistance(result.name, result.label, budget_m, *reached, low, high, *without))
+    return tuple(found)
+
+
+def parse_gate(text: str) -> Gate:
+    """Read a gate.
+
+    Raises
+    ------
+    ConfigError
+        The text is neither of the form ``model.metric@HORIZONm <= bound`` nor ``… <= FACTOR * baseline + OFFSET m``.
+    """
+    match = _FORM.match(text)
+    if match is None:
+        form = "model.p50|p95|expected|max@HORIZONm <= metres, model.within@ERRORm >= metres, or [FACTOR *] baseline"
+        example = 'for example "recommended.p95@10m <= 1.2" or "recommended.within@0.5m >= 10"'
+        raise ConfigError(f"gate {text!r}", f"not of the form {form}", example)
+    at_m, within = float(match["at"]), match["metric"] == "within"
+    if not at_m > 0:
+        raise ConfigError(f"gate {text!r}", "0 m is no length", "name one above zero, for example @10m")
+    factor = float(match["factor"] or 1.0) if match["baseline"] else 0.0
+    bound_m = float((match["bound"] or match["offset"] or "0").replace(" ", ""))
+    return Gate(
+        " ".join(text.split()), match["model"], match["metric"], None if within else at_m, match["relation"], bound_m,
+        factor, at_m if within else None,
+    )  # fmt: skip
+
+
+def check_gate(
+    gate: Gate, report: OpenLoopErrors, baseline: BaselineReport | None = None, *, strict: bool = False
+) -> Verdict:
+    """Compare a report with an acceptance limit.
+
+    Parameters
+    ----------
+    baseline : what a limit relative to the baseline is compared with; without one such a limit is not checked
+    strict : a relative limit is missed by the number alone, not only beyond the interval of the difference
+
+    Raises
+    ------
+    ConfigError
+        A model or horizon that the report, or the baseline, does not have.
+    """
+    if (result := report.result(gate.model)) is None:
+        if gate.model.removesuffix("_gyro") in FORMER_ROWS:
+            raise ConfigError(f"gate {gate.text!r}", "no such row", "use recommended")
+        found = ", ".join(one.name for one in report.results)
+        advice = f"this run has {found}; no_slip needs robot.track_width_m"
+        raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
+    sums = None
+    if gate.budget_m is not None:
+        reached = within_budget(report.horizons_m, result.column("p95_m"), gate.budget_m)
+        value = math.nan if reached is None else reached[0]
+    else:
+        places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m or math.nan))
+        if not len(places):
+            found = ", ".join(f"{horizon:g}" for horizon in report.horizons_m)
+            raise ConfigError(f"gate {gate.text!r}", f"no horizon of {gate.horizon_m:g} m", f"use {found}")
+        h = int(places[0])
+        value, sums = float(result.column(METRICS[gate.metric])[h]), result.block_sums[h]
+    half_width, before = math.nan, math.nan
+    if gate.baseline_factor:
+        if baseline is None:
+            why = "this log is not in the baseline"
+            return verdict_on(gate, report.run_document.log, value_m=value, passed=True, not_checked=why)
+        before, old = baseline.number_for(gate)
+        same = baseline.is_of(report.run_document)
+        half_width = difference_half_width(sums, old, gate.metric, gate.baseline_factor, paired=same)
+    bound = gate.bound_m + (gate.baseline_factor * before if gate.baseline_factor else 0.0)
+    margin = bound - value if gate.relation.startswith("<") else value - bound
+    passed = _RELATIONS[gate.relation](value, bound) or (not strict and margin + half_width >= 0.0)
+    return verdict_on(
+        gate, report.run_document.log, passed=passed, value_m=value, value_bound_m=bound, baseline_m=before,
+        margin_m=margin, margin_low_m=margin - half_width, margin_high_m=margin + half_width,
+    )  # fmt: skip
+
+
+def verdict_on(gate: Gate, log: str, *, passed: bool, **found: float | str | None) -> Verdict:
+    """Return a limit that was checked, with the line about it, which names the log.
+
+    Parameters
+    ----------
+    found : further fields of `Verdict`; a number that is not finite is not known
+    """
+    fields = {"value_m": None} | {name: plain(value) for name, value in found.items()}
+    checked = Verdict(*astuple(gate), passed=passed, verdict="", **fields)
+    return replace(checked, verdict=checked.line(log))

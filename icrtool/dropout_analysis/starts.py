@@ -1,24 +1,29 @@
 """Which recorded states open-loop trials start from, and what they are compared with.
 
-From which state on the ICRs were learned; the filter's estimate or the smoother's as the reference, and the error that
-it has itself.
+From which state on the ICRs were learned; which trials turn; the filter's estimate or the smoother's as the reference,
+and the error that it has itself.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from icrtool.calibration.model_comparison import models_of
 from icrtool.errors import RunError
 from icrtool.estimation.observability import WEAK_SHARE
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints, rows_of_cells
+from icrtool.kernels.open_loop import open_loop_errors
 from icrtool.kernels.track import STANDING, Track, trial_ends
+from icrtool.records.dropout import TurningSplit
 from icrtool.records.dropout_document import ReferenceRow
 from icrtool.records.plain_data import known
-from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.run import ICR_COLUMNS, Run, track_of
 
 Starts = Literal["moving", "all"]
 """``moving``: each standstill gives one start, the state from which the robot drives on; ``all``: every state."""
@@ -40,16 +45,11 @@ def standing_states(track: Track) -> Bools:
     return standing
 
 
-def leave_out_standing(ends: NDArray[np.signedinteger], standing: Bools) -> None:
-    """Mark the trials of standing starts as none, in the ends (n, h) of `trial_ends`."""
-    ends[standing[:, None] & (ends >= 0)] = STANDING
-
-
 def counted_ends(track: Track, horizon_m: float, starts: Starts) -> Ints:
     """Return `trial_ends` (n, 1) of one horizon, without the starts that do not count."""
     ends = trial_ends(track, np.array([horizon_m]))
     if starts == "moving":
-        leave_out_standing(ends, standing_states(track))
+        ends[standing_states(track)[:, None] & (ends >= 0)] = STANDING
     return ends
 
 
@@ -83,6 +83,8 @@ def first_learned(run: Run) -> int | None:
 DRAWS = 20_000
 """Errors drawn a horizon: p95 is then known to 1 %."""
 
+POSE = ("north_m", "east_m", "heading_rad")
+
 GNSS_NIS, HEADING_NIS = 2.0, 1.0
 """Mean normalised innovation squared where the noise is right: the number of measured components."""
 
@@ -114,9 +116,10 @@ def reference_error(
     independent: what both share, an offset of all fixes, is in no trial, and what they share in part makes the result
     an upper bound. A heading offset common to the whole log is not in the variances.
     """
-    position, heading = _spread(run)
-    table = run.table
-    rows = []
+    table, noise, rows = run.table, run.document.filter, []
+    # Fixes and headings spread by these factors more than the filter assumes, in variance; at least 1.
+    position = max((noise.nis_gnss_mean or 0.0) / GNSS_NIS, 1.0)
+    heading = max((noise.nis_heading_mean or 0.0) / HEADING_NIS, 1.0)
     rng = np.random.default_rng(seed)
     for horizon_m, column in zip(horizons_m.tolist(), ends, strict=True):
         start = np.flatnonzero(column >= 0)
@@ -141,13 +144,6 @@ def reference_error(
     return tuple(rows)
 
 
-def _spread(run: Run) -> tuple[float, float]:
-    """Return the factors by which fixes and headings spread more than the filter assumes, in variance; at least 1."""
-    noise = run.document.filter
-    position, heading = noise.nis_gnss_mean, noise.nis_heading_mean
-    return max((position or 0.0) / GNSS_NIS, 1.0), max((heading or 0.0) / HEADING_NIS, 1.0)
-
-
 def with_smoothed_reference(run: Run) -> Run:
     """Return a run whose positions and headings are the smoother's.
 
@@ -161,12 +157,55 @@ def with_smoothed_reference(run: Run) -> Run:
     Starts, their ICRs, the wheel speeds and the path length stay the filter's: only where a trial begins, where it
     points, and what its end is compared with change.
     """
-    smoothed = run.smoothed
-    if smoothed is None:
+    if run.smoothed is None:
         raise RunError(run.directory or run.name, "it has no smoothed states", "run icrtool fit --smooth")
-    table = replace(
-        run.table,
-        north_m=smoothed.north_m, east_m=smoothed.east_m, heading_rad=smoothed.heading_rad,
-        std_north_m=smoothed.std_north_m, std_east_m=smoothed.std_east_m, std_heading_rad=smoothed.std_heading_rad,
-    )  # fmt: skip
-    return replace(run, table=table)
+    smoothed = {name: getattr(run.smoothed, name) for pose in POSE for name in (pose, f"std_{pose}")}
+    return replace(run, table=replace(run.table, **smoothed))
+
+
+SPLIT_HORIZON_M = 5.0
+STRAIGHT_RAD = math.radians(10.0)
+CELLS = 20
+"""Cells of path a horizon is cut into, to find the range of the heading."""
+
+SPLIT_MODELS = ("icr", "no_slip")
+
+
+def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
+    """Return the errors of straight and turning trials of `SPLIT_HORIZON_M` (Pentzer 2014, Section 6.4, Figs. 33-34).
+
+    What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
+    """
+    track = track_of(run)
+    ends = counted_ends(track, SPLIT_HORIZON_M, starts)
+    tried = np.flatnonzero(ends[:, 0] >= 0)
+    straight = heading_range(track, SPLIT_HORIZON_M)[tried] < STRAIGHT_RAD
+    models = [model for model in models_of(run) if model.name in SPLIT_MODELS]
+    errors = {model.name: open_loop_errors(track, model.icrs, ends)[tried, 0] for model in models}
+    splits = []
+    for is_straight, part in ((True, straight), (False, ~straight)):
+        if part.any():
+            means = {name: float(column[part].mean()) for name, column in errors.items()}
+            splits.append(TurningSplit(is_straight, SPLIT_HORIZON_M, int(np.count_nonzero(part)), means))
+    return tuple(splits)
+
+
+def heading_range(track: Track, horizon_m: float) -> Floats:
+    """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of path."""
+    size = horizon_m / CELLS
+    # A step longer than a horizon counts as a little more than one: a damaged speed fills no memory.
+    distance = track.distance
+
+    def cells_of(part: Floats) -> Floats:
+        return np.asarray(np.floor((part - distance[0]) / size))
+
+    first = rows_of_cells(distance, cells_of)
+    steps = np.diff(cells_of(distance[first]), prepend=0.0)
+    cell = np.cumsum(np.minimum(steps, CELLS + 1.0)).astype(np.int64)
+    cells = np.arange(cell[-1] + CELLS + 1)
+    # In a cell without a state the heading lies between those around it.
+    highest, lowest = (
+        sliding_window_view(np.interp(cells, cell, extreme.reduceat(track.heading, first)), CELLS + 1)
+        for extreme in (np.maximum, np.minimum)
+    )
+    return np.repeat((highest.max(axis=1) - lowest.min(axis=1))[cell], np.diff(first, append=len(distance)))

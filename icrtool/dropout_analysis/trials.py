@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 
 from icrtool.calibration.model_comparison import ComparedRow, Model, models_of
 from icrtool.dropout_analysis.report import OpenLoopErrors
-from icrtool.dropout_analysis.starts import (
-    Starts,
-    first_learned,
-    leave_out_standing,
-    reference_error,
-    standing_states,
-)
+from icrtool.dropout_analysis.starts import Starts, first_learned, reference_error, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.error_statistics import (
@@ -36,7 +30,7 @@ from icrtool.kernels.error_statistics import (
 )
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop import open_loop_errors
-from icrtool.kernels.track import FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
+from icrtool.kernels.track import STANDING, FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
 from icrtool.motion.recording import MOST_TRIALS, Trials
 from icrtool.records.dropout_document import (
     BlocksDocument,
@@ -100,48 +94,62 @@ def measure_errors(
     horizons = check_horizons(horizons_m)
     track = track if track is not None else track_of(run)
     predictors: list[Model | ComparedRow] = [*(models if models is not None else models_of(run)), *further]
-    standing, learned = standing_states(track), first_learned(run)
-    left_out = standing if starts == "moving" else np.zeros_like(standing)
     if len({model.name for model in predictors}) < len(predictors):
         raise ValueError("two models have the same name")
-    sparse = starts_of_further if starts_of_further is not None else sparse_starts(track)
-    asked = _Asked(run, track, predictors, left_out, learned, seed, sink, sparse)
+    standing, learned = standing_states(track), first_learned(run)
+    left_out = standing if starts == "moving" else np.zeros_like(standing)
+    sparse = starts_of_further
+    if sparse is None:
+        moving = np.flatnonzero(~standing)
+        sparse = moving[:: max(len(moving) // MOST_TRIALS, 1)]
+    counts: list[TrialCounts] = []
+    reference: list[ReferenceRow] = []
+    found: list[list[_AtHorizon]] = [[] for _ in predictors]
+    before: list[ErrorRow] = []
+    after: list[ErrorRow] = []
+    together = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
     with ThreadPoolExecutor(THREADS) as pool:
-        parts = [_part(asked, horizons[group], pool) for group in _groups(len(horizons), len(run.table))]
-    split = None
-    if sides := [part.by_learning for part in parts if part.by_learning is not None]:
+        for begin in range(0, len(horizons), together):
+            group = horizons[begin : begin + together]
+            ends, of_group = _ends(track, group, left_out, pool)
+            counts.append(of_group)
+            trials = Trials(sparse, ends[:, sparse].T.astype(np.int64))
+            blocks, slipping = _blocks(track.distance, group, ends, pool), _slipping_trials(run, ends)
+            for model, rows in zip(predictors, found, strict=True):
+                give_back_freed()
+                if isinstance(model, ComparedRow):
+                    errors, turned = model.errors_of(trials)
+                    tested = _blocks(track.distance[sparse], group, np.isfinite(errors.T) - 1, pool)
+                    touching = None if slipping is None else slipping[sparse]
+                else:
+                    errors, turned = _errors(track, model, ends, pool), _turn_errors(track, model.icrs, trials)
+                    tested, touching = blocks, slipping
+                rows.extend(_at_horizons(group, errors, turned, tested, touching, pool))
+                if model.name == "icr":
+                    first = len(errors) if learned is None else learned
+                    before += _rows(group, errors[:first])
+                    after += _rows(group, errors[first:])
+                if sink is not None:
+                    if isinstance(model, ComparedRow):
+                        of_some, errors = errors, np.full((len(track.distance), len(group)), np.nan)
+                        errors[sparse] = of_some
+                    sink(model.name, group, errors)
+                del errors  # before those of the next model are made
+            reference += reference_error(run, track, group, ends, seed)
+    by_learning = None
+    if before:
         at, driven = (None if learned is None else float(one[learned]) for one in (run.table.t_s, run.table.distance_m))
-        before, after = ([row for rows in part for row in rows] for part in zip(*sides, strict=True))
-        split = LearnedDocument("icr", at, driven, before, after)
+        by_learning = LearnedDocument("icr", at, driven, before, after)
     return OpenLoopErrors(
-        run=run.document,
+        run_document=run.document,
         horizons_m=horizons,
-        results=tuple(map(_result, predictors, zip(*(part.results for part in parts), strict=True))),
-        counts=TrialCounts(*(np.concatenate(column) for column in zip(*(part.counts for part in parts), strict=True))),
+        results=tuple(map(_result, predictors, found)),
+        counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
         states=len(run.table),
         standing=int(np.count_nonzero(standing)),
-        reference=tuple(row for part in parts for row in part.reference),
-        by_learning=split,
+        reference=tuple(reference),
+        by_learning=by_learning,
     )
-
-
-class _Asked(NamedTuple):
-    """What is the same for all horizons.
-
-    Attributes
-    ----------
-    left_out : (n,) starts that count as none; learned : the first at which the ICRs were learned
-    sparse : starts of models of constant parameters
-    """
-
-    run: Run
-    track: Track
-    predictors: Sequence[Model | ComparedRow]
-    left_out: Bools
-    learned: int | None
-    seed: int
-    sink: ErrorSink | None
-    sparse: Ints
 
 
 class _AtHorizon(NamedTuple):
@@ -153,55 +161,12 @@ class _AtHorizon(NamedTuple):
     free: ErrorRow | None
 
 
-class _Part(NamedTuple):
-    """The trials of some horizons; `by_learning`: before and after the ICRs were learned, of the momentary ICRs."""
-
-    counts: TrialCounts
-    reference: tuple[ReferenceRow, ...]
-    results: list[list[_AtHorizon]]
-    by_learning: tuple[list[ErrorRow], list[ErrorRow]] | None
-
-
-def _part(asked: _Asked, horizons: Floats, pool: Executor) -> _Part:
-    """Return the errors of all models at some horizons."""
-    track, learned, by_learning = asked.track, asked.learned, None
-    ends, counts = _ends(track, horizons, asked.left_out, pool)
-    blocks = _blocks(track.distance, horizons, ends, pool)
-    sparse = Trials(asked.sparse, ends[:, asked.sparse].T.astype(np.int64))
-    slipping = _slipping_trials(asked.run, ends)
-    results = []
-    for model in asked.predictors:
-        give_back_freed()
-        if isinstance(model, ComparedRow):
-            errors, turned = model.errors_of(sparse)
-            tested = _blocks(track.distance[sparse.starts], horizons, np.isfinite(errors.T) - 1, pool)
-        else:
-            errors, turned = _errors(track, model, ends, pool), _turn_errors(track, model.icrs, sparse)
-            tested = blocks
-        if asked.sink is not None:
-            asked.sink(model.name, horizons, errors if len(errors) == len(track.distance) else _spread(errors, asked))
-        touching = slipping if slipping is None or len(errors) == len(slipping) else slipping[asked.sparse]
-        results.append(_at_horizons(horizons, errors, turned, tested, touching, pool))
-        if model.name == "icr":
-            first = len(errors) if learned is None else learned
-            by_learning = _rows(horizons, errors[:first]), _rows(horizons, errors[first:])
-        del errors  # before those of the next model are made
-    return _Part(counts, reference_error(asked.run, track, horizons, ends, asked.seed), results, by_learning)
-
-
 def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> Bools | None:
     """Return which trials (n, h) touch a slip event, by their ends (h, n); None where the run has no event."""
     if not run.sensors.events:
         return None
     before: Ints = np.cumsum(run.slipping) - run.slipping
     return np.asarray((before[np.maximum(ends, 0)] > before).T)
-
-
-def _spread(errors: Floats, asked: _Asked) -> Floats:
-    """Return errors (n, h) of all starts from those of some."""
-    all_errors: Floats = np.full((len(asked.track.distance), errors.shape[1]), np.nan)
-    all_errors[asked.sparse] = errors
-    return all_errors
 
 
 def _turn_errors(track: Track, icrs: FrozenIcrs, trials: Trials) -> Floats:
@@ -259,18 +224,6 @@ def load_kernels() -> None:
     open_loop_errors(track, icrs, ends)
 
 
-def sparse_starts(track: Track) -> Ints:
-    """Return evenly spaced starts of a drive without standstill, at most some `MOST_TRIALS`."""
-    moving = np.flatnonzero(~standing_states(track))
-    return moving[:: max(len(moving) // MOST_TRIALS, 1)]
-
-
-def _groups(horizons: int, states: int) -> list[slice]:
-    """Cut the horizons into groups whose table of errors is not too large."""
-    size = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * max(states, 1)))
-    return [slice(begin, min(begin + size, horizons)) for begin in range(0, horizons, size)]
-
-
 def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
     """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
     states, find = len(track.distance), ends_finder(track)
@@ -279,7 +232,7 @@ def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tu
     def fill(lo: int) -> TrialCounts:
         hi = min(lo + STARTS_AT_ONCE, states)
         found = find(horizons, np.arange(lo, hi))
-        leave_out_standing(found, left_out[lo:hi])
+        found[left_out[lo:hi, None] & (found >= 0)] = STANDING
         ends[:, lo:hi] = found.T
         return count_trials(found)
 
@@ -328,7 +281,9 @@ def _at_horizons(
         ordered = sort_trials(column[:, 0])
         trials, *found = (one[0] for one in summary_of_sorted([ordered]))
         expected, p50, p95, largest = map(float, found)
-        bins = histogram_sorted(ordered, _bin_width(p95, largest))
+        # Bins that show the bulk of the trials, few outliers apart, in at most some hundred bins.
+        shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
+        bins = histogram_sorted(ordered, round_bin_width(shown_m))
         sums = block_sums(column[:, 0], blocks[h], ordered, p50, p95)
         intervals = error_intervals(column[:, 0], blocks[h], sums, p95)
         of_turns = error_summary(np.degrees(turned[:, h : h + 1]))
@@ -341,9 +296,8 @@ def _at_horizons(
     return list(pool.map(at_horizon, range(len(blocks))))
 
 
-def _result(model: Model | ComparedRow, parts: Iterable[list[_AtHorizon]]) -> ModelResult:
-    """Return the errors of one model from those of groups of horizons."""
-    found = [one for part in parts for one in part]
+def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> ModelResult:
+    """Return the errors of one model from those at each horizon."""
     rows, bins, sums, free = zip(*found, strict=True)
     blocks = [
         BlocksDocument(row.horizon_m, **plain(one._asdict() | {"errors_m": [float(f"{e:.6g}") for e in one.errors_m]}))
@@ -351,10 +305,3 @@ def _result(model: Model | ComparedRow, parts: Iterable[list[_AtHorizon]]) -> Mo
     ]  # fmt: skip
     document = ModelDocument(model.name, model.label, model.knows, list(rows), blocks)
     return ModelResult(document, bins, sums, tuple(row for row in free if row is not None))
-
-
-def _bin_width(p95_m: float, largest_m: float) -> float:
-    """Return the width of bins that show the bulk of the trials, few outliers apart, in at most some hundred bins."""
-    if math.isnan(largest_m):
-        return round_bin_width(0.0)
-    return round_bin_width(max(min(largest_m, BULK_IN_P95 * p95_m), largest_m / MOST_BULKS))

@@ -75,7 +75,7 @@ def plan(
     OutputError
         `output` is a run, or something else than a directory, or holds somebody's own file of the name of a result.
     """
-    from icrtool.dropout_analysis.acceptance_limits import parse_gate
+    from icrtool.dropout_analysis.report import parse_gate
     from icrtool.output.run_directory import RUN_FILE
 
     for gate in options.report.gates:

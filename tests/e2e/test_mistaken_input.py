@@ -90,7 +90,7 @@ def test_a_run_from_before_jumps_were_listed_is_read_without_any(run: Path) -> N
     (run / CHECKSUM_FILE).write_text("\n".join([*sums, ""]))
     opened = library.open_run(run)
     assert opened.summary["reference_jumps"] == []
-    assert library.dropout(opened).errors.counts.crosses_jump.sum() == 0
+    assert library.dropout(opened).counts.crosses_jump.sum() == 0
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])

@@ -22,7 +22,7 @@ def with_content(report: DropoutReport, **changes: Any) -> DropoutReport:
 def with_run(report: DropoutReport, run: RunDocument) -> DropoutReport:
     """Return a report of another run."""
     of_run = msgspec.structs.replace(report.document.run, log=run.log)
-    return replace(with_content(report, run=of_run), errors=replace(report.errors, run=run))
+    return replace(with_content(report, run=of_run), run_document=run)
 
 
 def with_outages(report: DropoutReport, outages: tuple[Outage, ...]) -> DropoutReport:
@@ -32,7 +32,7 @@ def with_outages(report: DropoutReport, outages: tuple[Outage, ...]) -> DropoutR
 def with_models(report: DropoutReport, *results: ModelResult) -> DropoutReport:
     """Return a report of other models."""
     document = msgspec.structs.replace(report.document, models=tuple(one.document for one in results))
-    return replace(report, document=document, errors=replace(report.errors, results=results))
+    return replace(report, document=document, results=results)
 
 
 def with_numbers(result: ModelResult, name: str | None = None, **columns: Sequence[float]) -> ModelResult:

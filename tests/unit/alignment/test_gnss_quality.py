@@ -12,7 +12,7 @@ from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.gnss_quality import grade_fixes
 from icrtool.alignment.sensor_noise import without_frozen
 from icrtool.config import load_config
-from icrtool.dropout_analysis.outages import real_outages
+from icrtool.dropout_analysis.shown_paths import real_outages
 from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Bools
 from icrtool.kernels.filter_records import GATED

@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import isotonic_regression
 
-from icrtool.dropout_analysis.acceptance_limits import (
-    budget_distances,
-    check_gate,
-    parse_gate,
-)
 from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
-from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.report import DropoutReport, budget_distances, check_gate, parse_gate
 from icrtool.errors import ConfigError
 from icrtool.kernels.error_statistics import never_falling, within_budget
 from icrtool.records.run import Run
@@ -40,7 +35,7 @@ def test_a_gate_holds_its_number_against_its_bound(
     value = float(result.column(METRICS[metric])[1])
     above, below = value + 0.25, value - 0.25
     for bound in (above, below):
-        verdict = check_gate(parse_gate(f"{model}.{metric}@2.5m {relation} {bound}"), report.errors)
+        verdict = check_gate(parse_gate(f"{model}.{metric}@2.5m {relation} {bound}"), report)
         assert verdict.value_m == value
         assert verdict.passed == ((bound == above) == (relation[0] == "<"))
         assert verdict.margin_m == pytest.approx(0.25 if verdict.passed else -0.25)
@@ -51,7 +46,7 @@ def test_a_number_on_its_bound_passes_only_where_equality_is_allowed(
     report: DropoutReport, relation: str, passes: bool
 ) -> None:
     value = float(report.results[0].column("p95_m")[0])
-    verdict = check_gate(parse_gate(f"icr.p95@1m{relation}{value!r}"), report.errors)
+    verdict = check_gate(parse_gate(f"icr.p95@1m{relation}{value!r}"), report)
     assert verdict.passed is passes
     assert verdict.margin_m == 0.0
 
@@ -91,15 +86,15 @@ def test_text_that_is_no_gate_is_refused_with_an_example(text: str) -> None:
 
 def test_an_unknown_model_or_horizon_is_an_error_that_names_what_there_is(report: DropoutReport) -> None:
     with pytest.raises(ConfigError, match="no model calibrated; this run has icr, no_slip, icr_final"):
-        check_gate(parse_gate("calibrated.p95@1m <= 1"), report.errors)
+        check_gate(parse_gate("calibrated.p95@1m <= 1"), report)
     with pytest.raises(ConfigError, match="no horizon of 7 m"):
-        check_gate(parse_gate("icr.p95@7m <= 1"), report.errors)
+        check_gate(parse_gate("icr.p95@7m <= 1"), report)
 
 
 def test_a_gate_without_trials_fails_and_says_so(run: Run) -> None:
     report = dropout(run, [900.0])
     for relation in ("<=", ">="):
-        verdict = check_gate(parse_gate(f"icr.p95@900m {relation} 1"), report.errors)
+        verdict = check_gate(parse_gate(f"icr.p95@900m {relation} 1"), report)
         assert not verdict.passed
         assert verdict.value_m is None
         assert verdict.verdict.startswith(f"FAIL  icr.p95@900m {relation} 1: no trial of 900 m in this log")
@@ -107,7 +102,7 @@ def test_a_gate_without_trials_fails_and_says_so(run: Run) -> None:
 
 def test_the_verdict_names_number_bound_and_margin(report: DropoutReport) -> None:
     value = float(report.results[0].column("p95_m")[0])
-    line = check_gate(parse_gate("icr.p95@1m <= 3"), report.errors).verdict
+    line = check_gate(parse_gate("icr.p95@1m <= 3"), report).verdict
     assert line.startswith(f"pass  icr.p95@1m <= 3: {value:.4g} m, margin {3 - value:+.4g} m")
     assert report.name in line
 
@@ -134,16 +129,16 @@ def with_p95(report: DropoutReport, *p95: float) -> DropoutReport:
 def test_a_budget_is_interpolated_between_horizons_from_zero(
     report: DropoutReport, budget: float, p95: tuple[float, ...], distance: float, beyond: bool
 ) -> None:
-    (found,) = budget_distances(with_p95(report, *p95).errors, budget)
+    (found,) = budget_distances(with_p95(report, *p95), budget)
     assert found.distance_m == pytest.approx(distance)
     assert (found.model, found.budget_m, found.beyond) == ("icr", budget, beyond)
 
 
 def test_a_budget_without_trials_is_left_out_and_no_length_is_refused(report: DropoutReport) -> None:
-    assert budget_distances(with_p95(report, math.nan, math.nan, math.nan).errors, 1.0) == ()
+    assert budget_distances(with_p95(report, math.nan, math.nan, math.nan), 1.0) == ()
     for budget in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ConfigError, match="budget"):
-            budget_distances(report.errors, budget)
+            budget_distances(report, budget)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +154,7 @@ def test_an_interval_of_a_budget_ends_where_its_knowledge_ends(
 ) -> None:
     one = with_p95(report, 0.1, 0.4, 2.0)
     between = with_numbers(one.results[0], p95_low_m=low, p95_high_m=high)
-    (found,) = budget_distances(with_models(one, between).errors, 0.3)
+    (found,) = budget_distances(with_models(one, between), 0.3)
     assert found.distance_m == pytest.approx(1.0 + 1.5 * 0.2 / 0.3)
     assert found.interval_text == text
 
@@ -182,11 +177,11 @@ def test_a_short_distance_that_is_worse_than_a_longer_one_does_not_end_the_reach
 
 
 def test_a_limit_on_the_distance_within_a_budget(report: DropoutReport) -> None:
-    reached = next(one for one in budget_distances(report.errors, 0.2) if one.model == "icr")
+    reached = next(one for one in budget_distances(report, 0.2) if one.model == "icr")
     for bound, passed in ((reached.distance_m - 0.01, True), (reached.distance_m + 0.01, False)):
-        verdict = check_gate(parse_gate(f"icr.within@0.2m >= {bound}"), report.errors)
+        verdict = check_gate(parse_gate(f"icr.within@0.2m >= {bound}"), report)
         assert (verdict.passed, verdict.value_m) == (passed, pytest.approx(reached.distance_m))
-    wide = check_gate(parse_gate("icr.within@99 >= 1"), report.errors)
+    wide = check_gate(parse_gate("icr.within@99 >= 1"), report)
     assert wide.value_m == report.horizons_m[np.isfinite(report.results[0].column("p95_m"))][-1]
 
 

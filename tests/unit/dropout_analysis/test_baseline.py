@@ -12,9 +12,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from icrtool.dropout_analysis.acceptance_limits import check_gate, parse_gate
 from icrtool.dropout_analysis.dropout_report import dropout_report
-from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport, check_gate, parse_gate
 from icrtool.errors import ConfigError, IcrToolError
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.fleet.roll_up import runs_of_fleet
@@ -127,14 +126,14 @@ def test_a_report_equals_its_own_baseline(report: DropoutReport, written: Path) 
     baseline = open_baseline(written).find("any", ())
     assert baseline is not None
     for model in ("icr", "recommended"):
-        verdict = check_gate(parse_gate(f"{model}.p95@2m <= baseline"), report.errors, baseline)
+        verdict = check_gate(parse_gate(f"{model}.p95@2m <= baseline"), report, baseline)
         assert verdict.passed
         assert verdict.margin_m == 0.0
         result = report.result(model)
         assert result is not None
         assert verdict.baseline_m == result.column("p95_m")[1]
     held_out = "controller"
-    assert check_gate(parse_gate(f"{held_out}.p95@5m <= baseline"), report.errors, baseline).margin_m == 0.0
+    assert check_gate(parse_gate(f"{held_out}.p95@5m <= baseline"), report, baseline).margin_m == 0.0
     stored, made = baseline.at("icr", 2.0)[1], report.result("icr").block_sums[1]
     for name, column in made._asdict().items():
         np.testing.assert_allclose(getattr(stored, name), column, rtol=1e-5)
@@ -143,11 +142,11 @@ def test_a_report_equals_its_own_baseline(report: DropoutReport, written: Path) 
 def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, written: Path) -> None:
     baseline = read_report(written, "earlier")
     gate = parse_gate("icr.p95@2m <= 0.97 * baseline")
-    verdict = check_gate(gate, report.errors, other_document(baseline, inputs=(EarlierInput("other"),)))
+    verdict = check_gate(gate, report, other_document(baseline, inputs=(EarlierInput("other"),)))
     assert verdict.margin_m < 0 < verdict.margin_high_m
     assert verdict.passed
-    assert not check_gate(gate, report.errors, baseline, strict=True).passed
-    far = check_gate(parse_gate("icr_final.p95@2m <= 0.1 * baseline"), report.errors, baseline)
+    assert not check_gate(gate, report, baseline, strict=True).passed
+    far = check_gate(parse_gate("icr_final.p95@2m <= 0.1 * baseline"), report, baseline)
     assert not far.passed
     assert far.margin_high_m < 0
     for part in (
@@ -158,11 +157,11 @@ def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, writt
         report.name,
     ):
         assert part in far.verdict
-    unknown = check_gate(gate, report.errors)
+    unknown = check_gate(gate, report)
     assert unknown.passed
     assert unknown.not_checked
     with pytest.raises(ConfigError, match="over 3 m"):
-        baseline.row(msgspec.structs.replace(gate, horizon_m=3.0))
+        baseline.number_for(msgspec.structs.replace(gate, horizon_m=3.0))
 
 
 def other_document(baseline: BaselineReport, **changes: Any) -> BaselineReport:
@@ -222,7 +221,7 @@ def test_an_edited_baseline_is_refused_in_one_line_or_compared(report: DropoutRe
             baseline = open_baseline(written).find("any", ())
             assert baseline is not None
             for metric in ("p50", "p95", "expected", "max"):
-                check_gate(parse_gate(f"icr.{metric}@2m <= 1.1 * baseline"), report.errors, baseline)
+                check_gate(parse_gate(f"icr.{metric}@2m <= 1.1 * baseline"), report, baseline)
             compared += bool(str(baseline.changes(report.run_document)))
         except ConfigError as err:
             refusals.append(str(err))

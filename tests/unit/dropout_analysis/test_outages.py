@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from icrtool.config import load_config
-from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
+from icrtool.dropout_analysis.shown_paths import force_outages, plan_outages, real_outages
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.fit import fit
 from icrtool.kernels.filter_records import GATED, RECOVERED, USED

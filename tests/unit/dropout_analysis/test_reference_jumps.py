@@ -72,19 +72,16 @@ def test_no_trial_of_any_row_crosses_it(jumping: Run, report: DropoutReport) -> 
 
 
 def test_left_out_trials_are_counted_and_all_starts_add_up(report: DropoutReport) -> None:
-    assert (report.errors.counts.crosses_jump > 0).all()
-    assert (np.sum(report.errors.counts, axis=0) == report.errors.states).all()
-    for row, count in zip(report.document.trials, report.errors.counts.crosses_jump, strict=True):
+    assert (report.counts.crosses_jump > 0).all()
+    assert (np.sum(report.counts, axis=0) == report.states).all()
+    for row, count in zip(report.document.trials, report.counts.crosses_jump, strict=True):
         assert row.no_trial["crosses_jump"] == count
 
 
 def test_with_jumps_brings_them_back_and_shows_their_size(jumping: Run, report: DropoutReport) -> None:
     whole = dropout_report(jumping, horizons_m=HORIZONS_M, comparison=False, with_jumps=True)
-    assert not whole.errors.counts.crosses_jump.any()
-    assert (
-        whole.errors.counts.trials
-        >= report.errors.counts.trials + report.errors.counts.crosses_jump - whole.errors.counts.standing
-    ).all()
+    assert not whole.counts.crosses_jump.any()
+    assert (whole.counts.trials >= report.counts.trials + report.counts.crosses_jump - whole.counts.standing).all()
     icr = whole.result("icr")
     assert icr is not None
     assert icr.column("max_m")[-1] > 0.8 * JUMP_M
@@ -93,7 +90,7 @@ def test_with_jumps_brings_them_back_and_shows_their_size(jumping: Run, report: 
 def test_preset_paper_leaves_nothing_out() -> None:
     run = fitted(step, [*FIELD, "filter.preset=paper"])
     assert run.summary["reference_jumps"] == []
-    assert not dropout(run, HORIZONS_M).errors.counts.crosses_jump.any()
+    assert not dropout(run, HORIZONS_M).counts.crosses_jump.any()
 
 
 def test_a_run_read_back_has_its_jumps(jumping: Run, tmp_path) -> None:
@@ -106,7 +103,7 @@ def test_a_slide_without_a_gyro_stays_in_the_headline(speed_mps: float) -> None:
     run = fitted(lambda t: speed_mps * np.clip(t - AT_S, 0.0, 2.0))
     assert all(jump["undecided"] for jump in run.summary["reference_jumps"])
     found = dropout(run, HORIZONS_M)
-    assert not found.errors.counts.crosses_jump.any()
+    assert not found.counts.crosses_jump.any()
     whole = dropout(replace(run, sensors=replace(run.sensors, jumps=())), HORIZONS_M)
     for one, other in zip(found.results, whole.results, strict=True):
         np.testing.assert_array_equal(one.column("p95_m"), other.column("p95_m"))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.dropout_analysis.example_trials import CELLS, STRAIGHT_RAD, heading_range
+from icrtool.dropout_analysis.starts import CELLS, STRAIGHT_RAD, heading_range
 from icrtool.kernels.track import Track
 
 HORIZON_M, STEP_M = 5.0, 0.6

@@ -85,8 +85,8 @@ def test_the_contracts_columns_come_first(run: Run) -> None:
 
 def test_starts_that_are_no_trial_are_counted_by_kind(run: Run) -> None:
     report = dropout(run, HORIZONS_M)
-    table, counts = run.table, report.errors.counts
-    assert report.errors.states == len(table)
+    table, counts = run.table, report.counts
+    assert report.states == len(table)
     distance, stamps = table.distance_m, table.stamp_ns
     (outage,) = run.outages_ns
     for h, horizon in enumerate(HORIZONS_M):
@@ -119,7 +119,7 @@ def test_a_model_is_data(run: Run) -> None:
     assert mine is not None
     assert known is not None
     np.testing.assert_allclose(numbers(mine), numbers(known), rtol=1e-12)
-    assert dropout(run, [5.0], models=models).errors.counts.trials == known.column("trials")
+    assert dropout(run, [5.0], models=models).counts.trials == known.column("trials")
 
 
 def test_rotating_and_shifting_the_world_changes_no_error(run: Run) -> None:
@@ -148,7 +148,7 @@ def test_small_tables_and_small_ranges_give_the_same(run: Run, monkeypatch: pyte
     monkeypatch.setattr(module, "LARGEST_TABLE_BYTES", 1)
     monkeypatch.setattr(module, "STARTS_AT_ONCE", 333)
     pieces = dropout(run, HORIZONS_M)
-    np.testing.assert_array_equal(np.array(pieces.errors.counts), np.array(report.errors.counts))
+    np.testing.assert_array_equal(np.array(pieces.counts), np.array(report.counts))
     for ours, theirs in zip(pieces.results, report.results, strict=True):
         np.testing.assert_allclose(numbers(ours, SummaryRow), numbers(theirs, SummaryRow), rtol=0, atol=EQUAL_M)
 
@@ -189,7 +189,7 @@ def test_a_run_of_one_state_is_refused(run: Run) -> None:
 
 def test_a_drive_shorter_than_every_horizon_has_no_numbers(make_run: Callable[..., Run]) -> None:
     report = dropout(make_run(duration_s=12.0, troubles=False), [500.0])
-    assert report.errors.counts.trials.tolist() == [0]
+    assert report.counts.trials.tolist() == [0]
     assert np.isnan(report.results[0].column("p95_m")).all()
     assert np.isnan(report.summary.p95_pct).all()
 
@@ -215,14 +215,14 @@ def stopping(run: Run) -> Run:
 def test_a_standstill_counts_once_whatever_its_length(run: Run, stopping: Run) -> None:
     without, moving = dropout(run, HORIZONS_M), dropout(stopping, HORIZONS_M)
     every = dropout(stopping, HORIZONS_M, starts="all")
-    np.testing.assert_array_equal(moving.errors.counts.trials, without.errors.counts.trials)
-    np.testing.assert_array_equal(moving.errors.counts.standing, 440)
-    np.testing.assert_array_equal(every.errors.counts.trials, without.errors.counts.trials + 440)
+    np.testing.assert_array_equal(moving.counts.trials, without.counts.trials)
+    np.testing.assert_array_equal(moving.counts.standing, 440)
+    np.testing.assert_array_equal(every.counts.trials, without.counts.trials + 440)
     for ours, theirs in zip(moving.results, without.results, strict=True):
         np.testing.assert_allclose(numbers(ours), numbers(theirs), rtol=0, atol=EQUAL_M)
     for report in (moving, every):
-        assert sum(int(column[0]) for column in report.errors.counts) == report.errors.states == len(stopping.table)
-        assert report.errors.standing == 440
+        assert sum(int(column[0]) for column in report.counts) == report.states == len(stopping.table)
+        assert report.standing == 440
     assert not np.allclose(every.results[0].column("p95_m"), moving.results[0].column("p95_m"), rtol=1e-3)
 
 
@@ -263,9 +263,9 @@ def test_icrs_are_learned_when_their_standard_deviations_have_fallen(run: Run, m
 
 
 def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
-    assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).errors.standing == 0
+    assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).standing == 0
     parked = make_run(duration_s=20.0, **PARKED)
-    assert dropout(parked, [1.0]).errors.standing == len(parked.table) - 1
+    assert dropout(parked, [1.0]).standing == len(parked.table) - 1
 
 
 def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:

@@ -45,7 +45,7 @@ def test_only_trials_across_an_event_are_left_out(run: Run) -> None:
         crossing = (ends[:, h] >= 0) & (t < EVENT_S[1]) & (last > EVENT_S[0])
         left_out = report.document.trials[h].no_trial["across_slip_event"]
         assert left_out == np.count_nonzero(crossing)
-        assert report.errors.counts.trials[h] == whole.errors.counts.trials[h] - left_out
+        assert report.counts.trials[h] == whole.counts.trials[h] - left_out
         errors = errors_from_states(run, horizon)["icr"]
         icr = report.result("icr")
         assert icr is not None

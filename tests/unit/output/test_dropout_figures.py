@@ -15,11 +15,15 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from icrtool.calibration.model_comparison import models_of
-from icrtool.dropout_analysis.acceptance_limits import budget_distances
 from icrtool.dropout_analysis.dropout_report import dropout
-from icrtool.dropout_analysis.example_trials import example_trials, worst_trials
-from icrtool.dropout_analysis.outages import force_outages, plan_outages, real_outages
-from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.report import DropoutReport, budget_distances
+from icrtool.dropout_analysis.shown_paths import (
+    example_trials,
+    force_outages,
+    plan_outages,
+    real_outages,
+    worst_trials,
+)
 from icrtool.output.figure_catalogue import draw_figures
 from icrtool.output.figures.dropout_errors import dropout_histogram, dropout_histograms, dropout_summary
 from icrtool.output.figures.dropout_paths import dropout_examples, dropout_outages, dropout_worst
@@ -132,7 +136,7 @@ def with_rows(report: DropoutReport) -> DropoutReport:
     rows = {"recommended": 0.6, "controller": 0.9, "recommended_gyro": 0.3, "calibration:season": 0.7}
     further = [named(icr, name, factor) for name, factor in rows.items()]
     whole = with_models(report, *report.results, *further)
-    return with_content(whole, budgets=budget_distances(whole.errors, 0.1))
+    return with_content(whole, budgets=budget_distances(whole, 0.1))
 
 
 def test_the_summary_marks_the_distances_that_the_report_states(report: DropoutReport) -> None:
@@ -162,7 +166,7 @@ def test_a_run_that_is_not_usable_is_named_so_in_the_title(report: DropoutReport
 
 
 def test_a_distance_beyond_all_trials_is_not_marked(report: DropoutReport) -> None:
-    far = with_content(report, budgets=budget_distances(report.errors, 1000.0))
+    far = with_content(report, budgets=budget_distances(report, 1000.0))
     figure = drawn(lambda: dropout_summary(far))
     assert [text.get_text() for text in figure.axes[0].texts] == []
     assert "more than 10 m" in figure.texts[0].get_text()

@@ -1,0 +1,265 @@
+"""Paths without GNSS that are shown one by one: the worst and typical trials, forced outages, and those of the log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from icrtool.calibration.model_comparison import ComparedModels, ComparedRow, Model, models_of
+from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
+from icrtool.errors import ConfigError, DataError
+from icrtool.estimation.run_filter import set_up_again
+from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.ekf import run_ekf
+from icrtool.kernels.open_loop import open_loop_errors, open_loop_path
+from icrtool.kernels.track import OpenLoopPath, Track, trial_ends
+from icrtool.motion.models import RECOMMENDED
+from icrtool.motion.recording import Trials
+from icrtool.records.dropout_document import ExampleTrial, Outage, OutageDocument, TrialDocument
+from icrtool.records.plain_data import known
+from icrtool.records.run import Run, track_of
+
+WORST_COUNT = 10
+WORST_HORIZON_M = 10.0
+EXAMPLE_HORIZON_M = 15.0
+ALIKE_RAD = np.radians(10.0)
+STRAIGHT_SHARE, LONGEST_CHORD = 0.05, 1.1
+TYPICAL_OF = 30
+"""Trials enough to find the median error."""
+PICTURED = ("icr", "no_slip", "recommended", "controller")
+
+LONGEST_SHARE = 0.5
+"""Spaced outages leave at least this share of the time between them to learn."""
+
+MOST_SPACED = 10
+
+SAME_M = 1e-6
+"""Before the first outage the disturbed run is the undisturbed one, to rounding."""
+
+COMPARED_S = 1.0
+"""Fixes of this time after an outage are compared with the open-loop path, which is driven on for as long."""
+
+
+def worst_trials(
+    run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT, *,
+    starts: Starts = "moving",
+) -> tuple[ExampleTrial, ...]:  # fmt: skip
+    """Return the trials with the largest error that do not overlap, worst first.
+
+    Parameters
+    ----------
+    compared : held-out models, of which ``recommended`` is evaluated; without them the momentary ICRs
+    """
+    track, models = track_of(run), models_of(run)
+    ends, rows = counted_ends(track, horizon_m, starts), compared.rows if compared is not None else ()
+    held_out = next((row for row in rows if row.name == RECOMMENDED), None)
+    if compared is not None and held_out is not None:
+        some = compared.trials.starts
+        errors = np.full(len(ends), np.nan)
+        errors[some] = held_out.errors_of(Trials(some, ends[some])).position[:, 0]
+    else:
+        errors = open_loop_errors(track, models[0].icrs, ends)[:, 0]
+    ends, left = ends[:, 0], np.nan_to_num(errors, copy=False, nan=-1.0)
+    chosen: list[int] = []
+    while len(chosen) < count and left[worst := int(np.argmax(left))] >= 0.0:
+        chosen.append(worst)
+        before_its_end = slice(ends[worst] + 1)
+        left[before_its_end][ends[before_its_end] >= worst] = -1.0
+    name = held_out.name if held_out is not None else models[0].name
+    return tuple(_example(run, track, models, rows, name, start, int(ends[start]), horizon_m) for start in chosen)
+
+
+def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[ExampleTrial, ...]:
+    """Return a typical cornering trial and a typical straight one, none when no trial is that long.
+
+    Notes
+    -----
+    Cornering: the heading changes by about half a turn, or as nearly so as the drive has it. Straight: of the
+    twentieth part of the trials that end furthest from their start. Typical: of those, the one with the median error
+    of the momentary ICRs.
+    """
+    track, models = track_of(run), models_of(run)
+    ends = trial_ends(track, np.array([horizon_m]))[:, 0]
+    # A parked start repeats the same path many times: the last state of each stop stands for it.
+    moving = np.flatnonzero((ends >= 0) & ~standing_states(track))
+    if not len(moving):
+        return ()
+    columns = (track.north, track.east, track.heading)
+    north, east, turned = (column[ends[moving]] - column[moving] for column in columns)
+    chord = np.hypot(north, east)
+    # Further than its wheels rolled: the reference jumped.
+    chord[chord > LONGEST_CHORD * horizon_m] = 0.0
+    off = np.abs(np.abs(turned) - np.pi)
+    found = []
+    for group in (moving[off <= off.min() + ALIKE_RAD], moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)]):
+        sample = group[:: -(-len(group) // TYPICAL_OF)]
+        errors = [open_loop_errors(track, models[0].icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
+        start = int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])
+        found.append(_example(run, track, models, (), models[0].name, start, int(ends[start]), horizon_m))
+    return tuple(found)
+
+
+def _example(
+    run: Run, track: Track, models: tuple[Model, ...], rows: Sequence[ComparedRow], by: str, start: int, end: int,
+    horizon_m: float,
+) -> ExampleTrial:  # fmt: skip
+    paths: dict[str, OpenLoopPath] = {}
+    errors: dict[str, float | None] = {}
+    for model in models:
+        if model.name in PICTURED:
+            right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
+            paths[model.name] = open_loop_path(track, right, left, x, start, end)
+    for row in rows:
+        if row.name in PICTURED and row.path is not None and (path := row.path(start, end)) is not None:
+            paths[row.name] = path
+    for name, path in paths.items():
+        errors[name] = known(float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end])))
+    table = run.table
+    columns = (table.t_s, table.heading_rad, table.distance_m)
+    duration, turned, driven = (float(column[end] - column[start]) for column in columns)
+    document = TrialDocument(
+        model=by, stamp_ns=int(table.stamp_ns[start]), t_s=float(table.t_s[start]),
+        north_m=float(table.north_m[start]), east_m=float(table.east_m[start]), horizon_m=horizon_m,
+        heading_change_deg=float(np.degrees(turned)), speed_mean_mps=driven / duration if duration > 0 else 0.0,
+        errors_m=errors,
+    )  # fmt: skip
+    shown = slice(start, end + 1)
+    return ExampleTrial(document, start, end, table.north_m[shown], table.east_m[shown], paths)
+
+
+def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple[tuple[int, int], ...]:
+    """Place outages of one length: at given seconds, or spaced over the time in which the robot moves.
+
+    Returns
+    -------
+    Half-open spans [ns], in order.
+
+    Raises
+    ------
+    ConfigError
+        An outage that does not fit into the drive, or into the time between two others, or lies in one that the log
+        has itself.
+    """
+    last = float(run.table.t_s[-1])
+    if not length_s > 0:
+        raise ConfigError("outage", f"{length_s:g} s is no duration", "give positive seconds")
+    begins = sorted(float(t) for t in at_s) if at_s else _spaced(run, length_s)
+    for begin in begins:
+        if not 0 <= begin <= last - length_s:
+            what = f"{length_s:g} s from {begin:g} s on do not fit"
+            raise ConfigError("outage", what, f"the drive lasts {last:.1f} s")
+    for begin, following in pairwise(begins):
+        if begin + length_s >= following:
+            what = f"{length_s:g} s from {begin:g} s on reach into the one at {following:g} s"
+            raise ConfigError("outage", what, "the filter must learn between two outages: place them further apart")
+    for begin in np.array(begins)[_meets(np.array(begins), length_s, _own_outages_s(run))]:
+        what = f"{length_s:g} s from {begin:g} s on lie in an outage of the log's own"
+        raise ConfigError("outage", what, "there is no estimate to compare it with: choose another time")
+    origin = int(run.table.stamp_ns[0])
+    return tuple((origin + round(t * 1e9), origin + round((t + length_s) * 1e9)) for t in begins)
+
+
+def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage, ...]:
+    """Run the filter again without GNSS and heading in the spans, and compare it with the undisturbed run.
+
+    Raises
+    ------
+    ConfigError
+        A span holds fewer than two states of the disturbed run.
+    DataError
+        The run cannot be made again.
+    """
+    setup = set_up_again(run, tuple(spans_ns))
+    output = run_ekf(*setup)
+    # An outage at the very start delays the first state of the disturbed run: the last rows are those of both.
+    rows = min(len(output.x), len(run.table))
+    north, east = output.x[-rows:, 0], output.x[-rows:, 1]
+    away = np.hypot(north - run.table.north_m[-rows:], east - run.table.east_m[-rows:])
+    stamps, distance = run.table.stamp_ns[-rows:], run.table.distance_m[-rows:]
+    if (away[stamps < min(begin for begin, _ in spans_ns)] > SAME_M).any():
+        raise DataError(run.name, "the run cannot be made again for forced outages", "run icrtool fit again")
+    origin = int(run.table.stamp_ns[0])
+    outages = []
+    for begin, end in spans_ns:
+        inside = slice(*np.searchsorted(stamps, [begin, end]))
+        if len(stamps[inside]) < 2:
+            what = f"{(end - begin) / 1e9:g} s from {(begin - origin) / 1e9:g} s on hold fewer than two states"
+            advice = "the filter must have begun, and the outage last longer than a wheel sample"
+            raise ConfigError("outage", what, advice)
+        document = OutageDocument(
+            "forced", (begin - origin) / 1e9, (end - origin) / 1e9, float(np.ptp(distance[inside])),
+            known(float(away[inside][-1])), known(float(away[inside].max())),
+        )  # fmt: skip
+        outages.append(Outage(document, north[inside], east[inside]))
+    return tuple(outages)
+
+
+def _own_outages_s(run: Run) -> Floats:
+    """Return the spans (k, 2) [s] of the outages that the log has itself."""
+    return np.asarray((run.outages_ns - int(run.table.stamp_ns[0])) / 1e9)
+
+
+def _meets(begin_s: Floats, length_s: float, spans_s: Floats) -> Bools:
+    """Return which outages of a length, by their begins (k,) [s], share time with one of the ordered spans (m, 2)."""
+    following = np.searchsorted(spans_s[:, 1], begin_s, side="right")
+    return np.asarray(np.append(spans_s[:, 0], np.inf)[following] < begin_s + length_s)
+
+
+def _spaced(run: Run, length_s: float) -> list[float]:
+    """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn.
+
+    Time from which an outage would reach into one of the log's own, a gap in the wheel data or a jump of the reference,
+    is not one to begin in.
+    """
+    t, last = run.table.t_s, float(run.table.t_s[-1])
+    moves = ~standing_states(track_of(run))[:-1]
+    gaps = np.flatnonzero(run.in_gap | run.jumping)
+    for spans_s in (_own_outages_s(run), np.column_stack([t[gaps], t[gaps + 1]])):
+        moves &= ~_meets(t[:-1], length_s, spans_s)
+    moved = np.concatenate([[0.0], np.cumsum(np.diff(t) * moves)])
+    before = float(np.interp(min(run.settled_s, last / 4), t, moved))
+    rest = float(moved[-1]) - before
+    count = min(MOST_SPACED, int(rest * LONGEST_SHARE / length_s))
+    if count < 1:
+        text = f"{length_s:g} s is too long for a drive of {last:.1f} s, {moved[-1]:.1f} s of it moving"
+        raise ConfigError("outage", text, "choose a shorter one")
+    free = (rest - count * length_s) / (count + 1)
+    begins = before + free + np.arange(count) * (length_s + free)
+    # Where the robot stood for a while, the outage begins when it goes on.
+    return [float(t[place - 1]) for place in np.searchsorted(moved, begins, side="right")]
+
+
+def real_outages(run: Run) -> tuple[Outage, ...]:
+    """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix before.
+
+    The end error is the distance to the fixes that ended the outage, not to the filter: a filter that drove on with its
+    wheels is as wrong as the open-loop path. An outage that never ends, and one with a gap in the wheel data, has no
+    end error and is left out; so is one that the drive begins with: neither position nor ICRs were known before it.
+    """
+    track, table, fixes = track_of(run), run.table, run.sensors.fixes
+    (forward, right), origin = run.sensors.antenna_m, int(table.stamp_ns[0])
+    outages = []
+    for begin, end in run.outages_ns:
+        first, last = (int(row) for row in np.searchsorted(table.stamp_ns, [begin, end]))
+        if first == 0 or last >= len(table) or last <= first or run.in_gap[first:last].any():
+            continue
+        after = int(np.searchsorted(table.stamp_ns, end + round(COMPARED_S * 1e9)))
+        gaps = np.flatnonzero(run.in_gap[last:after])
+        after = last + int(gaps[0]) if len(gaps) else min(after, len(table) - 1)
+        path = open_loop_path(track, *table.icrs_at(first), first, after)
+        stamps = table.stamp_ns[first : after + 1]
+        # how far the antenna on the path is from the used fixes since the outage's end
+        rows = np.flatnonzero(run.gnss.used & (fixes.stamp_ns >= end) & (fixes.stamp_ns <= max(end, stamps[-1])))
+        cos, sin = np.cos(path.heading), np.sin(path.heading)
+        at, of = (fixes.stamp_ns[rows] - stamps[0]) / 1e9, (stamps - stamps[0]) / 1e9
+        north = np.interp(at, of, path.north + forward * cos - right * sin) - fixes.north_m[rows]
+        east = np.interp(at, of, path.east + forward * sin + right * cos) - fixes.east_m[rows]
+        error = known(float(np.hypot(north.mean(), east.mean())))
+        inside = slice(last - first + 1)
+        driven_m = float(table.distance_m[last] - table.distance_m[first])
+        begin_s, end_s = ((int(one) - origin) / 1e9 for one in (begin, end))
+        document = OutageDocument("real", begin_s, end_s, driven_m, error, error)
+        outages.append(Outage(document, path.north[inside], path.east[inside]))
+    return tuple(outages)
