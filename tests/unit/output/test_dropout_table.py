@@ -62,7 +62,7 @@ def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: 
 
 
 def test_the_table_counts_trials_and_the_kinds_of_none(content: DropoutReport) -> None:
-    text, counts = format_dropout(content), content.errors.counts
+    text, counts = format_dropout(content), content.counts
     assert row_of(text, "trials")[0] == f"{counts.trials[1]:,}"
     assert row_of(text, "not counted: log ends")[0] == f"{counts.short[1]:,}"
     assert row_of(text, "  across a wheel gap")[0] == f"{counts.gap[1]:,}"
