@@ -29,7 +29,6 @@ from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import find_recordings
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.read_log import read_log
-from icrtool.motion.fit import Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import (
     CONTROLLER,
     FAMILY,
@@ -41,6 +40,7 @@ from icrtool.motion.models import (
     controller_model,
 )  # fmt: skip
 from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_trials, cut_windows, totals_of
+from icrtool.motion.window_fit import Fold, Pool, PooledFit, Prediction
 from icrtool.output.run_directory import RUN_FILE, is_run_directory, open_run
 
 SLIP_TERMS = ("vy_vw", "omega_sw", "omega_vw")

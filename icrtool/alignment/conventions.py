@@ -35,7 +35,7 @@ from icrtool.alignment.log_track import (
 from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import RobustFit, mad_std, robust_regression, sandwich_covariance, soft_l1_loss
 from icrtool.kernels.track import Track
-from icrtool.motion.turns import fit_gyro_line
+from icrtool.motion.recording import fit_gyro_line
 from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])

@@ -20,11 +20,11 @@ from icrtool.alignment.gyro_heading import (
 from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensor_noise import is_hole
 from icrtool.alignment.turn_rates import TurnRate, gyro_rate, wheel_rate
+from icrtool.alignment.wheel_alignment import compare_turns
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
-from icrtool.motion.turns import compare_turns
 from icrtool.records.samples import (
     NO_HEADINGS,
     GyroAxes,

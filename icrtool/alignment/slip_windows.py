@@ -17,7 +17,7 @@ from icrtool.alignment.sensor_noise import FEWEST_FIXES, MOVES_MPS, USUAL_POSITI
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapezoids
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
-from icrtool.motion.turns import fit_gyro_line
+from icrtool.motion.recording import fit_gyro_line
 from icrtool.records.measurements import SensorData
 
 KNOT_S = 0.1

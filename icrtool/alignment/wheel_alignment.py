@@ -19,7 +19,8 @@ from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, rows_at_steps
-from icrtool.motion.turns import compare_turns
+from icrtool.kernels.robust import robust_regression, sandwich_covariance
+from icrtool.kernels.track import Track
 from icrtool.records.measurements import WheelFacts
 from icrtool.records.plain_data import known
 from icrtool.records.samples import WheelSamples
@@ -285,6 +286,54 @@ def _fused_note(log: RobotLog) -> list[str]:
         return []
     fact = f"{stream.topic} turns exactly as the gyro does: it is fused, not measured by wheels, and shows no slip"
     return [f"{fact}; name the wheels' own topic with topics.wheels"]
+
+
+STARTS_A_SPAN, FEWEST_SPANS = 4, 6
+"""Windows of turns start so often in one, and so many whole ones are needed."""
+
+
+class Turns(NamedTuple):
+    """Turns of the heading and of the wheels over windows of one length.
+
+    Attributes
+    ----------
+    ratio, ratio_std : turn of the heading per turn of the wheels
+    left_rad : robust scatter of the heading's turn beyond that; turn_rad : rms turn of the heading
+    """
+
+    ratio: float
+    ratio_std: float
+    left_rad: float
+    turn_rad: float
+
+
+def compare_turns(track: Track, width_m: float, delay_s: float, window_s: float) -> Turns | None:
+    """Compare the turns of heading and wheels over windows of some length; None where there are too few.
+
+    Parameters
+    ----------
+    width_m : the track width b
+    delay_s : by which the heading lags the wheels
+    """
+    t = track.t
+    turned = track.cumulate(2.0 * track.half_difference / width_m)
+    first = max(t[0] + delay_s, track.heading_t[0])
+    last = min(t[-1] + delay_s, track.heading_t[-1]) - window_s
+    begin = np.arange(first, last, window_s / STARTS_A_SPAN)
+    by_wheels, by_heading = (
+        np.interp(begin + window_s - shift, times, angle) - np.interp(begin - shift, times, angle)
+        for shift, times, angle in ((delay_s, t, turned), (0.0, track.heading_t, track.heading))
+    )
+    travel = track.travel
+    moved = np.interp(begin + window_s - delay_s, t, travel) > np.interp(begin - delay_s, t, travel)
+    kept = np.flatnonzero(track.clear(begin - delay_s, begin + window_s - delay_s) & moved)
+    by_wheels, by_heading = by_wheels[kept], by_heading[kept]
+    if len(kept) < STARTS_A_SPAN * FEWEST_SPANS or not by_wheels.any():
+        return None
+    fit = robust_regression(by_wheels[:, None], by_heading)
+    variance = sandwich_covariance(fit, kept // STARTS_A_SPAN)[0, 0]
+    turn = math.sqrt(float(np.mean(by_heading**2)))
+    return Turns(float(fit.x[0]), math.sqrt(float(variance)), float(fit.scale[0]), turn)
 
 
 NOISE_S, SHORT_S, MIDDLE_S, LONGEST_S = 0.3, 1.0, 5.0, 40.0

@@ -18,7 +18,6 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.error_statistics import Summary, error_summary, within_budget
 from icrtool.kernels.track import OpenLoopPath, Track
-from icrtool.motion.fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, controller_model
 from icrtool.motion.recording import (
     NO_CONSTANTS,
@@ -31,6 +30,7 @@ from icrtool.motion.recording import (
     totals_of,
     trial_errors,
 )
+from icrtool.motion.window_fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 
 HORIZONS_M = (5.0, 10.0, 20.0)

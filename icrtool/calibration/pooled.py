@@ -19,9 +19,9 @@ from icrtool.calibration.record import Calibration, fitted_document, parameter_d
 from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Complexes
-from icrtool.motion.fit import Fold, Prediction, own_constants
 from icrtool.motion.models import FIVE, MODELS, RECOMMENDED
 from icrtool.motion.recording import ErrorsOf, Recording, Windows, cut_windows
+from icrtool.motion.window_fit import Fold, Prediction, own_constants
 from icrtool.records.calibration_document import (
     CALIBRATION_SCHEMA,
     CalibratedRobot,

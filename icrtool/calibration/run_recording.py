@@ -10,8 +10,7 @@ from icrtool.errors import ConfigError
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.motion.models import Lever
-from icrtool.motion.recording import Recording
-from icrtool.motion.turns import GyroLine, fit_gyro_line
+from icrtool.motion.recording import GyroLine, Recording, fit_gyro_line
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import Run, track_of

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
 
-Axis = int
-
 
 class WheelMotion(NamedTuple):
     """Inputs of the terms, (n,) each.
@@ -67,7 +65,7 @@ class Term:
     """
 
     name: str
-    axis: Axis
+    axis: int
     column: Callable[[WheelMotion], Floats]
     formula: str
     std: float
@@ -213,19 +211,6 @@ def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Ints
     return fixed, axes, columns
 
 
-def gyro_gains(model: MotionModel) -> Floats:
-    """Return by how much each parameter (k,) of a model with a gyro raises the gyro's share of the turn rate."""
-    return np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
-
-
-def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats:
-    """Return the body twist v_x, v_y [m/s], omega [rad/s], (3, n)."""
-    result, axes, columns = model_columns(model, motion)
-    for axis, parameter, column in zip(axes, parameters, columns, strict=True):
-        result[axis] += parameter * column
-    return result
-
-
 class TrackGeometry(NamedTuple):
     """Track ICRs and controller numbers of a twist that is linear in V_l and V_r.
 
@@ -350,7 +335,10 @@ class FittedModel:
 
     def twist(self, motion: WheelMotion) -> Floats:
         """Return the body twist v_x, v_y [m/s], omega [rad/s], (3, n)."""
-        return twist(self.model, self.parameters, self.complete(motion))
+        result, axes, columns = model_columns(self.model, self.complete(motion))
+        for axis, parameter, column in zip(axes, self.parameters, columns, strict=True):
+            result[axis] += parameter * column
+        return result
 
     def geometry(self, width_m: float) -> tuple[TrackGeometry, Floats]:
         """Return ICRs, multiplier and radius factors, and their covariance (6, 6)."""

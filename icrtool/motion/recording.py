@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.kernels.arrays import Complexes, Floats, Ints, rows_at_steps
+from icrtool.kernels.robust import robust_least_squares
 from icrtool.kernels.track import Track, cut, ends_from
 from icrtool.kernels.window_residuals import OMEGA, path_at
 from icrtool.motion.models import NO_LEVER, FittedModel, Lever, wheel_motion
@@ -167,11 +168,6 @@ def cut_windows(
     )
 
 
-def moving_states(track: Track) -> Bools:
-    """Return the states (n,) in which the robot moves: starts where it stands are copies of one another."""
-    return np.append(np.diff(track.distance) > TURNING_MPS * np.diff(track.t), False)
-
-
 def samples_a_step(track: Track, pooled_s: float | None = None) -> int:
     """Return how many wheel samples make a step of the fits; `pooled_s` is the time of all that is fitted together.
 
@@ -224,10 +220,12 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals
     ----------
     pooled : of all that is fitted together, default the recording
     """
-    moving = np.flatnonzero(moving_states(recording.track))
-    step = samples_a_step(recording.track, None if pooled is None else pooled.seconds)
+    track = recording.track
+    # starts where it stands are copies of one another
+    moving = np.flatnonzero(np.diff(track.distance) > TURNING_MPS * np.diff(track.t))
+    step = samples_a_step(track, None if pooled is None else pooled.seconds)
     starts = moving[:: max(step, len(moving) // MOST_TRIALS)].copy()
-    return Trials(starts, ends_from(recording.track, np.array(horizons_m, np.float64), starts))
+    return Trials(starts, ends_from(track, np.array(horizons_m, np.float64), starts))
 
 
 class TrialErrors(NamedTuple):
@@ -309,3 +307,48 @@ def predicted_path(
         return path.heading - own.heading_offset_rad, path.place
 
     return at_times
+
+
+TURN_S, FEWEST_TURNS = 1.0, 10
+"""Turns over this time are compared, at least so many."""
+
+GYRO_PRIOR_STD = np.array([10.0, 0.005, 0.2])
+"""Of scale, whose sign is open, bias [rad/s] and lead [s]: on a circle only this separates scale and bias."""
+
+GYRO_SCALE_RANGE = 0.1
+"""A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
+
+
+class GyroLine(NamedTuple):
+    """Scale, bias [rad/s] and lead [s] of a gyro; NaN, and no lead, where too few turns show them."""
+
+    scale: float
+    bias_radps: float
+    lead_s: float
+
+    @property
+    def is_yaw(self) -> bool:
+        """Whether the gyro measures the robot's yaw, in either sense."""
+        return abs(abs(self.scale) - 1.0) < GYRO_SCALE_RANGE
+
+
+def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: Floats) -> GyroLine:
+    """Fit the line to the reference's turns over seconds.
+
+    Parameters
+    ----------
+    t : (n,) times [s]; rate : (n,) of the gyro [rad/s]; turned : (n,) its integral [rad]
+    at : (m,) times of the headings [s], ascending; heading : (m,) of the reference, unwrapped [rad]
+    """
+    every = rows_at_steps(at - at[0], TURN_S)
+    if len(every) < FEWEST_TURNS:
+        return GyroLine(float("nan"), float("nan"), 0.0)
+    made, lasting = np.diff(heading[every]), np.diff(at[every])
+
+    def evaluate(x: Floats) -> tuple[Floats, Floats]:
+        read = at[every] + x[2]
+        by_scale, by_lead = (np.diff(np.interp(read, t, column)) for column in (turned, x[0] * rate))
+        return x[0] * by_scale + x[1] * lasting - made, np.column_stack([by_scale, lasting, by_lead])
+
+    zero = np.zeros(3)
+    return GyroLine(*robust_least_squares(evaluate, zero, zero, GYRO_PRIOR_STD, overlap=10.0).x.tolist())

@@ -23,9 +23,9 @@ from icrtool.estimation.fit import fit
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.open_loop import open_loop_path
 from icrtool.kernels.track import trial_ends
-from icrtool.motion.fit import own_constants
 from icrtool.motion.models import controller_model
 from icrtool.motion.recording import Trials, cut_windows, predicted_path
+from icrtool.motion.window_fit import own_constants
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.page import drive_data
 from icrtool.output.page.group_pages import comparison_page, fleet_page

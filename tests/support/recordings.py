@@ -8,12 +8,17 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import Track, ends_from
-from icrtool.motion.models import MotionModel, twist, wheel_motion
+from icrtool.motion.models import FittedModel, MotionModel, WheelMotion, wheel_motion
 from icrtool.motion.recording import PathAt, Recording, Trials, trial_errors
 
 WIDTH_M = 0.6
 SLOWEST_TURN = 0.15
 """A robot whose turn gain is less, or negative, is none."""
+
+
+def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats:
+    """Return the body twist of a model with some parameters (3, n)."""
+    return FittedModel(model, parameters, np.eye(len(parameters))).twist(motion)
 
 
 def draw_parameters(model: MotionModel, rng: np.random.Generator) -> Floats:

@@ -25,9 +25,9 @@ from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.motion.fit import own_constants
 from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
 from icrtool.motion.recording import Recording, cut_windows, predicted_path
+from icrtool.motion.window_fit import own_constants
 from icrtool.output.series import breaks_after, extremes, scale_end_m
 from icrtool.output.tables.errors import in_order, main_rows
 from icrtool.records.dropout_document import DropoutDocument, FitDocument

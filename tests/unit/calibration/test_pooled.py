@@ -17,9 +17,9 @@ from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Bools
-from icrtool.motion.fit import Pool, own_constants
 from icrtool.motion.models import FAMILY, MODELS
 from icrtool.motion.recording import Recording, Trials, Windows, cut_trials, cut_windows, predicted_path
+from icrtool.motion.window_fit import Pool, own_constants
 from icrtool.output.files.formats import open_calibration, write_calibration
 from icrtool.output.tables.calibration import calibration_blocks
 from icrtool.output.text_blocks import format_blocks

@@ -16,9 +16,9 @@ from icrtool.motion.models import (
     find_model,
     parameters_of_icrs,
     track_geometry,
-    twist,
     wheel_motion,
 )
+from support.recordings import twist
 
 WIDTH_M = 0.6
 ICRS = (0.52, -0.44, 0.1)

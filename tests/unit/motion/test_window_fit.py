@@ -13,11 +13,10 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import LOSS_SIGMAS
 from icrtool.kernels.track import Track
-from icrtool.motion.fit import SETTLED, Fold, Pool, PooledFit, own_constants
-from icrtool.motion.models import FAMILY, TERMS, FittedModel, MotionModel, find_model, twist, wheel_motion
+from icrtool.motion.models import FAMILY, TERMS, FittedModel, MotionModel, find_model, wheel_motion
 from icrtool.motion.recording import LogConstants, Recording, cut_trials, cut_windows, predicted_path
-from icrtool.motion.residuals import WindowResiduals, shortening
-from support.recordings import WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all
+from icrtool.motion.window_fit import SETTLED, Fold, Pool, PooledFit, own_constants, residuals_of, shortening
+from support.recordings import WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all, twist
 
 EIGHT = FAMILY["eight"]
 SEEDS = range(8)
@@ -55,7 +54,7 @@ def test_derivatives_are_those_of_differences(name: str) -> None:
     model = find_model(name)
     recording = make_recording(EIGHT, EIGHT.prior_mean, seconds=60.0, gyro=True)
     wheels = fitted(EIGHT, EIGHT.prior_mean + 0.01) if model.uses_gyro else None
-    residuals = WindowResiduals(cut_windows(recording, (5.0,)), model, WIDTH_M, wheels)
+    residuals = residuals_of(cut_windows(recording, (5.0,)), model, WIDTH_M, wheels)
     x = np.concatenate(
         [draw_parameters(model, np.random.default_rng(1)), [0.02, 0.033, *([0.01, 0.027] if model.uses_gyro else [])]]
     )
@@ -202,7 +201,7 @@ def test_a_pooled_fit_is_that_of_the_dense_least_squares() -> None:
     pool = Pool([cut_windows(one) for one in recordings], [WIDTH_M] * 3)
     wheels = pool.fit(FAMILY["five"])
     found = pool.fit(model, wheels)
-    parts = [WindowResiduals(w, model, WIDTH_M, wheels) for w in pool.windows]
+    parts = [residuals_of(w, model, WIDTH_M, wheels) for w in pool.windows]
     mean, std = pool.prior(model)
     k, scale = len(model.terms), np.split(found.solution.scale, pool.first[1:-1])
 

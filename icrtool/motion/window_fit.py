@@ -10,7 +10,7 @@ Of several recordings they are eliminated from the normal equations of each (`ic
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -23,15 +23,16 @@ from icrtool.kernels.elimination import Parts, normal_equations
 from icrtool.kernels.robust import (
     Linearised,
     RobustFit,
+    mad_std,
     robust_least_squares,
     robust_weights,
     scale_by_kind,
     soft_l1_weights,
     student_covariance,
 )
-from icrtool.motion.models import FittedModel, MotionModel
+from icrtool.kernels.window_residuals import OMEGA, path_at, turn_residuals, window_residuals
+from icrtool.motion.models import FittedModel, MotionModel, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, Windows, size_of
-from icrtool.motion.residuals import KINDS, WindowResiduals, constant_std
 
 SETTLED = 0.1
 """Delays have kinks, where a shorter last step is not found."""
@@ -41,8 +42,99 @@ REWEIGHTS = 2
 FEWEST_TO_SUBTRACT = 4
 """Of fewer recordings each is too large a part of all: the others are fitted anew."""
 
+
+CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
+"""Prior of `LogConstants` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
+
+OF_WHEELS = 2
+"""So many of them, the first, are there without a gyro, too."""
+
+KINDS = (0, 0, 1)
+"""Residuals of a window: forward and right, whose spread is one, and turn."""
+
 FEWEST_RESIDUALS = 10 * len(KINDS)
 """Fewer that are left beside a fold give no parameters."""
+
+
+def constant_std(model: MotionModel) -> Floats:
+    """Return the prior of the constants of each recording that a model has."""
+    return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:OF_WHEELS]
+
+
+def shortening(turned: Floats, length_m: Floats) -> Floats:
+    """Return the share (w,) of its displacement that a window goes on average where slip makes its heading wander.
+
+    Parameters
+    ----------
+    turned : (w,) turn of a model less that of the reference [rad]; length_m : (w,) of the windows
+
+    Notes
+    -----
+    A heading that wanders with a variance of q for each metre leaves the mean of e^{j Theta} short by q s / 2 after s
+    metres: a displacement over L by q L / 4, to first order. Without it, the scale of the wheels, and with it the
+    multiplier, is too small. q is what longer windows stray more than short ones: what both have is of the reference.
+    """
+    short, long = length_m.min(), length_m.max()
+    if short == long:
+        return np.ones(len(turned))
+    grown = np.square([mad_std(turned[length_m == one]) for one in (short, long)])
+    shares: Floats = np.exp(-max(grown[1] - grown[0], 0.0) / (long - short) * length_m / 4.0)
+    return shares
+
+
+def residuals_of(
+    windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None
+) -> Callable[[Floats, Floats], tuple[Floats, Floats]]:
+    """Return what gives the residuals of all windows of one recording for one model, by sqrt(length).
+
+    Displacements alone do not separate a turn from side slip, and show little of a spin on the spot: turns are
+    residuals, too, weighted by their own spread.
+
+    Parameters
+    ----------
+    windows : of `icrtool.motion.recording.cut_windows`
+    model, width_m : what predicts, and the track width b [m]
+    wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
+
+    Returns
+    -------
+    A function of parameters (k,) and constants (c,), `LogConstants`, those of a gyro only for a model with one. It
+    returns residuals (3 w,), forward, right [m^0.5], then turn [rad/m^0.5], and their derivatives (3 w, k + c).
+    """
+    steps, start, end, root = windows.steps, windows.start, windows.end, np.sqrt(windows.length_m)
+    motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
+    if wheels is not None:
+        motion = motion._replace(turn=wheels.twist(motion)[OMEGA])
+    of_model, axes, of_terms = model_columns(model, motion)
+    gyro_change, k = steps.gyro_change(), len(axes)
+    if model.uses_gyro:
+        # the gyro's bias and time are two more columns of the turn rate
+        axes = np.append(axes, [OMEGA, OMEGA])
+        of_terms = np.concatenate([of_terms, np.ones((2, len(steps.t)))])
+    # by how much each parameter raises the gyro's share of the turn rate
+    gains = np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
+
+    def evaluate(parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
+        offset, delay = constants[:OF_WHEELS].tolist()
+        fixed, columns, values = of_model, of_terms, parameters
+        if model.uses_gyro:
+            bias, later = constants[OF_WHEELS:].tolist()
+            shift = later * gyro_change
+            fixed, columns, values = fixed.copy(), columns.copy(), np.concatenate([parameters, [bias, 0.0]])
+            fixed[OMEGA] += shift
+            columns[:k] += gains[:, None] * shift
+            columns[-1] = (1.0 + parameters @ gains) * gyro_change
+        at = windows.knot_t + delay
+        path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, at)
+        turned, turned_by = turn_residuals(path, start, end, windows.turned, root)
+        share = shortening(turned * root, windows.length_m)
+        moved, moved_by = window_residuals(path, start, end, windows.reference, offset, root, share)
+        # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
+        terms = len(axes)
+        jacobian = np.concatenate([moved_by, turned_by])[:, [*range(k), terms, terms + 1, *range(k, terms)]]
+        return np.concatenate([moved, turned]), jacobian
+
+    return evaluate
 
 
 class Fold(NamedTuple):
@@ -144,7 +236,9 @@ class PooledFit(FittedModel):
             pull = model.prior_std**-2.0 - self.model.prior_std**-2.0
             gradient, curvature = gradient - pull * (self.parameters - model.prior_mean), curvature - np.diag(pull)
             covariance = self._covariance(np.linalg.inv(self.curvature - curvature))
-            steps = self._steps(gradient, curvature)
+            # a Newton step: at the minimum the gradients of all residuals and of the prior sum to zero, so what is left
+            # without some is minus theirs
+            steps = np.linalg.solve(self.curvature - curvature, gradient)
             fitted = FittedModel(model, self.parameters + steps, covariance, wheels)
             own = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
             return fitted, LogConstants(*own.tolist())
@@ -178,7 +272,8 @@ class PooledFit(FittedModel):
             scale, prior = scale_by_kind(left, pool.kind[clear]), np.diag(pull)
             return Linearised(residuals=left, jacobian=jacobian, scale=scale, prior=prior, overlap=pool.overlap)
 
-        x = at.x + self._steps(*self._derivatives(~clear))
+        gradient, curvature = self._derivatives(~clear)
+        x = at.x + np.linalg.solve(self.curvature - curvature, gradient)
         for _ in range(REWEIGHTS):
             here = near(x)
             gradient = jacobian.T @ (here.weights * here.residuals) + pull * (x - mean)
@@ -195,16 +290,6 @@ class PooledFit(FittedModel):
         """
         grown = np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(self.curvature)))
         return np.asarray(inverse * np.outer(grown, grown), np.float64)
-
-    def _steps(self, gradient: Floats, curvature: Floats) -> Floats:
-        """Return the steps (..., k) of the parameters without residuals of some gradient and curvature.
-
-        Notes
-        -----
-        A Newton step of the loss. At the minimum the gradients of all residuals and of the prior sum to zero, so what
-        is left without some is minus theirs.
-        """
-        return np.asarray(np.linalg.solve(self.curvature - curvature, gradient[..., None])[..., 0], np.float64)
 
     @cached_property
     def _by_recording(self) -> tuple[Floats, Floats]:
@@ -232,10 +317,10 @@ class PooledFit(FittedModel):
 
 def own_constants(windows: Windows, fitted: FittedModel, width_m: float) -> LogConstants:
     """Return the constants of one recording for given parameters of the model."""
-    part, std = WindowResiduals(windows, fitted.model, width_m, fitted.wheels), constant_std(fitted.model)
+    of_both, std = residuals_of(windows, fitted.model, width_m, fitted.wheels), constant_std(fitted.model)
 
     def evaluate(constants: Floats) -> tuple[Floats, Floats]:
-        residuals, by = part(fitted.parameters, constants)
+        residuals, by = of_both(fitted.parameters, constants)
         return residuals, by[:, len(fitted.parameters) :]
 
     zero, kind = np.zeros(len(std)), np.repeat(KINDS, len(windows.start))
@@ -308,8 +393,8 @@ class Pool:
         if widened is not None:
             wide = self.fit(widened, wheels)
             model = model.as_shown(wide)
-        residuals_of = [
-            WindowResiduals(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)
+        of_recordings = [
+            residuals_of(w, model, width, wheels) for w, width in zip(self.windows, self.widths_m, strict=True)
         ]
         k, own, count = len(model.terms), len(constant_std(model)), len(self.windows)
         mean, std = self.prior(model)
@@ -317,7 +402,7 @@ class Pool:
         def evaluate(x: Floats) -> tuple[Floats, Floats]:
             residuals, jacobian = np.empty(len(self.group)), np.empty((len(self.group), k + own))
             for i, constants in enumerate(x[k:].reshape(count, own)):
-                residuals[self.rows(i)], jacobian[self.rows(i)] = residuals_of[i](x[:k], constants)
+                residuals[self.rows(i)], jacobian[self.rows(i)] = of_recordings[i](x[:k], constants)
             return residuals, jacobian
 
         found = robust_least_squares(
