@@ -14,19 +14,23 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS
 from icrtool.alignment.log_track import FEWEST_WINDOWS
 from icrtool.alignment.turn_rates import Guess, TurnRate, fit_middle, measure_courses
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Floats
+from icrtool.kernels.heading_filter import (
+    HeadingEvents,
+    HeadingModel,
+    filter_headings,
+    heading_log_likelihood,
+    smooth_headings,
+)
 from icrtool.kernels.robust import long_run_factor
 from icrtool.kernels.track import Track
-
-if TYPE_CHECKING:
-    from icrtool.kernels.heading_filter import HeadingEvents, HeadingModel, HeadingPasses
 
 PSI, BIAS, SCALE, X, DELAY = range(5)
 OFFSET, WANDER, LAG = 5, 6, 7
@@ -71,6 +75,9 @@ NOISES_OF_A_SOURCE = {
 }
 """White noise in the stated one; growth [rad/sqrt(s)] and standard deviation [rad] of the error that wanders."""
 
+
+USUAL_NOISES = {name: float(grid[len(grid) // 2]) for name, grid in NOISES.items()}
+"""Where the search for the noises begins."""
 
 WANDERS = "0 size"
 """Of these, the standard deviation of the wandering error of the first absolute heading."""
@@ -138,10 +145,10 @@ def estimate_heading(
     absolute : further headings
     stands : whether the rate is zero while the wheels stand
     """
-    problem = _Problem(track, turn, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std), (), stands=stands)
+    noises, guess = USUAL_NOISES, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std)
+    problem = _Problem(track, turn, guess, (), stands=stands)
     if problem.courses < FEWEST_WINDOWS:
         return None
-    noises = problem.usual()
     guess = problem.guess(noises)
     for _ in range(ROUNDS):
         problem = _Problem(track, turn, guess, (), stands=stands)
@@ -157,7 +164,7 @@ def estimate_heading(
     if absolute:
         problem = _Problem(track, turn, guess, absolute, stands=stands)
         grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
-        noises = problem.choose(grids, problem.usual() | noises)
+        noises = problem.choose(grids, noises)
     found = problem.solve(noises)
     if absolute and math.isfinite(absolute[0].aligned_std):
         offset = math.remainder(float(found.constants[OFFSET]), 2.0 * math.pi)
@@ -196,13 +203,19 @@ class _Problem:
         self.window_s = float(np.median(courses.end - courses.begin))
         still_t, still_rate = _standing(track, turn) if stands else (np.empty(0), np.empty(0))
         t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
+        # steps that measure nothing, between events far apart
+        at = np.sort(t)
+        far = np.flatnonzero(np.diff(at) > 2.0 * LONGEST_STEP_S)
+        steps = [np.arange(at[i] + LONGEST_STEP_S, at[i + 1] - 0.5 * LONGEST_STEP_S, LONGEST_STEP_S) for i in far]
+        nothing = np.zeros(sum(map(len, steps)))
+        t = np.concatenate([t, *steps])
         kind = np.repeat(
-            [COURSE, STANDING, *range(ABSOLUTE, ABSOLUTE + len(absolute))],
-            [len(courses.end), len(still_t), *(len(one.t) for one in absolute)],
+            [COURSE, STANDING, *range(ABSOLUTE, ABSOLUTE + len(absolute)), NOTHING],
+            [len(courses.end), len(still_t), *(len(one.t) for one in absolute), len(nothing)],
         )
-        k = STATES + STATES_OF_A_SOURCE * len(absolute)
-        h = np.zeros((len(t), k))
-        h[kind != STANDING, PSI] = 1.0
+        order = np.lexsort((kind, t))
+        h = np.zeros((len(t), STATES + STATES_OF_A_SOURCE * len(absolute)))
+        h[:, PSI] = (kind != STANDING) & (kind != NOTHING)
         h[kind == STANDING, BIAS] = 1.0
         rows = kind == COURSE
         h[rows, BIAS], h[rows, SCALE], h[rows, X], h[rows, DELAY] = (
@@ -212,57 +225,29 @@ class _Problem:
             rows, first = kind == ABSOLUTE + i, STATES_OF_A_SOURCE * i
             h[rows, first + OFFSET] = h[rows, first + WANDER] = 1.0
             h[rows, first + LAG] = -one.rate
-        z = np.concatenate([courses.angle, still_rate, *(one.heading for one in absolute)])
-        std = np.concatenate([courses.std, np.full(len(still_t), STANDING_RATE_STD), *(one.std for one in absolute)])
-        of_x = np.concatenate([courses.of_x, np.zeros(len(t) - len(courses.of_x))])
-        self._order(t, kind, h, z, std, of_x)
-
-    def _order(self, t: Floats, kind: Ints, h: Floats, z: Floats, std: Floats, of_x: Floats) -> None:
-        """Sort the events by time, with steps that measure nothing between those far apart."""
-        sorted_t = np.sort(t)
-        gap = np.flatnonzero(np.diff(sorted_t) > 2.0 * LONGEST_STEP_S)
-        fill = [
-            np.arange(sorted_t[i] + LONGEST_STEP_S, sorted_t[i + 1] - 0.5 * LONGEST_STEP_S, LONGEST_STEP_S) for i in gap
-        ]
-        extra = np.concatenate([*fill, np.empty(0)])
-        n = len(extra)
-        t, kind = np.concatenate([t, extra]), np.concatenate([kind, np.full(n, NOTHING)])
-        order = np.lexsort((kind, t))
-        self.t, self.kind = t[order], kind[order]
-        self.h = np.concatenate([h, np.zeros((n, h.shape[1]))])[order]
-        self.z, self.of_x = np.concatenate([z, np.zeros(n)])[order], np.concatenate([of_x, np.zeros(n)])[order]
-        self.std = np.concatenate([std, np.ones(n)])[order]
-        self.at = np.interp(self.t, self.turn.t, self.G)
-        self.holes = np.diff(self.turn.hole_variance(self.t), prepend=0.0)
+        z = np.concatenate([courses.angle, still_rate, *(one.heading for one in absolute), nothing])
+        std = [courses.std, np.full(len(still_t), STANDING_RATE_STD), *(one.std for one in absolute), nothing + 1.0]
+        self.t, self.kind, self.h, self.z = t[order], kind[order], h[order], z[order]
+        self.std = np.concatenate(std)[order]
+        self.at = np.interp(self.t, turn.t, self.G)
+        self.holes = np.diff(turn.hole_variance(self.t), prepend=0.0)
 
     def events(self, noises: dict[str, float], alike: float = 1.0) -> HeadingEvents:
         """Return the events with the variances of some noises."""
-        from icrtool.kernels.heading_filter import HeadingEvents
-
         r = self.std**2
         course = self.kind == COURSE
         r[course] = alike * (
             (noises["fixes"] * self.std[course]) ** 2
-            + (noises["slip"] * self.of_x[course]) ** 2
+            + (noises["slip"] * self.h[course, X]) ** 2
             + LEAST_COURSE_STD_RAD**2
         )
         for i in range(len(self.absolute)):
             r[self.kind == ABSOLUTE + i] *= noises[f"{i} white"] ** 2
-        angle = (self.kind == COURSE) | (self.kind >= ABSOLUTE)
-        return HeadingEvents(
-            np.diff(self.t, prepend=self.t[:1]),
-            np.diff(self.at, prepend=self.at[:1]),
-            self.holes,
-            self.z,
-            self.h,
-            r,
-            angle,
-        )
+        elapsed, turned = (np.diff(column, prepend=column[:1]) for column in (self.t, self.at))
+        return HeadingEvents(elapsed, turned, self.holes, self.z, self.h, r, angle=self.h[:, PSI] > 0.0)
 
     def model(self, noises: dict[str, float]) -> HeadingModel:
         """Return start and process of the states."""
-        from icrtool.kernels.heading_filter import HeadingModel
-
         count = len(self.absolute)
         std = np.concatenate([PRIOR_STD, *(ABSOLUTE_PRIOR_STD for _ in range(count))])
         std[SCALE], std[BIAS] = self.turn.scale_std, self.turn.bias_std
@@ -283,8 +268,6 @@ class _Problem:
 
     def guess(self, noises: dict[str, float]) -> Guess:
         """Return where to measure the courses next."""
-        from icrtool.kernels.heading_filter import filter_headings, smooth_headings
-
         events, model = self.events(noises), self.model(noises)
         states, covariances = smooth_headings(events, model, filter_headings(events, model))
         bias = np.interp(self.turn.t, self.t, states[:, BIAS])
@@ -292,10 +275,23 @@ class _Problem:
         x, delay_s = float(states[-1, X]), float(states[-1, DELAY])
         return Guess(bias, float(bias_std), float(scale_std), x, delay_s, self.middle)
 
+    def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
+        """Return the noises with those of the grids that have the largest likelihood, one after the other."""
+
+        def likelihood(tried: dict[str, float]) -> float:
+            return heading_log_likelihood(self.events(tried).cut(MOST_EVENTS), self.model(tried))
+
+        noises = {name: float(values[len(values) // 2]) for name, values in grids.items()} | noises
+        for _ in range(MOST_SWEEPS):
+            before = noises
+            for name, values in grids.items():
+                noises = max((noises | {name: float(value)} for value in values), key=likelihood)
+            if noises == before:
+                break
+        return noises
+
     def solve(self, noises: dict[str, float]) -> HeadingEstimate:
         """Return the estimate with some noises."""
-        from icrtool.kernels.heading_filter import filter_headings, smooth_headings
-
         events, model = self.events(noises), self.model(noises)
         passes = filter_headings(events, model)
         # by how much courses of windows that follow one another err alike, by slip that the model lacks
@@ -310,55 +306,24 @@ class _Problem:
         fixed = np.ones(len(model.x), np.bool_)
         fixed[[PSI, BIAS]] = False
         fixed[STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
-        x, P = model.x.copy(), model.P.copy()
-        x[fixed] = states[-1][fixed]
-        P[np.ix_(fixed, fixed)] = covariances[-1][np.ix_(fixed, fixed)]
-        causal = filter_headings(events, model._replace(x=x, P=P, fixed=fixed))
-        return self._at_rate_samples(causal, states, covariances, noises)
-
-    def usual(self) -> dict[str, float]:
-        """Return noises to start from."""
-        grids = dict(NOISES)
-        for i in range(len(self.absolute)):
-            grids |= {f"{i} {name}": values for name, values in NOISES_OF_A_SOURCE.items()}
-        return {name: float(values[len(values) // 2]) for name, values in grids.items()}
-
-    def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
-        """Return the noises with those of the grids that have the largest likelihood, one after the other."""
-        from icrtool.kernels.heading_filter import heading_log_likelihood
-
-        def likelihood(name: str, value: float) -> float:
-            tried = noises | {name: value}
-            return heading_log_likelihood(self.events(tried).cut(MOST_EVENTS), self.model(tried))
-
-        for _ in range(MOST_SWEEPS):
-            before = dict(noises)
-            for name, values in grids.items():
-                costs = [likelihood(name, float(value)) for value in values]
-                noises = noises | {name: float(values[int(np.argmax(costs))])}
-            if noises == before:
-                break
-        return noises
-
-    def _at_rate_samples(
-        self, causal: HeadingPasses, states: Floats, covariances: Floats, noises: dict[str, float]
-    ) -> HeadingEstimate:
-        """Return the estimates at samples of the rate: carried on from the last event, or between events."""
+        both = np.outer(fixed, fixed)
+        start = np.where(fixed, states[-1], model.x), np.where(both, covariances[-1], model.P)
+        causal = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
         t, turn, G = self.t, self.turn, self.G
-        constants, variances = states[-1].copy(), np.diagonal(covariances[-1])
+        # at samples of the rate: carried on from the last event, or between events
         every = max(1, round(1.0 / (LARGEST_RATE_HZ * float(np.median(np.diff(turn.t))))))
         rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))[::every]
         s = turn.t[rows]
         last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
         dt, dG = s - t[last], G[rows] - self.at[last]
-        x, P = causal.x, causal.P
-        carried = x[last, PSI] + (1 + x[last, SCALE]) * dG - x[last, BIAS] * dt
+        x = causal.x[last]
+        carried = x[:, PSI] + (1 + x[:, SCALE]) * dG - x[:, BIAS] * dt
         variance = noises["angle"] ** 2 * dt
         f = {PSI: np.ones(len(rows)), BIAS: -dt, SCALE: dG}
         for i, j in product(f, f):
-            variance += f[i] * P[last, i, j] * f[j]
+            variance += f[i] * causal.P[last, i, j] * f[j]
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
-        scale = 1 + constants[SCALE]
+        scale = 1 + states[-1, SCALE]
         smoothed = scale * G[rows] + np.interp(s, t, states[:, PSI] - scale * self.at)
         # a rate may be the mean over the interval before its stamp, or after it
         delay_s = float(np.median(np.diff(turn.t))) / 2.0 if turn.delay_std_s is None else turn.delay_std_s
@@ -366,5 +331,5 @@ class _Problem:
         smoothed_std = np.sqrt(np.interp(s, t, covariances[:, PSI, PSI]) + stamp)
         return HeadingEstimate(
             s, carried, np.sqrt(np.maximum(variance, 0.0) + stamp), smoothed, smoothed_std,
-            constants, np.sqrt(variances), noises,
+            states[-1].copy(), np.sqrt(np.diagonal(covariances[-1])), noises,
         )  # fmt: skip
