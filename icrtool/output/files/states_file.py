@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -35,10 +32,7 @@ COLUMNS = tuple(field.name for field in fields(States))
 INTEGER_COLUMNS = frozenset({"stamp_ns"})
 
 CHUNK_ROWS = 1024
-"""Rows formatted at a time: they stay in the processor's cache, and memory does not grow with the log."""
-
-CHUNKS_A_PIECE = 16
-"""Chunks written at a time: a thread that asks for the interpreter again waits longer than it takes to write one."""
+"""Rows formatted at a time: their text stays in the processor's cache, and memory does not grow with the log."""
 
 PARQUET_ROWS = 1 << 17
 """Rows of a row group: a group is held in memory until it is written."""
@@ -48,9 +42,6 @@ FREE_BYTES = 1 << 29
 
 ROWS_A_GROUP = 1 << 18
 """Trials written at a time: 6 MB."""
-
-PIECES_AHEAD = 4
-"""Pieces of text that wait to be written at most."""
 
 
 class StatesFileError(ValueError):
@@ -91,18 +82,12 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
                 use_dictionary=False, use_byte_stream_split=floats,
             )  # fmt: skip
         return file_b2sum(path)
-    digest, pieces = hashlib.blake2b(), _csv_pieces(table)
-
-    def store(piece: bytes) -> None:
-        digest.update(piece)
-        file.write(piece)
-
-    with path.open("xb") as file, ThreadPoolExecutor(1) as pool:
-        # Hashing and writing free the interpreter for the formatting of what comes next.
-        waiting = deque(pool.submit(store, piece) for piece in islice(pieces, PIECES_AHEAD))
-        while waiting:
-            waiting.popleft().result()
-            waiting.extend(pool.submit(store, piece) for piece in islice(pieces, 1))
+    digest = hashlib.blake2b()
+    # A chunk is summed and written while it is in the processor's cache: a thread for that takes longer.
+    with path.open("xb") as file:
+        for chunk in _csv_chunks(table):
+            digest.update(chunk)
+            file.write(chunk)
     return digest.hexdigest()
 
 
@@ -198,13 +183,6 @@ def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
                     writer.write_table(pa.table(columns, schema=schema))
 
         yield append
-
-
-def _csv_pieces(table: States) -> Iterator[bytes]:
-    """Yield the file piece by piece."""
-    chunks = _csv_chunks(table)
-    while piece := b"".join(islice(chunks, CHUNKS_A_PIECE)):
-        yield piece
 
 
 def _csv_chunks(table: States) -> Iterator[bytes]:
