@@ -27,8 +27,8 @@ def main() -> None:
         # Before the first thread starts; not where only help is asked for, since it takes some milliseconds.
         use_one_arena()
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
-    # numba and matplotlib, and of drawing.
-    gc.set_threshold(100_000)
+    # numba and matplotlib, and of drawing. What a command loads is less than so many.
+    gc.set_threshold(300_000)
     with suppress(ImportError, ValueError, OSError):
         # A recording split every minute has more files than a process may open; on Windows there is no such limit.
         import resource
