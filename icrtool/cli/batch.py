@@ -14,11 +14,17 @@ from threading import RLock
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
+from msgspec.structs import replace
 
-from icrtool.cli import options
+from icrtool.cli import options, when_used
 from icrtool.cli.options import LOG, PLACE, POSITIVE, Exports, flag, option
 from icrtool.cli.printing import LiveLine, Printer, error
 from icrtool.records.text import LogText, counted, escaped, shortened
+
+with when_used():
+    from icrtool.fleet import batch as batches
+    from icrtool.fleet import fleet_files, one_log, roll_up
+    from icrtool.output.files import remote_place
 
 if TYPE_CHECKING:
     from icrtool.fleet.batch import BatchOptions
@@ -66,7 +72,7 @@ BATCH = options.together(
 @WORKERS
 @BATCH
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
-def command(
+def batch_command(
     places: tuple[Path, ...], output: Path, workers: Workers, batch: BatchOptions, exports: Exports, printer: Printer
 ) -> None:
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
@@ -82,29 +88,26 @@ def command(
       icrtool batch season/ -o results --robot husky-a200
       icrtool batch logs.csv -o results -j 4 --gate "recommended.p95@10m <= 1.5"
     """  # noqa: D301 - click reads the escape
-    from msgspec.structs import replace
-
-    from icrtool.fleet import fleet_files
-    from icrtool.fleet.batch import plan
-    from icrtool.fleet.roll_up import pooled_calibrations
-    from icrtool.output.files.remote_place import on_disk
-
     asked = batch.report
     compared = options.baseline_of(batch.baseline, asked.gates)
-    with on_disk(output, parts=fleet_files.FOLDERS) as folder:
-        requests = plan(places, output, batch, folder)
+    with remote_place.on_disk(output, parts=fleet_files.FOLDERS) as folder:
+        requests = batches.plan(places, output, batch, folder)
         folder.mkdir(parents=True, exist_ok=True)
         view = View(len(requests), printer)
         rows = run_all(requests, workers, batch, view, folder)
     missing = compared.missing(row.log for row in rows) if compared is not None else []
     # Of an address once more: it has the runs now.
-    with on_disk(output, parts=fleet_files.FOLDERS) as folder:
-        pooled = pooled_calibrations(rows, folder, output, allow_unusable=asked.allow_unusable) if asked.ladder else ()
-        calibrations = list(pooled)
+    with remote_place.on_disk(output, parts=fleet_files.FOLDERS) as folder:
+        calibrations = []
+        if asked.ladder:
+            pooled = roll_up.pooled_calibrations(rows, folder, output, allow_unusable=asked.allow_unusable)
+            calibrations = list(pooled)
         new = any((row.status, row.this_time) == ("done", "processed") for row in rows)
         plots = asked.plots if new or not (folder / fleet_files.PLOTS).is_dir() else ()
         document = fleet_files.write_fleet(rows, folder, calibrations, plots, page=asked.page)
-        written = files_written(folder)
+        results = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")
+        there = [name for name in results if (folder / name).exists()]
+        written = ", ".join(f"{name}/" if (folder / name).is_dir() else name for name in there)
     if compared is not None:
         printer.warn(map(escaped, fleet_files.changes_of(rows, missing)))
     exports.write(
@@ -129,15 +132,14 @@ def run_all(
     ----------
     folder : on disk, that stands for the place of the results
     """
-    from icrtool.fleet.batch import run_batch
-    from icrtool.fleet.one_log import path_of
+    # Loaded from here on: at a signal, nothing can be loaded any more.
     from icrtool.fleet.processes import executor_of
 
     rows: list[FleetLog] = []
     with (
-        executor_of([path_of(one.path) for one in requests], *workers) as (executor, lost),
+        executor_of([one_log.path_of(one.path) for one in requests], *workers) as (executor, lost),
         view,
-        closing(run_batch(requests, executor, batch, view.stage, lost, folder)) as coming,
+        closing(batches.run_batch(requests, executor, batch, view.stage, lost, folder)) as coming,
     ):
         for row in coming:
             rows.append(row)
@@ -169,24 +171,20 @@ class View(LiveLine):
     def row(self, row: FleetLog) -> None:
         """Show the result of a log."""
         with self._lock:
-            self._add(row)
-
-    def _add(self, row: FleetLog) -> None:
-        self._stages.pop(row.log, None)
-        self._counts[row.status] += 1
-        self._processed += row.this_time == "processed"
-        self.clear()
-        if row.status == "failed":
-            if not self._printer.quiet:
+            self._stages.pop(row.log, None)
+            self._counts[row.status] += 1
+            self._processed += row.this_time == "processed"
+            self.clear()
+            if row.status != "failed":
+                self._printer.text(line_of(row))
+            elif not self._printer.quiet:
                 error(f"{escaped(row.log)}: {escaped(row.reason)}")
                 if row.details:
                     self._printer.detail("\n".join(map(escaped, row.details.splitlines())))
-        else:
-            self._printer.text(line_of(row))
-        for verdict in row.verdicts:
-            if not verdict.passed:
-                click.echo(escaped(verdict.line), err=True)
-        self._show()
+            for verdict in row.verdicts:
+                if not verdict.passed:
+                    click.echo(escaped(verdict.line), err=True)
+            self._show()
 
     def _show(self) -> None:
         if not self.on_terminal:
@@ -225,17 +223,9 @@ def line_of(row: FleetLog) -> str:
     return "  ".join(parts)
 
 
-def files_written(folder: Path) -> str:
-    """Return what stands in the folder of a batch."""
-    files = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")
-    return ", ".join(f"{name}/" if (folder / name).is_dir() else name for name in files if (folder / name).exists())
-
-
 def summary_of(rows: Sequence[FleetLog], output: Path, written: str) -> str:
     """Return the last line: how many logs were done or failed, and where the tables are."""
-    from icrtool.fleet.fleet_files import counts_text
-
-    parts = [counts_text(rows)]
+    parts = [fleet_files.counts_text(rows)]
     failed_gates = sum(row.gates_failed for row in rows)
     parts += [f"acceptance limits not met: {failed_gates}"] if failed_gates else []
     place = f"written to {LogText(str(output))}: {written}"

@@ -1,23 +1,39 @@
-"""``icrtool calibrate``."""
+"""``icrtool calibrate``, and ``icrtool forecast`` with what it found."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from icrtool.cli import options
-from icrtool.cli.inputs import check_run_config, runs_of, runs_or_logs
-from icrtool.cli.options import FILE, NEW_PICTURE, option
+from icrtool.cli import options, when_used
+from icrtool.cli.inputs import check_run_config, read_calibration, runs_of, runs_or_logs
+from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, PLACE, option
 from icrtool.cli.printing import Printer
 
+with when_used():
+    from icrtool import errors
+    from icrtool.alignment import align, corrections, estimator, wheel_units
+    from icrtool.calibration import forecast as forecasting
+    from icrtool.calibration import one_log, run_recording
+    from icrtool.logs import read_log
+    from icrtool.output import run_directory
+    from icrtool.output.figures import calibrations as figures
+    from icrtool.output.files import atomic, formats
+    from icrtool.output.tables import calibration as tables
+
 if TYPE_CHECKING:
-    from icrtool.config import Config, ConfigSources
-    from icrtool.records.calibration_document import CalibrationFile, SensorDocument
+    from icrtool.calibration.forecast import Forecast
+    from icrtool.calibration.record import Calibration
+    from icrtool.config import ConfigSources
+    from icrtool.records.calibration_document import CalibrationFile
     from icrtool.records.run import Run
+
+LARGEST_PLAN_BYTES = 50_000_000
 
 
 @click.command("calibrate")
@@ -28,7 +44,7 @@ if TYPE_CHECKING:
 @options.ALLOW_UNUSABLE
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
-def command(
+def calibrate_command(
     sources: tuple[Path, ...],
     output: Path | None,
     x_icr: float | None,
@@ -50,79 +66,107 @@ def command(
       icrtool calibrate monday.mcap tuesday.mcap --robot warthog -o warthog.json
       icrtool calibrate icrtool-runs -o calibration.json
     """  # noqa: D301 - click reads the escape
-    from icrtool.errors import IcrToolError
-    from icrtool.output.files.formats import calibration_file, write_calibration
-
     config = settings.load()
     sources = tuple(one for source in sources for one in runs_or_logs(source))
     if len(sources) > 1 and (plot is not None or x_icr is not None):
         raise click.UsageError("--plot and --x-icr are for one log")
     if output is not None:
-        calibration_file(output)
-    runs = _runs(sources, config, printer)
-    from icrtool.calibration.one_log import with_sensors
-    from icrtool.calibration.pooled import calibrate_runs
-
-    sensors = _sensors(runs[0], x_icr, printer) if len(runs) == 1 else None
-    result = None
-    try:
-        result = calibrate_runs(runs, allow_unusable=allow_unusable)
-        printer.warn(map(str, result.left_out))
-    except IcrToolError as err:
-        if sensors is None or not (runs[0].usable or allow_unusable):
-            raise
-        printer.warn([f"no motion model: {err}"])
-    from icrtool.output.tables.calibration import calibration_blocks
-
-    texts = []
-    document: CalibrationFile | None = sensors
-    if result is not None:
-        document = result.calibration if sensors is None else with_sensors(result.calibration, sensors)
-    if output is not None and document is not None:
-        texts.append(f"written to {write_calibration(document, output)}")
-    if plot is not None:
-        _draw(sources[0], runs[0], plot)
-        texts.append(f"drawn to {plot}")
-    printer.json("calibrate", {"calibration": document})
-    printer.show(calibration_blocks(result, sensors))
-    for text in texts:
-        printer.text(f"\n{text}" if printer.verbose else text)
-
-
-def _runs(sources: tuple[Path, ...], config: Config, printer: Printer) -> list[Run]:
-    """Read runs, and fit logs."""
-    from icrtool.output.run_directory import is_run_directory
-
-    finished = all(is_run_directory(source) for source in sources)
+        formats.calibration_file(output)
+    finished = all(run_directory.is_run_directory(source) for source in sources)
     if finished:
         check_run_config(config)
     with ThreadPoolExecutor(1) as other:
         if finished:
             # takes as long as to read a run of an hour, most of which is done outside of the interpreter
             other.submit(import_module, "icrtool.calibration.pooled")
-        return runs_of(sources, config, printer)
+        runs = runs_of(sources, config, printer)
+    from icrtool.calibration.pooled import calibrate_runs
+
+    sensors = None
+    if len(runs) == 1:
+        printer.warn_of(runs[0])
+        sensors = one_log.calibrate_log(runs[0], x_icr_m=x_icr)
+    result = None
+    try:
+        result = calibrate_runs(runs, allow_unusable=allow_unusable)
+        printer.warn(map(str, result.left_out))
+    except errors.IcrToolError as err:
+        if sensors is None or not (runs[0].usable or allow_unusable):
+            raise
+        printer.warn([f"no motion model: {err}"])
+    texts = []
+    document: CalibrationFile | None = sensors
+    if result is not None:
+        document = result.calibration if sensors is None else one_log.with_sensors(result.calibration, sensors)
+    if output is not None and document is not None:
+        texts.append(f"written to {formats.write_calibration(document, output)}")
+    if plot is not None:
+        _draw_residuals(sources[0], runs[0], plot)
+        texts.append(f"drawn to {plot}")
+    printer.json("calibrate", {"calibration": document})
+    printer.show(tables.calibration_blocks(result, sensors))
+    for text in texts:
+        printer.text(f"\n{text}" if printer.verbose else text)
 
 
-def _sensors(run: Run, x_icr: float | None, printer: Printer) -> SensorDocument:
-    """Return what one log shows of antenna, offsets, delays and scales."""
-    from icrtool.calibration.one_log import calibrate_log
-
-    printer.warn_of(run)
-    return calibrate_log(run, x_icr_m=x_icr)
-
-
-def _draw(source: Path, run: Run, plot: Path) -> None:
+def _draw_residuals(source: Path, run: Run, plot: Path) -> None:
     """Draw the residuals of one log's alignment."""
-    from icrtool.alignment.align import choose_reference
-    from icrtool.alignment.corrections import align_streams
-    from icrtool.alignment.estimator import residuals_by_estimate
-    from icrtool.alignment.wheel_units import with_wheel_speeds
-    from icrtool.logs.read_log import read_log
-    from icrtool.output.figures.calibrations import residuals_figure
-    from icrtool.output.files.formats import save_picture
-    from icrtool.output.run_directory import log_of
-
-    log = read_log(source if run.directory is None else log_of(run), run.config)
-    fit = align_streams(with_wheel_speeds(choose_reference(log, run.config), run.config), run.config).fit
+    log = read_log.read_log(source if run.directory is None else run_directory.log_of(run), run.config)
+    measured = wheel_units.with_wheel_speeds(align.choose_reference(log, run.config), run.config)
+    fit = corrections.align_streams(measured, run.config).fit
     if fit is not None:
-        save_picture(residuals_figure(run.name, residuals_by_estimate(fit)), plot)
+        formats.save_picture(figures.residuals_figure(run.name, estimator.residuals_by_estimate(fit)), plot)
+
+
+@click.command("forecast")
+@option("--calibration calibration_file", "CAL.json|RUN", PLACE, "File that icrtool calibrate -o wrote, or a run, "
+        "which is calibrated.", required=True)  # fmt: skip
+@option("--path", "PLAN.csv|RUN", PLACE, "Path to drive: a table with east_m, north_m[, speed_mps], or a run, driven "
+        "again.", required=True)  # fmt: skip
+@options.BUDGETS
+@option("-o --output", "FILE.csv", NEW_FILE, "Write a row for each metre.")
+@option("--plot", "FILE", NEW_PICTURE, "Draw the errors: png, svg, pdf.")
+@options.printing(options.AS_JSON, options.QUIET_RESULTS)
+def forecast_command(
+    calibration_file: Path,
+    path: Path,
+    budgets_m: tuple[float, ...],
+    output: Path | None,
+    plot: Path | None,
+    printer: Printer,
+) -> None:
+    """Forecast the error of driving a path without GNSS, with a calibrated motion model.
+
+    The expected and the 95 % error are given after each metre of the path: for wheels alone and, where the calibration
+    has a gyro, with it. They follow from the covariance of the calibration and from its error growth, which was
+    measured on held-out distance. A negative speed_mps in a plan drives in reverse.
+
+    \b
+    Example:
+      icrtool calibrate monday.mcap tuesday.mcap --robot warthog -o warthog.json
+      icrtool forecast --calibration warthog.json --path plan.csv --budget 0.5
+      icrtool forecast --calibration warthog.json --path icrtool-runs/field -o errors.csv --plot errors.png
+    """  # noqa: D301 - click reads the escape
+    _, calibration = read_calibration(calibration_file)
+    forecast, gyro = _forecasts(calibration, path)
+    if output is not None:
+        atomic.write_file(output, tables.forecast_csv(forecast, gyro))
+    if plot is not None:
+        measured_m = tables.measured_to_m(calibration)
+        formats.save_picture(figures.forecast_figure(forecast, path.name, budgets_m, measured_m, gyro), plot)
+    printer.json("forecast", tables.forecast_document(forecast, calibration, budgets_m, gyro))
+    printer.show(tables.forecast_blocks(forecast, calibration, budgets_m, gyro))
+
+
+def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast | None]:
+    """Forecast along a run's path or the points of a table: wheels alone, and with a gyro where both have one."""
+    with_gyro = calibration.gyro is not None and calibration.gyro.error_sources is not None
+    if run_directory.is_run_directory(path):
+        recording = run_recording.turning_recording_of(run_directory.open_run(path))
+        with_gyro = with_gyro and recording.track.gyro is not None
+        forecast = partial(forecasting.forecast_drive, calibration, recording)
+    else:
+        plan = formats.read_numbers(path, ("east_m", "north_m"), ("speed_mps",), most_bytes=LARGEST_PLAN_BYTES)
+        points = plan["east_m"], plan["north_m"], plan.get("speed_mps")
+        forecast = partial(forecasting.forecast_plan, calibration, *points)
+    return forecast(), forecast(with_gyro=True) if with_gyro else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+from importlib import import_module
 
 import click
 
@@ -27,9 +27,18 @@ _COMMANDS = {
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",
 }
 
+_HOMES = {
+    "info": "fit",
+    "forecast": "calibrate",
+    "compare": "report",
+    "study": "simulate",
+    **dict.fromkeys(("robots", "config", "cache", "completion"), "installation"),
+}
+"""Module of a command where that has another name."""
+
 
 class _Commands(click.Group):
-    """Finds command NAME in module ``icrtool.cli.NAME``."""
+    """Finds the commands in their modules, each as ``NAME_command``."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)
@@ -37,8 +46,8 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in _COMMANDS:
             return None
-        module = importlib.import_module(f"icrtool.cli.{cmd_name.replace('-', '_')}")
-        command: click.Command = module.command
+        name = cmd_name.replace("-", "_")
+        command: click.Command = getattr(import_module(f"icrtool.cli.{_HOMES.get(name, name)}"), f"{name}_command")
         return command
 
     def resolve_command(

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from icrtool.cli import options
+from icrtool.cli import options, when_used
 from icrtool.cli.fit import fitted_log
 from icrtool.cli.inputs import RUNS, ResultPlace, RunPlace, check_run_config, logs_of, run_directories
 from icrtool.cli.options import FILE, POSITIVE, Exports, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.text import LogText, escaped
+
+with when_used():
+    from icrtool import errors
+    from icrtool.dropout_analysis import dropout_report, trials
+    from icrtool.fleet import one_log
+    from icrtool.output import run_directory, text_blocks
+    from icrtool.output.exports import acceptance
+    from icrtool.output.files import formats, remote_place
+    from icrtool.output.tables import dropout
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
@@ -50,7 +60,7 @@ class Request(NamedTuple):
 
 def distances(text: str) -> tuple[float, ...]:
     """Read the distances [m] of ``--horizons``."""
-    found = options.numbers(text, "M,M,...")
+    found = options.numbers("M,M,...")(text)
     if min(found) <= 0:
         raise click.BadParameter(f"{text!r} has a distance that is not above zero")
     return found
@@ -85,7 +95,7 @@ FURTHER = options.together(
 @options.REPORT
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
-def command(
+def dropout_report_command(
     sources: tuple[Path, ...], place: ResultPlace, overwrite: bool, further: TrialOptions, trials: bool,
     calibration_files: tuple[Path, ...], report: ReportOptions, baseline: Path | None, exports: Exports,
     settings: ConfigSources, printer: Printer,
@@ -102,12 +112,9 @@ def command(
       icrtool dropout-report icrtool-runs/field --calibration season.json --gate "calibration.p95@10m <= 0.6"
       icrtool dropout-report log.bag --robot jackal --gate "recommended.p95@10m <= 1.5" --junit gates.xml
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.exports.acceptance import format_outcomes, suite_of
-    from icrtool.output.files.formats import open_calibration
-
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)
-    further = further.configured(config, map(open_calibration, calibration_files))
+    further = further.configured(config, map(formats.open_calibration, calibration_files))
     request = Request(config, report, compared, further, trials, overwrite, printer)
     sources, places = plan_sources(sources, place, config, printer)
     inputs = Inputs("source")
@@ -121,7 +128,8 @@ def command(
                 document["report"] = found.document
     printer.json("dropout-report", {"reports": inputs.documents})
     outcomes = [(str(source), (inputs.errors | reports)[str(source)]) for source in sources]
-    exports.write("dropout-report", lambda: [suite_of(*one) for one in outcomes], lambda: format_outcomes(outcomes))
+    suites = [acceptance.suite_of(*one) for one in outcomes]
+    exports.write("dropout-report", lambda: suites, lambda: acceptance.format_outcomes(outcomes))
     verdicts = [verdict for one in reports.values() for verdict in one.document.gates]
     options.check_compared(verdicts)
     inputs.leave("runs and logs", gate_failed=not all(one.passed for one in verdicts))
@@ -135,34 +143,38 @@ def plan_sources(
     Everything that can be refused without reading a log is refused here: a finished run keeps its configuration and
     its place.
     """
-    from icrtool.errors import ConfigError
-    from icrtool.output.run_directory import RUN_FILE, is_run_directory, newest_run
-
-    sources = logs_of(sources or (newest_run(RUNS),), printer)
-    logs = tuple(source for source in sources if not ((source / RUN_FILE).is_file() or is_run_directory(source)))
+    sources = logs_of(sources or (run_directory.newest_run(RUNS),), printer)
+    logs = tuple(
+        source
+        for source in sources
+        if not ((source / run_directory.RUN_FILE).is_file() or run_directory.is_run_directory(source))
+    )
     if logs:
         return sources, dict(zip(logs, run_directories(logs, place), strict=True))
     check_run_config(config, free="dropout")
     if place.output or place.into:
-        raise ConfigError("-o", "a report on a finished run is written into that run", "leave -o out")
+        why = "a report on a finished run is written into that run"
+        raise errors.ConfigError("-o", why, "leave -o out")
     return sources, {}
 
 
 def _report_one(source: Path, place: RunPlace | None, request: Request) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
-    from icrtool.output.run_directory import PAGE_FILE
-    from icrtool.output.tables.dropout import dropout_blocks
-    from icrtool.output.text_blocks import Facts, Section
-
-    printer = request.printer
+    printer, further = request.printer, request.further
     with _run_of(source, place, request) as (run, folder):
-        report = _analyse(run, folder, request)
+        if further.outage_at_s and not dropout_report.forced_lengths_s(run, further.outage_s):
+            raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
+        baseline = request.baseline.find(run.name, run.document.content) if request.baseline is not None else None
+        with printer.stages(LogText(run.name)) as stages:
+            report = one_log.report_and_write(
+                run, folder, request.asked, stages.begin, baseline=baseline, trials=request.trials, further=further
+            )
     if report.baseline is not None:
         printer.warn(f"{run.name}: {change}" for change in report.baseline.changes(run.document))
     directory = source if place is None else place.directory
-    label, name = ("page", PAGE_FILE) if request.asked.page else ("written to", "dropout")
-    where = Section("", [Facts([(label, escaped(str(directory / name)))])])
-    printer.show([*dropout_blocks(report), where])
+    label, name = ("page", run_directory.PAGE_FILE) if request.asked.page else ("written to", "dropout")
+    where = text_blocks.Section("", [text_blocks.Facts([(label, escaped(str(directory / name)))])])
+    printer.show([*dropout.dropout_blocks(report), where])
     if not printer.shows:
         for verdict in report.document.gates:
             if not verdict.passed:
@@ -173,44 +185,15 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
 @contextmanager
 def _run_of(source: Path, place: RunPlace | None, request: Request) -> Iterator[tuple[Run, Path]]:
     """Give the run of a source, and the folder on disk that the report goes into."""
-    from icrtool.fleet.one_log import FitOptions
-    from icrtool.output.files.remote_place import on_disk
-
     if place is None:
-        with on_disk(source, needed=bool) as folder:
-            yield _read(folder), folder
+        with remote_place.on_disk(source, needed=bool) as folder, ThreadPoolExecutor(1) as pool:
+            reading = pool.submit(run_directory.open_run, folder)
+            # What the analysis needs is loaded beside it.
+            trials.load_kernels()
+            yield reading.result(), folder
         return
     # One result: where the report fails, an old run in this place stays, with its report.
     smooth = request.further.reference == "smoothed"
-    asked = FitOptions(request.overwrite, request.asked.plots, request.asked.figures, smooth=smooth)
+    asked = one_log.FitOptions(request.overwrite, request.asked.plots, request.asked.figures, smooth=smooth)
     with fitted_log(source, place.directory, request.config, asked, request.printer, place.inside) as found:
         yield found
-
-
-def _analyse(run: Run, directory: Path, request: Request) -> DropoutReport:
-    """Analyse a run, and write its report into its directory."""
-    from icrtool.dropout_analysis.dropout_report import forced_lengths_s
-    from icrtool.fleet.one_log import report_and_write
-
-    if request.further.outage_at_s and not forced_lengths_s(run, request.further.outage_s):
-        raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-    baseline = request.baseline.find(run.name, run.document.content) if request.baseline is not None else None
-    with request.printer.stages(LogText(run.name)) as stages:
-        return report_and_write(
-            run, directory, request.asked, stages.begin, baseline=baseline, trials=request.trials,
-            further=request.further,
-        )  # fmt: skip
-
-
-def _read(directory: Path) -> Run:
-    """Read a run; what the analysis needs is loaded beside it."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    from icrtool.output.run_directory import open_run
-
-    with ThreadPoolExecutor(1) as pool:
-        reading = pool.submit(open_run, directory)
-        from icrtool.dropout_analysis.trials import load_kernels
-
-        load_kernels()
-        return reading.result()

@@ -7,12 +7,19 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
+from icrtool.cli import when_used
 from icrtool.cli.inputs import RUNS, read_calibration
 from icrtool.cli.options import FILE, PLACE, choice, flag, option
 from icrtool.cli.printing import Printer, write_or_print
 
+with when_used():
+    from icrtool import errors
+    from icrtool.calibration import record
+    from icrtool.output import run_directory
+    from icrtool.output.exports import controllers, foxglove, maps, paths
+    from icrtool.output.files import atomic, formats
+
 if TYPE_CHECKING:
-    from icrtool.calibration.record import Calibration
     from icrtool.output.exports.controllers import Target
     from icrtool.output.exports.paths import TrajectoryFormat
     from icrtool.records.run import Run
@@ -33,7 +40,7 @@ ALL_THE_SAME = "--force exports it all the same"
 @option("-o --output", "FILE", FILE, "File to write; for evo and kitti a directory with a file for each path of the "
         "run, or a file with the suffix .tum, .kitti, .txt or .csv.")  # fmt: skip
 @flag("--force", "Also export what is not fit for use.")
-def command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
+def export_command(source: Path | None, target: str, output: Path | None, force: bool) -> None:
     """Print a calibration for a robot's controller, or a run for other programs.
 
     CAL.json is a file that `icrtool calibrate -o` wrote. A RUN, a directory that `icrtool fit` wrote, is calibrated
@@ -54,98 +61,64 @@ def command(source: Path | None, target: str, output: Path | None, force: bool) 
       icrtool export --for evo icrtool-runs/field -o trajectories
       icrtool export --for foxglove icrtool-runs/field -o field.mcap
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.files.atomic import check_place
-
-    if target in TRAJECTORIES and output is not None and not _is_one_file(output):
-        _write_trajectories(_run(source), cast("TrajectoryFormat", target), output)
-        return
     if target == "foxglove" and output is None:
         raise click.UsageError("an MCAP file is not text: name it with -o FILE.mcap")
+    if target in TRAJECTORIES and output is not None:
+        # A file by what is there, else by a suffix that such files have.
+        suffixes = (*paths.SUFFIXES.values(), *TEXT_SUFFIXES)
+        if not (output.is_file() or (output.suffix.lower() in suffixes and not output.is_dir())):
+            _write_trajectories(_run(source), cast("TrajectoryFormat", target), output)
+            return
     if output is not None:
-        check_place(output)
-    if target == "foxglove" and output is not None:
-        _write_foxglove(_run(source, output), output)
-        return
+        atomic.check_place(output)
     if target in CONTROLLERS:
-        from icrtool.output.exports.controllers import format_export
-
-        write_or_print(f"{format_export(_calibration(source, force=force), cast('Target', target))}\n", output)
+        name, found = read_calibration(source, force=force, advice=f"; {ALL_THE_SAME}")
+        if (reasons := record.unfit_reasons(found)) and not force:
+            advice = f"calibrate with other logs; {ALL_THE_SAME}"
+            raise errors.DataError(name, f"not fit for use: {reasons[0]}", advice)
+        text = controllers.format_export(found, cast("Target", target))
     else:
-        write_or_print(_path_text(_run(source, output), target), output)
-
-
-def _is_one_file(output: Path) -> bool:
-    """Return whether a place for trajectories is a file: by what is there, else by a suffix that such files have."""
-    from icrtool.output.exports.paths import SUFFIXES
-
-    return output.is_file() or (output.suffix.lower() in (*SUFFIXES.values(), *TEXT_SUFFIXES) and not output.is_dir())
-
-
-def _path_text(run: Run, target: str) -> str:
-    """Return the paths of a run in a text format."""
-    if target in TRAJECTORIES:
-        from icrtool.output.exports.paths import format_trajectory, paths_of
-
-        return format_trajectory(paths_of(run)[0], cast("TrajectoryFormat", target))
-    if target == "qgis":
-        from icrtool.output.exports.maps import format_geojson
-
-        return f"{format_geojson(run)}\n"
-    from icrtool.output.exports.maps import format_kml
-
-    return f"{format_kml(run)}\n"
+        run = _run(source, output)
+        if target == "foxglove" and output is not None:
+            _write_foxglove(run, output)
+            return
+        if target in TRAJECTORIES:
+            text = paths.format_trajectory(paths.paths_of(run)[0], cast("TrajectoryFormat", target))
+        else:
+            text = maps.format_geojson(run) if target == "qgis" else maps.format_kml(run)
+    write_or_print(text if target in TRAJECTORIES else f"{text}\n", output)
 
 
 def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
     """Write a file for each path of a run."""
-    from icrtool.output.exports.paths import SUFFIXES, format_trajectory, is_trajectory, paths_of
-
     directory.mkdir(parents=True, exist_ok=True)
-    from icrtool.output.files.atomic import check_place, write_file
-
-    files = {directory / f"{path.name}{SUFFIXES[target]}": path for path in paths_of(run)}
+    files = {directory / f"{path.name}{paths.SUFFIXES[target]}": path for path in paths.paths_of(run)}
     for file in files:
-        check_place(file, directory, is_trajectory)
+        atomic.check_place(file, directory, paths.is_trajectory)
     for file, path in files.items():
-        write_file(file, format_trajectory(path, target), directory, is_trajectory)
+        atomic.write_file(file, paths.format_trajectory(path, target), directory, paths.is_trajectory)
         click.echo(f"written to {file}")
 
 
 def _write_foxglove(run: Run, output: Path) -> None:
     """Write the MCAP file, and the layout beside it."""
-    from icrtool.output.exports.foxglove import foxglove_layout, is_layout, write_foxglove
-    from icrtool.output.files.atomic import atomic_file, check_place, write_file
-    from icrtool.output.files.formats import json_bytes
-
     layout = output.with_name(f"{output.stem}.layout.json")
-    check_place(layout, layout.parent, is_layout)
-    with atomic_file(output) as partial:
-        write_foxglove(run, partial)
-    write_file(layout, json_bytes(foxglove_layout(run)), layout.parent, is_layout)
+    atomic.check_place(layout, layout.parent, foxglove.is_layout)
+    with atomic.atomic_file(output) as partial:
+        foxglove.write_foxglove(run, partial)
+    content = formats.json_bytes(foxglove.foxglove_layout(run))
+    atomic.write_file(layout, content, layout.parent, foxglove.is_layout)
     click.echo(f"written to {output}; layout for Foxglove: {layout}")
 
 
 def _run(source: Path | None, output: Path | None = None) -> Run:
     """Read the run whose paths are asked for; one that is not usable has them too. Its log is never the output."""
-    from icrtool.errors import OutputError, RunError
-    from icrtool.output.run_directory import newest_run, open_run
-
     if source is not None and source.is_file():
-        raise RunError(source, "is a file, and paths come from a run", "name a directory that icrtool fit wrote")
-    run = open_run(source or newest_run(RUNS))
+        advice = "name a directory that icrtool fit wrote"
+        raise errors.RunError(source, "is a file, and paths come from a run", advice)
+    run = run_directory.open_run(source or run_directory.newest_run(RUNS))
     if output is not None and output.resolve() in (Path(file.path).resolve() for file in run.document.inputs):
-        raise OutputError(output, "is the log that the run was made from", "name another file")
+        raise errors.OutputError(output, "is the log that the run was made from", "name another file")
     if not run.usable:
         Printer().warn([f"{run.name}: its ICRs are not usable: {run.document.unusable_because}"])
     return run
-
-
-def _calibration(source: Path | None, *, force: bool) -> Calibration:
-    """Read a calibration file, or calibrate from a run; one that is not fit for use is refused without `force`."""
-    from icrtool.calibration.record import unfit_reasons
-    from icrtool.errors import DataError
-
-    name, found = read_calibration(source, force=force, advice=f"; {ALL_THE_SAME}")
-    if (reasons := unfit_reasons(found)) and not force:
-        raise DataError(name, f"not fit for use: {reasons[0]}", f"calibrate with other logs; {ALL_THE_SAME}")
-    return found

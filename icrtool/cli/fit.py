@@ -1,31 +1,38 @@
-"""``icrtool fit``."""
+"""``icrtool fit`` and ``icrtool info``: what a log shows of its robot, written as a run or printed."""
 
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from icrtool.cli import options
+from icrtool.cli import options, when_used
 from icrtool.cli.inputs import ResultPlace, logs_of, run_directories
-from icrtool.cli.options import PLACE, choice, flag, option
+from icrtool.cli.options import PLACE, Span, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.text import LogText, escaped
+
+with when_used():
+    from icrtool import errors
+    from icrtool.alignment import wheel_units
+    from icrtool.calibration import fit as fitting
+    from icrtool.fleet import one_log
+    from icrtool.logs import describe, read_log
+    from icrtool.logs.streams import assembly
+    from icrtool.output import text_format
+    from icrtool.output.tables import overview
+    from icrtool.output.tables import run as run_tables
+    from icrtool.records import plain_data
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
     from icrtool.fleet.one_log import FitOptions
     from icrtool.records.run import Run
-
-
-def seconds(text: str) -> float:
-    """Read a time of ``--terrain-change`` [s]."""
-    return options.numbers(text, "T, finite seconds", 1)[0]
-
 
 ASKED = options.together(
     "asked",
@@ -36,8 +43,8 @@ ASKED = options.together(
     options.FIGURES,
     option("--warm-start", "RUN|CAL.json", PLACE, "Start from another run's final ICRs and covariance, or from those "
            "of a calibration."),
-    option("--terrain-change changes_s", "T", seconds, "The ground changes after T seconds: inflate the ICR "
-           "covariance there; repeatable.", multiple=True),
+    option("--terrain-change changes_s", "T", lambda text: options.numbers("T, finite seconds", 1)(text)[0], "The "
+           "ground changes after T seconds: inflate the ICR covariance there; repeatable.", multiple=True),
     flag("--smooth", "Also write the RTS smoother's states (smoothed.csv)."),
     options.CUT,
 )  # fmt: skip
@@ -48,7 +55,7 @@ ASKED = options.together(
 @ASKED
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
-def command(
+def fit_command(
     logs: tuple[Path, ...], place: ResultPlace, asked: FitOptions, settings: ConfigSources, printer: Printer
 ) -> None:
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
@@ -61,8 +68,6 @@ def command(
       icrtool fit field.mcap --robot husky-a200
       icrtool fit log.bag --set topics.gnss=/rtk/fix -o runs/today
     """  # noqa: D301 - click reads the escape
-    from icrtool.output.tables.run import next_blocks, run_blocks
-
     config = settings.load()
     logs = logs_of(logs, printer)
     inputs = Inputs("log")
@@ -74,7 +79,7 @@ def command(
             document |= {"directory": where, "run": run.summary}
             # The command that names what is wrong in the log.
             examine = shlex.join(["icrtool", "info", escaped(str(log)), "-v", *options.given(settings, asked.span)])
-            printer.show([*run_blocks(run.document), *next_blocks(run.document, where, examine)])
+            printer.show([*run_tables.run_blocks(run.document), *run_tables.next_blocks(run.document, where, examine)])
     printer.json("fit", {"logs": inputs.documents})
     inputs.leave("logs")
 
@@ -84,17 +89,90 @@ def fitted_log(
     log: Path, directory: Path, config: Config, asked: FitOptions, printer: Printer, inside: Path | None
 ) -> Iterator[tuple[Run, Path]]:
     """Fit a log, and give as `icrtool.fleet.one_log.fitted` does; print warnings and chosen streams on stderr."""
-    from icrtool.fleet.one_log import fitted
-    from icrtool.output.text_format import jump_lines
-
     notes: list[str] = []
     with (
         printer.stages(LogText(log.name)) as stages,
-        fitted(
+        one_log.fitted(
             log, directory, config, asked, stages.begin, share=stages.share, note=notes.append, inside=inside
         ) as found,
     ):
         yield found
     printer.warn_of(found[0], *notes)
-    for line in jump_lines(found[0].document.reference_jumps):
+    for line in text_format.jump_lines(found[0].document.reference_jumps):
         printer.detail(line)
+
+
+@click.command("info")
+@options.LOGS
+@options.CUT
+@options.CONFIGURATION
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+def info_command(logs: tuple[Path, ...], span: Span, settings: ConfigSources, printer: Printer) -> None:
+    """List what each log holds, which topics are used for wheels, position and heading, and the problems found.
+
+    The filter runs too, but nothing is written. The report names the ICRs that the drive shows and, where
+    one is not shown, what to drive next.
+
+    Exit status 1 when `icrtool fit` could not run on a log.
+    """
+    config, given = settings.load(), options.given(settings, span)
+    inputs = Inputs("log")
+    for log in logs_of(logs, printer):
+        with inputs.each(log) as document:
+            _examine(log, config, span, given, document, printer)
+    printer.json("info", {"logs": inputs.documents})
+    inputs.leave("logs")
+
+
+def _examine(
+    log: Path, config: Config, span: Span, given: list[str], document: dict[str, Any], printer: Printer
+) -> None:
+    """Read and fit a log, and print whether it can be fitted, what it holds, and the command to run next.
+
+    Only the filter shows which ICRs the drive determines, and which sensors disagree. `document` gets the same as plain
+    data; ``run`` as in run.json, null where the log cannot be fitted.
+
+    Raises
+    ------
+    IcrToolError
+        The log cannot be fitted; what was found up to there is printed.
+    """
+    survey = measured = run = problem = None
+    try:
+        with printer.stages(LogText(log.name)) as stages:
+            stages.begin("reading")
+            if read_log.is_table(log):
+                measured = read_log.read_log(log, config, start=span.start, end=span.end)
+            else:
+                survey = read_log.survey_log(log, config, stages.share, start=span.start, end=span.end)
+                measured = assembly.assemble(survey, config)
+            measured = wheel_units.with_wheel_speeds(measured, config)
+            run = fitting.fit(measured, config, watch=stages.begin)
+    except errors.IcrToolError as err:
+        problem = err
+    holds = describe.survey_document(survey) if survey is not None else None
+    # What errors and warnings of the log begin with: its name, or its path.
+    names = (survey.name if survey is not None else LogText(log.stem), escaped(str(log)))
+    command = overview.next_command(escaped(str(log)), given, run)
+    warnings = survey.problems if survey is not None else ()
+    if measured is not None:
+        warnings = measured.warnings if run is None else run.warnings
+    if printer.as_json:
+        document.update(
+            {
+                "reason": None,
+                **(plain_data.plain(holds) if holds is not None else {}),
+                "streams": plain_data.plain(measured.streams) if measured is not None else [],
+                "warnings": list(warnings),
+                "verdict": overview.verdict(run, problem, names),
+                "next": command,
+                "run": run.summary if run is not None else None,
+            }
+        )
+    elif printer.shows:
+        printer.show(overview.info_blocks(holds, measured, run, problem, names, config, command))
+    # On a terminal the answer names the gravest one.
+    if printer.verbose or printer.as_json or not sys.stderr.isatty():
+        printer.warn(warnings)
+    if problem is not None:
+        raise problem

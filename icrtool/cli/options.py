@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import wraps
@@ -16,12 +17,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import click
+from click.shell_completion import CompletionItem
 
-from icrtool.cli.completion import complete_robot, complete_setting
+from icrtool.cli import when_used
 from icrtool.cli.inputs import ResultPlace
 from icrtool.cli.printing import Printer
 from icrtool.records.text import escaped
 from icrtool.records.urls import UrlPath, place_of
+
+with when_used():
+    from icrtool import config, errors
+    from icrtool.dropout_analysis import report
+    from icrtool.logs.containers import open_log
+    from icrtool.output.exports import acceptance
+    from icrtool.output.files import atomic, baseline_file, formats
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
@@ -63,7 +72,7 @@ def flag(names: str, text: str, **further: Any) -> Option:
     return click.option(*names.split(), is_flag=True, help=text, **further)
 
 
-def together(name: str, home: str | Callable[..., object], *options: Option) -> Option:
+def together(name: str, home: str | Callable[..., Any], *options: Option, change: bool = False) -> Option:
     """Return what adds options to a command, in this order, and gives it a record of them as one argument.
 
     Parameters
@@ -71,28 +80,18 @@ def together(name: str, home: str | Callable[..., object], *options: Option) -> 
     name : of the argument
     home : the record, or where it is: ``icrtool.config:ConfigSources``, imported when the command is called. Those of
         the options that have the names of its fields become these, if they are given; the command gets the others
+    change : the argument changes a record, a dataclass, by the options that are given
     """
-    return _joined(name, home, lambda record, values: record(**values), options)
+    bare = add_options(lambda: None, *options)
+    known = {one.name for one in bare.__dict__.get("__click_params__", ())}.union(bare.__dict__.get("made", ()))
 
-
-def changes(name: str, home: str, *options: Option) -> Option:
-    """Return the same as `together`, but the argument changes a record, a dataclass, by the options that are given."""
-    return _joined(name, home, lambda _, values: lambda record: replace(record, **values), options)
-
-
-def _joined(
-    name: str,
-    home: str | Callable[..., object],
-    make: Callable[[Callable[..., object], dict[str, object]], object],
-    options: Sequence[Option],
-) -> Option:
     def add(command: Command) -> Command:
         @wraps(command)
         def call(**given: Any) -> object:
             record = _imported(home) if isinstance(home, str) else home
-            known = _names(add_options(lambda: None, *options))
-            values = {one: given.pop(one) for one in known.intersection(signature(record).parameters, given)}
-            made = make(record, {one: value for one, value in values.items() if value is not None})
+            taken = {one: given.pop(one) for one in known.intersection(signature(record).parameters, given)}
+            values = {one: value for one, value in taken.items() if value is not None}
+            made = (lambda old: replace(old, **values)) if change else record(**values)
             return command(**{name: made}, **given)
 
         call.__dict__["made"] = {name, *command.__dict__.get("made", ())}
@@ -101,16 +100,11 @@ def _joined(
     return add
 
 
-def _imported(home: str) -> Callable[..., object]:
+def _imported(home: str) -> Callable[..., Any]:
     """Return what is at ``module:name``."""
     module, _, name = home.partition(":")
-    found: Callable[..., object] = getattr(import_module(module), name)
+    found: Callable[..., Any] = getattr(import_module(module), name)
     return found
-
-
-def _names(command: Command) -> set[str]:
-    """Return the arguments that a command gets of its options: those that are made of several, and the others."""
-    return {one.name for one in command.__dict__.get("__click_params__", ())}.union(command.__dict__.get("made", ()))
 
 
 def add_options(command: Command, *options: Option) -> Command:
@@ -153,15 +147,62 @@ FILE, NEW_FILE = _Path(), _Path(check="icrtool.output.files.atomic:check_place")
 NEW_PICTURE = _Path(check="icrtool.output.files.formats:check_picture")
 
 
-def numbers(text: str, form: str, count: int | None = None) -> tuple[float, ...]:
-    """Read numbers separated by commas; `form` is what they shall look like."""
-    try:
-        found = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        found = ()
-    if len(found) != (count or len(found)) or not found or not all(map(math.isfinite, found)):
-        raise click.BadParameter(f"{text!r} is not of the form {form}")
-    return found
+def numbers(form: str, count: int | None = None) -> Callable[[str], tuple[float, ...]]:
+    """Return what reads numbers separated by commas; `form` is what they shall look like."""
+
+    def read(text: str) -> tuple[float, ...]:
+        try:
+            found = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            found = ()
+        if len(found) != (count or len(found)) or not found or not all(map(math.isfinite, found)):
+            raise click.BadParameter(f"{text!r} is not of the form {form}")
+        return found
+
+    return read
+
+
+def complete_robot(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Return the built-in robots that begin with `incomplete`."""
+    return [
+        CompletionItem(name, help=f"track width {robot['track_width_m']:g} m")
+        for name, robot in config.builtin_robots().items()
+        if name.startswith(incomplete)
+    ]
+
+
+def complete_setting(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Return the keys that begin with `incomplete`, or the values of a key: its words, or the topics of the log."""
+    key, equals, begun = incomplete.partition("=")
+    section, _, name = key.partition(".")
+    if not equals:
+        texts = config.key_texts()
+        keys = [(f"{one}.{two}", texts[one][two]["text"]) for one in config.SECTIONS for two in texts[one]]
+        return [CompletionItem(f"{one}=", help=text) for one, text in keys if one.startswith(incomplete)]
+    if section == "topics":
+        # Without the value of --set, click leaves what stands before it in `args`.
+        values = topics_of(ctx.params.get("logs") or ctx.params.get("sources") or ctx.args)
+    else:
+        values = config.words_of_key(section, name)
+    return [CompletionItem(f"{key}={value}") for value in values if value.startswith(begun)]
+
+
+def topics_of(logs: object) -> tuple[str, ...]:
+    """Return the topics of the logs that were named before, as far as they can be read and are names of ROS.
+
+    Bash puts a completion into the line without quoting it: no other text of a log must come there.
+    """
+    topics: set[str] = set()
+    for log in logs if isinstance(logs, tuple | list) else ():
+        if log == "-":
+            continue  # a completion must not wait for its input
+        try:
+            container = open_log.open_log(Path(log))
+        except errors.IcrToolError:
+            continue
+        topics |= {str(one.topic) for one in container.channels if re.fullmatch(r"[\w/~.-]+", one.topic, re.ASCII)}
+        container.close()
+    return tuple(sorted(topics))
 
 
 CONFIGURATION = together(
@@ -219,15 +260,14 @@ SEED = option("--seed", None, click.IntRange(min=0), "Seed of all noise; the sam
 
 def plot_formats(text: str) -> tuple[str, ...]:
     """Read ``png,svg,pdf`` or ``none``."""
-    formats = tuple(part.strip().lower() for part in text.split(",") if part.strip())
-    if formats == ("none",):
+    asked = tuple(part.strip().lower() for part in text.split(",") if part.strip())
+    if asked == ("none",):
         return ()
-    from icrtool.output.files.formats import PLOT_FORMATS
-
-    unknown = [part for part in formats if part not in PLOT_FORMATS]
-    if unknown or not formats:
-        raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of {', '.join(PLOT_FORMATS)}, none")
-    return formats
+    known = formats.PLOT_FORMATS
+    unknown = [part for part in asked if part not in known]
+    if unknown or not asked:
+        raise click.BadParameter(f"{', '.join(unknown) or text!r} is not one of {', '.join(known)}, none")
+    return asked
 
 
 PLOTS = option("--plots", "png,svg,pdf|none", plot_formats, "Formats of the pictures.", default="png")
@@ -254,13 +294,10 @@ class Exports(NamedTuple):
 
     def write(self, command: str, suites: Callable[[], Sequence[Suite]], text: Callable[[], str]) -> None:
         """Write what is asked for: the acceptance limits of the logs, and a summary in Markdown."""
-        from icrtool.output.exports.acceptance import write_junit
-        from icrtool.output.files.atomic import write_file
-
         if self.junit is not None:
-            write_junit(self.junit, suites(), command)
+            acceptance.write_junit(self.junit, suites(), command)
         if self.markdown is not None:
-            write_file(self.markdown, text())
+            atomic.write_file(self.markdown, text())
 
 
 REPORT = together("exports", Exports, together(
@@ -288,26 +325,21 @@ REPORT = together("exports", Exports, together(
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
     """Find the reports of --baseline; refuse gates that cannot be read, or need one where there is none."""
-    from icrtool.dropout_analysis.report import parse_gate
-    from icrtool.errors import ConfigError
-
-    relative = [gate.text for gate in map(parse_gate, gates) if gate.baseline_factor]
+    relative = [gate.text for gate in map(report.parse_gate, gates) if gate.baseline_factor]
     if place is not None:
-        from icrtool.output.files.baseline_file import open_baseline
-
-        return open_baseline(place)
+        return baseline_file.open_baseline(place)
     if relative:
-        raise ConfigError(f"gate {relative[0]!r}", "needs an earlier report", "name it with --baseline REPORT.json|DIR")
+        advice = "name it with --baseline REPORT.json|DIR"
+        raise errors.ConfigError(f"gate {relative[0]!r}", "needs an earlier report", advice)
     return None
 
 
 def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
     """Refuse a baseline that has none of the logs: a gate that is never checked would always pass."""
-    from icrtool.errors import ConfigError
-
     relative = [bool(one.not_checked) for one in verdicts if one.relative]
     if relative and all(relative):
-        raise ConfigError("--baseline", "none of these logs is in it", "logs are matched by content, else by name")
+        advice = "logs are matched by content, else by name"
+        raise errors.ConfigError("--baseline", "none of these logs is in it", advice)
 
 
 def given(settings: ConfigSources, span: tuple[str | None, str | None]) -> list[str]:

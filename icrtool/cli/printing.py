@@ -16,14 +16,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import click
 
-from icrtool.output.text_blocks import Block, Line, Printed, Table, format_blocks, narrowed, printed
+from icrtool import __version__
+from icrtool.cli import when_used
+from icrtool.output.text_blocks import Block, Line, Table, format_blocks, narrowed, printed
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
 
+with when_used():
+    from icrtool import errors
+    from icrtool.output import text_format
+    from icrtool.output.files import atomic, formats
+    from icrtool.records import plain_data, samples
+
 if TYPE_CHECKING:
     import msgspec
-    from rich.console import Console, JustifyMethod
-    from rich.table import Table as RichTable
+    from rich.console import Console
 
     from icrtool.errors import IcrToolError
     from icrtool.records.run import Run
@@ -47,27 +54,40 @@ def show(blocks: Iterable[Block], *, verbose: bool) -> None:
         click.echo(format_blocks(blocks, verbose=verbose))
         return
     from rich.console import Console
+    from rich.text import Text as RichText
 
     console = Console(force_terminal=True, highlight=False, markup=False, emoji=False)
     console.width = min(console.width, WIDEST)
-    _print(printed(blocks, verbose=verbose), console)
+    for block in printed(blocks, verbose=verbose):
+        if isinstance(block, Table):
+            _print_table(block, console)
+        elif isinstance(block, Line):
+            console.print(RichText(block.text, STYLES[block.look]), soft_wrap=block.look == "as is")
+        else:
+            console.print(RichText(str(block)))
 
 
-def _print(blocks: Iterable[Printed], console: Console) -> None:
+def _print_table(block: Table, console: Console) -> None:
     from rich.table import Table as RichTable
     from rich.text import Text as RichText
 
-    for block in blocks:
-        if isinstance(block, Line):
-            console.print(RichText(block.text, STYLES[block.look]), soft_wrap=block.look == "as is")
-        elif isinstance(block, str):
-            console.print(RichText(str(block)))
-        else:
-            table, left_out = _fitting(narrowed(block, console.width), console.width)
-            console.print(_rich_table(table, RichTable(box=None, pad_edge=False, show_header=bool(table.head))))
-            if left_out:
-                why = f"the terminal has {console.width} columns"
-                console.print(RichText(f"  ({', '.join(left_out)} left out: {why})", "dim"))
+    table, left_out = _fitting(narrowed(block, console.width), console.width)
+    shown = RichTable(box=None, pad_edge=False, show_header=bool(table.head))
+    sides = table.sides()
+    for number, side in enumerate(sides):
+        head = RichText(str(table.head[number])) if table.head else ""
+        # A sentence, in the last column, is wrapped; a name or a number is not broken.
+        last = number == len(sides) - 1
+        shown.add_column(
+            head, justify="left" if side == "l" else "right", no_wrap=not last or side == "r", header_style="bold",
+            style="" if number else "cyan", overflow="fold" if last else "ellipsis",
+        )  # fmt: skip
+    for row in table.rows:
+        shown.add_row(*(RichText(str(cell)) for cell in row))
+    console.print(shown)
+    if left_out:
+        why = f"the terminal has {console.width} columns"
+        console.print(RichText(f"  ({', '.join(left_out)} left out: {why})", "dim"))
 
 
 def _fitting(table: Table, width: int) -> tuple[Table, list[str]]:
@@ -90,40 +110,18 @@ def _fitting(table: Table, width: int) -> tuple[Table, list[str]]:
     return Table("".join(sides[column] for column in kept), chosen, head), left_out
 
 
-def _rich_table(table: Table, shown: RichTable) -> RichTable:
-    from rich.text import Text as RichText
-
-    sides = table.sides()
-    for number, side in enumerate(sides):
-        head = RichText(str(table.head[number])) if table.head else ""
-        justify: JustifyMethod = "left" if side == "l" else "right"
-        # A sentence, in the last column, is wrapped; a name or a number is not broken.
-        last = number == len(sides) - 1
-        shown.add_column(
-            head, justify=justify, no_wrap=not last or side == "r", header_style="bold", style="" if number else "cyan",
-            overflow="fold" if last else "ellipsis",
-        )  # fmt: skip
-    for row in table.rows:
-        shown.add_row(*(RichText(str(cell)) for cell in row))
-    return shown
-
-
 def write_or_print(text: str, output: Path | None) -> None:
     """Write a text to its file, or print it where none is named."""
     if output is None:
         click.echo(text, nl=False)
-        return
-    from icrtool.output.files.atomic import write_file
-
-    write_file(output, text)
+    else:
+        atomic.write_file(output, text)
 
 
 def signal_word(word: str, color: str) -> str:
     """Return the word that begins a line on standard error, coloured on a terminal; NO_COLOR is respected."""
-    from click import style
-
     wanted = sys.stderr.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-    return style(word, fg=color, bold=True) if wanted else word
+    return click.style(word, fg=color, bold=True) if wanted else word
 
 
 def error(text: str) -> None:
@@ -163,12 +161,9 @@ class Printer(NamedTuple):
         """
         if not self.as_json:
             return
-        from icrtool import __version__
-        from icrtool.output.files.formats import json_bytes
-        from icrtool.records.plain_data import plain
-
         own = {"schema": f"icrtool/{command}/1", "tool_version": __version__}
-        click.echo(json_bytes(own | {key: value for key, value in plain(document).items() if key not in own}), nl=False)
+        content = own | {key: value for key, value in plain_data.plain(document).items() if key not in own}
+        click.echo(formats.json_bytes(content), nl=False)
 
     def detail(self, text: str) -> None:
         """Print a line on standard error, with -v."""
@@ -187,11 +182,9 @@ class Printer(NamedTuple):
         everything = self.verbose or not sys.stderr.isatty()
         self.warn((*(run.warnings if everything else ()), *further))
         if self.verbose:
-            from icrtool.output.text_format import topics_text
-            from icrtool.records.samples import ROLE_WORDS
-
             for stream in run.document.streams:
-                self.detail(f"{ROLE_WORDS[stream.role]}: {topics_text(stream.topic)}: {stream.why}")
+                topics = text_format.topics_text(stream.topic)
+                self.detail(f"{samples.ROLE_WORDS[stream.role]}: {topics}: {stream.why}")
 
     def stages(self, name: str) -> Stages:
         """Return the stages of the work on one log."""
@@ -222,13 +215,11 @@ class Inputs:
     @contextmanager
     def each(self, source: Path) -> Iterator[dict[str, Any]]:
         """Do the work on one input; give its document."""
-        from icrtool.errors import IcrToolError
-
         document: dict[str, Any] = {self._key: escaped(str(source)), "status": "done"}
         self.documents.append(document)
         try:
             yield document
-        except IcrToolError as err:
+        except errors.IcrToolError as err:
             document |= {"status": "failed", "reason": str(err)}
             self.errors[str(source)] = err
             name = shortened(escaped(str(source)), LONGEST_NAME)
@@ -283,15 +274,15 @@ class Stages(LiveLine):
         super().__init__(quiet=quiet)
         self.name = name
         self.prints_lines = verbose and not quiet and not self.on_terminal
-        self._stage = ""
+        self._title = name
         self._shown_s = 0.0
 
     def begin(self, stage: str) -> None:
         """Begin a stage: what is being done, for example ``reading``."""
         give_back_freed()
-        self._stage = stage
+        self._title = f"{self.name}: {stage}" if stage else self.name
         self._shown_s = time.monotonic()
-        self.rewrite(f"{self._title()} …")
+        self.rewrite(f"{self._title} …")
         if self.prints_lines:
             click.echo(f"{self.name}: {stage}", err=True)
 
@@ -301,7 +292,4 @@ class Stages(LiveLine):
         if self.on_terminal and now_s - self._shown_s >= REFRESH_S:
             self._shown_s = now_s
             percent = f"{100 * min(max(done, 0.0), 1.0):.0f} %" if done < 1.0 else "…"
-            self.rewrite(f"{self._title()} {percent}")
-
-    def _title(self) -> str:
-        return f"{self.name}: {self._stage}" if self._stage else self.name
+            self.rewrite(f"{self._title} {percent}")

@@ -1,17 +1,36 @@
-"""``icrtool report``."""
+"""``icrtool report``, the page of a result, and ``icrtool compare``, which makes one of groups of runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from icrtool.cli import options
-from icrtool.cli.inputs import RUNS
-from icrtool.cli.options import FILE, flag, option
+from icrtool.cli import options, when_used
+from icrtool.cli.inputs import RUNS, runs_of, runs_or_logs
+from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, flag, option
 from icrtool.cli.printing import Printer
+from icrtool.records.text import LogText
+from icrtool.records.urls import UrlPath, place_of
+
+with when_used():
+    from icrtool import errors
+    from icrtool.calibration import transfer
+    from icrtool.dropout_analysis import dropout_report
+    from icrtool.fleet import roll_up
+    from icrtool.output import run_directory
+    from icrtool.output.figures import calibrations as figures
+    from icrtool.output.files import atomic, formats
+    from icrtool.output.page import group_pages, render, run_page
+    from icrtool.output.tables import calibration as tables
+    from icrtool.records import fleet_document, regular_file
+
+if TYPE_CHECKING:
+    from icrtool.config import ConfigSources
+    from icrtool.records.run import Run
 
 
 @click.command("report")
@@ -19,7 +38,7 @@ from icrtool.cli.printing import Printer
 @option("-o --output", "FILE", FILE, "The page; default: report.html in the directory of the run or fleet.")
 @flag("--no-coordinates", "Leave out the place on the globe, for a page that others will read.")
 @options.printing(options.QUIET_RESULTS)
-def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, printer: Printer) -> None:
+def report_command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, printer: Printer) -> None:
     """Write a run, a fleet or a comparison as one HTML file that needs no network.
 
     RUN is a directory that `icrtool fit` wrote, with or without its dropout report; FLEET the folder of `icrtool
@@ -31,62 +50,50 @@ def command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool
       icrtool report icrtool-runs/field -o field.html --no-coordinates
       icrtool report results/
     """  # noqa: D301 - click reads the escape
-    from icrtool.errors import ConfigError
-    from icrtool.output.files.atomic import check_place, is_page, write_file
-    from icrtool.output.run_directory import PAGE_FILE, newest_run
-
-    sources = sources or (newest_run(RUNS),)
+    sources = sources or (run_directory.newest_run(RUNS),)
     if output is not None and len(sources) > 1:
-        raise ConfigError("-o", "names one file for several pages", "leave it out: each page goes to its own directory")
+        advice = "leave it out: each page goes to its own directory"
+        raise errors.ConfigError("-o", "names one file for several pages", advice)
     for source in sources:
-        place = output or (source / PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
+        place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
         # A page in its usual place is beside what a stranger may have put there.
-        inside = place.parent if output is None else None
-        ours = is_page if output is None else None
-        check_place(place, inside, ours)
+        inside, ours = (place.parent, atomic.is_page) if output is None else (None, None)
+        atomic.check_place(place, inside, ours)
         page = _page_of(source, coordinates=not no_coordinates)
-        write_file(place, page, inside, ours)
+        atomic.write_file(place, page, inside, ours)
         printer.text(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
 
 
 def _page_of(source: Path, *, coordinates: bool) -> str:
     """Return the page of a run, a fleet or a comparison."""
-    from icrtool.errors import RunError
-    from icrtool.output.files.formats import read_fleet, schema_of
-    from icrtool.output.page.group_pages import comparison_in, comparison_page, fleet_page, read_comparison
-    from icrtool.output.run_directory import is_run_directory
-    from icrtool.records.fleet_document import FLEET_FAMILY, FLEET_FILE
-    from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
-
-    if is_run_directory(source):
+    if run_directory.is_run_directory(source):
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
             return _page_of_run(source, coordinates=coordinates)
-    if schema_of(source / FLEET_FILE, source).startswith(FLEET_FAMILY):
-        with _as_written(source / FLEET_FILE, "run icrtool batch again"):
-            return fleet_page(read_fleet(source), source)
-    if (file := comparison_in(source)) is not None:
+    fleet = source / fleet_document.FLEET_FILE
+    if formats.schema_of(fleet, source).startswith(fleet_document.FLEET_FAMILY):
+        with _as_written(fleet, "run icrtool batch again"):
+            return group_pages.fleet_page(formats.read_fleet(source), source)
+    if (file := group_pages.comparison_in(source)) is not None:
         with _as_written(file, "run icrtool compare again"):
-            return comparison_page(read_comparison(file, source if source.is_dir() else None), file.stem)
-    if is_special(source):
-        raise RunError(source, NOT_REGULAR, SAVE_IT)
+            comparison = group_pages.read_comparison(file, source if source.is_dir() else None)
+            return group_pages.comparison_page(comparison, file.stem)
+    if regular_file.is_special(source):
+        raise errors.RunError(source, regular_file.NOT_REGULAR, regular_file.SAVE_IT)
     what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
-    raise RunError(source, what, "icrtool fit, batch and compare make one")
+    raise errors.RunError(source, what, "icrtool fit, batch and compare make one")
 
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> str:
     """Return the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
-    from icrtool.output.page.run_page import draw_pictures, pictures_of_run, read_report, run_page
-    from icrtool.output.run_directory import open_run
-
-    run, report, pictures = open_run(directory), read_report(directory), pictures_of_run(directory)
+    run, report = run_directory.open_run(directory), run_page.read_report(directory)
+    pictures = run_page.pictures_of_run(directory)
     if "trajectory" not in pictures:
-        pictures = draw_pictures(run) | pictures
+        pictures = run_page.draw_pictures(run) | pictures
     if report is None:
-        from icrtool.dropout_analysis.dropout_report import dropout_report
-
-        return run_page(run, dropout_report(run).document, pictures, coordinates=coordinates)
+        made = dropout_report.dropout_report(run).document
+        return run_page.run_page(run, made, pictures, coordinates=coordinates)
     with _as_written(directory / "dropout", "make it again with icrtool dropout-report"):
-        return run_page(run, report, pictures, coordinates=coordinates)
+        return run_page.run_page(run, report, pictures, coordinates=coordinates)
 
 
 @contextmanager
@@ -94,10 +101,82 @@ def _as_written(place: Path, advice: str) -> Iterator[None]:
     """Refuse a document that was edited, or that another version wrote."""
     from jinja2 import TemplateError
 
-    from icrtool.errors import RunError
-    from icrtool.output.page.render import DOCUMENT_ERRORS
-
     try:
         yield
-    except (*DOCUMENT_ERRORS, TemplateError) as err:
-        raise RunError(place, "is not as this version of icrtool writes it", advice) from err
+    except (*render.DOCUMENT_ERRORS, TemplateError) as err:
+        raise errors.RunError(place, "is not as this version of icrtool writes it", advice) from err
+
+
+@click.command("compare")
+@click.argument("sources", metavar="[NAME=]RUN|LOG|FOLDER...", nargs=-1, required=True)
+@option("--csv", "FILE", NEW_FILE, "Write the transfer matrix: the errors of each calibration in each group.")
+@option("-o --output", "FILE", NEW_FILE, "Write the comparison as JSON, for icrtool report.")
+@option("--plot", "FILE", NEW_PICTURE, "Draw the comparison: png, svg, pdf.")
+@options.CONFIGURATION
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+def compare_command(
+    sources: tuple[str, ...],
+    csv: Path | None,
+    output: Path | None,
+    plot: Path | None,
+    settings: ConfigSources,
+    printer: Printer,
+) -> None:
+    """Compare groups of runs: ICRs, multiplier and errors, and what the calibration of one costs on another.
+
+    Each argument is a group: a run, a log, or a folder of runs or logs; arguments of one NAME are one group. The first
+    group is compared with each of the others. The folder of a batch, given alone, stands for its robots and groups.
+
+    \b
+    Example:
+      icrtool compare old=season1/ new=season2/
+      icrtool compare grass=icrtool-runs/monday asphalt=icrtool-runs/tuesday --json
+    """  # noqa: D301 - click reads the escape
+    config = settings.load()
+    found = [
+        (name, one) for name, places in groups_of(sources).items() for path in places for one in runs_or_logs(path)
+    ]
+    groups: dict[str, list[Run]] = {}
+    runs = runs_of([path for _, path in found], config, printer)
+    for (name, _), run in zip(found, runs, strict=True):
+        groups.setdefault(name, []).append(run)
+    compared = transfer.compare_groups(groups)
+    for file, content in ((csv, tables.transfer_csv(compared)), (output, formats.json_bytes(compared))):
+        if file is not None:
+            atomic.write_file(file, content)
+    if plot is not None:
+        formats.save_picture(figures.transfer(compared), plot)
+    printer.json("compare", compared)
+    printer.show(tables.transfer_blocks(compared))
+
+
+def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
+    """Return the places of each group; the only argument may be the folder of a batch, which has groups of its own.
+
+    Raises
+    ------
+    ConfigError
+        There is only one group.
+    RunError
+        The table of the batch cannot be read.
+    """
+    places: dict[LogText, list[Path]] = {}
+    for source in sources:
+        name, path = named_place(source)
+        if len(sources) == 1 and roll_up.is_fleet(path):
+            places = {LogText(group): runs for group, runs in roll_up.runs_of_fleet(path).items()}
+        else:
+            places.setdefault(name, []).append(path)
+    if len(places) < 2:
+        raise errors.ConfigError("compare", "names one group only", "name two or more: old=season1/ new=season2/")
+    return places
+
+
+def named_place(source: str) -> tuple[LogText, Path]:
+    """Return the group's name and the place of one argument of ``compare``."""
+    whole = place_of(source)
+    name, sign, place = source.partition("=")
+    # An address may have an equals sign in its query.
+    if sign and name and place and not isinstance(whole, UrlPath) and not whole.exists():
+        return LogText(name), place_of(place)
+    return LogText(whole.name or str(whole)), whole

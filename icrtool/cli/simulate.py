@@ -1,25 +1,34 @@
-"""``icrtool simulate``, and the options of a simulated drive, which ``study`` has too."""
+"""``icrtool simulate``, one drive as a log, and ``icrtool study``, many drives filtered; both by the same options."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from icrtool.cli import options
-from icrtool.cli.options import NOT_NEGATIVE, POSITIVE, Change, Option, changes, flag, numbers, option
+from icrtool.cli import options, when_used
+from icrtool.cli.inputs import RUNS
+from icrtool.cli.options import FILE, NOT_NEGATIVE, POSITIVE, Change, Option, choice, flag, numbers, option, together
 from icrtool.cli.printing import Printer
+
+with when_used():
+    from icrtool import errors
+    from icrtool.logs import write_log
+    from icrtool.output import simulation_files
+    from icrtool.output.tables import study as study_tables
+    from icrtool.simulation import drives, record, studies
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
-    from icrtool.logs.write_log import WheelMessages, WriteOptions
+    from icrtool.logs.write_log import WheelMessages
     from icrtool.records.tables import Icrs
     from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
     from icrtool.simulation.record import TruthTable
+    from icrtool.simulation.study_records import Study, StudyName, StudyRequest
 
 PATHS = ("circle", "curved", "lawnmower", "figure-eight", "spins", "straight")
 GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
@@ -33,35 +42,25 @@ DEFAULT_MULTIPLIER = 1.5
 ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
 
 
-def icrs_text(text: str) -> tuple[float, ...]:
-    """Read ``YR,YL,X``."""
-    return numbers(text, "YR,YL,X", 3)
-
-
 def change_text(text: str) -> tuple[float, tuple[float, ...]]:
     """Read ``T:YR,YL,X``."""
     time, _, icrs = text.partition(":")
-    return numbers(time, "T:YR,YL,X", 1)[0], numbers(icrs, "T:YR,YL,X", 3)
+    return numbers("T:YR,YL,X", 1)(time)[0], numbers("T:YR,YL,X", 3)(icrs)
 
 
 def span_text(text: str) -> tuple[float, ...]:
     """Read ``BEGIN:END``."""
-    span = numbers(text.replace(":", ",", 1) if ":" in text else "", "BEGIN:END", 2)
+    span = numbers("BEGIN:END", 2)(text.replace(":", ",", 1) if ":" in text else "")
     if span[1] <= span[0]:
         raise click.BadParameter(f"{text!r} ends before it begins")
     return span
-
-
-def place_text(text: str) -> tuple[float, ...]:
-    """Read ``FORWARD,RIGHT``."""
-    return numbers(text, "FORWARD,RIGHT", 2)
 
 
 def gnss_text(text: str) -> float:
     """Read ``rtk``, ``waas`` or metres."""
     if text in GNSS_NOISE_M:
         return GNSS_NOISE_M[text]
-    metres = numbers(text, "rtk, waas or METRES", 1)[0]
+    metres = numbers("rtk, waas or METRES", 1)(text)[0]
     if metres < 0:
         raise click.BadParameter(f"{text!r} is a negative noise")
     return metres
@@ -85,7 +84,12 @@ def degrees(within: click.FloatRange | None = None) -> Callable[[Any], float]:
 
 
 DRIVE = (
-    ("--icrs icrs_m", "YR,YL,X", icrs_text, "True ICRs [m]; default: by the robot's width, or the study's."),
+    (
+        "--icrs icrs_m",
+        "YR,YL,X",
+        numbers("YR,YL,X", 3),
+        "True ICRs [m]; default: by the robot's width, or the study's.",
+    ),
     ("--path kind", None, click.Choice(PATHS), "Path to drive; study convergence then has no other."),
     ("--duration duration_s", "S", POSITIVE, "Duration of a drive [s]; default: 100, or the study's."),
     ("--speed speed_mps", "MPS", POSITIVE, "Speed of the body; on the spot: of the faster track."),
@@ -112,7 +116,8 @@ RECORDED = (
     ("--wheel-messages", None, click.Choice(WHEEL_MESSAGES), "Message type of the wheels.", "joint_states"),
     ("--wheel-rate", "HZ", POSITIVE, "Wheel messages a second; default 100, commanded 10.", None),
     ("--motor-lag motor_lag_s", "S", NOT_NEGATIVE, "Time constant with which the tracks follow their commands.", 0.0),
-    ("--antenna", "FORWARD,RIGHT", place_text, "Position of the antenna, from the body origin [m].", "0,0"),
+    ("--antenna", "FORWARD,RIGHT", numbers("FORWARD,RIGHT", 2), "Position of the antenna, from the body origin [m].",
+     "0,0"),
     ("--gnss-delay gnss_delay_s", "S", float, "The stamps of the fixes lag by this.", 0.0),
     ("--heading convention", None, click.Choice(["enu", "ned"]), "Convention of the Imu: REP-103, or REP-145's NED.",
      "enu"),
@@ -136,16 +141,16 @@ def drive_options(*further: Option, **defaults: object) -> Option:
     text = "The ICRs become these after T seconds; repeatable."
     change = option("--change changes", "T:YR,YL,X", change_text, text, multiple=True)
     of_drive = [option(*row, default=defaults.get(row[0].split()[-1])) for row in DRIVE]
-    of_sensors = changes("sensors", "icrtool.simulation.drives:Sensors", *of_drive, change, *further)
-    of_plan = changes("plan", "icrtool.simulation.drives:DrivePlan", of_sensors)
-    return changes("path", "icrtool.simulation.drives:PathPlan", of_plan)
+    of_sensors = together("sensors", "icrtool.simulation.drives:Sensors", *of_drive, change, *further, change=True)
+    of_plan = together("plan", "icrtool.simulation.drives:DrivePlan", of_sensors, change=True)
+    return together("path", "icrtool.simulation.drives:PathPlan", of_plan, change=True)
 
 
 @click.command("simulate")
-@option("-o --output log", "LOG", options.FILE, "Log to make: .mcap, .bag, or a ROS 2 directory.", required=True)
+@option("-o --output log", "LOG", FILE, "Log to make: .mcap, .bag, or a ROS 2 directory.", required=True)
 @flag("--force", "Replace a log that is there.")
 @options.SEED
-@option("--speeds", "FILE.csv", options.FILE, "Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")
+@option("--speeds", "FILE.csv", FILE, "Drive these track speeds instead: t_s, v_left_mps, v_right_mps.")
 @drive_options(
     option("--outage outages_s", "BEGIN:END", span_text, "No fixes between these seconds; repeatable.", multiple=True),
     *(option(*row, default=default) for *row, default in RECORDED),
@@ -153,7 +158,7 @@ def drive_options(*further: Option, **defaults: object) -> Option:
 )
 @options.CONFIGURATION
 @options.printing(options.QUIET, options.VERBOSE)
-def command(
+def simulate_command(
     log: Path, force: bool, seed: int, speeds: Path | None, path: Change[PathPlan], plan: Change[DrivePlan],
     sensors: Change[Sensors], encoder_counts: float | None, wheel_rate: float | None, antenna: tuple[float, float],
     wheel_messages: WheelMessages, convention: Literal["enu", "ned"], settings: ConfigSources, printer: Printer,
@@ -169,38 +174,41 @@ def command(
       icrtool simulate -o drive.mcap --robot husky-a200 --path figure-eight
       icrtool fit drive.mcap --robot husky-a200
     """  # noqa: D301 - click reads the escape
-    from icrtool.logs.write_log import write_log
-    from icrtool.output.simulation_files import log_and_truth, read_speeds, truth_path, write_truth
-    from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
-    from icrtool.simulation.record import simulate
-
-    config = simulated_robot(settings)
-    driven = path(PathPlan()) if speeds is None else read_speeds(speeds)
-    duration_s = 100.0 if isinstance(driven, PathPlan) else float(driven.t_s[-1])
-    drive = plan(DrivePlan(icrs_m=default_icrs(config), path=driven, duration_s=duration_s))
+    config = settings.load()
+    if settings.robot is None and config.robot.track_width_m is None and config.robot.wheel_radius_m is None:
+        config = settings._replace(robot=DEFAULT_ROBOT).load()
+    driven = path(drives.PathPlan()) if speeds is None else simulation_files.read_speeds(speeds)
+    duration_s = 100.0 if isinstance(driven, drives.PathPlan) else float(driven.t_s[-1])
+    drive = plan(drives.DrivePlan(icrs_m=default_icrs(config), path=driven, duration_s=duration_s))
     check_changes(drive.changes, drive.duration_s)
     counts = encoder_counts or encoder_counts_of(config)
-    metres = 2 * math.pi * needed(config, "wheel_radius_m") / counts
-    sensed = sensors(Sensors(metres_per_count=metres, antenna_forward_m=antenna[0], antenna_right_m=antenna[1]))
+    radius_m = needed(config, "wheel_radius_m")
+    metres = 2 * math.pi * radius_m / counts
+    given = drives.Sensors(metres_per_count=metres, antenna_forward_m=antenna[0], antenna_right_m=antenna[1])
+    sensed = sensors(given)
     rate = wheel_rate or (COMMAND_RATE_HZ if sensed.wheels == "commanded" else ENCODER_RATE_HZ)
     sensed = replace(sensed, wheel_rate_hz=rate)
     if sensed.wheels == "commanded":
         drive = replace(drive, command_rate_hz=rate)
-    writing = _write_options(log, config, sensed, wheel_messages, convention, counts)
-    with log_and_truth(log, force=force) as (fresh_log, fresh_truth):
-        recorded, truth = simulate(drive, sensed, seed)
-        write_log(fresh_log, recorded, writing)
-        write_truth(truth, fresh_truth)
-    printer.text(f"{_summary(config, drive, truth, seed)}\n\nwritten to {log}, truth to {truth_path(log)}")
+    if log.suffix not in ("", ".mcap", ".bag"):
+        advice = "name an .mcap or .bag file, or for a ROS 2 bag a directory, without a dot"
+        raise errors.ConfigError(log, f"{log.suffix} is not written", advice)
+    writing = write_log.WriteOptions(
+        container="mcap" if log.suffix == ".mcap" else "bag" if log.suffix == ".bag" else "db3",
+        wheels=wheel_messages,
+        heading=convention,
+        wheel_radius_m=radius_m,
+        track_width_m=needed(config, "track_width_m"),
+        counts_per_rev=counts,
+        heading_std_deg=math.degrees(sensed.heading_std_rad),
+    )
+    with simulation_files.log_and_truth(log, force=force) as (fresh_log, fresh_truth):
+        recorded, truth = record.simulate(drive, sensed, seed)
+        write_log.write_log(fresh_log, recorded, writing)
+        simulation_files.write_truth(truth, fresh_truth)
+    beside = simulation_files.truth_path(log)
+    printer.text(f"{_summary(config, drive, truth, seed)}\n\nwritten to {log}, truth to {beside}")
     printer.detail(f"sensors: {sensed}")
-
-
-def simulated_robot(settings: ConfigSources) -> Config:
-    """Return the configuration; without any setting of a robot, it is the paper's."""
-    config = settings.load()
-    if settings.robot is None and config.robot.track_width_m is None and config.robot.wheel_radius_m is None:
-        return settings._replace(robot=DEFAULT_ROBOT).load()
-    return config
 
 
 def default_icrs(config: Config) -> Icrs:
@@ -211,11 +219,10 @@ def default_icrs(config: Config) -> Icrs:
 
 def needed(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> float:
     """Return a number of the robot that a simulation cannot do without."""
-    from icrtool.errors import ConfigError
-
     value: float | None = getattr(config.robot, key)
     if value is None:
-        raise ConfigError(f"robot.{key}", "needed to simulate a robot", f"--set robot.{key}=…, or --robot NAME")
+        advice = f"--set robot.{key}=…, or --robot NAME"
+        raise errors.ConfigError(f"robot.{key}", "needed to simulate a robot", advice)
     return value
 
 
@@ -224,36 +231,11 @@ def encoder_counts_of(config: Config) -> float:
     return config.robot.encoder_counts_per_rev or 8192.0
 
 
-def _write_options(
-    log: Path, config: Config, sensors: Sensors, wheels: WheelMessages, heading: Literal["enu", "ned"], counts: float
-) -> WriteOptions:
-    from icrtool.errors import ConfigError
-    from icrtool.logs.write_log import WriteOptions
-
-    if log.suffix not in ("", ".mcap", ".bag"):
-        raise ConfigError(
-            log,
-            f"{log.suffix} is not written",
-            "name an .mcap or .bag file, or for a ROS 2 bag a directory, without a dot",
-        )
-    return WriteOptions(
-        container="mcap" if log.suffix == ".mcap" else "bag" if log.suffix == ".bag" else "db3",
-        wheels=wheels,
-        heading=heading,
-        wheel_radius_m=needed(config, "wheel_radius_m"),
-        track_width_m=needed(config, "track_width_m"),
-        counts_per_rev=counts,
-        heading_std_deg=math.degrees(sensors.heading_std_rad),
-    )
-
-
 def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> str:
     import numpy as np
 
-    from icrtool.simulation.drives import PathPlan
-
     distance_m = float(np.hypot(np.diff(truth["north_m"]), np.diff(truth["east_m"])).sum())
-    what = f"{plan.path.kind} path" if isinstance(plan.path, PathPlan) else "track speeds as given"
+    what = f"{plan.path.kind} path" if isinstance(plan.path, drives.PathPlan) else "track speeds as given"
     lines = [
         f"robot  {config.robot.name or 'as configured'}, b = {needed(config, 'track_width_m'):g} m",
         f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {seed}",
@@ -263,3 +245,96 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
         f"       from {time:g} s on {right:+.3f}, {left:+.3f}, {x:+.3f} m" for time, (right, left, x) in plan.changes
     ]
     return "\n".join(lines)
+
+
+STUDY_NAMES = (
+    "convergence", "initial", "icr-change", "turn-radius", "input-noise", "input-bias", "input-source", "gnss", "rate",
+    "consistency",
+)  # fmt: skip
+
+
+@click.command("study")
+@click.argument("name", metavar="NAME", type=click.Choice(STUDY_NAMES))
+@option("-o --output", "DIR", FILE, "Study directory; default icrtool-runs/study-NAME.")
+@together(
+    "request",
+    "icrtool.simulation.study_records:StudyRequest",
+    option("--runs", "N", click.IntRange(min=1), "Runs for each value (in study initial: for each start)."),
+    options.SEED,
+    option("--values", "V,V,...", numbers("V,V,..."), "Values of the quantity that the study varies, in its unit."),
+    change=True,
+)
+@choice("--preset", ("paper", "field"), "Study this preset alone; default: both; initial: paper; convergence: paper, "
+        "or field with --robot.")  # fmt: skip
+@drive_options(
+    choice("--wheels", ("ideal", "encoder"), "Wheel speeds without error, or counted travel."),
+    option("--rate", "HZ", click.FloatRange(min=1, max=200), "Wheel and heading samples per second."),
+    option("--heading-std heading_std_rad", "DEG", degrees(POSITIVE), "White noise of the heading."),
+)
+@options.PLOTS
+@options.CONFIGURATION
+@options.printing(options.QUIET, options.VERBOSE)
+def study_command(
+    name: StudyName, output: Path | None, request: Change[StudyRequest], preset: Literal["paper", "field"] | None,
+    path: Change[PathPlan], plan: Change[DrivePlan], sensors: Change[Sensors], encoder_counts: float | None,
+    rate: float | None, plots: tuple[str, ...], settings: ConfigSources, printer: Printer,
+) -> None:  # fmt: skip
+    """Simulate and filter many drives, and report accuracy, convergence time and consistency of the ICRs.
+
+    \b
+    NAME is one of
+      convergence   Figs. 4, 5    convergence time of the ICRs, by kind of path
+      initial       Figs. 6, 7    which initial ICRs converge, without and with the sign guard
+      icr-change    Figs. 8, 9    following a change of the ICRs, with and without covariance inflation
+      turn-radius   Fig. 10       convergence after a change, by radius of the turn
+      input-source  Fig. 11       encoders against commanded speeds
+      input-noise   Fig. 12       ICR error by noise of the track speeds
+      input-bias    Fig. 13       ICR error by bias of the track speeds
+      gnss          Figs. 35-37   ICR error and open-loop error by noise of the GNSS
+      rate                        whether logs of any rate give the same ICRs
+      consistency                 whether the filter's covariance is right
+
+    Defaults are those of the paper (Pentzer 2014, Section 5); --robot and the options replace them. DIR holds
+    study.json, every run in NAME.csv, and the picture.
+
+    \b
+    Example:
+      icrtool study convergence --robot husky-a200 --wheels encoder --gnss waas
+    """  # noqa: D301 - click reads the escape
+    config, given = settings.load(), click.get_current_context().params
+    check_varied(studies.STUDIES[name], name, given)
+    asked = request(studies.default_request(name, config))
+    if config.robot.track_width_m is not None:
+        asked = replace(asked, plan=replace(asked.plan, icrs_m=default_icrs(config)))
+    asked = replace(asked, plan=plan(replace(asked.plan, path=path(asked.path))), sensors=sensors(asked.sensors))
+    check_changes(asked.plan.changes, asked.plan.duration_s)
+    if rate is not None:
+        asked = replace(asked, sensors=replace(asked.sensors, wheel_rate_hz=rate, heading_rate_hz=rate))
+    if (radius_m := config.robot.wheel_radius_m) is not None:
+        metres = 2 * math.pi * radius_m / (encoder_counts or encoder_counts_of(config))
+        asked = replace(asked, sensors=replace(asked.sensors, metres_per_count=metres))
+    if given["kind"] is not None and asked.paths:
+        asked = replace(asked, paths=(asked.path.kind,))
+    if preset is None and "filter.preset" in config.given:
+        preset = config.filter.preset
+    if preset is None and name == "convergence" and config.robot.track_width_m is not None:
+        preset = "field"
+    if preset is not None:
+        asked = replace(asked, presets=(preset,))
+    directory = output if output is not None else RUNS / f"study-{name}"
+    simulation_files.check_study_target(directory)
+    with printer.progress(f"study {name}") as progress:
+        result = studies.run_study(asked, progress)
+    simulation_files.write_study(result, directory, plots=plots)
+    printer.show(study_tables.study_blocks(result))
+    printer.text(f"\nwritten to {directory}")
+    printer.detail(f"settings: {asked.settings()}")
+
+
+def check_varied(study: Study, name: str, given: Mapping[str, object]) -> None:
+    """Refuse an option for what a study varies, and values where it varies no number; `given`: the options by name."""
+    if given.get(study.varied) is not None:
+        option = next(one.opts[0] for one in study_command.params if one.name == study.varied)
+        raise click.UsageError(f"{option} is what study {name} varies; --values V,V,... sets where")
+    if given["values"] is not None and not study.varies:
+        raise click.UsageError(f"study {name} varies no number; it takes no --values")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from icrtool.cli.completion import _topics
+from icrtool.cli.options import topics_of
 from icrtool.cli.printing import Stages, signal_word
 from icrtool.config import builtin_robots, load_config
 
@@ -171,7 +171,7 @@ def test_only_names_of_ros_are_completed(tmp_path: Path) -> None:
             channel = writer.register_channel(topic, "cdr", schema)
             writer.add_message(channel, 1, bytes(12), 1)
         writer.finish()
-    assert _topics([tmp_path / "log.mcap"]) == ("/robot_1/gps/fix",)
+    assert topics_of([tmp_path / "log.mcap"]) == ("/robot_1/gps/fix",)
 
 
 def test_the_verdict_on_a_log_begins_with_what_is_missing(icrtool, tmp_path: Path) -> None:

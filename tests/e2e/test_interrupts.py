@@ -23,7 +23,7 @@ print("loaded", flush=True)
 COMMAND = """
 import signal, sys
 from pathlib import Path
-from icrtool.cli.process import end_at_once
+from icrtool.cli import end_at_once
 from icrtool.records.process_resources import unfinished
 
 def command():
@@ -65,7 +65,7 @@ def test_what_was_ignored_stays_ignored(tmp_path: Path) -> None:
 COMPUTING = """
 import hashlib, os, signal, sys, threading
 from pathlib import Path
-from icrtool.cli.process import end_at_once
+from icrtool.cli import end_at_once
 from icrtool.records.process_resources import unfinished
 
 def command():
@@ -92,7 +92,7 @@ def test_compiled_code_that_looks_for_no_signal_is_ended_and_leaves_nothing(tmp_
 
 AT_THE_END = """
 import hashlib, os, signal, sys, threading
-from icrtool.cli.process import end_at_once
+from icrtool.cli import end_at_once
 
 def compute():
     hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
@@ -117,7 +117,7 @@ def test_a_thread_that_computes_does_not_hold_up_the_end() -> None:
 
 IN_A_CALLBACK = """
 import os, signal, time, weakref
-from icrtool.cli.process import end_at_once
+from icrtool.cli import end_at_once
 
 def gone(_):
     os.kill(os.getpid(), signal.SIGINT)

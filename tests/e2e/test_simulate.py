@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from icrtool.cli import main
-from icrtool.cli.simulate import command
+from icrtool.cli.simulate import simulate_command as command
 
 SHORT = ("--duration", "3")
 

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from icrtool.cli import main
-from icrtool.cli.study import command
+from icrtool.cli.simulate import study_command as command
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("--runs", "2", "--duration", "5", "--plots", "none")

@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from icrtool.cli.simulate import PATHS, WHEEL_MESSAGES, command
+from icrtool.cli.simulate import PATHS, WHEEL_MESSAGES
+from icrtool.cli.simulate import simulate_command as command
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.logs.read_log import read_log

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from icrtool.cli.commands import icrtool as command_line
-from icrtool.cli.options import changes, flag, option, together
+from icrtool.cli.options import flag, option, together
 
 COMMANDS = command_line.list_commands(click.Context(command_line))
 
@@ -28,12 +28,12 @@ LEFT, RIGHT, OTHER = (
 )
 
 
-def call(*arguments: str, kind=together) -> dict[str, object]:
+def call(*arguments: str, change: bool = False) -> dict[str, object]:
     """Return what a command gets."""
     found: dict[str, object] = {}
 
     @click.command()
-    @kind("pair", f"{__name__}:Pair" if kind is changes else Pair, LEFT, RIGHT, OTHER)
+    @together("pair", f"{__name__}:Pair" if change else Pair, LEFT, RIGHT, OTHER, change=change)
     def command(**given: object) -> None:
         found.update(given)
 
@@ -48,7 +48,7 @@ def test_options_become_a_record_that_keeps_its_defaults_and_the_others_stay() -
 
 def test_a_change_replaces_what_is_given_of_another_record(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("icrtool.cli.options.import_module", lambda _: SimpleNamespace(Pair=Pair))
-    change = call("--left", "-3", kind=changes)["pair"]
+    change = call("--left", "-3", change=True)["pair"]
     assert callable(change)
     assert change(Pair(7.0, 8.0)) == Pair(-3.0, 8.0)
 

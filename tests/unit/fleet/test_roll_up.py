@@ -10,8 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from icrtool.cli.batch import line_of, summary_of
-from icrtool.cli.compare import _groups
 from icrtool.cli.inputs import runs_or_logs
+from icrtool.cli.report import groups_of
 from icrtool.errors import RunError
 from icrtool.fleet.fleet_files import calibrations_text, write_fleet
 from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
@@ -81,7 +81,7 @@ def test_a_fleet_s_groups_are_those_of_its_manifest(place: Path) -> None:
     logs += [*rows("unusable", usable=False), FleetLog("d", "runs/d", "failed", robot="barn")]
     write_fleet(logs, place)
     groups = {"grass": [place / "runs/a"], "ice": [place / "runs/b", place / "runs/copy"]}
-    assert runs_of_fleet(place) == _groups((str(place),)) == groups
+    assert runs_of_fleet(place) == groups_of((str(place),)) == groups
     write_fleet([*logs, *rows("a", multiplier=1.5)], place)
     assert runs_of_fleet(place) == groups, "a copy in the same group would be tested on itself"
     assert runs_or_logs(place) == [run for runs in groups.values() for run in runs]

@@ -20,7 +20,7 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.cli import main
-from icrtool.cli.compare import _named
+from icrtool.cli.report import named_place
 from icrtool.config import load_config
 from icrtool.errors import LogError
 from icrtool.fleet.manifest import read_manifest
@@ -417,10 +417,10 @@ def test_an_address_keeps_its_slashes_and_hides_its_secrets():
 
 
 def test_compare_names_an_address_by_its_file_and_without_its_query():
-    name, place = _named(f"https://host/mon/a.mcap?{TOKEN}")
+    name, place = named_place(f"https://host/mon/a.mcap?{TOKEN}")
     assert (name, str(place)) == ("a.mcap", "https://host/mon/a.mcap")
     assert place.url.endswith(TOKEN)
-    name, place = _named(f"grass=https://host/mon/a.mcap?{TOKEN}")
+    name, place = named_place(f"grass=https://host/mon/a.mcap?{TOKEN}")
     assert (name, place.url) == ("grass", f"https://host/mon/a.mcap?{TOKEN}")
 
 

@@ -9,8 +9,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from icrtool.cli.simulate import PATHS
-from icrtool.cli.study import NAMES, command
+from icrtool.cli.simulate import PATHS, STUDY_NAMES, study_command
 from icrtool.errors import ConfigError
 from icrtool.kernels.kinematics import body_velocity
 from icrtool.simulation.drives import (
@@ -236,7 +235,7 @@ def test_the_command_knows_the_paths_and_studies_there_are() -> None:
     from icrtool.simulation.study_records import StudyName
 
     assert get_args(PathKind) == PATHS
-    assert set(NAMES) == set(get_args(StudyName)) == set(STUDIES)
+    assert set(STUDY_NAMES) == set(get_args(StudyName)) == set(STUDIES)
     varied = {study.varied for study in STUDIES.values()} - {""}
-    assert varied <= {option.name for option in command.params}
+    assert varied <= {option.name for option in study_command.params}
     assert {name for name, study in STUDIES.items() if study.varies and not study.varied} == {"initial"}

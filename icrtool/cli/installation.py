@@ -1,0 +1,201 @@
+"""``icrtool robots``, ``config``, ``cache`` and ``completion``: what an installation knows, and what is added to it."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from click.shell_completion import BashComplete, CompletionItem, add_completion_class, get_completion_class
+
+from icrtool.cli import options, when_used
+from icrtool.cli.options import flag, option
+from icrtool.cli.printing import Printer, write_or_print
+from icrtool.output.text_blocks import Line, Table
+
+with when_used():
+    from icrtool import config
+    from icrtool.output.tables import configuration
+
+if TYPE_CHECKING:
+    from icrtool.config import ConfigSources
+
+
+@click.command("robots")
+@options.printing(options.AS_JSON)
+def robots_command(printer: Printer) -> None:
+    """List the built-in robots for --robot, with their numbers and sources.
+
+    For another robot, give --set robot.track_width_m=… and --set robot.wheel_radius_m=…, or a file: icrtool config
+    prints one to fill in.
+    """
+    robots = config.builtin_robots()
+    keys = ("track_width_m", "wheel_radius_m", "encoder_counts_per_rev", "source")
+    listed = [{"name": name} | {key: robot.get(key) for key in keys} for name, robot in robots.items()]
+    printer.json("robots", {"robots": listed})
+    rows = [
+        (
+            name, f"{robot['track_width_m']:.3f} m", f"{robot['wheel_radius_m']:.4f} m",
+            f"{robot['encoder_counts_per_rev']:,}" if "encoder_counts_per_rev" in robot else "-",
+        )
+        for name, robot in robots.items()
+    ]  # fmt: skip
+    head = ("robot", "track width", "wheel radius", "counts per turn")
+    sources = Table("l", [(f"  {name}", robot["source"]) for name, robot in robots.items()])
+    printer.show([Table("lr", rows, head), "", Line("Sources", "title"), sources])
+
+
+@click.command("config")
+@options.CONFIGURATION
+@option("-o --output", "FILE", options.NEW_FILE, "File to write; default: standard output.")
+def config_command(settings: ConfigSources, output: Path | None) -> None:
+    """Print all configuration keys as a TOML file: meaning, type and bounds, and value.
+
+    Without options these are the defaults; --robot, --config and --set change them. Keys without default stand in
+    comments, with an example. Edit the result, and use it with --config.
+
+    \b
+    Example:
+      icrtool config --robot husky-a200 -o my-husky.toml
+      icrtool fit field.mcap --config my-husky.toml
+    """  # noqa: D301 - click reads the escape
+    write_or_print(configuration.format_configuration(settings.load()), output)
+
+
+@click.group("cache")
+def cache_command() -> None:
+    """Machine code of the compiled kernels, which the first commands on a computer otherwise wait for."""
+
+
+@cache_command.command("warm")
+@flag("-q --quiet", "Print no result.")
+def warm(*, quiet: bool) -> None:
+    """Compile all kernels and modules now, so that no later command waits for it: for an image or a CI cache.
+
+    The kernels' code is kept in NUMBA_CACHE_DIR; without it, beside the installed package, or else in the user's
+    cache. From a NUMBA_CACHE_DIR that can only be read it is used too. With NUMBA_CPU_NAME=generic, here and in later
+    commands, it runs on any processor of this architecture.
+
+    \b
+    Example:
+      export NUMBA_CACHE_DIR=$HOME/kernels NUMBA_CPU_NAME=generic
+      icrtool cache warm
+    """  # noqa: D301 - click reads the escape
+    import icrtool
+    from icrtool.errors import OutputError
+    from icrtool.kernels.compiled import all_kernels, processor
+
+    begin = time.perf_counter()
+    for module in pkgutil.walk_packages(icrtool.__path__, "icrtool."):
+        # Python keeps what it compiled of a module that is imported
+        importlib.import_module(module.name)
+    kernels = list(all_kernels())
+    place = Path(kernels[0].stats.cache_path or os.devnull)
+    wanted = Path(os.environ.get("NUMBA_CACHE_DIR") or place)
+    try:
+        tempfile.TemporaryFile(dir=place).close()
+        # numba takes another place where it cannot use the one that it was given
+        place.relative_to(wanted)
+    except (OSError, ValueError) as err:
+        raise OutputError(wanted, "cannot be written", "set NUMBA_CACHE_DIR to a directory that can") from err
+    call_all_kernels()
+    if not quiet:
+        compiled = sum(bool(one.stats.cache_misses) for one in kernels)
+        click.echo(
+            f"{compiled} of {len(kernels)} kernels compiled for {processor()}, in {time.perf_counter() - begin:.1f} s; "
+            f"kept in {wanted}"
+        )
+
+
+def call_all_kernels() -> None:
+    """Call each kernel with the types that the commands call it with: drive a robot, fit, smooth, report and study."""
+    import numpy as np
+
+    import icrtool
+    from icrtool.estimation.run_filter import smooth
+    from icrtool.kernels.open_loop import open_loop_errors_direct
+    from icrtool.kernels.track import FrozenIcrs, trial_ends
+    from icrtool.logs.write_log import WriteOptions, write_log
+    from icrtool.records.process_resources import unfinished
+    from icrtool.records.run import track_of
+    from icrtool.simulation.drives import DrivePlan, Sensors
+    from icrtool.simulation.record import simulate
+    from icrtool.simulation.studies import default_request, run_study
+
+    robot = icrtool.load_config(robot="husky-a200")
+    columns, _ = simulate(DrivePlan(motor_lag_s=0.1), Sensors(), 0)
+    writing = WriteOptions(
+        wheel_radius_m=robot.robot.wheel_radius_m or 0.0, track_width_m=robot.robot.track_width_m or 0.0
+    )
+    with tempfile.TemporaryDirectory() as folder, unfinished(Path(folder)):
+        log = icrtool.read_log(write_log(Path(folder) / "drive.mcap", columns, writing), robot)
+    run = icrtool.fit(log, robot)
+    icrtool.dropout(run)
+    smooth(run)
+    track = track_of(run)
+    open_loop_errors_direct(track, FrozenIcrs.constant(0.4, -0.4, 0.0), trial_ends(track, np.array([1.0])))
+    request = default_request("consistency", robot)
+    run_study(replace(request, runs=1, plan=replace(request.plan, duration_s=10.0)))
+
+
+NO_BLANK_AFTER_EQUALS = """\
+    [[ ${#COMPREPLY[@]} == 1 && ${COMPREPLY[0]} == *= ]] && compopt -o nospace
+    return 0
+"""
+
+
+class BashWithEquals(BashComplete):
+    """Completes ``--set key=value``: bash ends a word at ``=``, and replaces only what follows it."""
+
+    source_template = BashComplete.source_template.replace("    return 0\n", NO_BLANK_AFTER_EQUALS, 1)
+
+    def get_completion_args(self) -> tuple[list[str], str]:
+        """Return the words before the one to complete, and that one; words that bash cut at ``=`` are joined."""
+        args, incomplete = super().get_completion_args()
+        rest, words = [*args, incomplete], [""]
+        while rest:
+            word = rest.pop(0)
+            if word != "=":
+                words.append(word)
+            elif words[-1].startswith("-"):
+                words.append(rest.pop(0) if rest else "")
+            else:
+                words[-1] += f"={rest.pop(0) if rest else ''}"
+        return words[1:-1], words[-1]
+
+    def format_completion(self, item: CompletionItem) -> str:
+        """Return a completion without what stands before its ``=``."""
+        key, equals, value = item.value.partition("=")
+        after = value if equals and value else f"{key}{equals}"
+        return f"{item.type},{after}"
+
+
+def register_completion() -> None:
+    """Have click use the completion above; called before it looks whether a shell asks for one."""
+    add_completion_class(BashWithEquals, "bash")
+
+
+@click.command("completion")
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion_command(shell: str) -> None:
+    """Print what a shell needs to complete commands, options, robots, configuration keys and topics of a log.
+
+    \b
+    One line in the shell's start-up file:
+      eval "$(icrtool completion bash)"        # in ~/.bashrc
+      eval "$(icrtool completion zsh)"         # in ~/.zshrc, after compinit
+      icrtool completion fish | source         # in ~/.config/fish/config.fish
+    """  # noqa: D301 - click reads the escape
+    from icrtool.cli.commands import icrtool
+
+    register_completion()
+    kind = get_completion_class(shell)
+    if kind is None:
+        raise click.UsageError(f"click knows no completion for {shell}")
+    click.echo(kind(icrtool, {}, "icrtool", "_ICRTOOL_COMPLETE").source())
