@@ -24,7 +24,7 @@ from icrtool import __version__
 from icrtool.config import Config
 from icrtool.errors import IcrToolError, LogChangedError, OutputError
 from icrtool.fleet.recordings import as_text
-from icrtool.logs.containers.channel import truncation
+from icrtool.logs.containers.container import truncation
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, log_name
 from icrtool.records.dropout import DEFAULT_SEED
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict

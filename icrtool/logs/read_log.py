@@ -20,8 +20,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError, LogError
-from icrtool.logs.containers.channel import LATEST_NS, WHOLE, Cut
-from icrtool.logs.containers.container import Container
+from icrtool.logs.containers.container import LATEST_NS, WHOLE, Container, Cut
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED, log_name
 from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable, collector_for

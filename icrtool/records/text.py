@@ -120,6 +120,16 @@ def listed(names: Sequence[str], most: int = 5) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
+MOST_NAMED = 12
+"""Names from a log that a message to the user lists; of more names it shows that there are more."""
+
+
+def some_of(names: Sequence[str]) -> str:
+    """Return names from a log, separated by commas; of many names only the first ones."""
+    shown = [str(LogText(name)) for name in names[:MOST_NAMED]]
+    return ", ".join([*shown, *(["…"] if len(names) > MOST_NAMED else [])])
+
+
 MOST_DIGITS = 5
 """Decimals that are printed at most."""
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.logs.containers.channel import Block, Channel
+from icrtool.logs.containers.container import Block, Channel
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.records.text import LogText
 

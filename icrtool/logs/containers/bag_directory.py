@@ -13,15 +13,15 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.containers.channel import Block, Channel, Cut, some_of
 from icrtool.logs.containers.chunked_file import NotByRangesError
-from icrtool.logs.containers.container import Container
+from icrtool.logs.containers.container import Block, Channel, Container, Cut
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.containers.recording_files import Span, check_spans, storage_files, unpacked_name
 from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.source import RemoteFile
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.logs.containers.unpack import ScratchFolder, unpack
+from icrtool.records.text import some_of
 
 _LARGEST_METADATA_BYTES, _DEEPEST = 1 << 18, 20
 """Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""

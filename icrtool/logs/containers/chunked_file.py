@@ -12,17 +12,17 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import Block, Cut, ahead, made_ahead, with_possible_times
-from icrtool.logs.containers.container import Container
-from icrtool.logs.containers.decompress import (
+from icrtool.logs.containers.chunk import (
     LARGEST_CHUNK_BYTES,
+    Chunk,
     DecompressionError,
     Inflation,
     Packed,
+    Records,
     Space,
     decompress,
 )
-from icrtool.logs.containers.record_table import Chunk, Part, Records
+from icrtool.logs.containers.container import Block, Container, Cut, ahead, made_ahead
 from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile, Source
 
 THREADS, BLOCKS_AHEAD = 2, 3
@@ -50,6 +50,29 @@ class NotByRangesError(Exception):
 
 class _PartError(DecompressionError):
     """Damaged records, read without their checksum: those of the chunks beside them are computed, too."""
+
+
+class Part(NamedTuple):
+    """What is read of a chunk.
+
+    Attributes
+    ----------
+    messages : where messages begin in the records that are read, by the message index; None without one
+    ranges : begin and end (2, n) of the wanted records, where only those are read
+    held : its bytes, read ahead of a distant file
+    records : the wanted ones, likewise
+    """
+
+    chunk: Chunk
+    messages: Ints | None = None
+    ranges: Ints | None = None
+    held: Held | None = None
+    records: bytes | None = None
+
+    @property
+    def wanted_bytes(self) -> int:
+        """Bytes of the records that are read."""
+        return max(self.chunk.size, 0) if self.ranges is None else int((self.ranges[1] - self.ranges[0]).sum())
 
 
 class Spaces(NamedTuple):
@@ -81,7 +104,7 @@ class ChunkedFile(Container):
     """Whether a compressed chunk is decompressed in part: without a checksum to compute, that saves nothing."""
 
     _scan: Callable[[Bytes, int, Ints | None], Records]
-    """Finds records: a function of `icrtool.logs.containers.record_table`."""
+    """Finds records: `scan_mcap` or `scan_bag`."""
 
     _message_index: Callable[[bytes], tuple[Ints, Ints]]
     """Returns where in its records the messages of a chunk begin (n,), and their channels (n,); none where damaged."""
@@ -95,13 +118,12 @@ class ChunkedFile(Container):
         self._size = self._source.size
 
     @abstractmethod
-    def _packed(self, part: Part, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:
+    def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:
         """Read a chunk from the file.
 
         Parameters
         ----------
         space : for the chunk as it is in the file
-        cut : it is cut off; what can be decompressed is not checked
         needed : where not 0, so many bytes of its records are enough, and are not checked
 
         Raises
@@ -111,13 +133,8 @@ class ChunkedFile(Container):
         """
 
     @abstractmethod
-    def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
-        """Yield the messages by reading the records one after the other, as far as they can be read.
-
-        Parameters
-        ----------
-        learn : remember what other records state about channels
-        """
+    def _read_in_order(self) -> Iterator[Block]:
+        """Yield the messages by reading the records one after the other, as far as they can be read."""
 
     @abstractmethod
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
@@ -131,12 +148,14 @@ class ChunkedFile(Container):
         """Yield the messages of the wanted channels, in the order of their chunks; the next are made meanwhile."""
         if self._chunks is None:
             yield from made_ahead(self._read_in_order())
-        else:
-            needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
-            if self._remote is not None:
-                yield from self._indexed(self._read_ahead(self._remote, needed, wanted))
-            else:
-                yield from self._indexed(self._located(chunk, wanted) for chunk in needed)
+            return
+        needed = (one for one in self._chunks if cut.needs(one.channels, one.begin_ns, one.end_ns, wanted))
+        located = (self._located(chunk, wanted) for chunk in needed)
+        parts = located if self._remote is None else self._read_ahead(self._remote, needed, wanted)
+        groups = zip(_groups(parts), reused_spaces(), strict=False)
+        for (group, spaces), made in ahead(lambda one: self._joined(*one), groups, THREADS, BLOCKS_AHEAD):
+            self._at = group[-1].chunk.at
+            yield from self._sound(group, spaces, made)
 
     def _read_ahead(self, remote: RemoteFile, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Part]:
         """Yield parts of a distant file as `_located` does, with what is wanted of the next ones read meanwhile."""
@@ -184,13 +203,6 @@ class ChunkedFile(Container):
             records = self._remote.gather(behind - chunk.size, ranges)
         return Part(chunk, np.cumsum(sizes) - sizes, ranges, held, records)
 
-    def _indexed(self, parts: Iterable[Part]) -> Iterator[Block]:
-        """Yield the messages in some chunks."""
-        groups = zip(_groups(parts), reused_spaces(), strict=False)
-        for (group, spaces), made in ahead(lambda one: self._joined(*one), groups, THREADS, BLOCKS_AHEAD):
-            self._at = group[-1].chunk.at
-            yield from self._sound(group, spaces, made)
-
     def _sound(
         self, group: Sequence[Part], spaces: Spaces, made: Callable[[], tuple[Block, Inflation]]
     ) -> Iterator[Block]:
@@ -205,7 +217,7 @@ class ChunkedFile(Container):
                     yield from self._sound([part], spaces, partial(self._joined, [part], spaces))
         else:
             self._inflation.left += inflation.left
-            yield with_possible_times(block, self.report)
+            yield self._with_possible_times(block)
 
     def _joined(self, group: Sequence[Part], spaces: Spaces) -> tuple[Block, Inflation]:
         """Return the messages of some chunks, and how much less than allowed these inflate.
@@ -282,7 +294,7 @@ class ChunkedFile(Container):
         """
         if self._remote is not None:
             raise NotByRangesError
-        for _ in self._read_in_order(learn=True):
+        for _ in self._read_in_order():
             pass
 
     def share_read(self) -> float:
@@ -319,32 +331,37 @@ class ChunkedFile(Container):
         content = space.of(length)
         return content[: self._source.read_into(at, content)]
 
-    def _read_chunk(self, part: Part, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        """Yield the messages of a chunk; `cut`: it is cut off."""
-        place = part.chunk.at - self._chunk_head
-        self._at = min(part.chunk.at, self._size)
+    def _read_chunk(self, part: Part, spaces: Spaces) -> Iterator[Block]:
+        """Yield the messages of a chunk."""
+        chunk = part.chunk
+        place = chunk.at - self._chunk_head
+        if chunk.size < 0:
+            self.report(f"no chunk at byte {place}, where the index lists one")
+            return
+        self._at = min(chunk.at, self._size)
         try:
-            packed = self._packed(part, spaces.packed, cut=cut)
+            packed = self._packed(part, spaces.packed)
             self._inflation.count(len(packed.data), packed.claimed)
             data = decompress(packed, spaces.records.of(packed.claimed + 1))
         except (DecompressionError, MemoryError) as err:
-            if not cut:
+            if not chunk.is_cut:
                 self.report(f"chunk at byte {place} left out: {err}")
             return
         stop, begin = 0, -1
         while begin < stop < len(data):
             begin = stop
-            block, stop = self._scanned(data, begin, learn=learn)
+            block, stop = self._scanned(data, begin)
             yield block
-        if stop < len(data) and not cut:
+        if stop < len(data) and not chunk.is_cut:
             self.report(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
 
-    def _scanned(self, data: Bytes, begin: int = 0, *, learn: bool = False) -> tuple[Block, int]:
+    def _scanned(self, data: Bytes, begin: int = 0) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
         messages, others, stop = self._scan(data, begin, None)
-        for record in others if learn else ():
-            self._learn(data, record)
-        return with_possible_times(Block(data, *messages), self.report), stop
+        if self._chunks is None:
+            for record in others:
+                self._learn(data, record)
+        return self._with_possible_times(Block(data, *messages)), stop
 
 
 def _spans(chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[list[Chunk], int, int]]:

@@ -3,15 +3,207 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from threading import Event
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
-from icrtool.logs.containers.channel import WHOLE, Block, Channel, Cut, Problems
-from icrtool.logs.containers.decompress import unpack_messages
+import numpy as np
+
+from icrtool.kernels.arrays import Bools, Bytes, Ints
+from icrtool.logs.containers.chunk import PIECE_BYTES, DecompressionError, Inflation, unpack_message
 from icrtool.logs.containers.recording_files import inputs_of
 from icrtool.records.samples import InputFile
+from icrtool.records.text import LogText, escaped, shortened
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
+
+LATEST_NS = 1 << 62
+"""The year 2116. A log time beyond it is damage, and differences of such times do not fit into 64 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One topic of a log.
+
+    Attributes
+    ----------
+    id : the number that blocks refer to
+    message_type : ``package/Name``, without ROS 2's ``/msg/``
+    encoding : ``cdr`` (ROS 2), ``ros1``, ``protobuf``, ``json``, or what the log calls one that cannot be read
+    definition : text of the message definition, empty when the log does not carry it; of Protobuf a character for each
+        byte of its FileDescriptorSet
+    definition_format : how a definition of ROS is written
+    count : number of messages by the log's index, None without an index
+    """
+
+    id: int
+    topic: LogText
+    message_type: LogText
+    encoding: LogText
+    definition: str = ""
+    definition_format: Literal["msg", "idl"] = "msg"
+    count: int | None = None
+
+
+class Block(NamedTuple):
+    """Messages that share one buffer. Valid until the next block is asked for.
+
+    Attributes
+    ----------
+    data : uint8 (bytes,)
+    channel : int64 (n,) channel ids
+    log_time_ns : int64 (n,)
+    start, end : int64 (n,) half-open byte ranges in `data`
+    """
+
+    data: Bytes
+    channel: Ints
+    log_time_ns: Ints
+    start: Ints
+    end: Ints
+
+    def rows(self, chosen: Bools) -> Block:
+        """Return the block of the chosen (n,) messages."""
+        if chosen.all():
+            return self
+        _, *columns = self
+        return Block(self.data, *(column[chosen] for column in columns))
+
+
+class Cut(NamedTuple):
+    """The part of a log that is read: log times in [begin_ns, end_ns); the channels in `whole` are read in full."""
+
+    begin_ns: int = 0
+    end_ns: int = LATEST_NS
+    whole: frozenset[int] = frozenset()
+
+    def needs(self, held: frozenset[int] | None, begin_ns: int, end_ns: int, wanted: frozenset[int]) -> bool:
+        """Return whether a chunk has to be read.
+
+        Parameters
+        ----------
+        held : its channels, None without an index
+        begin_ns, end_ns : its first and last log time by the index; 0 and 0 where that is not known
+        """
+        if held is not None and not held & wanted:
+            return False
+        known = 0 < begin_ns <= end_ns
+        outside = known and (end_ns < self.begin_ns or begin_ns >= self.end_ns)
+        return not outside or (bool(self.whole) and (held is None or bool(held & self.whole)))
+
+    def of(self, block: Block) -> Block:
+        """Return a block without the messages outside the cut."""
+        if self == WHOLE:
+            return block
+        inside = (block.log_time_ns >= self.begin_ns) & (block.log_time_ns < self.end_ns)
+        return block.rows(inside | np.isin(block.channel, list(self.whole)))
+
+
+WHOLE = Cut()
+
+
+def ahead(
+    work: Callable[[Item], Result], items: Iterable[Item], threads: int, count: int,
+    weight: Callable[[Item], float] = lambda _: 0.0,
+) -> Generator[tuple[Item, Callable[[], Result]]]:  # fmt: skip
+    """Yield items, each with what returns the result of some work on it; threads work on the next ones meanwhile.
+
+    Parameters
+    ----------
+    count : of the items worked on before they are used
+    weight : the share that an item takes of what may be worked on before it is used
+    """
+    pending: deque[tuple[Item, Future[Result]]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for item in items:
+                pending.append((item, pool.submit(work, item)))
+                while len(pending) > count or sum(weight(one) for one, _ in pending) > 1:
+                    first, made = pending.popleft()
+                    yield first, made.result
+            while pending:
+                first, made = pending.popleft()
+                yield first, made.result
+        finally:
+            for _, made in pending:
+                made.cancel()
+
+
+def made_ahead(blocks: Iterator[Block], stop: Callable[[], object] | None = None) -> Generator[Block]:
+    """Yield blocks; the next one is made in a thread while one is used.
+
+    Parameters
+    ----------
+    stop : called where no more blocks are wanted, to end the making of the next one
+    """
+    try:
+        for _, made in ahead(lambda _: next(blocks, None), repeat(None), threads=1, count=1):
+            if (block := made()) is None:
+                break
+            yield block
+    except BaseException:
+        if stop is not None:
+            stop()
+        raise
+
+
+def unpack_messages(
+    blocks: Iterator[Block], wanted: frozenset[int], compression: str, report: Callable[[str], None]
+) -> Iterator[Block]:
+    """Decompress the wanted messages of a bag that was written with message compression.
+
+    Parameters
+    ----------
+    compression : ``zstd``, or the name in metadata.yaml of a compression that is not supported
+    report : called once, after the last block, with how many messages could not be decompressed, and why
+    """
+    left_out, reason = 0, ""
+    inflation = Inflation()
+    for block in blocks:
+        kept: list[int] = []
+        messages: list[bytes] = []
+        held = 0
+        rows = np.flatnonzero(np.isin(block.channel, list(wanted)))
+        for row in rows.tolist():
+            packed = block.data[block.start[row] : block.end[row]].tobytes()
+            try:
+                message = unpack_message(packed, compression, inflation)
+            except DecompressionError as err:
+                left_out, reason = left_out + 1, reason or str(err.args[0])
+            else:
+                kept.append(row)
+                messages.append(message)
+                held += len(message)
+            if row == rows[-1] or held > PIECE_BYTES:
+                end = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
+                data = np.frombuffer(b"".join(messages), np.uint8)
+                yield Block(data, block.channel[kept], block.log_time_ns[kept], np.append(0, end)[:-1], end)
+                kept, messages, held = [], [], 0
+    if left_out:
+        report(f"{left_out} compressed messages left out: {reason}")
+
+
+CUT_OFF = "cut off"
+"""Stands in the sentence about a file whose end is missing."""
+
+
+def truncation(warnings: Iterable[str]) -> str:
+    """Return the warning that the end of a log is missing; empty where it is there."""
+    return next((one for one in warnings if CUT_OFF in one), "")
+
+
+def ros_type_name(name: str) -> LogText:
+    """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``; a name of one part as it is."""
+    package, separator, rest = name.partition("/")
+    return LogText(f"{package}{separator}{rest.removeprefix('msg/')}")
 
 
 class Origin(NamedTuple):
@@ -27,9 +219,6 @@ class Origin(NamedTuple):
     inputs: tuple[InputFile, ...] = ()
     transfer: Callable[[], str] = str
     remove: Callable[[], object] = str
-
-
-MIXED = "topics share compressed chunks, which are read whole"
 
 
 class Container(ABC):
@@ -51,16 +240,19 @@ class Container(ABC):
         self.mixed = False
         self.message_compression = message_compression
         self.origin = Origin()
-        self._problems = Problems(path.name)
+        self._name, self._problems = LogText(path.name), list[str]()
 
     @property
     def problems(self) -> list[str]:
         """What could not be read and was left out; complete after the last block."""
-        return list(self._problems)
+        return [*self._problems]
 
     def report(self, problem: str) -> None:
-        """Remember what could not be read."""
-        self._problems.add(problem)
+        """Remember what could not be read: each sentence once, and at most `MOST_PROBLEMS` of them."""
+        text = shortened(escaped(f"{self._name}: {problem}"), LONGEST_PROBLEM)
+        if text not in self._problems and len(self._problems) <= MOST_PROBLEMS:
+            is_last = len(self._problems) == MOST_PROBLEMS
+            self._problems.append(f"{self._name}: and more of the kind" if is_last else text)
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:
         """Return the files that make up this log, with their SHA-256: of their beginning once `ended` is set."""
@@ -68,7 +260,8 @@ class Container(ABC):
 
     def transfer(self) -> str:
         """Return in words how much came over a connection, and why all of it; empty for nothing."""
-        return "; ".join(filter(None, [self.origin.transfer(), MIXED if self.mixed else ""]))
+        why = "topics share compressed chunks, which are read whole" if self.mixed else ""
+        return "; ".join(filter(None, [self.origin.transfer(), why]))
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
         """Yield the messages of the channels in `wanted` in file order; others, and some outside the cut, among them.
@@ -96,3 +289,11 @@ class Container(ABC):
     def close(self) -> None:
         """Release files, and remove what was made for it."""
         self.origin.remove()
+
+    def _with_possible_times(self, block: Block) -> Block:
+        """Return a block without the messages whose log time is negative or beyond `LATEST_NS`."""
+        # Negative ones are above all others as unsigned numbers.
+        possible = block.log_time_ns.view(np.uint64) < LATEST_NS
+        if not possible.all():
+            self.report("messages with an impossible log time left out")
+        return block.rows(possible)

@@ -10,13 +10,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import CUT_OFF, Block, Channel, ros_type_name
-from icrtool.logs.containers.chunked_file import ChunkedFile, reused_spaces
-from icrtool.logs.containers.decompress import LARGEST_CHUNK_BYTES, DecompressionError, Packed, Space
-from icrtool.logs.containers.record_table import MCAP_CHANNEL, MCAP_MESSAGE, MCAP_SCHEMA, Chunk, Part, scan_mcap
+from icrtool.logs.containers.chunk import (
+    LARGEST_CHUNK_BYTES,
+    MOST_ROWS,
+    Chunk,
+    DecompressionError,
+    Packed,
+    Records,
+    Space,
+    record_starts,
+    unaligned,
+)
+from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
+from icrtool.logs.containers.container import CUT_OFF, Block, Channel, ros_type_name
 from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
 
@@ -26,16 +36,78 @@ if TYPE_CHECKING:
 
 MAGIC = b"\x89MCAP0\r\n"
 PIECE_BYTES = 1 << 22
-_FOOTER, _CHUNK, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 8, 11, 15
-_HEAD_BYTES, _FOOTER_BYTES = 9, 20
-_MESSAGE_INDEX, _INDEX_HEAD = 7, struct.Struct("<BQHI")
-_CHECKSUM_BYTES = 4
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = (
+    2, 3, 4, 5, 6, 7, 8, 11, 15
+)  # fmt: skip
+"""Operation codes of records."""
+
+_HEAD, _INDEX_HEAD = struct.Struct("<BQ"), struct.Struct("<BQHI")
+_HEAD_BYTES, _FOOTER_BYTES, _CHECKSUM_BYTES = 9, 20, 4
+_MESSAGE_HEADS = np.dtype(
+    [("code", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("time", "<i8"), ("published", "<u8")]
+)
+_LEAST_MESSAGE_BYTES = _MESSAGE_HEADS.itemsize - _HEAD_BYTES
+
 _ENCODINGS = {
     ("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg"), ("protobuf", "protobuf"), ("json", "jsonschema")
 }  # fmt: skip
 
 _LARGEST_BLOCK_BYTES = (1 << 17) + 1024
 """Of a zstd block with the frame's header: so many compressed bytes more give all bytes up to a place."""
+
+
+def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
+    """Find the schema, channel and message records from `begin` on.
+
+    Parameters
+    ----------
+    hint : (n,) where messages are by the index, ascending; None without one
+    """
+    starts, stop = record_starts(data, begin, hint, _follow_mcap, _mcap_ends)
+    codes = data[starts]
+    is_message = codes == _MESSAGE
+    at = starts if is_message.all() else starts[is_message]
+    heads = _message_heads(data, at)
+    messages = np.empty((4, len(at)), np.int64)
+    messages[0], messages[1] = heads["channel"], heads["time"]
+    messages[2], messages[3] = at + _MESSAGE_HEADS.itemsize, at + (9 + heads["length"].astype(np.int64))
+    others = []
+    for place in starts[~is_message].tolist():
+        code, length = _HEAD.unpack_from(data.data, place)
+        others.append((code, place, place + 9, place + 9 + length))
+    return Records(messages, others, stop)
+
+
+def _follow_mcap(data: memoryview, begin: int, end: int) -> tuple[list[int], int]:
+    """Return where the records [begin, end) begin, one after the other, and where they stop."""
+    starts: list[int] = []
+    at, unpack = begin, _HEAD.unpack_from
+    while at + 9 <= end and len(starts) < MOST_ROWS:
+        code, length = unpack(data, at)
+        behind = at + 9 + length
+        if behind > end or not _SCHEMA <= code <= _MESSAGE:
+            break
+        if code == _MESSAGE and length < _LEAST_MESSAGE_BYTES:
+            break
+        starts.append(at)
+        at = behind
+    return starts, at
+
+
+def _mcap_ends(data: Bytes, at: Ints) -> Ints:
+    """Return where messages (n,) end; their begin where there is none."""
+    if at[-1] > len(data) - _MESSAGE_HEADS.itemsize:
+        return at
+    heads = _message_heads(data, at)
+    length = heads["length"]
+    good = (heads["code"] == _MESSAGE) & (length >= _LEAST_MESSAGE_BYTES) & (length <= len(data))
+    return np.where(good, at + (length.astype(np.int64) + 9), at)
+
+
+def _message_heads(data: Bytes, at: Ints) -> NDArray[Any]:
+    """Return the heads (n,) of messages."""
+    together: NDArray[Any] = unaligned(data, f"V{_MESSAGE_HEADS.itemsize}")[at].view(_MESSAGE_HEADS)
+    return together
 
 
 def _message_index(index: bytes) -> tuple[Ints, Ints]:
@@ -117,7 +189,7 @@ class McapFile(ChunkedFile):
             elif opcode == _STATISTICS:
                 statistics = record
             else:
-                (schemas if opcode == MCAP_SCHEMA else channels)[record.id] = record
+                (schemas if opcode == _SCHEMA else channels)[record.id] = record
         if statistics is None or not chunks or len(chunks) != statistics.chunk_count:
             return None
         if len(schemas) < statistics.schema_count or len(channels) < statistics.channel_count:
@@ -151,7 +223,7 @@ class McapFile(ChunkedFile):
         while at + _HEAD_BYTES <= len(summary):
             opcode, length = struct.unpack_from("<BQ", summary, at)
             at += _HEAD_BYTES
-            if opcode in (MCAP_SCHEMA, MCAP_CHANNEL, _CHUNK_INDEX, _STATISTICS):
+            if opcode in (_SCHEMA, _CHANNEL, _CHUNK_INDEX, _STATISTICS):
                 yield opcode, summary[at : at + length]
             at += length
 
@@ -172,7 +244,7 @@ class McapFile(ChunkedFile):
             opcode, length = (_CHUNK, chunk.length) if chunk is not None and is_known else self._head(at)
             if opcode in (_FOOTER, _DATA_END):
                 return not listed and chunk is None
-            if opcode in (0, MCAP_MESSAGE) or length > self._size - at - _HEAD_BYTES:
+            if opcode in (0, _MESSAGE) or length > self._size - at - _HEAD_BYTES:
                 return False
             if (opcode == _CHUNK) != (chunk is not None) or (chunk is not None and chunk.length != length):
                 return False
@@ -183,7 +255,7 @@ class McapFile(ChunkedFile):
         head = self._source.read_at(at, _HEAD_BYTES) if 0 <= at < self._size else b""
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
-    def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
+    def _read_in_order(self) -> Iterator[Block]:
         """Yield the messages record by record; behind damage it goes on at the next chunk that the index lists."""
         begin = at = len(MAGIC)
         spaces = reused_spaces()
@@ -193,10 +265,10 @@ class McapFile(ChunkedFile):
             if opcode in (_FOOTER, _DATA_END):
                 return
             if opcode == _CHUNK:
-                chunk = Chunk(at + _HEAD_BYTES, min(length, left))
-                yield from self._read_chunk(Part(chunk), next(spaces), learn=learn, cut=length > left)
-            elif opcode in (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE) and length <= left:
-                block, length = self._read_loose(at, length, learn=learn)
+                chunk = Chunk(at + _HEAD_BYTES, min(length, left), is_cut=length > left)
+                yield from self._read_chunk(Part(chunk), next(spaces))
+            elif opcode in (_SCHEMA, _CHANNEL, _MESSAGE) and length <= left:
+                block, length = self._read_loose(at, length)
                 if block is not None:
                     yield block
             if opcode != 0 and length <= left:
@@ -209,19 +281,19 @@ class McapFile(ChunkedFile):
             begin = at = further
         self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
-    def _read_loose(self, at: int, length: int, *, learn: bool) -> tuple[Block | None, int]:
+    def _read_loose(self, at: int, length: int) -> tuple[Block | None, int]:
         """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""
         stop = 0
         if length <= LARGEST_CHUNK_BYTES:
             self._at = at
             piece = np.frombuffer(self._source.read_at(at, max(PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
-            block, stop = self._scanned(piece, learn=learn)
+            block, stop = self._scanned(piece)
             if stop:
                 return block, stop - _HEAD_BYTES
         self.report(f"record at byte {at} left out: damaged")
         return None, length
 
-    def _packed(self, part: Part, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:
+    def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:
         length = min(part.chunk.length, needed + _LARGEST_BLOCK_BYTES) if needed else part.chunk.length
         content = self._content(part.chunk.at, length, space, part.held)
         if len(content) < 40:
@@ -234,7 +306,7 @@ class McapFile(ChunkedFile):
             raise DecompressionError("its header is damaged")
         packed = int.from_bytes(content[name_end : name_end + 8], "little")
         data = content[name_end + 8 : name_end + 8 + packed]
-        if cut or needed:
+        if part.chunk.is_cut or needed:
             return Packed(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
         if len(data) < packed:
             raise DecompressionError("its header is damaged")
@@ -246,7 +318,7 @@ class McapFile(ChunkedFile):
         if described is None:
             self.report("a schema or channel that cannot be read was left out")
             return
-        before: dict[int, Any] = self._schemas if code == MCAP_SCHEMA else self._channels
+        before: dict[int, Any] = self._schemas if code == _SCHEMA else self._channels
         known = before.setdefault(described.id, described) == described
         if not known:
             what = f"{type(described).__name__.lower()} {described.id}"
@@ -274,7 +346,7 @@ def _parse(opcode: int, content: bytes) -> Any:  # noqa: ANN401 - a record of th
     from mcap.exceptions import McapError
     from mcap.records import Channel, Schema, Statistics
 
-    kinds = {MCAP_SCHEMA: Schema.read, MCAP_CHANNEL: Channel.read, _STATISTICS: Statistics.read}
+    kinds = {_SCHEMA: Schema.read, _CHANNEL: Channel.read, _STATISTICS: Statistics.read}
     try:
         return kinds[opcode](ReadDataStream(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError, MemoryError):

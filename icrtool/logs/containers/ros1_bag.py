@@ -5,28 +5,48 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from struct import Struct
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.channel import CUT_OFF, Block, Channel, ros_type_name
-from icrtool.logs.containers.chunked_file import ChunkedFile, Spaces, reused_spaces
-from icrtool.logs.containers.decompress import STORED, DecompressionError, Packed, Space
-from icrtool.logs.containers.record_table import BAG_CONNECTION, Chunk, Part, scan_bag
+from icrtool.logs.containers.chunk import (
+    MOST_ROWS,
+    STORED,
+    Chunk,
+    DecompressionError,
+    Packed,
+    Records,
+    Space,
+    record_starts,
+    unaligned,
+)
+from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
+from icrtool.logs.containers.container import CUT_OFF, Block, Channel, ros_type_name
 from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
-_BAG_HEADER, _INDEX_DATA, _CHUNK, _CHUNK_INFO = 3, 4, 5, 6
+_MESSAGE, _BAG_HEADER, _INDEX_DATA, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
+"""Operation codes of records."""
+
 _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
 _HEADER_BYTES = 1 << 12
 """Of a chunk that are read to learn how it is compressed, where it may be read in part."""
 
+_LENGTH = Struct("<I")
 _NONE: Ints = np.empty(0, np.int64)
 _MOST_FIELDS = 100
 """Of a header; real ones have ten at most."""
+
+_MOST_HEADERS = 1 << 4
+"""Kinds of headers in a chunk that all records are compared with; further ones are read one by one."""
+
+_VALUES = {b"op": 1, b"conn": 4, b"time": 8}
+"""Bytes of the values in the headers of a chunk's records."""
 
 
 class _Record(NamedTuple):
@@ -52,18 +72,20 @@ class _Record(NamedTuple):
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
-def _header_fields(header: bytes) -> dict[bytes, bytes]:
-    """Return the fields of a record's or a connection's header by name."""
-    fields: dict[bytes, bytes] = {}
-    place = 0
+def _fields(header: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Yield the fields of a record's or a connection's header: name, and begin and end of the value."""
+    end = 0
     for _ in range(_MOST_FIELDS):
-        if place + 4 > len(header):
+        begin = end + 4
+        if begin > len(header):
             break
-        end = place + 4 + int.from_bytes(header[place : place + 4], "little")
-        name, _, value = header[place + 4 : end].partition(b"=")
-        fields[name] = value
-        place = end
-    return fields
+        end = begin + _LENGTH.unpack_from(header, begin - 4)[0]
+        name, equals, _ = header[begin:end].partition(b"=")
+        yield name, begin + len(name + equals), end
+
+
+def _header_fields(header: bytes) -> dict[bytes, bytes]:
+    return {name: header[begin:end] for name, begin, end in _fields(header)}
 
 
 def _message_index(index: bytes) -> tuple[Ints, Ints]:
@@ -82,6 +104,77 @@ def _message_index(index: bytes) -> tuple[Ints, Ints]:
     return np.concatenate(places), np.concatenate(connections)
 
 
+def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
+    """Find the message and connection records of a ROS 1 bag from `begin` on; as `scan_mcap`."""
+    starts, stop = record_starts(data, begin, hint, _follow_bag, _bag_ends)
+    sizes = unaligned(data, "<u4")[starts] + np.int64(8)
+    table = np.empty((5, len(starts)), np.int64)
+    left, rounds = np.arange(len(starts)), 0
+    while len(left):
+        # Most have headers of the same fields.
+        size = int(sizes[left[0]])
+        fits = sizes[left] == size if rounds < _MOST_HEADERS else np.arange(len(left)) == 0
+        heads = unaligned(data, f"V{size}")[starts[left if fits.all() else left[fits]]]
+        header = heads[0].tobytes()[4:-4]
+        values = [(name, begin + 4) for name, begin, end in _fields(header) if end - begin == _VALUES.get(name)]
+        fields = {name: at for name, at in values if at + _VALUES[name] <= size - 4}
+        same, end = np.ones(len(heads), np.bool_), 0
+        for name, at in [*fields.items(), (b"", size - 4)]:
+            if at > end:
+                parts = _strided(heads, end, f"V{at - end}")
+                same &= parts == parts[0]
+            end = at + _VALUES.get(name, 0)
+        if not same.all():
+            fits[fits] = same
+            heads = heads[same]
+        rows = slice(None) if len(heads) == len(starts) else left[fits]
+        table[0, rows] = _strided(heads, fields[b"op"], "u1") if b"op" in fields else 0
+        table[1, rows] = _strided(heads, fields[b"conn"], "<u4") if b"conn" in fields else -1
+        table[2, rows] = 0
+        if b"time" in fields:
+            seconds, nanoseconds = (_strided(heads, fields[b"time"] + part, "<u4") for part in (0, 4))
+            table[2, rows] = seconds * np.int64(1_000_000_000) + nanoseconds
+        table[3, rows] = starts[rows] + size
+        table[4, rows] = table[3, rows] + _strided(heads, size - 4, "<u4")
+        left, rounds = left[~fits], rounds + 1
+    codes, messages = table[0], table[1:]
+    is_message = codes == _MESSAGE
+    others = [
+        (_CONNECTION, int(starts[row]), *messages[2:, row].tolist()) for row in np.flatnonzero(codes == _CONNECTION)
+    ]
+    return Records(messages if is_message.all() else messages[:, is_message], others, stop)
+
+
+def _follow_bag(data: memoryview, begin: int, end: int) -> tuple[list[int], int]:
+    """Return where the records [begin, end) of a bag begin, one after the other, and where they stop."""
+    starts: list[int] = []
+    at, unpack = begin, _LENGTH.unpack_from
+    while at + 8 <= end and len(starts) < MOST_ROWS:
+        content = at + 8 + unpack(data, at)[0]
+        if content > end:
+            break
+        behind = content + unpack(data, content - 4)[0]
+        if behind > end:
+            break
+        starts.append(at)
+        at = behind
+    return starts, at
+
+
+def _bag_ends(data: Bytes, at: Ints) -> Ints:
+    """Return where records (n,) of a bag end that have headers as long as the first; the begin of others."""
+    lengths, last = unaligned(data, "<u4"), len(data) - 4
+    size = 8 + int(lengths[at[0]]) if at[-1] <= last else len(data)
+    if at[-1] + size > len(data):
+        return at
+    return np.where(lengths[at] == size - 8, at + (size + lengths[at + (size - 4)].astype(np.int64)), at)
+
+
+def _strided(rows: NDArray[Any], offset: int, kind: str) -> NDArray[Any]:
+    """Return the value at an offset in each of some rows of bytes (n,)."""
+    return np.ndarray(len(rows), kind, rows, offset, rows.strides)
+
+
 class Ros1Bag(ChunkedFile):
     """One ROS 1 bag.
 
@@ -98,7 +191,12 @@ class Ros1Bag(ChunkedFile):
         super().__init__(path, source=source)
         self._connections: dict[int, Channel] = {}
         try:
-            self._check_start()
+            start = self._source.read_at(0, len(MAGIC))
+            if start != MAGIC and start.startswith(MAGIC[:9]):
+                advice = "only 2.0 can be read; `rosbag fix` converts older ones"
+                raise LogError(path, "a bag of another version", advice)
+            if start != MAGIC:
+                raise LogError(path, "not a ROS 1 bag", "its first bytes are not a bag's")
             self._chunks: list[Chunk] | None = self._read_index()
             if self._chunks is None:
                 self.report(f"has no index (not closed, or {CUT_OFF}); read from start to end")
@@ -117,15 +215,6 @@ class Ros1Bag(ChunkedFile):
         found = _chunk_of(record)
         index_length = max(chunk.at + chunk.index_length - found.at - found.length, 0)
         return found._replace(channels=chunk.channels, index_length=index_length)
-
-    def _check_start(self) -> None:
-        start = self._source.read_at(0, len(MAGIC))
-        if start[:9] == MAGIC[:9] and start != MAGIC:
-            raise LogError(
-                self.path, "a bag of another version", "only 2.0 can be read; `rosbag fix` converts older ones"
-            )
-        if start != MAGIC:
-            raise LogError(self.path, "not a ROS 1 bag", "its first bytes are not a bag's")
 
     def _record(self, at: int) -> _Record | None:
         """Return the record at a file offset with its header fields; None where there is no complete header."""
@@ -155,7 +244,7 @@ class Ros1Bag(ChunkedFile):
             if record is None or record.length > min(_LARGEST_CONTENT_BYTES, self._size - record.at):
                 return None
             content = self._source.read_at(record.at, record.length)
-            if record.op == BAG_CONNECTION:
+            if record.op == _CONNECTION:
                 self._connect(record.number(b"conn"), record.text(b"topic"), content)
             elif record.op == _CHUNK_INFO:
                 held = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
@@ -180,36 +269,30 @@ class Ros1Bag(ChunkedFile):
             for chunk, end in zip(ordered, ends, strict=False)
         ]
 
-    def _read_in_order(self, *, learn: bool = False) -> Iterator[Block]:
+    def _read_in_order(self) -> Iterator[Block]:
         at, spaces = len(MAGIC), reused_spaces()
         while at < self._size:
             record = self._record(at)
-            if record is None or not 0 < record.op <= BAG_CONNECTION:
+            if record is None or not 0 < record.op <= _CONNECTION:
                 break
-            cut = record.length > self._size - record.at
+            is_cut = record.length > self._size - record.at
             if record.op == _CHUNK:
-                yield from self._read_chunk(Part(_chunk_of(record)), next(spaces), learn=learn, cut=cut)
-            if cut:
+                yield from self._read_chunk(Part(_chunk_of(record)._replace(is_cut=is_cut)), next(spaces))
+            if is_cut:
                 break
-            if learn and record.op == BAG_CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
+            if record.op == _CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
                 content = self._source.read_at(record.at, record.length)
                 self._connect(record.number(b"conn"), record.text(b"topic"), content)
             at = record.at + record.length
         if at < self._size:
             self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
-    def _read_chunk(self, part: Part, spaces: Spaces, *, learn: bool = False, cut: bool = False) -> Iterator[Block]:
-        if part.chunk.size < 0:
-            self.report(f"no chunk at byte {part.chunk.at}, where the index lists one")
-        else:
-            yield from super()._read_chunk(part, spaces, learn=learn, cut=cut)
-
-    def _packed(self, part: Part, space: Space, *, cut: bool = False, needed: int = 0) -> Packed:  # noqa: ARG002 - all of it
+    def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:  # noqa: ARG002 - all of it
         chunk = part.chunk
         if chunk.size < 0:
             raise DecompressionError("no chunk")
         content = self._content(chunk.at, chunk.length, space, part.held)
-        return Packed(content, chunk.compression, chunk.size, partial=cut)
+        return Packed(content, chunk.compression, chunk.size, partial=chunk.is_cut)
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         _, at, start, end = record

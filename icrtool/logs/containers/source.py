@@ -1,25 +1,49 @@
-"""Files that are read at any place: on disk, or in object stores and on web servers, by ranges or fetched whole."""
+"""Files that are read at any place: on disk, or in object stores and on web servers, by ranges or fetched whole.
+
+The one place that opens connections, by fsspec, and only for an address that the user, or his manifest, names.
+Credentials are those that the provider's own library finds.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
+import sys
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock, local
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from msgspec import UNSET
 
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
-from icrtool.logs.containers.address import address_of, asked, filesystem
-from icrtool.logs.containers.channel import ahead
+from icrtool.logs.containers.container import ahead
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, natural_order, unpacked_name
 from icrtool.records.samples import InputFile
-from icrtool.records.urls import UrlPath, without_secrets
+from icrtool.records.urls import UrlPath, place_of, without_secrets
+
+Result = TypeVar("Result")
+
+_NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
+          "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
+"""The library that each kind of address is read with."""
+
+_LOGGERS = ("fsspec", "s3fs", "aiobotocore", "botocore", "gcsfs", "google", "adlfs", "azure", "aiohttp")
+
+PAUSES_S = (0.5, 2.0)
+"""Before a request to a web server is made again; the libraries of object stores do so themselves."""
+
+_FAILURES = (
+    ("botocore.exceptions", "BotoCoreError"), ("botocore.exceptions", "ClientError"), ("aiohttp", "ClientError"),
+    ("google.auth.exceptions", "GoogleAuthError"), ("gcsfs.retry", "HttpError"),
+    ("azure.core.exceptions", "AzureError"), ("fsspec.exceptions", "FSTimeoutError"),
+)  # fmt: skip
+"""What libraries raise beside OSError, where they are loaded."""
 
 NEAR_BYTES = 1 << 15
 """Between two ranges of a distant file that are read too: a request takes as long as some 100 kB."""
@@ -28,6 +52,64 @@ _LEAST_BYTES = 1 << 18
 """That are read at once: the records of an index follow one another."""
 
 _PIECE_BYTES, PIECES_AHEAD = 1 << 24, 4
+
+
+def filesystem(path: UrlPath) -> tuple[Any, str]:
+    """Return the fsspec file system of an address, and the name of the file in it."""
+    needed = _NEEDS.get(path.scheme)
+    extra = "http" if needed == "aiohttp" else "cloud"
+    try:
+        import fsspec
+        from fsspec.core import url_to_fs
+
+        fsspec.get_filesystem_class(path.scheme)
+    except ImportError as err:
+        raise LogError(path, f"needs {needed or err}", f"pip install 'icrtool[{extra}]'") from err
+    except ValueError as err:
+        raise LogError(
+            path, f"{path.scheme}:// is no kind of address that can be read", "try s3, gs, az or https"
+        ) from err
+    for name in _LOGGERS:
+        # They log tracebacks of requests, and addresses with their queries; one line reports where they fail.
+        if (logger := logging.getLogger(name)).level == logging.NOTSET:
+            logger.setLevel(logging.CRITICAL + 1)
+    found: tuple[Any, str] = asked(path, lambda: url_to_fs(path.url))
+    return found
+
+
+def asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done: str = "read") -> Result:
+    """Return the answer to a request, made again where the connection broke.
+
+    Parameters
+    ----------
+    done : what is to be done: ``read`` or ``written``
+
+    Raises
+    ------
+    LogError
+        The file is not there, it must not be done, or the connection stays broken.
+    """
+    pauses = list(PAUSES_S) if again and path.scheme.startswith("http") else []
+    while True:
+        try:
+            return ask()
+        except _failures() as err:
+            # fsspec calls every failure of a web server a file that is not there, and names the true one as its cause.
+            cause = err.__cause__ if isinstance(err, FileNotFoundError) and err.__cause__ is not None else err
+            status = getattr(cause, "status", None)
+            if isinstance(cause, FileNotFoundError) or status == 404:
+                raise LogError(path, "no such file") from None
+            refused = isinstance(cause, PermissionError | ValueError) or status in {401, 403}
+            if refused or not pauses:
+                why = f"may not be {done}" if refused else f"cannot be {done}"
+                raise LogError(path, why, without_secrets(str(cause) or type(cause).__name__)) from None
+            time.sleep(pauses.pop(0))
+
+
+def _failures() -> tuple[type[Exception], ...]:
+    """Return what a broken connection or a refused request is raised as."""
+    loaded = [getattr(sys.modules.get(module), name, None) for module, name in _FAILURES]
+    return (OSError, ValueError, *(one for one in loaded if one is not None))
 
 
 class Held(NamedTuple):
@@ -39,6 +121,12 @@ class Held(NamedTuple):
     def has(self, at: int, end: int) -> bool:
         """Return whether they hold a range of the file."""
         return self.at <= at and end <= self.at + len(self.data)
+
+
+class _OfThread(local):
+    """What a thread read last."""
+
+    held = Held(0, b"")
 
 
 class LocalFile:
@@ -85,19 +173,16 @@ class RemoteFile:
         about = _about(path) if about is None else about
         self.is_folder = about.get("type") == "directory"
         self.size = int(about.get("size") or 0)
-        self.has_ranges = self._finds_ranges(about)
-        self._about = about
+        self.has_ranges = not self.is_folder and self.size > 0 and about.get("partial") is not False
+        if self.has_ranges and path.scheme.startswith("http"):
+            self.has_ranges = asked(path, self._gives_last_byte)
+        self.version = _version_of(about)
+        """What the store states about the content: ``version``, or else ``etag``; none where it states neither."""
+        self.input = InputFile(str(path), self.size, None, **self.version)
+        """What run.json states about the file where not all of it is read: no SHA-256."""
         self.bytes_read = 0
         self._ends: tuple[Held, ...] = ()
-        self._held = local()
-
-    def _finds_ranges(self, about: dict[str, Any]) -> bool:
-        """Return whether the server gives parts of the file."""
-        if self.is_folder or not self.size or about.get("partial") is False:
-            return False
-        if not self.path.scheme.startswith("http"):
-            return True
-        return asked(self.path, self._gives_last_byte)
+        self._last = _OfThread()
 
     def _gives_last_byte(self) -> bool:
         try:
@@ -111,23 +196,15 @@ class RemoteFile:
         """Return bytes of the file, as many as there are."""
         end = min(at + count, self.size)
         if not self._ends:
-            self._ends = self._read_ends()
-        held = next((one for one in (*self._ends, self._last) if one.has(at, end)), None)
+            # All that is read by an index begins with start and end of the file.
+            begins = sorted({0, max(self.size - _LEAST_BYTES, 0)})
+            self._ends = tuple(map(Held, begins, self._ranges(begins, [begin + _LEAST_BYTES for begin in begins])))
+        held = next((one for one in (*self._ends, self._last.held) if one.has(at, end)), None)
         if held is None:
             # What stands at the end of a file is read from its footer backwards.
             first = max(min(at, self.size - _LEAST_BYTES), 0)
             held = self.hold(first, max(end - first, _LEAST_BYTES))
         return held.data[at - held.at : end - held.at]
-
-    def _read_ends(self) -> tuple[Held, ...]:
-        """Return start and end of the file, which all that is read by an index begins with, by one request each."""
-        begins = sorted({0, max(self.size - _LEAST_BYTES, 0)})
-        return tuple(map(Held, begins, self._ranges(begins, [begin + _LEAST_BYTES for begin in begins])))
-
-    @property
-    def _last(self) -> Held:
-        """What this thread read last."""
-        return getattr(self._held, "last", Held(0, b""))
 
     def read_into(self, at: int, space: Bytes) -> int:
         """Fill some space with bytes of the file, and return how many there are."""
@@ -137,12 +214,9 @@ class RemoteFile:
 
     def hold(self, at: int, count: int) -> Held:
         """Return bytes that `read_at` gives to this thread without another request."""
-        held = self._last
-        if held.has(at, min(at + count, self.size)):
-            return held
-        held = Held(at, self._range(at, count))
-        self._held.last = held
-        return held
+        if not self._last.held.has(at, min(at + count, self.size)):
+            self._last.held = Held(at, self._range(at, count))
+        return self._last.held
 
     def gather(self, at: int, ranges: Ints) -> bytes:
         """Return what stands in several ranges (2, n) behind a place, one after the other."""
@@ -173,17 +247,6 @@ class RemoteFile:
         self.bytes_read += sum(map(len, pieces))
         return pieces
 
-    def pieces(self) -> Iterator[bytes]:
-        """Yield the content from start to end; the next pieces are read meanwhile."""
-        if not self.has_ranges:
-            with asked(self.path, lambda: self._files.open(self._name, block_size=0)) as stream:
-                while piece := asked(self.path, lambda: stream.read(_PIECE_BYTES), again=False):
-                    yield piece
-            return
-        places = range(0, self.size, _PIECE_BYTES)
-        for _, piece in ahead(lambda at: self._range(at, _PIECE_BYTES), places, PIECES_AHEAD, PIECES_AHEAD):
-            yield piece()
-
     def fetch(self, place: Path, share: Callable[[float], None] | None) -> InputFile:
         """Write the file to a place on disk, and return what run.json states about it.
 
@@ -196,7 +259,7 @@ class RemoteFile:
         """
         digest, written = hashlib.sha256(), 0
         with place.open("wb") as sink:
-            for piece in self.pieces():
+            for piece in self._pieces():
                 sink.write(piece)
                 digest.update(piece)
                 written += len(piece)
@@ -204,19 +267,20 @@ class RemoteFile:
                     share(min(written / max(self.size, 1), 1.0))
         return replace(self.input, bytes=written, sha256=digest.hexdigest())
 
-    @property
-    def version(self) -> dict[str, str]:
-        """What the store states about the content: ``version``, or else ``etag``; none where it states neither."""
-        return _version_of(self._about)
-
-    @property
-    def input(self) -> InputFile:
-        """What run.json states about the file where not all of it is read: no SHA-256."""
-        return InputFile(str(self.path), self.size, None, **self.version)
+    def _pieces(self) -> Iterator[bytes]:
+        """Yield the content from start to end; the next pieces are read meanwhile."""
+        if not self.has_ranges:
+            with asked(self.path, lambda: self._files.open(self._name, block_size=0)) as stream:
+                while piece := asked(self.path, lambda: stream.read(_PIECE_BYTES), again=False):
+                    yield piece
+            return
+        places = range(0, self.size, _PIECE_BYTES)
+        for _, piece in ahead(lambda at: self._range(at, _PIECE_BYTES), places, PIECES_AHEAD, PIECES_AHEAD):
+            yield piece()
 
     def close(self) -> None:
         """Forget what is held."""
-        self._held = local()
+        self._last = _OfThread()
 
 
 Source = LocalFile | RemoteFile
@@ -237,27 +301,6 @@ def _version_of(about: dict[str, Any]) -> dict[str, str]:
     return {}
 
 
-def changed_since(path: UrlPath, inputs: Iterable[InputFile]) -> bool:
-    """Return whether the files at an address are not those that they were when they were opened.
-
-    Parameters
-    ----------
-    inputs : the files as they were
-    """
-    about = _about(path)
-    now = (
-        {str(one): stated for one, stated in _in_folder(path)}
-        if about.get("type") == "directory"
-        else {str(path): about}
-    )
-    for one in inputs:
-        stated = now.get(one.path, {})
-        version = {key: value for key in ("version", "etag") if (value := getattr(one, key)) is not UNSET}
-        if stated.get("size") not in {one.bytes, None} or _version_of(stated) != version:
-            return True
-    return False
-
-
 def _about(path: UrlPath) -> dict[str, Any]:
     """Return what a store states about a file now, whatever it stated before."""
     files, name = filesystem(path)
@@ -271,7 +314,35 @@ def _in_folder(path: UrlPath) -> list[tuple[UrlPath, dict[str, Any]]]:
     files, name = filesystem(path)
     files.invalidate_cache(name)
     found: list[dict[str, Any]] = asked(path, lambda: files.ls(name, detail=True))
-    return [(address_of(files.unstrip_protocol(one["name"]), path), one) for one in found]
+    return [(_address(files, one["name"], path), one) for one in found]
+
+
+def _address(files: Any, name: str, asked_for: UrlPath) -> UrlPath:  # noqa: ANN401 - a file system of fsspec
+    """Return the address of a file that was found, with the query of the one asked for, where a web server needs it."""
+    url = files.unstrip_protocol(name)
+    query = asked_for.url.partition("?")[2] if asked_for.scheme.startswith("http") else ""
+    found = place_of(f"{url}?{query}" if query and "?" not in url else url)
+    if not isinstance(found, UrlPath):
+        raise LogError(asked_for, "is no address", str(found))
+    return found
+
+
+def changed_since(path: UrlPath, inputs: Iterable[InputFile]) -> bool:
+    """Return whether the files at an address are not those that they were when they were opened.
+
+    Parameters
+    ----------
+    inputs : the files as they were
+    """
+    about = _about(path)
+    is_folder = about.get("type") == "directory"
+    now = {str(one): stated for one, stated in (_in_folder(path) if is_folder else [(path, about)])}
+    for one in inputs:
+        stated = now.get(one.path, {})
+        version = {key: value for key in ("version", "etag") if (value := getattr(one, key)) is not UNSET}
+        if stated.get("size") not in {one.bytes, None} or _version_of(stated) != version:
+            return True
+    return False
 
 
 def find(path: UrlPath) -> list[UrlPath]:
@@ -284,19 +355,17 @@ def find(path: UrlPath) -> list[UrlPath]:
     """
     address = without_secrets(path.url) if path.scheme.startswith("http") else path.url
     if not re.search(r"[*\[]" if path.scheme.startswith("http") else r"[*?\[]", address):
-        one = RemoteFile(path)
-        found = _below(path) if one.is_folder else [path]
+        found = _below(path) if RemoteFile(path).is_folder else [path]
         if not found:
-            raise LogError(
-                path, "no recording in it", f"a log has one of the suffixes {', '.join(sorted(LOG_SUFFIXES))}"
-            )
+            suffixes = ", ".join(sorted(LOG_SUFFIXES))
+            raise LogError(path, "no recording in it", f"a log has one of the suffixes {suffixes}")
         return found
     files, name = filesystem(path)
     matched: dict[str, Any] = asked(path, lambda: files.glob(name, detail=True))
     found = []
     for inner, about in matched.items():
-        one_path = address_of(files.unstrip_protocol(inner), path)
-        found += _below(one_path) if about.get("type") == "directory" else [one_path]
+        one = _address(files, inner, path)
+        found += _below(one) if about.get("type") == "directory" else [one]
     if not found:
         raise LogError(path, "matches nothing")
     return sorted(set(found), key=natural_order)
@@ -314,21 +383,18 @@ def _below(folder: UrlPath) -> list[UrlPath]:
     bags = {one.rpartition("/")[0] for one in names if one.endswith("/metadata.yaml")}
     logs = {one for one in names if Path(unpacked_name(one.rpartition("/")[2])).suffix in LOG_SUFFIXES}
     found = {parent if (parent := one.rpartition("/")[0]) in bags else one for one in logs}
-    return sorted((address_of(files.unstrip_protocol(one), folder) for one in found), key=natural_order)
+    return sorted((_address(files, one, folder) for one in found), key=natural_order)
 
 
-class FetchedFolder(NamedTuple):
-    """A bag directory on disk: its storage files as run.json states them, and those that are read by ranges.
-
-    The latter are empty on disk.
-    """
-
-    inputs: tuple[InputFile, ...]
-    distant: dict[str, RemoteFile]
-
-
-def fetch_folder(path: UrlPath, place: Path, share: Callable[[float], None] | None) -> FetchedFolder:
+def fetch_folder(
+    path: UrlPath, place: Path, share: Callable[[float], None] | None
+) -> tuple[tuple[InputFile, ...], dict[str, RemoteFile]]:
     """Write the storage files and metadata.yaml of a bag directory to a folder on disk, but MCAP files.
+
+    Returns
+    -------
+    inputs : the storage files as run.json states them
+    distant : those that are read by ranges, by their names; they are empty on disk
 
     Raises
     ------
@@ -349,4 +415,4 @@ def fetch_folder(path: UrlPath, place: Path, share: Callable[[float], None] | No
             inputs.append(remote.input)
         else:
             inputs.append(remote.fetch(file, part))
-    return FetchedFolder(tuple(one for one in inputs if not one.path.endswith("metadata.yaml")), distant)
+    return tuple(one for one in inputs if not one.path.endswith("metadata.yaml")), distant

@@ -16,18 +16,8 @@ from urllib.parse import quote
 import numpy as np
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import (
-    CUT_OFF,
-    WHOLE,
-    Block,
-    Channel,
-    Cut,
-    made_ahead,
-    ros_type_name,
-    with_possible_times,
-)
-from icrtool.logs.containers.container import Container
-from icrtool.logs.containers.decompress import ZSTD_MAGIC
+from icrtool.logs.containers.chunk import ZSTD_MAGIC
+from icrtool.logs.containers.container import CUT_OFF, WHOLE, Block, Channel, Container, Cut, made_ahead, ros_type_name
 from icrtool.records.text import LogText
 
 MAGIC = b"SQLite format 3\0"
@@ -295,7 +285,7 @@ class SqliteBag(Container):
             if content is None:
                 continue
             block = _unpacked(texts, content)
-            yield with_possible_times(block, self.report)
+            yield self._with_possible_times(block)
             by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
             count = max(1, min(4 * count, _MOST_ROWS, by_size))
 
@@ -341,7 +331,5 @@ def _without_last(blocks: Iterable[Block], lost: int) -> Iterator[Block]:
             size -= len(held[0].data)
             yield held.popleft()
     for block in held:
-        _, *columns = block
-        whole = block.end <= size - lost
-        yield Block(block.data, *(column[whole] for column in columns))
+        yield block.rows(block.end <= size - lost)
         size -= len(block.data)

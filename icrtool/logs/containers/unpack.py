@@ -6,36 +6,120 @@ directory in an archive; what stands in an archive may be compressed again.
 
 from __future__ import annotations
 
+import bz2
 import hashlib
+import lzma
 import re
 import secrets
 import shutil
 import tempfile
 import weakref
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
+from gzip import GzipFile
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from tarfile import AREGTYPE, CONTTYPE, REGTYPE, SUPPORTED_TYPES, TarError, TarInfo
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple, Protocol
+
+import lz4.frame
+import zstandard
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.channel import CUT_OFF, some_of
-from icrtool.logs.containers.decompress import DECODERS, LARGEST_CHUNK_BYTES, LARGEST_RATIO, Readable, decoding_errors
+from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, LARGEST_RATIO, ZSTD_MAGIC
+from icrtool.logs.containers.container import CUT_OFF
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
 from icrtool.records import process_resources
 from icrtool.records.regular_file import open_regular
+from icrtool.records.text import some_of
 
 _PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED})?$|\.db3-wal$|^metadata\.yaml$")
 
-_PIECE_BYTES = 1 << 20
+_PIECE_BYTES, _DECODER_BYTES = 1 << 20, LARGEST_CHUNK_BYTES
+"""That are unpacked at a time, and that a decoder may hold."""
+
 _MOST_ENTRIES = 100_000
 """Of an archive that are looked at."""
 
 _LARGEST_EXTRA_BYTES, _LARGEST_READ_BYTES = 1 << 16, 1 << 22
 """Of a long name in a tar archive; of what zipfile reads at once, such as the directory of an archive."""
 
+_BEHIND = b"icrtool: behind the last frame"
 _BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
+
+
+class Readable(Protocol):
+    """What is read from start to end."""
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`; none at the end."""
+        ...
+
+
+class _Frames:
+    """What a decoder of the standard library, or of lz4, makes of frames that follow one another."""
+
+    def __init__(self, make: Callable[[], Any], source: Readable) -> None:
+        self._make, self._source, self._decoder = make, source, make()
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`."""
+        while True:
+            data = b""
+            if self._decoder.eof:
+                if not (data := self._decoder.unused_data or self._source.read(_PIECE_BYTES)):
+                    return b""
+                self._decoder = self._make()
+            elif self._decoder.needs_input and not (data := self._source.read(_PIECE_BYTES)):
+                raise EOFError("no end mark")
+            if out := self._decoder.decompress(data, max_length=count):
+                return bytes(out)
+
+
+class _Zstd:
+    """What zstandard makes of frames that follow one another.
+
+    Its reader does not show whether the last frame has ended: a frame of our own behind it comes out only then.
+    """
+
+    def __init__(self, source: Readable) -> None:
+        self._source, self._behind, self._held = source, zstandard.compress(_BEHIND), b""
+        decoder = zstandard.ZstdDecompressor(max_window_size=_DECODER_BYTES)
+        self._decoded = decoder.stream_reader(SimpleNamespace(read=self._packed), read_across_frames=True)  # type: ignore[arg-type]  # reads alone are needed
+
+    def _packed(self, count: int) -> bytes:
+        if not (piece := self._source.read(count)):
+            piece, self._behind = self._behind, b""
+        return piece
+
+    def read(self, count: int, /) -> bytes:
+        """Return the next bytes, at most `count`."""
+        while piece := self._decoded.read(count):
+            together = self._held + piece
+            ready, self._held = together[: -len(_BEHIND)], together[-len(_BEHIND) :]
+            if ready:
+                return ready
+        if self._held != _BEHIND:
+            raise EOFError("no end mark")
+        return b""
+
+
+DECODERS: dict[bytes, Callable[[Readable], Readable]] = {
+    ZSTD_MAGIC: _Zstd,
+    b"\x1f\x8b": lambda source: GzipFile(fileobj=source, mode="rb"),  # type: ignore[call-overload]  # as above
+    b"BZh": partial(_Frames, bz2.BZ2Decompressor),
+    b"\x04\x22\x4d\x18": partial(_Frames, lz4.frame.LZ4FrameDecompressor),
+    b"\xfd7zXZ\0": partial(_Frames, partial(lzma.LZMADecompressor, memlimit=_DECODER_BYTES)),
+}
+
+_DECODING_ERRORS = (
+    OSError, EOFError, RuntimeError, ValueError, NotImplementedError, zlib.error, lzma.LZMAError,
+    zipfile.BadZipFile, zstandard.ZstdError,
+)  # fmt: skip
+"""What decoders raise of data that is damaged or cut off."""
 
 
 class ScratchFolder:
@@ -147,7 +231,7 @@ class _Stream:
             return b""
         try:
             piece = self._read(count)
-        except decoding_errors() as err:
+        except _DECODING_ERRORS as err:
             if isinstance(err, OSError) and err.errno is not None:
                 raise  # of the disk, not of the data
             self._budget.stop(f"{CUT_OFF} or damaged ({err})")

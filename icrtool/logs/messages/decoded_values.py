@@ -16,7 +16,7 @@ import orjson
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Ints
-from icrtool.logs.containers.channel import Block
+from icrtool.logs.containers.container import Block
 from icrtool.logs.messages.decoder import MESSAGES_AT_ONCE, Decoder, text_numbers
 from icrtool.logs.messages.schema import MOST_ELEMENTS, Slot, Step, steps_of
 from icrtool.records.text import LONGEST_TEXT

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
-from icrtool.logs.containers.channel import Block, Channel
+from icrtool.logs.containers.container import Block, Channel
 from icrtool.logs.messages.definitions import definitions_of
 from icrtool.logs.messages.schema import (
     COUNTED,

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import orjson
 
 from icrtool.errors import DefinitionError
-from icrtool.logs.containers.channel import Channel
+from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.protobuf import definitions_in, descriptors_of
 from icrtool.logs.messages.schema import (
     ARRAY,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Ints
-from icrtool.logs.containers.channel import Block, Channel
+from icrtool.logs.containers.container import Block, Channel
 from icrtool.logs.messages.decoded_values import (
     NMEA_SENTENCE,
     MessageColumns,

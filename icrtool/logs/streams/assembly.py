@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.logs.containers.channel import Channel
+from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.headings import GYRO_TYPE, find_gyro, find_gyros
 from icrtool.logs.streams.select import Candidates, Choice, choose_streams, ignored_joints, other_references

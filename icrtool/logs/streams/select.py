@@ -9,14 +9,14 @@ from typing import TypeVar, cast
 
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
-from icrtool.logs.containers.channel import Channel, some_of
+from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import HEADER, READ_ENCODINGS, TopicTable
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE
 from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelMotion, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
 from icrtool.records.samples import ROLE_WORDS, Role
-from icrtool.records.text import did_you_mean
+from icrtool.records.text import did_you_mean, some_of
 
 Kind = TypeVar("Kind", WheelMotion, PositionSource, HeadingSource)
 

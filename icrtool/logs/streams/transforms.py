@@ -11,7 +11,7 @@ import numpy as np
 from icrtool.config import TopicsConfig
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.logs.containers.channel import Channel
+from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import FRAME, STAMPS, TopicTable
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.positions import REFERENCE_FRAMES, REFERENCE_WORDS

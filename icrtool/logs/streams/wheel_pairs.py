@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Ints
-from icrtool.logs.containers.channel import Channel
+from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.definitions import number_fields
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import MESSAGE_TYPES

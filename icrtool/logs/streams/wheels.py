@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.logs.containers.channel import some_of
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
 from icrtool.logs.streams.sources import Sides, Unit, WheelMotion, motion_of, nonzero, of_topic
+from icrtool.records.text import some_of
 
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
 """Positions that stay within one turn, and jump by nearly one turn this often, are recorded modulo a turn."""

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 from icrtool.errors import IcrToolError, LogError, OutputError
-from icrtool.logs.containers.address import asked, filesystem
+from icrtool.logs.containers.source import asked, filesystem
 from icrtool.logs.containers.unpack import ScratchFolder
 from icrtool.output.files.atomic import OWN_FILES, make_folders, reported, write_file
 from icrtool.output.files.formats import CHECKSUM_FILE

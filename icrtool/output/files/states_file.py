@@ -16,7 +16,7 @@ import orjson
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.logs.containers.decompress import LARGEST_RATIO
+from icrtool.logs.containers.chunk import LARGEST_RATIO
 from icrtool.output.files.formats import file_b2sum
 from icrtool.records.regular_file import open_regular
 from icrtool.records.tables import States

@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from icrtool.errors import LogError
 from icrtool.logs.containers import bag_directory, unpack
-from icrtool.logs.containers.channel import MOST_PROBLEMS
+from icrtool.logs.containers.container import MOST_PROBLEMS
 from icrtool.logs.containers.open_log import open_log
 
 START_NS = 1_760_000_000_000_000_000

@@ -17,15 +17,14 @@ from mcap.writer import CompressionType, Writer
 from icrtool.config import Config, load_config
 from icrtool.errors import ConfigError, DefinitionError, IcrToolError, LogError
 from icrtool.estimation.fit import fit
-from icrtool.logs.containers.channel import Block, Channel, Cut
-from icrtool.logs.containers.decompress import (
+from icrtool.logs.containers.chunk import (
     LARGEST_CHUNK_BYTES,
     DecompressionError,
     Inflation,
     Packed,
     decompress,
-    unpack_messages,
 )
+from icrtool.logs.containers.container import Block, Channel, Cut, unpack_messages
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
 from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
@@ -430,7 +429,7 @@ def test_a_header_of_empty_fields_costs_no_time(tmp_path: Path) -> None:
 def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool import config
     from icrtool.fleet import manifest
-    from icrtool.logs.containers import bag_directory, decompress, open_log, sqlite_bag, unpack
+    from icrtool.logs.containers import bag_directory, chunk, open_log, sqlite_bag, unpack
     from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf, schema
     from icrtool.logs.streams import wheel_pairs, wheels
     from icrtool.records import text
@@ -440,7 +439,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     stated = [int(number.replace(",", "")) for row in rows for number in re.findall(r"(?<!\w)\d[\d,]*(?= |;)", row)]
     assert definitions.LONGEST_SCHEMA == protobuf.LONGEST_DESCRIPTORS
     assert stated == [
-        decompress.LARGEST_CHUNK_BYTES, decompress.LARGEST_RATIO, decompress.FREE_BYTES,
+        chunk.LARGEST_CHUNK_BYTES, chunk.LARGEST_RATIO, chunk.FREE_BYTES,
         unpack._MOST_ENTRIES, unpack._LARGEST_READ_BYTES, unpack._LARGEST_EXTRA_BYTES,
         sqlite_bag._LARGEST_MESSAGE_BYTES, decoded_values.LONGEST_MESSAGE_BYTES, protobuf.LONGEST_DESCRIPTORS,
         schema.DEEPEST, schema.MOST_FIELDS,

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from icrtool.errors import DefinitionError
-from icrtool.logs.containers.channel import Channel
+from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import LONGEST_MESSAGE_BYTES
 from icrtool.logs.messages.definitions import number_fields
 from icrtool.logs.messages.protobuf import LONGEST_DESCRIPTORS

@@ -26,8 +26,8 @@ from icrtool.errors import LogError
 from icrtool.fleet.manifest import read_manifest
 from icrtool.fleet.recordings import find_recordings
 from icrtool.fleet.roll_up import _content
-from icrtool.logs.containers import address
-from icrtool.logs.containers.channel import Block
+from icrtool.logs.containers import source
+from icrtool.logs.containers.container import Block
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.recording_files import log_name
 from icrtool.logs.containers.source import find
@@ -237,14 +237,14 @@ def test_a_log_without_an_index_is_fetched_and_read_to_its_end(tmp_path):
 
 
 def test_a_broken_connection_is_made_again(monkeypatch):
-    monkeypatch.setattr(address, "_PAUSES_S", (0.01, 0.01))
+    monkeypatch.setattr(source, "PAUSES_S", (0.01, 0.01))
     with file_server(SAMPLES, broken=2) as server:
         assert messages(UrlPath(f"{server.url}/{MCAP.name}")) == messages(MCAP)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_connections_that_break_while_chunks_are_read_are_made_again_or_one_error(monkeypatch, tmp_path, layout):
-    monkeypatch.setattr(address, "_PAUSES_S", (0.01, 0.01))
+    monkeypatch.setattr(source, "PAUSES_S", (0.01, 0.01))
     drive(tmp_path / "a.mcap", size=8_000_000, **LAYOUTS[layout])
     with file_server(tmp_path) as server:
         container = open_log(UrlPath(f"{server.url}/a.mcap"))
@@ -259,7 +259,7 @@ def test_connections_that_break_while_chunks_are_read_are_made_again_or_one_erro
 
 
 def test_a_connection_that_stays_broken_is_one_line_without_secrets(monkeypatch):
-    monkeypatch.setattr(address, "_PAUSES_S", (0.01, 0.01))
+    monkeypatch.setattr(source, "PAUSES_S", (0.01, 0.01))
     with file_server(SAMPLES, token=TOKEN) as server:
         container = open_log(UrlPath(f"{server.url}/{MCAP.name}?{TOKEN}"))
         server.broken = 10_000

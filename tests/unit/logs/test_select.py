@@ -10,7 +10,7 @@ import pytest
 
 from icrtool.config import load_config
 from icrtool.errors import ConfigError, MissingStreamError
-from icrtool.logs.containers.channel import Channel
+from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.assembly import Survey, assemble
 from icrtool.logs.streams.select import (

@@ -1,0 +1,259 @@
+"""A chunk of an MCAP file or a ROS 1 bag: where it is, what it decompresses to, and where its records begin.
+
+Its stated size is checked before memory is allocated. The index of messages is only a hint. Each record begins where
+the one before it ends, which is checked for all of them at once; records that it lacks are found by following their
+lengths, and so are all records where it is wrong.
+"""
+
+from __future__ import annotations
+
+import bz2
+import zlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import lz4.frame
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from icrtool.kernels.arrays import Bytes, Ints
+
+LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
+"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; four are in memory at a time."""
+
+LARGEST_RATIO = 100
+"""A log may take this many times its size when decompressed, and `FREE_BYTES` more.
+
+Recorded chunks shrink by a factor of 2 to 20, images of one colour by more.
+"""
+
+STORED = ("", "none")
+"""What logs call no compression."""
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+PIECE_BYTES = 1 << 24
+"""Decompressed at once: libraries hold twice as much while they do. Of a message that states no size: at most."""
+
+MOST_ROWS = 1 << 18
+"""Records that are followed at a time."""
+
+_MOST_GAPS = 1 << 8
+"""Between messages of an index, that are followed; where there are more, all records are."""
+
+
+class DecompressionError(Exception):
+    """A chunk that cannot be decompressed; `args[0]` is the reason."""
+
+
+class Space:
+    """Memory that is used again and again: fresh memory of the system costs as much as reading a file into it."""
+
+    def __init__(self) -> None:
+        self._bytes: Bytes = np.empty(0, np.uint8)
+
+    def of(self, size: int) -> Bytes:
+        """Return `size` bytes (size,), the same ones as before where there are as many."""
+        if len(self._bytes) < size:
+            self._bytes = np.empty(size, np.uint8)
+        return self._bytes[:size]
+
+
+class Chunk(NamedTuple):
+    """A chunk in a file, by the index.
+
+    Attributes
+    ----------
+    at, length : where its content is in the file; before a bag's record is read: where that begins, and 0
+    channels : those it holds, None without an entry
+    begin_ns, end_ns : first and last log time in it, 0 where they are not known
+    index_length : of the message index records that follow it, and of what of a bag's record was not read
+    size : of its records, decompressed; -1 where there is no chunk in its place
+    compression : as the log calls it
+    is_cut : the file ends in it: what can be decompressed is not checked
+    """
+
+    at: int
+    length: int = 0
+    channels: frozenset[int] | None = None
+    begin_ns: int = 0
+    end_ns: int = 0
+    index_length: int = 0
+    size: int = 0
+    compression: str = ""
+    is_cut: bool = False
+
+    def is_partly(self, wanted: frozenset[int]) -> bool:
+        """Return whether it holds other channels, too."""
+        return self.channels is not None and not self.channels <= wanted
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether its records can be read one by one."""
+        return self.compression in STORED and self.index_length > 0 and self.size <= self.length
+
+
+class Packed(NamedTuple):
+    """What is compressed in a chunk.
+
+    Attributes
+    ----------
+    compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
+    size : decompressed size stated in the log [bytes]
+    partial : the data is cut off, or `size` is only a part of it: what can be decompressed is wanted
+    checksum : CRC-32 of the decompressed bytes, 0 where that is not checked
+    """
+
+    data: Bytes
+    compression: str
+    size: int
+    partial: bool = False
+    checksum: int = 0
+
+    @property
+    def claimed(self) -> int:
+        """The bytes that it takes when decompressed, as stated."""
+        return len(self.data) if self.compression in STORED else self.size
+
+
+def decompress(packed: Packed, space: Bytes) -> Bytes:
+    """Decompress a chunk.
+
+    Parameters
+    ----------
+    space : for what is decompressed; one byte more than that
+
+    Returns
+    -------
+    uint8, not to be written to; in `space`, in the chunk's data, or in memory of its own.
+
+    Raises
+    ------
+    DecompressionError
+        Damaged data, a size or checksum other than stated, or an unknown compression.
+    """
+    data, compression, size, partial, checksum = packed
+    try:
+        match compression:
+            case "" | "none":
+                out = data
+            case "zstd":
+                # Where the space holds all of a frame, zstd decompresses straight into it.
+                space = space[: size if partial else size + 1]
+                with zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES).stream_reader(data.data) as reader:
+                    out = space[: reader.readinto(space)]
+            case "lz4":
+                out = _in_pieces(lz4.frame.LZ4FrameDecompressor(), data, size)
+            case "bz2":
+                out = _in_pieces(bz2.BZ2Decompressor(), data, size)
+            case _:
+                raise DecompressionError(f"compression {compression!r} is not known")
+    except (OSError, RuntimeError, EOFError, ValueError, MemoryError, zstandard.ZstdError) as err:
+        raise DecompressionError(str(err) or "not enough memory") from err
+    if len(out) != packed.claimed and not partial:
+        raise DecompressionError(f"{len(out)} bytes instead of {size}")
+    if checksum and zlib.crc32(out.data) != checksum:
+        raise DecompressionError("its checksum is wrong")
+    return out
+
+
+def _in_pieces(decoder: Any, data: Bytes, size: int) -> Bytes:  # noqa: ANN401 - of two libraries
+    """Decompress up to `size` bytes and one more, a piece at a time."""
+    piece = decoder.decompress(data, max_length=min(size + 1, PIECE_BYTES))
+    if len(piece) < PIECE_BYTES:
+        return np.frombuffer(piece, np.uint8)
+    out = bytearray(piece)
+    while not decoder.eof and (piece := decoder.decompress(b"", max_length=min(size + 1 - len(out), PIECE_BYTES))):
+        out += piece
+    return np.frombuffer(out, np.uint8)
+
+
+class Inflation:
+    """Limits what the chunks of a log are decompressed to, to a multiple of their size in the file.
+
+    Attributes
+    ----------
+    left : bytes that the next ones may take in addition
+    """
+
+    def __init__(self, left: int = FREE_BYTES) -> None:
+        self.left = left
+
+    def count(self, packed: int, unpacked: int) -> None:
+        """Count what is decompressed [bytes].
+
+        Raises
+        ------
+        DecompressionError
+            It is more than one chunk, or the log, may take.
+        """
+        if unpacked > LARGEST_CHUNK_BYTES:
+            raise DecompressionError(f"it claims {unpacked} bytes")
+        left = self.left + LARGEST_RATIO * packed - unpacked
+        if left < 0:
+            raise DecompressionError(
+                f"it inflates from {packed} to {unpacked} bytes; {LARGEST_RATIO} times are allowed"
+            )
+        self.left = left
+
+
+def unpack_message(data: bytes, compression: str, inflation: Inflation) -> bytes:
+    """Decompress one message, by the name of its compression.
+
+    Raises
+    ------
+    DecompressionError
+    """
+    if compression != "zstd":
+        raise DecompressionError(f"compression {compression!r} is not known")
+    try:
+        size = zstandard.frame_content_size(data)
+        if size >= 0:
+            inflation.count(len(data), size)
+        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=PIECE_BYTES)
+        if size < 0:
+            inflation.count(len(data), len(out))
+    except (zstandard.ZstdError, MemoryError) as err:
+        raise DecompressionError(str(err)) from err
+    return out
+
+
+class Records(NamedTuple):
+    """Records that follow one another.
+
+    Attributes
+    ----------
+    messages : (4, n) channel, log time [ns], begin and end of the content
+    others : operation code, begin, and begin and end of the content of the other ones
+    stop : the first byte behind: an incomplete record, another kind of record, or the end
+    """
+
+    messages: Ints
+    others: list[tuple[int, int, int, int]]
+    stop: int
+
+
+def record_starts(
+    data: Bytes,
+    begin: int,
+    hint: Ints | None,
+    follow: Callable[[memoryview, int, int], tuple[list[int], int]],
+    ends: Callable[[Bytes, Ints], Ints],
+) -> tuple[Ints, int]:
+    """Return where records begin (n,), and the first byte behind them."""
+    view = data.data
+    if hint is not None and 0 < len(hint) <= MOST_ROWS and hint[0] >= begin:
+        first, last = np.append(begin, ends(data, hint)), np.append(hint, len(data))
+        gaps = np.flatnonzero(first != last)
+        if (first <= last).all() and (last[:-1] < first[1:]).all() and len(gaps) <= _MOST_GAPS:
+            found = [follow(view, *gap) for gap in zip(first[gaps].tolist(), last[gaps].tolist(), strict=True)]
+            if all(stop == last[gap] for gap, (_, stop) in zip(gaps, found, strict=True)):
+                others = np.array([at for some, _ in found for at in some], np.int64)
+                return (np.sort(np.append(hint, others)) if len(others) else hint), len(data)
+    starts, stop = follow(view, begin, len(data))
+    return np.array(starts, np.int64), stop
+
+
+def unaligned(data: Bytes, kind: str) -> NDArray[Any]:
+    """Return the value that begins at each byte."""
+    return np.ndarray(max(len(data) - np.dtype(kind).itemsize + 1, 0), kind, data, strides=(1,))
