@@ -21,7 +21,7 @@ from icrtool.output.text_blocks import Line, Table
 
 with when_used():
     from icrtool import config
-    from icrtool.output.tables import configuration
+    from icrtool.output import text_format
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
@@ -65,7 +65,7 @@ def config_command(settings: ConfigSources, output: Path | None) -> None:
       icrtool config --robot husky-a200 -o my-husky.toml
       icrtool fit field.mcap --config my-husky.toml
     """  # noqa: D301 - click reads the escape
-    write_or_print(configuration.format_configuration(settings.load()), output)
+    write_or_print(text_format.format_configuration(settings.load()), output)
 
 
 @click.group("cache")

@@ -1,15 +1,17 @@
-"""Words and numbers as a reader of our figures and tables meets them."""
+"""Words and numbers as a reader of our figures and tables meets them, and a configuration as a file to edit."""
 
 from __future__ import annotations
 
+import json
 import math
 import re
-from collections import Counter
+import textwrap
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
+from icrtool.config import SECTIONS, Config, describe_key, key_texts
 from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import counted, distance_text
 
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
     from icrtool.records.calibration_document import ControllerErrors
     from icrtool.records.run_document import (
         DriveDocument,
-        EventDocument,
         ReferenceJumpDocument,
         RunDocument,
     )
@@ -50,11 +51,6 @@ def role_word(summary: RunDocument, role: Role) -> str:
 def topics_text(topics: str) -> str:
     """Return the topics of a stream, each once."""
     return " + ".join(dict.fromkeys(topics.split(" + ")))
-
-
-def event_kinds(events: Sequence[EventDocument]) -> str:
-    """Return how many slip events there are of each kind, as ``2 skid, 1 spin``."""
-    return ", ".join(f"{count} {kind}" for kind, count in Counter(event.kind for event in events).items())
 
 
 def jump_lines(jumps: Sequence[ReferenceJumpDocument]) -> list[str]:
@@ -109,27 +105,6 @@ def driven_text(drive: DriveDocument) -> str:
     return f"{distance_text(drive.distance_m)} in {duration_text(drive.duration_s)}"
 
 
-AGREES_SIGMAS = 3.0
-"""Two estimates of an ICR agree where they differ by less than so many standard deviations."""
-
-
-def filter_agreement(summary: RunDocument) -> str:
-    """Return where the filter's ICRs ended, and whether they agree with those of the drive; empty without both."""
-    final, final_std = summary.icr.final, summary.icr.final_std
-    ends, apart = [], []
-    for column in ICR_COLUMNS:
-        word = ICR_WORDS[column]
-        at, at_std, of_drive = final[column], final_std[column], summary.icr_of_drive(column)
-        if of_drive is None or at is None or at_std is None:
-            continue
-        value, std = of_drive
-        ends.append(f"{word.removeprefix('y ')} {at:+.3f}")
-        sigmas = abs(at - value) / max(math.hypot(std, at_std), 1e-9)
-        if sigmas > AGREES_SIGMAS:
-            apart.append(f"{word} differs by {sigmas:.1f} σ: the end of the drive is not like the whole")
-    return f"ends at {', '.join(ends)}: {'; '.join(apart) or 'agrees'}" if ends else ""
-
-
 def model_text(fitted: FittedModel) -> str:
     """Return a fitted model as ``three ICRs (3 parameters, model icr)``."""
     return f"{fitted.model.label} ({counted(len(fitted.parameters), 'parameter')}, model {fitted.model.name})"
@@ -155,3 +130,52 @@ def error_text(metres: float | None) -> str:
     if metres is None or not math.isfinite(metres):
         return "-"
     return f"{metres:.{4 if metres < 0.01 else 3 if metres < 1 else 2}f} m"
+
+
+CONFIGURATION_WIDTH = 110
+
+CONFIGURATION_HEAD = """\
+# Configuration of icrtool, for --config FILE.toml; --set section.key=value changes single keys.
+# Each key is shown with its default; remove the # before it and change it. Behind it: its type and bounds.
+"""
+
+
+def format_configuration(config: Config) -> str:
+    """Return all keys as TOML that loads as this `config`: those that have another value than their default are set.
+
+    Notes
+    -----
+    A default is a comment: a key that is set has precedence over what icrtool would find in the log.
+    """
+    texts, document, default = key_texts(), config.effective(), Config().effective()
+    parts = [CONFIGURATION_HEAD]
+    for section, kind in SECTIONS.items():
+        parts.append(f"\n[{section}]\n")
+        for key in (field.name for field in fields(kind)):
+            about, value = texts[section][key], document[section][key]
+            parts += [
+                f"# {line}\n" for line in textwrap.wrap(about["text"], CONFIGURATION_WIDTH, break_long_words=False)
+            ]
+            mark = "#" if value == default[section][key] else ""
+            note = f"{describe_key(section, key)}{'; no default, this is an example' if value is None else ''}"
+            shown = _toml(about["example"] if value is None else value)
+            parts.append(f"{mark}{key} = {shown}  # {note}\n\n")
+        parts[-1] = parts[-1].removesuffix("\n")
+    return "".join(parts)
+
+
+def format_settings(config: Config) -> str:
+    """Return the keys that have a value as TOML, a key a line."""
+    lines = []
+    for section, keys in config.effective().items():
+        lines += [f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in keys.items() if value is not None), ""]
+    return "\n".join(lines)
+
+
+def _toml(value: object) -> str:
+    """Return a value of the configuration as TOML: JSON values are the same there, except the escapes of a text."""
+    if isinstance(value, list):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e6:
+        return f"{value:.1f}"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -23,18 +23,13 @@ from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, ren
 from icrtool.output.run_directory import check_sum
 from icrtool.output.tables.dropout import answer_sections, model_sections, outage_blocks, verdict_lines, worst_section
 from icrtool.output.tables.errors import errors_section, main_rows
-from icrtool.output.tables.run import (
-    advice_blocks,
-    events_section,
-    log_sections,
-    unusable_lines,
-    warnings_section,
-)
-from icrtool.output.text_blocks import PAGE, Block, Facts, Figure, Section, Title
-from icrtool.output.text_format import driven_text, position_word, run_title
+from icrtool.output.tables.run import advice_blocks, log_sections, unusable_lines
+from icrtool.output.text_blocks import PAGE, Block, Facts, Figure, Items, Section, Table, Title
+from icrtool.output.text_format import driven_text, duration_text, position_word, run_title
 from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument, TrialDocument
 from icrtool.records.run import Run, check_type
 from icrtool.records.run_document import EventDocument, RunDocument
+from icrtool.records.text import distance_text
 
 SCRIPTS = (
     "vendor/uPlot.iife.min.js",
@@ -113,15 +108,25 @@ ABOUT = (
 
 def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
-    series, further = Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive"), ("icr_clusters", "outages")
-    drive: list[Block] = [series, *events_section(summary), *outage_blocks(report), Figure(further)]
+    drive: list[Block] = [Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive")]
+    if events := summary.events:
+        rows = []
+        for one in events:
+            times = duration_text(one.begin_s), duration_text(one.end_s - one.begin_s)
+            rows.append((one.kind, *times, distance_text(one.distance_m), f"{100 * one.severity:.0f} %"))
+        head = ("kind", "from", "lasts", "distance", "missing motion")
+        caption = "Slip events: the robot did not move as its wheels did"
+        table = Table("lr", rows, head, caption, [one.begin_s for one in events])
+        drive.append(Section("", [table], PAGE))
+    drive += [*outage_blocks(report), Figure(("icr_clusters", "outages"))]
+    warnings = [one.removeprefix(f"{summary.log}: ") for one in summary.warnings]
     return [
         *unusable_lines(summary), *advice_blocks(summary),
         Section("Answer", answer_sections(summary, report), name="answer"),
         Section("The drive", drive, name="drive"),
         errors_section(report, summary), worst_section(summary, report), *model_sections(report),
         *([Section("Acceptance limits", verdict_lines(report), name="limits")] if report.gates else []),
-        warnings_section(summary),
+        Section("Warnings", [Items(warnings) if warnings else "None."], PAGE, name="warnings"),
     ]  # fmt: skip
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Literal
 
 from msgspec import UNSET
 
@@ -13,8 +12,8 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
 from icrtool.output.exports.controllers import format_export
-from icrtool.output.tables.errors import baseline_sections, errors_section, model_of
-from icrtool.output.tables.run import advice_blocks, number_blocks, numbers_of, run_checks, unusable_lines
+from icrtool.output.tables.errors import baseline_sections, errors_section, label_of, model_of
+from icrtool.output.tables.run import advice_blocks, number_blocks, run_checks, unusable_lines
 from icrtool.output.text_blocks import (
     PAGE,
     VERBOSE,
@@ -23,6 +22,7 @@ from icrtool.output.text_blocks import (
     Checks,
     Facts,
     Figure,
+    Grade,
     Line,
     Section,
     Table,
@@ -32,7 +32,6 @@ from icrtool.output.text_blocks import (
 from icrtool.output.text_format import controller_error_text, duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
-from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
@@ -67,9 +66,12 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     summary : of the run
     report : what report.json holds; null for a number that is not known
     """
+    # How many trials the numbers rest on, at the horizon nearest to `CHOICE_HORIZON_M` that has any.
+    row = min(report.trials, key=lambda one: (not one.trials, abs(one.horizon_m - CHOICE_HORIZON_M)))
+    trials = f"{distance_text(report.run.drive.distance_m)}, {row.trials:,} trials of {row.horizon_m:g} m"
     return [
         *unusable_lines(summary),
-        Title(run_title(summary), _trials_text(report)),
+        Title(run_title(summary), trials),
         *advice_blocks(summary),
         *answer_sections(summary, report),
         *outage_blocks(report),
@@ -86,14 +88,8 @@ def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Secti
         return [unknown, trust_section(summary, report)._replace(depth=VERBOSE)]
     return [
         reach_section(summary, report), numbers_section(summary, report), trust_section(summary, report),
-        *worst_cards(summary, report),
+        *([_worst_card(summary, report)] if report.worst else []),
     ]  # fmt: skip
-
-
-def _trials_text(report: DropoutDocument) -> str:
-    """Return how many trials the numbers rest on, at the horizon nearest to `CHOICE_HORIZON_M` that has any."""
-    row = min(report.trials, key=lambda one: (not one.trials, abs(one.horizon_m - CHOICE_HORIZON_M)))
-    return f"{distance_text(report.run.drive.distance_m)}, {row.trials:,} trials of {row.horizon_m:g} m"
 
 
 def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[list[Row], list[Row]]:
@@ -116,22 +112,16 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
         rows.append(("no slip", "not known", "needs robot.track_width_m (--robot, --set)"))
     if events and best is not None and (quiet := best.without_events_text):
         rows.append((f"without its {counted(events, 'slip event')}", quiet, best.label))
-    return rows, [(one.label, one.short_text, one.interval_text or _between_text(one)) for one in by_model.values()]
+    return rows, [reach_row(one, first=False) for one in by_model.values()]
 
 
-def reach_row(one: BudgetDistance) -> Row:
-    """Return label, distance and note of a model of `REACH_ROWS`."""
-    note = one.interval_text if one.model.startswith("recommended") else ""
-    return (
-        REACH_LABELS.get(one.model, one.label),
-        one.short_text,
-        REACH_NOTES.get(one.model, note or _between_text(one)),
-    )
-
-
-def _between_text(one: BudgetDistance) -> str:
+def reach_row(one: BudgetDistance, *, first: bool = True) -> Row:
+    """Return label, distance and note of a model; an interval stands `first` beside the whole model alone."""
     low, high = one.between_m
-    return f"between {low:g} and {high:g} m" if high - low > NEAR_HORIZONS_M and not one.beyond else ""
+    note = one.interval_text if one.model.startswith("recommended") or not first else ""
+    if not note and high - low > NEAR_HORIZONS_M and not one.beyond:
+        note = f"between {low:g} and {high:g} m"
+    return REACH_LABELS.get(one.model, one.label), one.short_text, REACH_NOTES.get(one.model, note)
 
 
 def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
@@ -155,25 +145,17 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
     return Section("How far without GNSS?", blocks, lead=lead, text=text)
 
 
-def trust(summary: RunDocument, report: DropoutDocument) -> tuple[Literal["good", "care", "bad"], str]:
-    """Return whether the numbers of a report can be trusted, and the reasons for care, one sentence."""
-    if not summary.usable:
-        return "bad", f"no: {summary.unusable_because}"
-    if not report.passed:
-        return "bad", "no: an acceptance limit is not met"
-    reasons = [
-        f"{one.what} {one.text}" for one in run_checks(summary) if one.grade == "care" and one.what != "slip events"
-    ]
+def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
+    """Return whether the numbers of a report can be trusted, the reasons for care, and what was checked."""
+    checks = run_checks(summary)
+    cares = [f"{one.what} {one.text}" for one in checks if one.grade == "care" and one.what != "slip events"]
     if events := summary.events:
         crossed = "trials across them count" if report.without_events is None else "left out"
-        reasons.append(f"{counted(len(events), 'slip event')}, {crossed}")
-    return ("care", f"yes, with care: {'; '.join(reasons)}") if reasons else ("good", "yes")
-
-
-def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
-    """Return whether the numbers can be trusted, and what was checked."""
-    grade, sentence = trust(summary, report)
-    checks = run_checks(summary)
+        cares.append(f"{counted(len(events), 'slip event')}, {crossed}")
+    grade: Grade = "care" if cares else "good"
+    sentence = f"yes, with care: {'; '.join(cares)}" if cares else "yes"
+    if not (summary.usable and report.passed):
+        grade, sentence = "bad", f"no: {summary.unusable_because or 'an acceptance limit is not met'}"
     if summary.warnings:
         checks.append(Check("care", "log", f"{counted(len(summary.warnings), 'warning')} about it"))
     found = Section("", [Checks(sorted(checks, key=lambda one: one.grade != "care"))], VERBOSE)
@@ -185,18 +167,14 @@ def verdict_lines(report: DropoutDocument) -> list[Line]:
     return [Line(one.verdict, "good" if one.passed else "bad") for one in report.gates]
 
 
-def worst_cards(summary: RunDocument, report: DropoutDocument) -> Iterator[Section]:
-    """Yield the worst trial in a sentence, and all of them in a table."""
-    if not report.worst:
-        return
+def _worst_card(summary: RunDocument, report: DropoutDocument) -> Section:
+    """Return the worst trial in a sentence."""
     one = report.worst[0]
     note = _meanwhile(one, summary, report)
     driven = f"{one.horizon_m:g} m from {duration_text(one.t_s)} on"
     turned = f"turning {turn_text(one.heading_change_deg)} at {one.speed_mean_mps:.2f} m/s"
-    text = f"after {driven}, {turned}, with the {_worst_label(report)}"
-    lead = error_text(one.errors_m[one.model])
-    text += f"; meanwhile: {note}" if note else ""
-    yield Section("Where was it worst?", [], lead=lead, text=text, label="Worst")
+    text = f"after {driven}, {turned}, with the {label_of(report, one.model)}{f'; meanwhile: {note}' if note else ''}"
+    return Section("Where was it worst?", [], lead=error_text(one.errors_m[one.model]), text=text, label="Worst")
 
 
 def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
@@ -214,8 +192,8 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
     ]  # fmt: skip
     head = ("", "from", "error", "no slip", "turn", "mean speed", "north", "east", "meanwhile")
     caption = (
-        f"Trials of {first.horizon_m:g} m with the largest error of the {_worst_label(report)} that do not overlap. "
-        "What they share (a speed, a turn, a place) is where the model fails"
+        f"Trials of {first.horizon_m:g} m with the largest error of the {label_of(report, first.model)} that do not "
+        "overlap. What they share (a speed, a turn, a place) is where the model fails"
     )
     moments = [one.t_s for one in report.worst]
     blocks: list[Block] = [Table("lrrrrrrrl", rows[:1], head, caption, moments[:1])]
@@ -223,12 +201,6 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
         further = Table("lrrrrrrrl", rows[1:], head, "", moments[1:])
         blocks.append(Section(f"The next {len(rows) - 1}", [further], PAGE))
     return Section("Worst cases", [*blocks, Figure(("worst",))], PAGE, name="worst")
-
-
-def _worst_label(report: DropoutDocument) -> str:
-    """Return the label of the model that the worst trials are of; in earlier versions the momentary ICRs."""
-    found = model_of(report, report.worst[0].model)
-    return found.label if found is not None else report.worst[0].model
 
 
 def _meanwhile(one: TrialDocument, summary: RunDocument, report: DropoutDocument) -> str:
@@ -303,16 +275,14 @@ def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Tab
 
 def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:
     """Return what a controller is given, the error with these numbers alone, and its configuration."""
-    width_m = summary.config.robot.track_width_m
-    blocks = number_blocks(summary)
-    if report.recommended is not None and width_m is not None:
-        calibration = stored_calibration(report.recommended)
-        icrs = [summary.icr_of_drive(column) for column in ICR_COLUMNS]
-        blocks = numbers_of(calibration.controller, width_m, icrs)
-        if alone := controller_error_text(calibration.controller_errors):
-            blocks.append(alone)
-        with suppress(DataError):
-            text = format_export(calibration, "diff_drive_controller")
-            other = "Other controllers: icrtool export --for clearpath RUN"
-            blocks.append(Section("As a diff_drive_controller takes them", [Line(text, "as is"), other], PAGE))
+    if report.recommended is None or summary.config.robot.track_width_m is None:
+        return Section("Which numbers into the controller?", number_blocks(summary), VERBOSE)
+    calibration = stored_calibration(report.recommended)
+    blocks = number_blocks(summary, calibration.controller)
+    if alone := controller_error_text(calibration.controller_errors):
+        blocks.append(alone)
+    with suppress(DataError):
+        text = format_export(calibration, "diff_drive_controller")
+        other = "Other controllers: icrtool export --for clearpath RUN"
+        blocks.append(Section("As a diff_drive_controller takes them", [Line(text, "as is"), other], PAGE))
     return Section("Which numbers into the controller?", blocks, VERBOSE)

@@ -13,7 +13,7 @@ from icrtool.kernels.error_statistics import difference_half_width
 from icrtool.output.text_blocks import VERBOSE, Block, Cell, Figure, Items, Section, Table
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, METRICS
-from icrtool.records.dropout_document import DropoutDocument, ErrorRow, ModelDocument, column_of
+from icrtool.records.dropout_document import DropoutDocument, ModelDocument, column_of
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
@@ -50,13 +50,15 @@ def shown_horizons(horizons_m: Floats) -> list[int]:
     return sorted(set(nearest))
 
 
-def _shown(report: DropoutDocument) -> list[int]:
-    return shown_horizons(np.array([row.horizon_m for row in report.trials]))
-
-
 def model_of(report: DropoutDocument, name: str) -> ModelDocument | None:
     """Return a model of a report; None where it was not computed."""
     return next((one for one in report.models if one.name == name), None)
+
+
+def label_of(report: DropoutDocument, name: str) -> str:
+    """Return what a model of a report is called: its name where it was not computed."""
+    found = model_of(report, name)
+    return name if found is None else found.label
 
 
 def main_rows(report: DropoutDocument) -> set[str]:
@@ -75,124 +77,107 @@ def in_order(models: Sequence[ModelDocument]) -> list[ModelDocument]:
 
 def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     """Return the errors over distance: what counts first, then all of them, and what they rest on."""
-    heads = [f"{report.trials[h].horizon_m:g} m" for h in _shown(report)]
+    shown = shown_horizons(np.array([row.horizon_m for row in report.trials]))
+    counts = [report.trials[h] for h in shown]
     main, models = main_rows(report), in_order(report.models)
-    rows = [_error_row(one.label, one.by_horizon, report) for one in models if one.name in main]
-    others = [_error_row(one.label, one.by_horizon, report) for one in models if one.name not in main]
-    head = ("distance without GNSS", "", *heads)
+    rows = [_error_row(one, shown) for one in models if one.name in main]
+    others = [_error_row(one, shown) for one in models if one.name not in main]
+    rows.append(["trials", "", *(f"{row.trials:,}" for row in counts)])
+    head = ("distance without GNSS", "", *(f"{row.horizon_m:g} m" for row in counts))
     further: list[Block] = []
     if others:
         further.append(Section(f"Other models ({len(others)})", [Table("llr", others, head)], VERBOSE))
-    rows.append(["trials", "", *(f"{report.trials[h].trials:,}" for h in _shown(report))])
-    rests = Table("llr", [*_reference_rows(report), *_ratio_rows(report), *_count_rows(report)], head)
-    sentences = [*_fitted_lines(report), *_reference_lines(report), *_count_lines(report, summary)]
-    further.append(
-        Section("What the errors rest on", [rests, *sentences, *_learned_blocks(report), *_turning(report)], VERBOSE)
-    )
+    sentences = [*_source_lines(report), *_count_lines(report, summary)]
+    rests = [Table("llr", list(_other_rows(report, shown)), head), *sentences, *_learned_blocks(report, shown)]
+    for split in report.by_turning:
+        kind = "straight" if split.straight else "turning"
+        errors = ", ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in split.expected_m.items())
+        rests.append(f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)")
     return Section(
         "Error over distance without GNSS",
-        [Figure(("summary",), "errors"), Table("llr", rows, head), *further, Figure(("histogram", "examples"))],
+        [
+            Figure(("summary",), "errors"),
+            Table("llr", rows, head),
+            *further,
+            Section("What the errors rest on", rests, VERBOSE),
+            Figure(("histogram", "examples")),
+        ],
         name="errors",
-    )  # fmt: skip
+    )
 
 
-def _error_row(label: str, by_horizon: Sequence[ErrorRow], report: DropoutDocument) -> list[str | Cell]:
+def _error_row(model: ModelDocument, shown: Sequence[int]) -> list[str | Cell]:
     """Return 95 %, its interval and the expected error of a model."""
     cells = []
-    for h in _shown(report):
-        row = by_horizon[h]
-        more = (_span_text(row), _with_share(row.expected_error_m, row.horizon_m))
-        cells.append(Cell(error_text(row.p95_m), _share(row.p95_m, row.horizon_m), more))
-    kinds = Cell("95 %", more=("interval", "expected"))
-    return [shortened(label, LONGEST_LABEL), kinds, *cells]
+    for row in (model.by_horizon[h] for h in shown):
+        low, high = row.p95_low_m, row.p95_high_m
+        interval = "too short" if low is None else f"{error_text(low).removesuffix(' m')}-{error_text(high)}"
+        cells.append(_error_cell(row.horizon_m, row.p95_m, row.expected_error_m, interval))
+    return [shortened(model.label, LONGEST_LABEL), Cell("95 %", more=("interval", "expected")), *cells]
 
 
-def _share(error_m: float | None, horizon_m: float) -> str:
-    return "-" if error_m is None else f"{100 * error_m / horizon_m:.1f} %"
+def _error_cell(horizon_m: float, p95_m: float | None, expected_m: float | None, *interval: str) -> Cell:
+    """Return 95 % and the expected error, each with its share of the distance, and between them an interval."""
+    share, expected_share = ("-" if one is None else f"{100 * one / horizon_m:.1f} %" for one in (p95_m, expected_m))
+    return Cell(error_text(p95_m), share, (*interval, f"{error_text(expected_m)} {expected_share:>7}"))
 
 
-def _with_share(error_m: float | None, horizon_m: float) -> str:
-    return f"{error_text(error_m)} {_share(error_m, horizon_m):>7}"
-
-
-def _span_text(row: ErrorRow) -> str:
-    low, high = getattr(row, "p95_low_m", None), getattr(row, "p95_high_m", None)
-    return "too short" if low is None else f"{error_text(low).removesuffix(' m')}-{error_text(high)}"
-
-
-def _reference_rows(report: DropoutDocument) -> Iterator[list[str | Cell]]:
-    """Yield what a perfect model would show."""
+def _other_rows(report: DropoutDocument, shown: Sequence[int]) -> Iterator[list[str | Cell]]:
+    """Yield what a perfect model would show, what the ICRs gain, and why starts gave no trial."""
+    kinds, icr, no_slip = Cell("95 %", more=("expected",)), model_of(report, "icr"), model_of(report, "no_slip")
     if any(row.p95_m is not None for row in report.reference_error):
-        cells = [
-            Cell(error_text(row.p95_m), _share(row.p95_m, row.horizon_m),
-                 (_with_share(row.expected_m, row.horizon_m),))
-            for row in (report.reference_error[h] for h in _shown(report))
-        ]  # fmt: skip
-        yield ["reference alone", Cell("95 %", more=("expected",)), *cells]
-
-
-def _ratio_rows(report: DropoutDocument) -> Iterator[list[str | Cell]]:
-    icr, no_slip = model_of(report, "icr"), model_of(report, "no_slip")
-    if icr is None or no_slip is None:
-        return
-    cells = []
-    for h in _shown(report):
-        ours, theirs = icr.by_horizon[h], no_slip.by_horizon[h]
-        p95, expected = (
-            f"{over / under:.1f} x" if over is not None and under else "-"
-            for over, under in (
-                (theirs.p95_m, ours.p95_m), (theirs.expected_error_m, ours.expected_error_m),
-            )
-        )  # fmt: skip
-        cells.append(Cell(p95, more=(expected,)))
-    yield ["no slip / ICR", Cell("95 %", more=("expected",)), *cells]
-
-
-def _count_rows(report: DropoutDocument) -> Iterator[list[str | Cell]]:
-    """Yield why starts gave no trial."""
-    shown = [report.trials[h] for h in _shown(report)]
+        own = (report.reference_error[h] for h in shown)
+        yield ["reference alone", kinds, *(_error_cell(row.horizon_m, row.p95_m, row.expected_m) for row in own)]
+    if icr is not None and no_slip is not None:
+        cells = []
+        for ours, theirs in ((icr.by_horizon[h], no_slip.by_horizon[h]) for h in shown):
+            pairs = (theirs.p95_m, ours.p95_m), (theirs.expected_error_m, ours.expected_error_m)
+            p95, expected = (f"{over / under:.1f} x" if over is not None and under else "-" for over, under in pairs)
+            cells.append(Cell(p95, more=(expected,)))
+        yield ["no slip / ICR", kinds, *cells]
     for key, label in NO_TRIAL.items():
-        counts = [row.no_trial.get(key, 0) for row in shown]
+        counts = [report.trials[h].no_trial.get(key, 0) for h in shown]
         if any(counts):
             yield [label, "", *(f"{count:,}" for count in counts)]
 
 
-def _fitted_lines(report: DropoutDocument) -> list[str]:
-    """Return what the numbers of each model were learned from, those of calibrations in detail."""
+def _source_lines(report: DropoutDocument) -> Iterator[str]:
+    """Yield what the numbers of each model were learned from, and how much can be the reference's own error."""
     learned: dict[str, list[str]] = {}
     for one in report.models:
         learned.setdefault(one.knows, []).append(one.label)
-    lines = [f"learned from {knows}: {'; '.join(labels)}" for knows, labels in learned.items()]
-    return lines + [
-        f"{one.label}: {one.model} from {counted(one.logs, 'log')}, {one.created[:10]}, {one.fitted}"
-        for one in report.calibrations
-    ]
-
-
-def _reference_lines(report: DropoutDocument) -> list[str]:
-    """Return how much of the momentary ICRs' error can be the reference's own."""
+    yield from (f"learned from {knows}: {'; '.join(labels)}" for knows, labels in learned.items())
+    for used in report.calibrations:
+        yield f"{used.label}: {used.model} from {counted(used.logs, 'log')}, {used.created[:10]}, {used.fitted}"
     known, icr = [row for row in report.reference_error if row.p95_m is not None], model_of(report, "icr")
-    if not known or icr is None:
-        return []
-    own = min(known, key=lambda row: abs(row.horizon_m - CHOICE_HORIZON_M))
-    whole = next(row.p95_m for row in icr.by_horizon if row.horizon_m == own.horizon_m)
-    what = f"the {error_text(whole)} of the momentary ICRs (95 %, {own.horizon_m:g} m)"
-    return [f"up to {error_text(own.p95_m)} of {what} can be the error of the position reference"]
+    if known and icr is not None:
+        own = min(known, key=lambda row: abs(row.horizon_m - CHOICE_HORIZON_M))
+        whole = next(row.p95_m for row in icr.by_horizon if row.horizon_m == own.horizon_m)
+        what = f"the {error_text(whole)} of the momentary ICRs (95 %, {own.horizon_m:g} m)"
+        yield f"up to {error_text(own.p95_m)} of {what} can be the error of the position reference"
 
 
-def _count_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
+def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]:
+    """Yield which trials count, what slip events cost, and why horizons are empty."""
     reference = "; compared with the smoothed trajectory" if report.smoothed else ""
     moving = "moving " if report.starts_counted == "moving" else ""
-    lines = [f"a trial from each {moving}state of {report.starts:,}, by wheel speeds alone{reference}"]
+    yield f"a trial from each {moving}state of {report.starts:,}, by wheel speeds alone{reference}"
     if model_of(report, "no_slip") is None:
-        lines.append("no slip is left out: robot.track_width_m is not known")
+        yield "no slip is left out: robot.track_width_m is not known"
     if report.starts_standing > NOTED_STANDING * report.starts:
         share = 100 * report.starts_standing / report.starts
         each = "each standstill is one start" if moving else "each is a start (--starts all)"
-        lines.append(f"the robot stood at {share:.0f} % of the states: {each}")
+        yield f"the robot stood at {share:.0f} % of the states: {each}"
     if summary.reference_jumps and report.with_jumps:
-        lines.append("trials across jumps of the reference count")
-    return [*lines, *_event_lines(report, summary), *_empty_lines(report)]
+        yield "trials across jumps of the reference count"
+    yield from _event_lines(report, summary)
+    horizons: dict[str, list[str]] = {}
+    for row in report.trials:
+        if row.why_none is not None:
+            horizons.setdefault(row.why_none, []).append(f"{row.horizon_m:g}")
+    for why, lengths in horizons.items():
+        span = ", ".join(lengths) if len(lengths) <= LISTED_HORIZONS else f"{lengths[0]} to {lengths[-1]}"
+        yield f"no trial of {span} m: {why}"
 
 
 def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
@@ -219,22 +204,9 @@ def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
     return [f"{left_out}: ICR after {after.horizon_m:g} m 95 % {errors} ({crossing:,} trials cross one)"]
 
 
-def _empty_lines(report: DropoutDocument) -> list[str]:
-    """Return a line for each reason why horizons are empty."""
-    horizons: dict[str, list[str]] = {}
-    for row in report.trials:
-        if row.why_none is not None:
-            horizons.setdefault(row.why_none, []).append(f"{row.horizon_m:g}")
-    lines = []
-    for why, lengths in horizons.items():
-        span = ", ".join(lengths) if len(lengths) <= LISTED_HORIZONS else f"{lengths[0]} to {lengths[-1]}"
-        lines.append(f"no trial of {span} m: {why}")
-    return lines
-
-
-def _learned_blocks(report: DropoutDocument) -> Iterator[Block]:
+def _learned_blocks(report: DropoutDocument, shown: Sequence[int]) -> Iterator[Block]:
     """Yield the errors of the momentary ICRs before and after the ICRs were first learned."""
-    split, shown = report.by_learning, _shown(report)
+    split = report.by_learning
     if split is None:
         return
     if split.learned_s is None or split.learned_at_distance_m is None:
@@ -242,26 +214,14 @@ def _learned_blocks(report: DropoutDocument) -> Iterator[Block]:
         return
     if not any(split.before[h].trials for h in shown):
         return
-    rows = [
-        [name, *(f"{_bare(row.p95_m)} / {_bare(row.expected_error_m)}" if row.trials else "-" for row in part)]
-        for name, part in (
-            ("  before", [split.before[h] for h in shown]), ("  after", [split.after[h] for h in shown]),
-        )
-    ]  # fmt: skip
+    rows = []
+    for name, part in (("  before", split.before), ("  after", split.after)):
+        errors = ((error_text(part[h].p95_m), error_text(part[h].expected_error_m)) for h in shown)
+        cells = [" / ".join(error.removesuffix(" m") for error in pair) for pair in errors]
+        rows.append([name, *(cell if part[h].trials else "-" for cell, h in zip(cells, shown, strict=True))])
     when = f"{duration_text(split.learned_s)}, {distance_text(split.learned_at_distance_m)}"
     caption = f"ICR, momentary, before and after the ICRs were first learned ({when}): 95 % / expected [m]"
     yield Table("lr", rows, ("", *(f"{report.trials[h].horizon_m:g} m" for h in shown)), caption)
-
-
-def _bare(metres: float | None) -> str:
-    return error_text(metres).removesuffix(" m")
-
-
-def _turning(report: DropoutDocument) -> Iterator[str]:
-    for split in report.by_turning:
-        kind = "straight" if split.straight else "turning"
-        errors = ", ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in split.expected_m.items())
-        yield f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)"
 
 
 def baseline_sections(report: DropoutReport) -> Iterator[Section]:

@@ -12,7 +12,7 @@ from icrtool.config import Config
 from icrtool.errors import IcrToolError
 from icrtool.logs.describe import SurveyDocument, SurveyedSource, SurveyedTopic
 from icrtool.logs.streams.wheel_pairs import topic_of_side
-from icrtool.output.tables.run import Row, copied, excitation_row, gravest
+from icrtool.output.tables.run import Row, excitation_check, gravest, next_line
 from icrtool.output.text_blocks import VERBOSE, Block, Facts, Section, Table
 from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
@@ -56,7 +56,10 @@ def info_blocks(
     """
     decision, good = verdict(run, problem, names), run is not None and run.usable
     rows = [*_holds_rows(names[0], survey, log), *(overview_rows(log, run) if log is not None else [])]
-    rows += [excitation_row(run)] if run is not None else []
+    if run is not None:
+        # Its advice is among the warnings.
+        _, what, text, more = excitation_check(run.document)
+        rows.append((what, "; ".join((text, *more))))
     rows += _topic_rows(survey, log)
     warnings = run.warnings if run is not None else log.warnings if log is not None else ()
     rows += [("warnings", gravest(warnings, names[0]))] if warnings else []
@@ -67,7 +70,7 @@ def info_blocks(
         )
         rows.append(("missing", missing))
     answer = Section("", [], lead=decision, label="verdict", grade="good" if good else "bad")
-    last: list[Block] = [copied("next", command)] if command is not None else []
+    last: list[Block] = [next_line(command)] if command is not None else []
     return [answer, Facts(rows), *last, *_survey_sections(names[1], survey, log)]
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import shlex
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -10,7 +12,6 @@ import numpy as np
 from icrtool.alignment.corrections import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.observability import lacking_turns
-from icrtool.output.tables.configuration import format_settings
 from icrtool.output.text_blocks import (
     BRIEF_WIDTH,
     PAGE,
@@ -19,7 +20,6 @@ from icrtool.output.text_blocks import (
     Check,
     Checks,
     Facts,
-    Items,
     Line,
     Section,
     Table,
@@ -29,8 +29,7 @@ from icrtool.output.text_blocks import (
 from icrtool.output.text_format import (
     duration_text,
     error_text,
-    event_kinds,
-    filter_agreement,
+    format_settings,
     jump_count,
     position_word,
     role_word,
@@ -63,6 +62,9 @@ SMALLEST_OFFSET_DEG = 0.05
 NOT_SHOWN_WORDS = {"weak": "weak: found roughly", "not shown": "not shown: cannot be found"}
 """What is printed beside an ICR, by the verdict of `find_excitation`."""
 
+AGREES_SIGMAS = 3.0
+"""Two estimates of an ICR agree where they differ by less than so many standard deviations."""
+
 LONGEST_TOPIC = 60
 """Characters of the topics of a stream in a sentence."""
 
@@ -91,7 +93,12 @@ def run_blocks(summary: RunDocument) -> list[Block]:
         blocks.append(Line(shown, "good" if summary.usable else "as is"))
     if summary.usable:
         blocks += number_blocks(summary)
-    found = [("corrected", "; ".join(corrections(summary))), ("inputs", "; ".join(_inputs(summary)))]
+    roles: dict[str, list[str]] = {}
+    for stream in summary.streams:
+        topics = shortened(topics_text(stream.topic), LONGEST_TOPIC)
+        roles.setdefault(topics, []).append("position" if stream.role == "gnss" else stream.role)
+    inputs = "; ".join(f"{topic} ({', '.join(taken)})" for topic, taken in roles.items())
+    found = [("corrected", "; ".join(corrections(summary))), ("inputs", inputs)]
     return [
         *blocks, Checks(run_checks(summary)), Facts([(label, text) for label, text in found if text]),
         *log_sections(summary),
@@ -101,7 +108,13 @@ def run_blocks(summary: RunDocument) -> list[Block]:
 def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
     """Return where a run was written, and what to do next; `examine`: command that names what is wrong in its log."""
     command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
-    return [Section("", [Facts([("written to", place)]), *(advice_blocks(summary) or [copied("next", command)])])]
+    following = advice_blocks(summary) or [next_line(command)]
+    return [Section("", [Facts([("written to", place)]), *following])]
+
+
+def next_line(command: str) -> Line:
+    """Return the command to run next on one line, however long: it is copied."""
+    return Line(f"{'next':12}{command}", "as is")
 
 
 def advice_blocks(summary: RunDocument) -> list[Block]:
@@ -115,11 +128,6 @@ def unusable_lines(summary: RunDocument) -> list[Line]:
     return [] if summary.usable else [Line(f"Do not use: {summary.unusable_because}", "bad")]
 
 
-def copied(label: str, command: str) -> Line:
-    """Return a command on one line, however long: it is copied."""
-    return Line(f"{label:12}{command}", "as is")
-
-
 def gravest(warnings: Sequence[str], log: str) -> str:
     """Return how many warnings there are and the gravest: the first that nothing was done about; none: empty."""
     plain = [one.removeprefix(f"{log}: ") for one in warnings]
@@ -127,17 +135,17 @@ def gravest(warnings: Sequence[str], log: str) -> str:
     return f"{counted(len(plain), 'warning')} (-v), first: {first}" if len(plain) > 1 else first
 
 
-def number_blocks(summary: RunDocument) -> list[Block]:
-    """Return what a controller is given, and the ICRs that it comes from."""
-    width_m, numbers = summary.config.robot.track_width_m, summary.controller
-    icrs = [summary.icr_of_drive(column) for column in ICR_COLUMNS]
+def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None) -> list[Block]:
+    """Return what a controller is given, by the run or as `fitted`, and the ICRs that it comes from."""
+    width_m, icrs = summary.config.robot.track_width_m, [summary.icr_of_drive(column) for column in ICR_COLUMNS]
+    numbers = fitted or summary.controller
     if width_m is not None and numbers is not None:
         return numbers_of(numbers, width_m, icrs)
-    unknown = [ICR_WORDS[name] for name in ICR_COLUMNS[:2] if summary.icr_of_drive(name) is None]
-    why = f"no multiplier: {' and '.join(unknown) or 'the ICRs'} could not be found"
-    if width_m is None:
-        why = "no multiplier and no no-slip model: robot.track_width_m is not known (--robot, --set)"
-    return [Facts([("controller", why), ("ICRs [m]", icrs_text(icrs))])]
+    why = "no multiplier and no no-slip model: robot.track_width_m is not known (--robot, --set)"
+    if width_m is not None:
+        unknown = [ICR_WORDS[name] for name, icr in zip(ICR_COLUMNS[:2], icrs, strict=False) if icr is None]
+        why = f"no multiplier: {' and '.join(unknown) or 'the ICRs'} could not be found"
+    return [Facts([("controller", why), _icr_row(icrs)])]
 
 
 def numbers_of(numbers: ControllerNumbers, width_m: float, icrs: Sequence[tuple[float, float] | None]) -> list[Block]:
@@ -149,21 +157,17 @@ def numbers_of(numbers: ControllerNumbers, width_m: float, icrs: Sequence[tuple[
         ("left, right wheel radius", f"{radii} ± {std:.3f} of the configured"),
     ]
     without = f"(right - left) / {width_m:g} m is the multiplier; without slip: ±{width_m / 2:.3g} m"
-    return [Facts(rows, "controller"), Facts([("ICRs [m]", icrs_text(icrs)), ("", without)])]
+    return [Facts(rows, "controller"), Facts([_icr_row(icrs), ("", without)])]
 
 
-def icrs_text(icrs: Sequence[tuple[float, float] | None]) -> str:
-    """Return the three ICRs, each with its standard deviation."""
-    rows = zip(ICR_WORDS.values(), icrs, strict=True)
-    return ", ".join(f"{word.removeprefix('y ')} {icr_text(*(found or (None, None)))}" for word, found in rows)
+def _icr_row(icrs: Sequence[tuple[float, float] | None]) -> Row:
+    found = zip(ICR_WORDS.values(), icrs, strict=True)
+    return "ICRs [m]", ", ".join(f"{word.removeprefix('y ')} {icr_text(*(icr or (None, None)))}" for word, icr in found)
 
 
 def run_checks(summary: RunDocument) -> list[Check]:
     """Return what was checked of a run, each with its finding and its details."""
-    found = []
-    if agreement := filter_agreement(summary):
-        found.append(Check("good" if agreement.endswith("agrees") else "care", "EKF", agreement))
-    found.append(excitation_check(summary))
+    found = [*_filter_check(summary), excitation_check(summary)]
     found += [*_fix_checks(summary), *_heading_checks(summary), *_delay_checks(summary)]
     if spans := summary.outages_ns:
         away = duration_text(sum(end - begin for begin, end in spans) / 1e9)
@@ -171,12 +175,32 @@ def run_checks(summary: RunDocument) -> list[Check]:
         cause = (f"{lost} by loss of RTK",) if lost else ()
         found.append(Check("care", "outages", f"{len(spans)}, {away} in all", cause))
     if events := summary.events:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(event.kind for event in events).items())
         worst = max(events, key=lambda event: (event.end_s - event.begin_s) * event.severity)
         lasted = duration_text(worst.end_s - worst.begin_s)
         missed = f"{100 * worst.severity:.0f} % of the wheels' motion missed"
         most = f"worst: {worst.kind} from {worst.begin_s:.1f} s for {lasted}, {missed}"
-        found.append(Check("care", "slip events", f"{event_kinds(events)}; left out of the fit", (most,)))
+        found.append(Check("care", "slip events", f"{kinds}; left out of the fit", (most,)))
     return found
+
+
+def _filter_check(summary: RunDocument) -> Iterator[Check]:
+    """Yield where the filter's ICRs ended, and whether they agree with those of the drive, as far as both are known."""
+    final, final_std = summary.icr.final, summary.icr.final_std
+    ends, apart = [], []
+    for column in ICR_COLUMNS:
+        word = ICR_WORDS[column]
+        at, at_std, of_drive = final[column], final_std[column], summary.icr_of_drive(column)
+        if of_drive is None or at is None or at_std is None:
+            continue
+        value, std = of_drive
+        ends.append(f"{word.removeprefix('y ')} {at:+.3f}")
+        sigmas = abs(at - value) / max(math.hypot(std, at_std), 1e-9)
+        if sigmas > AGREES_SIGMAS:
+            apart.append(f"{word} differs by {sigmas:.1f} σ: the end of the drive is not like the whole")
+    if ends:
+        text = f"ends at {', '.join(ends)}: {'; '.join(apart) or 'agrees'}"
+        yield Check("care" if apart else "good", "EKF", text)
 
 
 def excitation_check(summary: RunDocument) -> Check:
@@ -196,12 +220,6 @@ def excitation_check(summary: RunDocument) -> Check:
     # what was lacking stands beside the ICRs; what to drive, alone
     lacks = drive.rpartition(": ")[2]
     return Check("care", "excitation", f"{words}{f': {lacks}' if lacks else ''}", more)
-
-
-def excitation_row(run: Run) -> Row:
-    """Return what the drive could show of the ICRs, with its turns; advice is among the warnings."""
-    _, what, text, more = excitation_check(run.document)
-    return what, "; ".join((text, *more))
 
 
 def _fix_checks(summary: RunDocument) -> Iterator[Check]:
@@ -284,15 +302,6 @@ def corrections(summary: RunDocument) -> list[str]:
     return found
 
 
-def _inputs(summary: RunDocument) -> list[str]:
-    """Return the topics, each once, with what was taken from it."""
-    roles: dict[str, list[str]] = {}
-    for stream in summary.streams:
-        topics = shortened(topics_text(stream.topic), LONGEST_TOPIC)
-        roles.setdefault(topics, []).append("position" if stream.role == "gnss" else stream.role)
-    return [f"{topic} ({', '.join(taken)})" for topic, taken in roles.items()]
-
-
 def to_drive(summary: RunDocument) -> str:
     """Return what to drive to find the ICRs that a run does not show; empty where turns would not help."""
     excitation = summary.excitation
@@ -304,33 +313,32 @@ def to_drive(summary: RunDocument) -> str:
 def log_sections(summary: RunDocument) -> list[Block]:
     """Return what was read, and what the filter and the alignment made of it."""
     speed = f"{summary.drive.speed_mean_mps:.2f} ± {summary.drive.speed_std_mps:.2f} m/s (mean ± std)"
-    tables: list[Block] = [f"The robot drove at {speed}.", _stream_table(summary), _icr_table(summary)]
+    streams, alignment = [], []
+    for stream in summary.streams:
+        message_type = stream.message_type.replace("/msg/", "/")
+        rate = f"{stream.rate_hz:.1f} Hz" if stream.rate_hz is not None else "unknown"
+        names = (role_word(summary, stream.role), topics_text(stream.topic), message_type)
+        streams.append((*names, rate, f"{stream.count:,}", stream.clock))
+    head = ("stream", "topic", "type", "rate", "samples", "clock")
+    tables: list[Block] = [f"The robot drove at {speed}.", Table("lllrrl", streams, head), *_icr_tables(summary)]
+    why: list[Block] = [Facts([(role_word(summary, one.role), one.why) for one in summary.streams])]
+    for name, one in summary.alignment.items():
+        std = f" ± {one.std:.4f}" if one.std is not None else ""
+        value = "–" if one.value is None else f"{one.value:.4f}{std}"
+        alignment.append((name, value, f"{one.applied:.4f}" if one.applied else "–", one.why))
+    if alignment:
+        caption = "Alignment of the streams: what was found and corrected"
+        why.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
     return [
-        Section("Streams, filter", [*tables, *_terrain_table(summary)], VERBOSE),
-        Section("Why these streams, and what was found of them", [_why_facts(summary), *_alignment(summary)], PAGE),
+        Section("Streams, filter", tables, VERBOSE),
+        Section("Why these streams, and what was found of them", why, PAGE),
         Section("Configuration that the run was made with", [Line(format_settings(summary.config), "as is")], PAGE),
     ]
 
 
-def _why_facts(summary: RunDocument) -> Facts:
-    return Facts([(role_word(summary, one.role), one.why) for one in summary.streams])
-
-
-def _stream_table(summary: RunDocument) -> Table:
-    rows = []
-    for one in summary.streams:
-        type_name, hz = one.message_type.replace("/msg/", "/"), one.rate_hz
-        rate = f"{hz:.1f} Hz" if hz is not None else "unknown"
-        rows.append(
-            (role_word(summary, one.role), topics_text(one.topic), type_name, rate, f"{one.count:,}", one.clock)
-        )
-    return Table("lllrrl", rows, ("stream", "topic", "type", "rate", "samples", "clock"))
-
-
-def _icr_table(summary: RunDocument) -> Table:
-    """Return the ICRs of the drive, and how those of the filter converged."""
-    icr, verdicts = summary.icr, summary.excitation.verdict
-    rows = []
+def _icr_tables(summary: RunDocument) -> Iterator[Table]:
+    """Yield the ICRs of the drive, how those of the filter converged, and those between the terrain changes."""
+    icr, rows = summary.icr, []
     for column in ICR_COLUMNS:
         found = icr_text(*(summary.icr_of_drive(column) or (None, None)))
         mean, std, time_s = icr.mean[column], icr.std[column], icr.convergence_s[column]
@@ -339,52 +347,14 @@ def _icr_table(summary: RunDocument) -> Table:
             continue
         convergence = f"{time_s:.1f} s" if time_s is not None else "none"
         final = icr_text(icr.final[column], icr.final_std[column])
-        verdict = NOT_SHOWN_WORDS.get(verdicts[column], "")
+        verdict = NOT_SHOWN_WORDS.get(summary.excitation.verdict[column], "")
         rows.append((ICR_WORDS[column], found, final, convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
-    head = ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", "")
-    return Table("l", rows, head)
-
-
-def _terrain_table(summary: RunDocument) -> Iterator[Table]:
-    """Yield the ICRs between the terrain changes."""
-    rows = []
+    yield Table("l", rows, ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", ""))
+    segments = []
     for number, segment in enumerate(summary.segments, start=1):
-        mean, std = segment.mean, segment.std
-        icrs = (f"{mean[c]:+.3f} ± {std[c]:.3f}" if mean[c] is not None else "no states" for c in ICR_COLUMNS)
-        rows.append((f"  {number}", f"{segment.begin_s:.1f} s", *icrs))
-    if rows:
-        yield Table("lrl", rows, ("segment", "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS)))
-
-
-def _alignment(summary: RunDocument) -> Iterator[Table]:
-    """Yield what the alignment found and corrected."""
-    rows = []
-    for name, one in summary.alignment.items():
-        std = f" ± {one.std:.4f}" if one.std is not None else ""
-        value = "–" if one.value is None else f"{one.value:.4f}{std}"
-        applied = f"{one.applied:.4f}" if one.applied else "–"
-        rows.append((name, value, applied, one.why))
-    if rows:
-        head = ("estimate", "value ± σ", "applied", "why")
-        yield Table("lrrl", rows, head, "Alignment of the streams: what was found and corrected")
-
-
-def warnings_section(summary: RunDocument) -> Section:
-    """Return the warnings of a run, for a page: a command prints them on stderr."""
-    found: list[Block] = [Items([one.removeprefix(f"{summary.log}: ") for one in summary.warnings])]
-    return Section("Warnings", found if summary.warnings else ["None."], PAGE, name="warnings")
-
-
-def events_section(summary: RunDocument) -> list[Section]:
-    """Return the slip events one by one, for a page; without any: no section."""
-    rows = [
-        (one.kind, duration_text(one.begin_s), duration_text(one.end_s - one.begin_s), distance_text(one.distance_m),
-         f"{100 * one.severity:.0f} %")
-        for one in summary.events
-    ]  # fmt: skip
-    if not rows:
-        return []
-    head = ("kind", "from", "lasts", "distance", "missing motion")
-    moments = [one.begin_s for one in summary.events]
-    caption = "Slip events: the robot did not move as its wheels did"
-    return [Section("", [Table("lr", rows, head, caption, moments)], PAGE)]
+        icrs = [(segment.mean[column], segment.std[column]) for column in ICR_COLUMNS]
+        texts = (icr_text(*icr) if icr[0] is not None else "no states" for icr in icrs)
+        segments.append((f"  {number}", f"{segment.begin_s:.1f} s", *texts))
+    if segments:
+        head = ("segment", "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
+        yield Table("lrl", segments, head)
