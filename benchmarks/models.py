@@ -21,9 +21,9 @@ from unseen import robot_config
 from unseen_drives import is_on_ice, load_drives
 from unseen_logs import draw_case, make_log
 
-from icrtool.calibration.fit import fit
 from icrtool.calibration.held_out import HORIZONS_M, errors_without, plan_folds
-from icrtool.calibration.run_recording import recording_of
+from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.run_models import fit
 from icrtool.config import Config, load_config
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import find_recordings

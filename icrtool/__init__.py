@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from icrtool import figures
-    from icrtool.calibration.fit import fit
     from icrtool.calibration.pooled import calibrate
     from icrtool.calibration.record import Calibration
+    from icrtool.calibration.run_models import fit
     from icrtool.config import Config, load_config
     from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
     from icrtool.dropout_analysis.report import DropoutReport
@@ -78,7 +78,7 @@ _HOMES = {
     "calibrate": "icrtool.calibration.pooled",
     "dropout": "icrtool.dropout_analysis.dropout_report",
     "dropout_report": "icrtool.dropout_analysis.dropout_report",
-    "fit": "icrtool.calibration.fit",
+    "fit": "icrtool.calibration.run_models",
     "load_config": "icrtool.config",
     "open_calibration": "icrtool.output.files.formats",
     "open_run": "icrtool.output.run_directory",

@@ -12,9 +12,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from icrtool.calibration.forecast import forecast_drive
-from icrtool.calibration.pooled import calibrate
-from icrtool.calibration.run_recording import recording_of
+from icrtool.calibration.error_growth import forecast_drive
+from icrtool.calibration.pooled import calibrate, recording_of
 from icrtool.calibration.transfer import compare_groups
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import parse_gate, verdict_on

@@ -1,63 +1,48 @@
-"""How the error of a motion model grows along a path, measured on distance it was not fitted to.
+"""How the error of a motion model grows along a path, and its forecast for a path that is driven without GNSS.
 
 The position error of a drive without GNSS has two parts. The parameters have a covariance; what it makes of the path
 follows from their derivatives. What the model leaves out is described by a few sources of error with a variance each:
 the heading at the start, a turn rate off by a constant, turns off by a share, a turn rate that wanders, a speed off by
-a share, a speed that wanders. Their variances are fitted to the squared errors of held-out windows of several lengths,
-and the quantiles are scaled so that they hold there. A controller expresses a part of the model alone: its errors are
-measured in the same windows.
+a share, a speed that wanders. `icrtool.calibration.held_out` measures them.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
-from contextlib import suppress
 from itertools import product
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from msgspec.structs import astuple
 
-from icrtool.calibration.held_out import HeldOut, left_out
+from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.track import Track
-from icrtool.kernels.window_residuals import OMEGA, displacements, path_at
-from icrtool.motion.models import CONTROLLER, RECOMMENDED, FittedModel, model_columns, wheel_motion
-from icrtool.motion.recording import (
-    NO_CONSTANTS,
-    LogConstants,
-    Recording,
-    Windows,
-    cut_windows,
-    predicted_path,
-    totals_of,
-)
-from icrtool.records.calibration_document import ControllerErrors, ErrorSources
-from icrtool.records.dropout import CHOICE_HORIZON_M
-from icrtool.records.plain_data import known
-
-TWIST_OVER_M = 1.0
-"""Errors of velocities are those of their means over windows of this length."""
-
-LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-ALWAYS_TO_M, FEWEST_STRETCHES = 20.0, 10
-"""Held-out windows of these lengths are compared; longer ones where the drives hold so many stretches of them."""
-
-SCALED_FROM_M = 5.0
-"""Errors of shorter windows are more the reference's noise than the model's; they do not scale the quantiles."""
-
-FEWEST_WINDOWS = 20
+from icrtool.kernels.window_residuals import OMEGA, VX, displacements, path_at
+from icrtool.motion.models import FittedModel, model_columns, wheel_motion
+from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, steps_of
+from icrtool.records.calibration_document import ErrorSources
 
 ANGLES, BISECTIONS = 24, 26
 
-NORMAL_STRETCHES = 10
-"""That the errors are normal counts as much as so many independent stretches: quantiles of as many are as uncertain as
-those of robots differ. A few windows never show that errors are smaller than normal."""
+SOURCES = ErrorSources.__struct_fields__.index("p95_factor")
+
+STEP_M = 0.1
+"""A planned path is driven in steps of this length."""
+
+SPEED_MPS = 0.5
+"""Speed of a plan that gives none."""
+
+SLOWEST_MPS = 0.02
+
+INVERSIONS = 8
+
+FURTHEST_M, FASTEST_MPS = 1e8, 100.0
+"""Of a point from the origin, which may be that of UTM; of any robot with tracks."""
+
+LONGEST_PATH_M = 100_000.0
 
 Values = TypeVar("Values", Floats, Complexes)
-
-SOURCES = ErrorSources.__struct_fields__.index("p95_factor")
 
 
 class Spread(NamedTuple):
@@ -191,78 +176,7 @@ def _directions(spread: Spread) -> Floats:
     return np.asarray(large[:, None] * np.cos(angle) ** 2 + small[:, None] * np.sin(angle) ** 2)
 
 
-def cut_error_windows(recordings: Sequence[Recording]) -> list[tuple[int, Recording, Windows]]:
-    """Return windows of `LENGTHS_M` and `TWIST_OVER_M`, with number and recording; short recordings have none."""
-    pooled, found = totals_of(*recordings), []
-    for i, recording in enumerate(recordings):
-        with suppress(DataError):
-            found.append((i, recording, cut_windows(recording, (TWIST_OVER_M, *LENGTHS_M), pooled)))
-    return found
-
-
-def measure_error_sources(
-    cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut, name: str
-) -> ErrorSources | None:
-    """Return the sources of error of a row of a held-out table, from windows of what it was not fitted to.
-
-    Parameters
-    ----------
-    cut : of `cut_error_windows`
-
-    Returns
-    -------
-    None where too few windows were left out.
-
-    Notes
-    -----
-    Non-negative least squares of the squared errors, each length and direction with the same weight; the factors are
-    those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent, shrunk towards one
-    in their logarithm (James and Stein 1961): one short drive shows its largest error, not a quantile.
-    """
-    stretches: Counter[float] = Counter()
-    found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
-    for i, recording, windows in cut:
-        begin, end = windows.knot_t[windows.start], windows.knot_t[windows.end]
-        tested = np.zeros(len(begin), np.bool_)
-        for fold, of_fold in left_out(table.folds, i, windows.start_m, windows.end_m):
-            some = of_fold[windows.length_m[of_fold] >= LENGTHS_M[0]]
-            if not len(some) or (predicted := table.without(name, fold)) is None:
-                continue
-            fitted, own = predicted
-            steps = windows.steps.around(begin[some].min(), end[some].max())
-            errors = path_errors(steps, begin[some], end[some], fitted, recording.width_m, own)
-            reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
-            turn = errors.turned - windows.turned[some]
-            found.append((windows.length_m[some], errors, turn, errors.moved - reference))
-            tested[some] = True
-        for metres in LENGTHS_M:
-            starts = windows.start_m[tested & (windows.length_m == metres)]
-            stretches[metres] += len(np.unique(np.floor(starts / metres)))
-    measured_to_m = max(one for one in LENGTHS_M if one <= ALWAYS_TO_M or stretches[one] >= FEWEST_STRETCHES)
-    length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
-    used = length <= measured_to_m
-    length = length[used]
-    if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_WINDOWS:
-        return None
-    sources = _stacked([one[1].of_sources for one in found], used)
-    known = _stacked([one[1].of_parameters for one in found], used)
-    turned, missed = (np.concatenate([one[k] for one in found])[used] for k in (2, 3))
-    variances = _fit_variances(length, sources, known, turned, missed)
-    spread, far = sources.combined(variances).plus(known), length >= SCALED_FROM_M
-    error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
-    level = min(95.0 * (1.0 + 1.0 / count), 100.0)
-    share = np.percentile(error / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
-    mean = error.mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
-    # measured over normal: the fewer stretches show it, the nearer to normal
-    factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
-    return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
-
-
-def _stacked(parts: Sequence[Spread], used: Bools) -> Spread:
-    return Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
-
-
-def _fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats, missed: Complexes) -> Floats:
+def fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats, missed: Complexes) -> Floats:
     """Return the variances (`SOURCES`,) that make the squared errors of windows, beside those of the parameters."""
     matrix, y = np.zeros((SOURCES, SOURCES)), np.zeros(SOURCES)
     kinds = (
@@ -298,69 +212,129 @@ def nonnegative(matrix: Floats, y: Floats) -> Floats:
     return found
 
 
-SMALLEST_VARIANCE = 1e-6
-FEWEST_TESTED = 10
-"""A controller is given errors from so many windows at least."""
+class Forecast(NamedTuple):
+    """Errors along a path that is driven without GNSS from its start; (m,) each, after each metre.
+
+    Attributes
+    ----------
+    distance_m : driven; east_m, north_m : where the path is then
+    expected_m, p95_m : mean error, and the distance within which 95 % of the errors are
+    std_east_m, std_north_m, heading_std_deg : one standard deviation
+    """
+
+    distance_m: Floats
+    east_m: Floats
+    north_m: Floats
+    expected_m: Floats
+    p95_m: Floats
+    std_east_m: Floats
+    std_north_m: Floats
+    heading_std_deg: Floats
 
 
-def measure_controller_errors(cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut) -> ControllerErrors | None:
-    """Return the errors of what a controller can express, fitted without each fold, in that fold.
+def forecast_plan(
+    calibration: Calibration, east_m: Floats, north_m: Floats, speed_mps: Floats | None = None, *,
+    with_gyro: bool = False,
+) -> Forecast:  # fmt: skip
+    """Return the errors along a planned path.
 
     Parameters
     ----------
-    cut : of `cut_error_windows`
+    east_m, north_m : (p,) points of the path, driven in their order
+    speed_mps : (p,) speed from each point on, negative in reverse; default `SPEED_MPS`
+    with_gyro : by the calibration's model with a gyro
 
-    Returns
-    -------
-    None where too few windows were left out.
+    Raises
+    ------
+    DataError
+        A path shorter than a metre or with values that are not numbers, or a calibration without sources of error.
     """
-    far, near = (_window_errors(cut, length, table) for length in (CHOICE_HORIZON_M, TWIST_OVER_M))
-    if min(len(far), len(near)) < FEWEST_TESTED or CHOICE_HORIZON_M not in table.horizons_m:
-        return None
-    h = table.horizons_m.index(CHOICE_HORIZON_M)
-    return ControllerErrors(
-        pose_variance=_variances(far[:, :3]),
-        twist_variance=_variances(near[:, :3] / near[:, 3:4]),
-        turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
-        way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
-        p95_m=known(float(table.score(CONTROLLER).together.p95[h])),
-        full_p95_m=known(float(table.score(RECOMMENDED).together.p95[h])),
-    )
+    if not (np.abs([north_m, east_m]) <= FURTHEST_M).all():
+        raise DataError("plan", f"a point that is no number, or beyond {FURTHEST_M:g} m", "give metres")
+    points = np.asarray(north_m, np.float64) + 1j * np.asarray(east_m, np.float64)
+    length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
+    if not 1.0 <= length[-1] <= LONGEST_PATH_M:
+        raise DataError("plan", f"a path of {length[-1]:.3g} m", f"give 1 m to {LONGEST_PATH_M:g} m")
+    at = np.linspace(0.0, length[-1], max(round(length[-1] / STEP_M), 10) + 1)
+    line = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(points) - 2)
+    path = np.interp(at, length, points.real) + 1j * np.interp(at, length, points.imag)
+    step = np.diff(path)
+    speed = np.full(len(step), SPEED_MPS) if speed_mps is None else np.asarray(speed_mps, np.float64)[line[:-1]]
+    if not ((np.abs(speed) > 0.0) & (np.abs(speed) <= FASTEST_MPS)).all():
+        why = f"a speed that is zero, no number, or beyond {FASTEST_MPS:g} m/s"
+        raise DataError("plan", why, "give speed_mps in m/s, negative in reverse")
+    speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_MPS)
+    # a corner of the plan is turned over the steps around it, not on the spot: means over a track width
+    width = max(round(calibration.width_m / STEP_M), 1)
+    padded = np.pad(np.unwrap(np.angle(step * np.sign(speed))), (width // 2, width - 1 - width // 2), mode="edge")
+    direction = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+    held = np.abs(step / speed)
+    turn = np.append(np.diff(direction), 0.0) / held
+    left, right = wheel_speeds(calibration.fitted, calibration.width_m, speed, turn)
+    t, distance = (np.concatenate([[0.0], np.cumsum(one)]) for one in (held, np.abs(step)))
+    left, right, turn, direction = (np.append(one, one[-1:]) for one in (left, right, turn, direction))
+    planned = Track.of_states(
+        t, np.append(held, 0.0), left, right, path.real, path.imag, direction, distance
+    )._replace(gyro=turn, into=0.5)  # fmt: skip
+    return _along(calibration, planned, planned, with_gyro=with_gyro)
 
 
-def _window_errors(cut: Sequence[tuple[int, Recording, Windows]], length_m: float, table: HeldOut) -> Floats:
-    """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
-    rows = [np.empty((0, 6))]
-    for i, recording, windows in cut:
-        these = np.flatnonzero(windows.length_m == length_m)
-        for fold, some in left_out(table.folds, i, windows.start_m[these], windows.end_m[these]):
-            if (found := table.without(CONTROLLER, fold)) is not None:
-                rows.append(_fold_errors(recording, windows, these[some], *found))
-    return np.concatenate(rows)
+def forecast_drive(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Forecast:
+    """Return the errors of driving the path of a recording again, with its wheel speeds (and gyro)."""
+    return _along(calibration, recording.track, steps_of(recording), with_gyro=with_gyro)
 
 
-def _fold_errors(
-    recording: Recording, windows: Windows, some: Ints, fitted: FittedModel, own: LogConstants
-) -> Floats:  # fmt: skip
-    """Return the errors of some windows (m,) by a model that was not fitted to them."""
-    s, e = windows.start[some], windows.end[some]
-    begin, finish = windows.knot_t[s], windows.knot_t[e]
-    path = predicted_path(recording, fitted, own, windows.steps.around(begin.min(), finish.max()))
-    (theta, turned), (place, moved) = (np.split(one, 2) for one in path(np.append(begin, finish)))
-    error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
-    turn = windows.turned[some]
-    columns = error.real, error.imag, turned - theta - turn, finish - begin, turn, windows.length_m[some]
-    return np.column_stack(columns)
+def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Floats) -> tuple[Floats, Floats]:
+    """Return the speeds of the sides (n,) [m/s] that make a speed ahead [m/s] and a turn rate [rad/s] by a model.
+
+    Notes
+    -----
+    The model's matrix from (v, w) to (v_x, omega), its terms that are not linear taken at the last step.
+    """
+
+    def ahead_and_turn(v: Floats, w: Floats) -> Floats:
+        return fitted.twist(wheel_motion(v + w * width_m / 2.0, v - w * width_m / 2.0, width_m))[[VX, OMEGA]]
+
+    v, w = speed.copy(), turn.copy()
+    for _ in range(INVERSIONS):
+        made = ahead_and_turn(v, w)
+        by_v = (ahead_and_turn(v + 1e-4, w) - made) / 1e-4
+        by_w = (ahead_and_turn(v, w + 1e-4) - made) / 1e-4
+        off = np.array([speed, turn]) - made
+        size = by_v[0] * by_w[1] - by_v[1] * by_w[0]
+        size = np.where(np.abs(size) > 1e-3, size, 1e-3)
+        v = v + (off[0] * by_w[1] - off[1] * by_w[0]) / size
+        w = w + (off[1] * by_v[0] - off[0] * by_v[1]) / size
+    return v + w * width_m / 2.0, v - w * width_m / 2.0
 
 
-def _variances(errors: Floats) -> tuple[float, float, float]:
-    """Return mean squares (3,), never zero."""
-    along, across, heading = (max(float(value), SMALLEST_VARIANCE) for value in (errors**2).mean(axis=0))
-    return along, across, heading
+def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: bool) -> Forecast:
+    """Return the forecast after each metre of a track, and of its wheel samples as they are integrated."""
+    t, metres = track.t, np.arange(1.0, np.floor(track.distance[-1]) + 1.0)
+    if not len(metres):
+        raise DataError("path", f"{track.distance[-1]:.2f} m long", "a forecast needs a metre at least")
+    rows = np.searchsorted(track.distance, metres)
+    spread, expected, p95 = forecast_errors(calibration, steps, np.full(len(rows), t[0]), t[rows], with_gyro=with_gyro)
+    c, s = np.cos(track.heading[0]), np.sin(track.heading[0])
+    xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
+    north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
+    east = np.sqrt(np.maximum(s * s * xx + 2 * c * s * xy + c * c * yy, 0.0))
+    return Forecast(
+        metres, track.east[rows], track.north[rows], expected, p95, east, north,
+        np.degrees(np.sqrt(spread.heading[:, 0])),
+    )  # fmt: skip
 
 
-def _shares(miss: Floats, first: Floats, second: Floats) -> tuple[float, float]:
-    """Return a, b >= 0 with miss^2 about a first^2 + b second^2, by least squares."""
-    columns = np.column_stack([first**2, second**2])
-    both = np.maximum(nonnegative(columns.T @ columns, columns.T @ miss**2), SMALLEST_VARIANCE)
-    return float(both[0]), float(both[1])
+def forecast_errors(
+    calibration: Calibration, steps: Track, begin_s: Floats, end_s: Floats, *, with_gyro: bool
+) -> tuple[Spread, Floats, Floats]:
+    """Return moments, expected and 95 % error (w,) [m] of windows of a drive from and to times (w,)."""
+    fitted, sources = calibration.fitted, calibration.error_sources
+    if with_gyro and calibration.gyro is not None and (turned := calibration.fitted_with_gyro) is not None:
+        fitted, sources = turned, calibration.gyro.error_sources
+    if sources is None:
+        why = "its error growth was not measured"
+        raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
+    found = path_errors(steps, begin_s, end_s, fitted, calibration.width_m)
+    spread = found.of_sources.combined(np.array(astuple(sources)[:SOURCES])).plus(found.of_parameters)
+    return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius(spread, 0.95)

@@ -3,19 +3,32 @@
 Of many recordings each is left out in turn (Stone 1974). In a single one each trial is predicted without the windows
 that share distance with it (Burman, Chow and Nolan 1994; on recorded drives 5 or 10 m more between them changed no
 error).
+
+Held-out windows of several lengths also show how the errors of a model grow (`icrtool.calibration.error_growth`), with
+quantiles scaled so that they hold there, and the errors of what a controller can express of it.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, partial
 
 import numpy as np
 
+from icrtool.calibration.error_growth import (
+    PathErrors,
+    Spread,
+    fit_variances,
+    mean_error,
+    nonnegative,
+    path_errors,
+    radius,
+)
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.error_statistics import Summary, error_summary, within_budget
 from icrtool.kernels.track import OpenLoopPath, Track
 from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, controller_model
@@ -24,6 +37,7 @@ from icrtool.motion.recording import (
     Recording,
     TrialErrors,
     Trials,
+    Windows,
     cut_trials,
     cut_windows,
     predicted_path,
@@ -31,7 +45,9 @@ from icrtool.motion.recording import (
     trial_errors,
 )
 from icrtool.motion.window_fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
+from icrtool.records.calibration_document import ControllerErrors, ErrorSources
 from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
+from icrtool.records.plain_data import known
 
 HORIZONS_M = (5.0, 10.0, 20.0)
 
@@ -44,6 +60,28 @@ ROWS = {NO_SLIP: "no slip", CONTROLLER: "controller numbers", RECOMMENDED: MODEL
 """The rows of a held-out table and their labels; each may come again with a gyro, ``_gyro`` behind its name."""
 
 GYRO = "_gyro"
+
+TOO_SHORT = "too short to fit on one part and test on another"
+
+TWIST_OVER_M = 1.0
+"""Errors of velocities are those of their means over windows of this length."""
+
+LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+ALWAYS_TO_M, FEWEST_STRETCHES = 20.0, 10
+"""Held-out windows of these lengths are compared; longer ones where the drives hold so many stretches of them."""
+
+SCALED_FROM_M = 5.0
+"""Errors of shorter windows are more the reference's noise than the model's; they do not scale the quantiles."""
+
+FEWEST_WINDOWS = 20
+
+NORMAL_STRETCHES = 10
+"""That the errors are normal counts as much as so many independent stretches: quantiles of as many are as uncertain as
+those of robots differ. A few windows never show that errors are smaller than normal."""
+
+SMALLEST_VARIANCE = 1e-6
+FEWEST_TESTED = 10
+"""A controller is given errors from so many windows at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,20 +126,32 @@ class HeldOut:
     folds: tuple[Fold, ...]
     trials: tuple[Trials, ...]
     fits: dict[str, PooledFit]
-    steps: tuple[Track, ...]
 
     @cached_property
     def scores(self) -> tuple[HeldOutRow, ...]:
         """Errors in the trials of all recordings, a row a model."""
-        of_recordings = enumerate(zip(self.trials, self.recordings, strict=True))
-        fold_of = np.concatenate([_fold_of(self.folds, i, *one) for i, one in of_recordings])
-        first = np.searchsorted(fold_of, np.arange(1, len(self.folds)))
+        fold_of = []
+        for i, (trials, recording) in enumerate(zip(self.trials, self.recordings, strict=True)):
+            mine = [fold for fold in self.folds if fold.recording == i]
+            edges = [fold.end_m for fold in mine[:-1]]
+            at_m = recording.track.distance[trials.starts]
+            fold_of.append(mine[0].number + np.searchsorted(edges, at_m, side="right"))
+        first = np.searchsorted(np.concatenate(fold_of), np.arange(1, len(self.folds)))
         scores = []
         for name, label in self.rows.items():
             errors = np.concatenate([self.errors(name, i, one).position for i, one in enumerate(self.trials)])
             by_fold = tuple(error_summary(some) for some in np.split(errors, first))
             scores.append(HeldOutRow(name, label, by_fold, error_summary(errors)))
         return tuple(scores)
+
+    @cached_property
+    def error_windows(self) -> tuple[tuple[int, Windows], ...]:
+        """Windows of `LENGTHS_M` and `TWIST_OVER_M`, with the number of their recording; short ones have none."""
+        pooled, found = totals_of(*self.recordings), []
+        for i, recording in enumerate(self.recordings):
+            with suppress(DataError):
+                found.append((i, cut_windows(recording, (TWIST_OVER_M, *LENGTHS_M), pooled)))
+        return tuple(found)
 
     @property
     def has_gyro(self) -> bool:
@@ -132,8 +182,8 @@ class HeldOut:
 
     def errors(self, name: str, i: int, trials: Trials) -> TrialErrors:
         """Return the errors of a row in trials of recording i, each predicted without what it touches."""
-        return errors_without(self.recordings[i], trials, self.folds, i, lambda fold: self.without(name, fold),
-                              self.steps[i])  # fmt: skip
+        steps = self.fits[RECOMMENDED].pool.windows[i].steps
+        return errors_without(self.recordings[i], trials, self.folds, i, partial(self.without, name), steps)
 
     def path(self, name: str, i: int, start: int, end: int) -> OpenLoopPath | None:
         """Return the path of a row from one state of recording i to another, predicted without what it touches."""
@@ -143,7 +193,8 @@ class HeldOut:
         ((fold, _),) = left_out(self.folds, i, *ends)
         if (found := self.without(name, fold)) is None:
             return None
-        turned, place = predicted_path(recording, *found, self.steps[i].around(t[start], t[end]))(t[rows])
+        steps = self.fits[RECOMMENDED].pool.windows[i].steps.around(t[start], t[end])
+        turned, place = predicted_path(recording, *found, steps)(t[rows])
         turn = track.heading[start] - turned[0]
         moved = np.exp(1j * turn) * (place - place[0])
         return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, turned + turn)
@@ -161,8 +212,7 @@ def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
         return tuple(Fold(one.name, i, i, -np.inf, np.inf) for i, one in enumerate(recordings))
     total = float(recordings[0].track.distance[-1])
     if total < 2.0 * CHOICE_HORIZON_M:
-        why = f"{total:.1f} m of driven distance"
-        raise DataError(recordings[0].name, why, "too short to fit on one part and test on another")
+        raise DataError(recordings[0].name, f"{total:.1f} m of driven distance", TOO_SHORT)
     count = int(np.clip(total // SHORTEST_BLOCK_M, FEWEST_BLOCKS, MOST_BLOCKS))
     edges = np.linspace(0.0, total, count + 1).tolist()
     return tuple(Fold(f"block {i + 1}", i, 0, edges[i], edges[i + 1]) for i in range(count))
@@ -222,15 +272,7 @@ def errors_without(
     return errors
 
 
-class Fits(NamedTuple):
-    """The motion models fitted to recordings; `steps` are the wheel samples joined, by recording."""
-
-    fits: dict[str, PooledFit]
-    steps: tuple[Track, ...]
-    pool: Pool
-
-
-def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MODELS)) -> Fits:
+def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MODELS)) -> dict[str, PooledFit]:
     """Fit motion models to recordings, with a gyro too where every recording has one.
 
     Raises
@@ -239,8 +281,7 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
         Too short a drive.
     """
     pooled = totals_of(*recordings)
-    windows = [cut_windows(one, pooled=pooled) for one in recordings]
-    pool = Pool(windows, [one.width_m for one in recordings])
+    pool = Pool([cut_windows(one, pooled=pooled) for one in recordings], [one.width_m for one in recordings])
     fits = {name: pool.fit(MODELS[name]) for name in names}
     if FIVE in fits:
         # the clocks are those of one robot: many logs show them no better than one
@@ -248,7 +289,7 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
         fits[FIVE] = fits[FIVE].with_clock_error(off)
     if all(one.track.gyro is not None for one in recordings):
         fits |= {f"{name}{GYRO}": pool.fit(MODELS[name].with_gyro(), fits[name]) for name in names}
-    return Fits(fits, tuple(one.steps for one in windows), pool)
+    return fits
 
 
 def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HORIZONS_M) -> HeldOut:
@@ -264,18 +305,116 @@ def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HORI
         Too short a drive, or too little left beside a fold.
     """
     folds = plan_folds(recordings)
-    fits, steps, pool = fit_models(recordings)
+    fits = fit_models(recordings)
     for fold in folds:
-        if np.count_nonzero(pool.clear_of(fold)) < FEWEST_RESIDUALS:
-            why = "too short to fit on one part and test on another"
-            raise DataError(fold.name, "too few windows beside it", why)
+        if np.count_nonzero(fits[RECOMMENDED].pool.clear_of(fold)) < FEWEST_RESIDUALS:
+            raise DataError(fold.name, "too few windows beside it", TOO_SHORT)
     pooled = totals_of(*recordings)
     trials = tuple(cut_trials(one, horizons_m, pooled) for one in recordings)
-    return HeldOut(tuple(recordings), tuple(horizons_m), folds, trials, fits, steps)
+    return HeldOut(tuple(recordings), tuple(horizons_m), folds, trials, fits)
 
 
-def _fold_of(folds: Sequence[Fold], i: int, trials: Trials, recording: Recording) -> Ints:
-    """Return the number of the fold (k,) in which trials of recording i start."""
-    mine = [fold for fold in folds if fold.recording == i]
-    edges = [fold.end_m for fold in mine[:-1]]
-    return mine[0].number + np.searchsorted(edges, recording.track.distance[trials.starts], side="right")
+def _left_out_windows(
+    table: HeldOut, name: str, lengths_m: Sequence[float]
+) -> Iterator[tuple[int, Windows, Ints, tuple[Floats, Floats], Prediction, Track]]:
+    """Yield recording, rows (w,) of windows, their times, what is predicted without them, and the steps around them."""
+    for i, windows in table.error_windows:
+        these = np.flatnonzero(np.isin(windows.length_m, lengths_m))
+        for fold, some in left_out(table.folds, i, windows.start_m[these], windows.end_m[these]):
+            if (predicted := table.without(name, fold)) is not None:
+                rows = these[some]
+                begin, end = windows.knot_t[windows.start[rows]], windows.knot_t[windows.end[rows]]
+                yield i, windows, rows, (begin, end), predicted, windows.steps.around(begin.min(), end.max())
+
+
+def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
+    """Return the sources of error of a row of a held-out table, from windows of what it was not fitted to.
+
+    Returns
+    -------
+    None where too few windows were left out.
+
+    Notes
+    -----
+    Non-negative least squares of the squared errors, each length and direction with the same weight; the factors are
+    those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent, shrunk towards one
+    in their logarithm (James and Stein 1961): one short drive shows its largest error, not a quantile.
+    """
+    found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
+    tested = [np.empty((0, 3))]
+    for i, windows, some, (begin, end), (fitted, own), steps in _left_out_windows(table, name, LENGTHS_M):
+        errors = path_errors(steps, begin, end, fitted, table.recordings[i].width_m, own)
+        reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
+        length_m = windows.length_m[some]
+        found.append((length_m, errors, errors.turned - windows.turned[some], errors.moved - reference))
+        stretch = np.floor(windows.start_m[some] / length_m)
+        tested.append(np.column_stack([np.full(len(some), i), length_m, stretch]))
+    stretches = Counter(np.unique(np.concatenate(tested), axis=0)[:, 1].tolist())
+    measured_to_m = max(one for one in LENGTHS_M if one <= ALWAYS_TO_M or stretches[one] >= FEWEST_STRETCHES)
+    length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
+    used = length <= measured_to_m
+    length = length[used]
+    if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_WINDOWS:
+        return None
+    of_sources, of_parameters = ([getattr(one[1], name) for one in found] for name in ("of_sources", "of_parameters"))
+    sources, stated = (
+        Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
+        for parts in (of_sources, of_parameters)
+    )
+    turned, missed = (np.concatenate([one[k] for one in found])[used] for k in (2, 3))
+    variances = fit_variances(length, sources, stated, turned, missed)
+    spread, far = sources.combined(variances).plus(stated), length >= SCALED_FROM_M
+    error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
+    level = min(95.0 * (1.0 + 1.0 / count), 100.0)
+    share = np.percentile(error / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
+    mean = error.mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
+    # measured over normal: the fewer stretches show it, the nearer to normal
+    factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
+    return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
+
+
+def measure_controller_errors(table: HeldOut) -> ControllerErrors | None:
+    """Return the errors of what a controller can express, fitted without each fold, in that fold.
+
+    Returns
+    -------
+    None where too few windows were left out.
+    """
+    far, near = (_controller_window_errors(table, length) for length in (CHOICE_HORIZON_M, TWIST_OVER_M))
+    if min(len(far), len(near)) < FEWEST_TESTED or CHOICE_HORIZON_M not in table.horizons_m:
+        return None
+    h = table.horizons_m.index(CHOICE_HORIZON_M)
+    return ControllerErrors(
+        pose_variance=_variances(far[:, :3]),
+        twist_variance=_variances(near[:, :3] / near[:, 3:4]),
+        turn_noise=_shares(near[:, 2], near[:, 4], near[:, 5]),
+        way_noise=_shares(np.hypot(near[:, 0], near[:, 1]), near[:, 5], near[:, 4]),
+        p95_m=known(float(table.score(CONTROLLER).together.p95[h])),
+        full_p95_m=known(float(table.score(RECOMMENDED).together.p95[h])),
+    )
+
+
+def _variances(errors: Floats) -> tuple[float, float, float]:
+    """Return mean squares (3,), never zero."""
+    along, across, heading = np.maximum((errors**2).mean(axis=0), SMALLEST_VARIANCE).tolist()
+    return along, across, heading
+
+
+def _shares(missed: Floats, first: Floats, second: Floats) -> tuple[float, float]:
+    """Return a, b >= 0 with missed^2 about a first^2 + b second^2, by least squares."""
+    columns = np.column_stack([first**2, second**2])
+    a, b = np.maximum(nonnegative(columns.T @ columns, columns.T @ missed**2), SMALLEST_VARIANCE).tolist()
+    return a, b
+
+
+def _controller_window_errors(table: HeldOut, length_m: float) -> Floats:
+    """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
+    rows = [np.empty((0, 6))]
+    for i, windows, some, (begin, end), predicted, steps in _left_out_windows(table, CONTROLLER, [length_m]):
+        path = predicted_path(table.recordings[i], *predicted, steps)
+        (theta, turned), (place, moved) = (np.split(one, 2) for one in path(np.append(begin, end)))
+        error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
+        turn = windows.turned[some]
+        off = turned - theta - turn
+        rows.append(np.column_stack([error.real, error.imag, off, end - begin, turn, windows.length_m[some]]))
+    return np.concatenate(rows)

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
+from icrtool.calibration.pooled import known_antenna_m
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.run_recording import known_antenna_m
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
 from icrtool.records.calibration_document import (

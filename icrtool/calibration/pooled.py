@@ -1,9 +1,10 @@
-"""Calibrations of several logs pooled: of runs, and of the recordings that they are."""
+"""Runs as recordings, which motion models are fitted to and tested on, and the calibrations of several pooled."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from os import PathLike
 from typing import NamedTuple
@@ -13,14 +14,20 @@ from msgspec import UNSET
 from msgspec.structs import asdict
 
 from icrtool import __version__
-from icrtool.calibration.error_growth import cut_error_windows, measure_controller_errors, measure_error_sources
-from icrtool.calibration.held_out import GYRO, HeldOut, errors_without, hold_out
+from icrtool.calibration.held_out import (
+    GYRO,
+    HeldOut,
+    errors_without,
+    hold_out,
+    measure_controller_errors,
+    measure_error_sources,
+)
 from icrtool.calibration.record import Calibration, fitted_document, parameter_documents
-from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import ConfigError, DataError
-from icrtool.kernels.arrays import Complexes
-from icrtool.motion.models import FIVE, MODELS, RECOMMENDED
-from icrtool.motion.recording import ErrorsOf, Recording, Windows, cut_windows
+from icrtool.estimation.odometry import measured_headings
+from icrtool.kernels.arrays import Complexes, Floats
+from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, Lever
+from icrtool.motion.recording import ErrorsOf, GyroLine, Recording, cut_windows, fit_gyro_line
 from icrtool.motion.window_fit import Fold, Prediction, own_constants
 from icrtool.records.calibration_document import (
     CALIBRATION_SCHEMA,
@@ -32,8 +39,93 @@ from icrtool.records.calibration_document import (
     HeldOutScore,
     PooledScore,
 )
-from icrtool.records.run import MAKE_RUN, Run, check_type
+from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.process_resources import give_back_freed
+from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
 from icrtool.records.run_document import RecommendedDocument
+
+
+def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: float | None = None) -> Recording:
+    """Return a run as motion models see it: wheel speeds at the configured radius, reference, gyro.
+
+    Parameters
+    ----------
+    heading : a measured heading of the run, such as its gyro's; its turn rate is used where it turns as the reference
+        does
+    width_m : track width b to use; default the run's
+
+    Raises
+    ------
+    ConfigError
+        The robot's track width is not known.
+    """
+    width = width_m if width_m is not None else run.track_width_m
+    if width is None:
+        raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
+    track, inputs = track_of(run), run.document.inputs
+    left_scale, right_scale = run.wheel_scales
+    if (left_scale, right_scale) != (1.0, 1.0):
+        track = track._replace(v_left=track.v_left / left_scale, v_right=track.v_right / right_scale)
+    plain = Recording(
+        name=run.name,
+        track=track,
+        width_m=width,
+        path=inputs[0].path if inputs else "",
+        sha256=(inputs[0].sha256 or "") if inputs else "",
+        begin_ns=int(run.table.stamp_ns[0]),
+        lever=Lever(*(place is not None for place in known_antenna_m(run))),
+        x_clock_std_m=run.document.icr.x_clock_std_m,
+    )
+    return plain if heading is None else with_turn_rate(plain, heading)
+
+
+def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
+    """Return the antenna's position where it is configured, or in the log's transforms, forward and right [m]."""
+    used, given = run.sensors.antenna_m, run.config.frames
+    in_log = run.document.filter.antenna_is_known and given.antenna_right_m == "auto"
+    return (
+        used[0] if in_log or given.antenna_forward_m != "auto" else None,
+        used[1] if in_log or given.antenna_right_m != "auto" else None,
+    )
+
+
+def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
+    """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it."""
+    if not np.isfinite(heading.angle_rad).all():
+        return plain
+    t = plain.track.t
+
+    def rate(later_s: float) -> Floats:
+        turned, dt = (np.diff(one, append=one[-1:]) for one in (np.interp(t + later_s, t, heading.angle_rad), t))
+        return np.divide(turned, dt, out=np.zeros(len(t)), where=dt > 0.0)
+
+    line = _gyro_line(plain, rate(0.0))
+    give_back_freed()
+    if not line.is_yaw:
+        return plain
+    track = plain.track._replace(gyro=np.sign(line.scale) * rate(line.lead_s))
+    return replace(plain, track=track, gyro_reversed=line.scale < 0.0)
+
+
+def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None = None) -> Recording:
+    """Return a run as `recording_of`, with its measured heading of a kind (``gyro``, ``heading``) where it has one."""
+    return recording_of(run, next((one for one in measured_headings(run) if one.kind == kind), None), width_m=width_m)
+
+
+def scaled_gyro(recording: Recording) -> Floats:
+    """Return the turn rate of a recording's gyro (n,) [rad/s] with scale and bias that fit its reference."""
+    if recording.track.gyro is None:
+        return np.zeros(len(recording.track.t))
+    line = _gyro_line(recording, recording.track.gyro)
+    rate: Floats = line.scale * recording.track.gyro
+    rate += line.bias_radps
+    return rate
+
+
+def _gyro_line(recording: Recording, rate: Floats) -> GyroLine:
+    """Return the line by which a turn rate (n,) makes the turns of a recording's reference."""
+    track = recording.track
+    return fit_gyro_line(track.t, rate, track.cumulate(rate), track.t, track.heading)
 
 
 class LeftOut(NamedTuple):
@@ -81,7 +173,9 @@ def calibrate_recordings(
     if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
         raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
     table = hold_out(recordings)
-    return CalibrationResult(calibration_from(table, robot, warnings), table, _notes(recordings))
+    turnless = ", ".join(one.name for one in recordings if one.track.gyro is None)
+    notes = (f"no gyro that turns with the robot in {turnless}: wheels alone",) if turnless else ()
+    return CalibrationResult(calibration_from(table, robot, warnings), table, notes)
 
 
 def calibration_from(
@@ -89,18 +183,31 @@ def calibration_from(
 ) -> Calibration:
     """Return the calibration of the recordings that a held-out table is of."""
     recordings, best = table.recordings, table.fits[RECOMMENDED]
-    constants = [best.constants(i) for i in range(len(recordings))]
-    logs = tuple(
-        CalibrationLog(
-            one.name, one.path, one.sha256, float(one.track.distance[-1]), math.degrees(own.heading_offset_rad),
-            -own.wheels_later_s, one.begin_ns,
-        )
-        for one, own in zip(recordings, constants, strict=True)
-    )  # fmt: skip
+    logs = []
+    for i, one in enumerate(recordings):
+        own, metres = best.constants(i), float(one.track.distance[-1])
+        offset_deg, delay_s = math.degrees(own.heading_offset_rad), -own.wheels_later_s
+        logs.append(CalibrationLog(one.name, one.path, one.sha256, metres, offset_deg, delay_s, one.begin_ns))
+    by_fold, together = [], []
+    for row in table.scores:
+        # A score without trials is left out.
+        for fold, summary in zip(table.folds, row.folds, strict=True):
+            for h, horizon in enumerate(table.horizons_m):
+                if summary.trials[h]:
+                    p95, expected = float(summary.p95[h]), float(summary.expected[h])
+                    by_fold.append(HeldOutScore(row.name, horizon, p95, expected, fold.name))
+        for h, horizon in enumerate(table.horizons_m):
+            if row.together.trials[h]:
+                p95, expected = float(row.together.p95[h]), float(row.together.expected[h])
+                together.append(PooledScore(row.name, horizon, p95, expected))
+    gyro = None
+    if table.has_gyro:
+        turned = table.fits[f"{RECOMMENDED}{GYRO}"].fitted
+        sources = measure_error_sources(table, f"{RECOMMENDED}{GYRO}")
+        gyro = GyroDocument(turned.model.name, *parameter_documents(turned), sources)
     robot = robot if robot is not None else CalibratedRobot(track_width_m=recordings[0].width_m)
     geometry, covariance = table.fits[FIVE].fitted.geometry(robot.track_width_m)
-    found, cut = fitted_document(best.fitted, geometry, covariance, robot), cut_error_windows(recordings)
-    errors = measure_controller_errors(cut, table)
+    found, errors = fitted_document(best.fitted, geometry, covariance, robot), measure_controller_errors(table)
     return Calibration(
         schema=CALIBRATION_SCHEMA,
         tool_version=__version__,
@@ -109,43 +216,14 @@ def calibration_from(
         recommended=found.model,
         **{name: getattr(found, name) for name in RecommendedDocument.__struct_fields__[1:-1]},
         controller=ControllerDocument(**asdict(found.controller), **({} if errors is None else asdict(errors))),
-        gyro=_gyro(cut, table) if table.has_gyro else None,
+        gyro=gyro,
         models={name: FittedDocument(*parameter_documents(table.fits[name].fitted)) for name in MODELS},
-        logs=logs,
-        held_out=tuple(_scores(table)),
-        held_out_pooled=tuple(_pooled(table)),
-        error_sources=measure_error_sources(cut, table, RECOMMENDED),
+        logs=tuple(logs),
+        held_out=tuple(by_fold),
+        held_out_pooled=tuple(together),
+        error_sources=measure_error_sources(table, RECOMMENDED),
         warnings=warnings,
     )
-
-
-def _gyro(cut: Sequence[tuple[int, Recording, Windows]], table: HeldOut) -> GyroDocument:
-    """Return the recommended model with a gyro, and its sources of error."""
-    name = f"{RECOMMENDED}{GYRO}"
-    fitted = table.fits[name].fitted
-    return GyroDocument(fitted.model.name, *parameter_documents(fitted), measure_error_sources(cut, table, name))
-
-
-def _notes(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    without = [one.name for one in recordings if one.track.gyro is None]
-    return () if not without else (f"no gyro that turns with the robot in {', '.join(without)}: wheels alone",)
-
-
-def _scores(table: HeldOut) -> Iterator[HeldOutScore]:
-    """Yield the rows of ``held_out``; a score without trials is left out."""
-    for row in table.scores:
-        for fold, summary in zip(table.folds, row.folds, strict=True):
-            for h, horizon in enumerate(table.horizons_m):
-                if summary.trials[h]:
-                    yield HeldOutScore(row.name, horizon, float(summary.p95[h]), float(summary.expected[h]), fold.name)
-
-
-def _pooled(table: HeldOut) -> Iterator[PooledScore]:
-    """Yield the scores of all trials together; one without trials is left out."""
-    for row in table.scores:
-        for h, horizon in enumerate(table.horizons_m):
-            if row.together.trials[h]:
-                yield PooledScore(row.name, horizon, float(row.together.p95[h]), float(row.together.expected[h]))
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
@@ -217,7 +295,8 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
         check_type(run, Run, MAKE_RUN)
         recording = turning_recording_of(run)
         robot = robot_of(run, recording.width_m)
-        one = _Taken(recording, _positions(run), robot, use_warnings(run, alone=False))
+        positions = run.sensors.fixes.north_m + 1j * run.sensors.fixes.east_m
+        one = _Taken(recording, positions, robot, use_warnings(run, alone=False))
         if why := _why_left_out(run, one, taken, allow_unusable=allow_unusable):
             left_out.append(LeftOut(run.name, why))
             continue
@@ -252,11 +331,6 @@ class _Taken(NamedTuple):
     positions: Complexes
     robot: CalibratedRobot
     warnings: tuple[str, ...]
-
-
-def _positions(run: Run) -> Complexes:
-    found: Complexes = run.sensors.fixes.north_m + 1j * run.sensors.fixes.east_m
-    return found
 
 
 def _is_part(one: _Taken, of: _Taken) -> bool:

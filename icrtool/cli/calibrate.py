@@ -27,7 +27,7 @@ with when_used():
     from icrtool.output.tables import calibration as tables
 
 if TYPE_CHECKING:
-    from icrtool.calibration.forecast import Forecast
+    from icrtool.calibration.error_growth import Forecast
     from icrtool.calibration.record import Calibration
     from icrtool.config import ConfigSources
     from icrtool.records.calibration_document import CalibrationFile

@@ -13,10 +13,9 @@ from msgspec import UNSET
 from msgspec.structs import astuple
 
 from icrtool import __version__
-from icrtool.calibration.model_comparison import FITTED_TO, ComparedModels, ComparedRow, Model, compare_models
-from icrtool.calibration.pooled import predictor
+from icrtool.calibration.pooled import predictor, turning_recording_of
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.run_recording import turning_recording_of
+from icrtool.calibration.run_models import FITTED_TO, ComparedModels, ComparedRow, Model, compare_models
 from icrtool.dropout_analysis.report import (
     BaselineReport,
     DropoutReport,

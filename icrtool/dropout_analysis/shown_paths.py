@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from icrtool.calibration.model_comparison import ComparedModels, ComparedRow, Model, models_of
+from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, models_of
 from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.run_filter import set_up_again

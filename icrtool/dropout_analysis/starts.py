@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from icrtool.calibration.model_comparison import models_of
+from icrtool.calibration.run_models import models_of
 from icrtool.errors import RunError
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Bools, Floats, Ints, rows_of_cells

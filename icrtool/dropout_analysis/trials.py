@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.calibration.model_comparison import ComparedRow, Model, models_of
+from icrtool.calibration.run_models import ComparedRow, Model, models_of
 from icrtool.dropout_analysis.report import OpenLoopErrors
 from icrtool.dropout_analysis.starts import Starts, first_learned, reference_error, standing_states
 from icrtool.errors import ConfigError, DataError

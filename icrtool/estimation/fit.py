@@ -32,7 +32,7 @@ def fit(
 ) -> Run:
     """Align the sensors of a log, run the filter, summarise: `icrtool.fit` without its recommendation.
 
-    Parameters, return value and errors are those of `icrtool.calibration.fit.fit`.
+    Parameters, return value and errors are those of `icrtool.calibration.run_models.fit`.
 
     Notes
     -----

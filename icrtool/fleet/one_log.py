@@ -154,7 +154,7 @@ def fitted(
         from icrtool.logs.read_log import read_log
 
         logs = [read_log(log, config, share, start=asked.span[0], end=asked.span[1])]
-        from icrtool.calibration.fit import fit
+        from icrtool.calibration.run_models import fit
 
         # The callee alone holds the log, and frees its columns where they are needed no longer.
         run = fit(logs.pop(), config, warm_start=start, changes_s=asked.changes_s, smooth=asked.smooth, watch=begin)

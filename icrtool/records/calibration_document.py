@@ -351,7 +351,7 @@ class ForecastBudget(Record, frozen=True):
 
 
 class ForecastColumns(Record, frozen=True):
-    """The forecast after each metre, as `icrtool.calibration.forecast.Forecast`; with a gyro where that is known."""
+    """The forecast after each metre, as `icrtool.calibration.error_growth.Forecast`; of a gyro where that is known."""
 
     distance_m: list[float | None]
     east_m: list[float | None]

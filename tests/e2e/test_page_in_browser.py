@@ -14,9 +14,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from icrtool.calibration.model_comparison import compare_models
-from icrtool.calibration.pooled import calibrate, predictor
-from icrtool.calibration.run_recording import recording_of, turning_recording_of
+from icrtool.calibration.pooled import calibrate, predictor, recording_of, turning_recording_of
+from icrtool.calibration.run_models import compare_models
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit

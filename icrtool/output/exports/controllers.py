@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from icrtool import __version__
-from icrtool.calibration.error_growth import TWIST_OVER_M
+from icrtool.calibration.held_out import TWIST_OVER_M
 from icrtool.calibration.record import POSE_AFTER_M, Calibration, export_warnings, factor_to_old
 from icrtool.errors import DataError
 from icrtool.kernels.window_residuals import OMEGA, VX, VY

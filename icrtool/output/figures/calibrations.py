@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from icrtool.alignment.estimator import ResidualsByEstimate
-    from icrtool.calibration.forecast import Forecast
+    from icrtool.calibration.error_growth import Forecast
 
 CIRCLES = 20
 

@@ -19,9 +19,8 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-from icrtool.calibration.pooled import calibrated
+from icrtool.calibration.pooled import calibrated, turning_recording_of
 from icrtool.calibration.record import stored_calibration
-from icrtool.calibration.run_recording import turning_recording_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints

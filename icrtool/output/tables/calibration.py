@@ -8,7 +8,7 @@ import textwrap
 from msgspec import UNSET
 
 from icrtool import __version__
-from icrtool.calibration.forecast import Forecast
+from icrtool.calibration.error_growth import Forecast
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
 from icrtool.calibration.one_log import LABELS
 from icrtool.calibration.pooled import CalibrationResult

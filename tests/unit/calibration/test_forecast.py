@@ -12,8 +12,17 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from icrtool.calibration.error_growth import SOURCES, Spread, mean_error, nonnegative, radius
-from icrtool.calibration.forecast import forecast_drive, forecast_errors, forecast_plan, wheel_speeds
+from icrtool.calibration.error_growth import (
+    SOURCES,
+    Spread,
+    forecast_drive,
+    forecast_errors,
+    forecast_plan,
+    mean_error,
+    nonnegative,
+    radius,
+    wheel_speeds,
+)
 from icrtool.calibration.pooled import calibrate_recordings, predictor
 from icrtool.calibration.record import Calibration, parameter_documents
 from icrtool.errors import DataError, IcrToolError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.calibration.model_comparison import ComparedModels, _errors_along, compare_models, turned_path
-from icrtool.calibration.run_recording import recording_of
+from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.run_models import ComparedModels, _errors_along, compare_models, turned_path
 from icrtool.config import parse_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit

@@ -11,8 +11,14 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.held_out import hold_out, left_out, plan_folds
-from icrtool.calibration.pooled import CalibrationResult, calibrate_recordings, predictor, robot_of
-from icrtool.calibration.run_recording import recording_of, with_turn_rate
+from icrtool.calibration.pooled import (
+    CalibrationResult,
+    calibrate_recordings,
+    predictor,
+    recording_of,
+    robot_of,
+    with_turn_rate,
+)
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit

@@ -12,9 +12,8 @@ import pandas as pd
 import pytest
 
 import icrtool
-from icrtool.calibration.pooled import predictor
+from icrtool.calibration.pooled import predictor, recording_of
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.run_recording import recording_of
 from icrtool.dropout_analysis import trials
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from icrtool.calibration.model_comparison import compare_models, models_of
+from icrtool.calibration.run_models import compare_models, models_of
 from icrtool.dropout_analysis.shown_paths import example_trials, worst_trials
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import trial_ends

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.calibration.model_comparison import Model
+from icrtool.calibration.run_models import Model
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.kernels.track import FrozenIcrs
 from icrtool.records.dropout_document import column_of

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.calibration.fit import fit
-from icrtool.calibration.run_recording import recording_of
+from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.run_models import fit
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.calibration.model_comparison import models_of
+from icrtool.calibration.run_models import models_of
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import SHORT, trial_ends

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icrtool.calibration.model_comparison import models_of
+from icrtool.calibration.run_models import models_of
 from icrtool.config import parse_config
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.starts import with_smoothed_reference

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.calibration.model_comparison import Model, models_of
+from icrtool.calibration.run_models import Model, models_of
 from icrtool.dropout_analysis import trials as module
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.starts import first_learned

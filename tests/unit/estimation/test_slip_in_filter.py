@@ -9,7 +9,7 @@ import pytest
 
 from icrtool.alignment.align import align, sensors_as_sent
 from icrtool.alignment.slip_events import Disagreements
-from icrtool.calibration.run_recording import recording_of
+from icrtool.calibration.pooled import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
 from icrtool.estimation.fit import fit

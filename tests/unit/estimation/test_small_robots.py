@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icrtool.calibration.fit import with_motion
+from icrtool.calibration.run_models import with_motion
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.records.run import Run

@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from icrtool.calibration.model_comparison import models_of
+from icrtool.calibration.run_models import models_of
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.report import DropoutReport, budget_distances
 from icrtool.dropout_analysis.shown_paths import (

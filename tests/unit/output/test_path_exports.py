@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from icrtool.calibration.model_comparison import models_of
+from icrtool.calibration.run_models import models_of
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.open_loop import open_loop_errors_direct

@@ -1,4 +1,4 @@
-"""The models of one run, each tested on distance it was not fitted to.
+"""The motion models of one run: fitted (`icrtool.fit`), and each tested on distance it was not fitted to.
 
 What is fitted is fitted on windows that keep clear of the trials that it is tested in (`icrtool.calibration.held_out`);
 the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn by it and by the wheels.
@@ -7,28 +7,130 @@ the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
-from icrtool.calibration.held_out import GYRO, HeldOut, hold_out
-from icrtool.calibration.pooled import calibration_from, robot_of, use_warnings
-from icrtool.calibration.record import Calibration
-from icrtool.calibration.run_recording import recording_of, scaled_gyro, with_turn_rate
+from icrtool.calibration.held_out import GYRO, HeldOut, fit_models, hold_out
+from icrtool.calibration.pooled import (
+    calibration_from,
+    recording_of,
+    robot_of,
+    scaled_gyro,
+    use_warnings,
+    with_turn_rate,
+)
+from icrtool.calibration.record import Calibration, controller_numbers, fitted_document
+from icrtool.config import Config
+from icrtool.errors import DataError
+from icrtool.estimation.fit import fit as fit_filter
+from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
-from icrtool.motion.models import NO_SLIP, FittedModel
+from icrtool.motion.models import FIVE, ICRS, NO_SLIP, RECOMMENDED, FittedModel, TrackGeometry
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.run import Run, no_slip_icrs, width_or_usual_m
+from icrtool.records.run import ICR_COLUMNS, Run, WarmStart, check_type, no_slip_icrs, width_or_usual_m
+from icrtool.records.run_document import GeometryDocument, RunDocument
+from icrtool.records.tables import RobotLog
 
 FITTED_TO = {"icr": "up to the start", "icr_final": "in sample", NO_SLIP: "not fitted"}
 """What a row's numbers were learned from; those of the others are held out."""
 
 REST_OF_DRIVE = "the rest of the drive"
 """What the numbers of a row that is held out were learned from."""
+
+
+def fit(
+    log: RobotLog,
+    config: Config | None = None,
+    *,
+    warm_start: WarmStart | None = None,
+    changes_s: tuple[float, ...] = (),
+    smooth: bool = False,
+    watch: Callable[[str], None] | None = None,
+) -> Run:
+    """Learn a robot's track ICRs from a log, and its motion model.
+
+    Parameters
+    ----------
+    log : as `icrtool.read_log` returns it
+    config : default: all defaults
+    warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
+    changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
+    smooth : also make the states of the RTS smoother
+    watch : called with the name of each stage when it begins
+
+    Returns
+    -------
+    Run
+        No file is touched. `document` holds the motion model, as `icrtool.calibrate` fits it, the ICRs and what a
+        controller is given.
+
+    Raises
+    ------
+    DataError
+        Streams that cannot be used together, or hold values that are not finite numbers.
+    ConfigError
+        A start that preset ``field`` does not take.
+    """
+    check_type(log, RobotLog, "icrtool.read_log(path, config) reads one")
+    # The callee alone holds the log, and frees what it needs no longer.
+    logs = [log]
+    del log
+    run = fit_filter(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=watch)
+    return replace(run, document=with_motion(run))
+
+
+def with_motion(run: Run) -> RunDocument:
+    """Return the document of a run with its motion model, ICRs and controller numbers.
+
+    Notes
+    -----
+    ICRs and controller numbers come from one fit of `FIVE` to the windows of the drive, so that
+    (right - left) / b is the multiplier. With preset ``paper`` they are those of the filter at the end.
+    """
+    recording = recording_of(run, width_m=width_or_usual_m(run.track_width_m))
+    try:
+        fits = fit_models([recording], (FIVE, RECOMMENDED))
+    except DataError:
+        fits = {}
+    paper, width = run.config.filter.preset == "paper", recording.width_m
+    if paper:
+        # The filter's final ICRs, with radii as configured.
+        right, left, x = run.table.icrs_at(-1)
+        geometry = TrackGeometry(right, left, x, (right - left) / width, 1.0, 1.0)
+        by_icr = np.zeros((len(geometry), ICRS))
+        by_icr[:ICRS] = np.eye(ICRS)
+        by_icr[ICRS, :2] = 1.0 / width, -1.0 / width
+        covariance: Floats = by_icr @ np.array(run.document.icr.final_covariance_m2) @ by_icr.T
+    elif FIVE in fits:
+        geometry, covariance = fits[FIVE].geometry(width)
+    else:
+        return run.document
+    robot = robot_of(run, width)
+    found = None
+    if run.usable and run.track_width_m is not None and RECOMMENDED in fits:
+        found = fitted_document(fits[RECOMMENDED], geometry, covariance, robot)
+    # An ICR is shown by the excitation of the drive, and by its own standard deviation.
+    verdicts = run.document.excitation.verdict
+    largest = WEAK_SHARE * abs(geometry.y_icr_right_m - geometry.y_icr_left_m)
+    shown: dict[str, float] = {}
+    for name, value, std in zip(ICR_COLUMNS, geometry, np.sqrt(np.diag(covariance)).tolist(), strict=False):
+        if paper or (verdicts[name] != "not shown" and std <= largest):
+            shown |= {name: float(value), f"{name}_std": std}
+    return msgspec.structs.replace(
+        run.document,
+        recommended=found,
+        geometry=GeometryDocument(**shown, covariance_m2=covariance[:ICRS, :ICRS].tolist()),
+        controller=controller_numbers(geometry, covariance, robot)
+        if found is not None and set(ICR_COLUMNS[:2]) <= shown.keys()
+        else None,
+    )
 
 
 class Model(NamedTuple):
@@ -106,9 +208,17 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     filter's momentary ICRs know the drive up to the start, its final ones all of it.
     """
     recording, heading, notes = _with_heading(run, headings)
+    parts = {"ahead of": recording.lever.ahead, "to the right of": recording.lever.aside}
+    if unknown := " and ".join(word for word, known in parts.items() if not known):
+        what = f"how far {unknown} the body's origin the position is measured is not known"
+        lever = "in the row of the controller numbers it is a constant of this log"
+        notes.append(f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it")
     found = hold_out([recording])
     give_back_freed()
     rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
+    calibration = None
+    if run.track_width_m is not None:
+        calibration = calibration_from(found, robot_of(run, recording.width_m), use_warnings(run))
     return ComparedModels(
         tuple(rows), found.trials[0],
         recording.track._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps),
@@ -116,19 +226,12 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
         fits={name: fit.fitted for name, fit in found.fits.items()},
         width_m=recording.width_m,
         heading=heading,
-        notes=(*notes, *_lever_notes(recording)),
-        calibration=_calibration(run, found),
+        notes=tuple(notes),
+        calibration=calibration,
     )  # fmt: skip
 
 
-def _calibration(run: Run, found: HeldOut) -> Calibration | None:
-    """Return the calibration of a run from the table that compares its models; an attitude is no gyro."""
-    if run.track_width_m is None:
-        return None
-    return calibration_from(found, robot_of(run, found.recordings[0].width_m), use_warnings(run))
-
-
-def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, tuple[str, ...]]:
+def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, list[str]]:
     """Return the recording with the first measured heading that turns with the robot, its kind, and notes."""
     notes = []
     plain = recording_of(run, width_m=width_or_usual_m(run.track_width_m))
@@ -137,11 +240,11 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
         if found.track.gyro is not None:
             if found.gyro_reversed:
                 notes.append(f"the {one.kind} counts turns in the other direction: its sign was changed")
-            return found, one.kind, tuple(notes)
+            return found, one.kind, notes
         notes.append(f"the {one.kind} does not turn with the robot: rows with it are left out")
     if not notes:
         notes.append("the run holds no heading measured apart from the position: no rows with one")
-    return plain, "", tuple(notes)
+    return plain, "", notes
 
 
 def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
@@ -158,15 +261,6 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
             if one.name != NO_SLIP:
                 errors_of = partial(_errors_along, path, recording.track, one.icrs)
                 yield ComparedRow(f"{one.name}_{kind}", f"{one.label} + {kind}", errors_of)
-
-
-def _lever_notes(recording: Recording) -> list[str]:
-    """Return which part of the position's place on the robot is not known, and what the row ``controller`` does."""
-    parts = {"ahead of": recording.lever.ahead, "to the right of": recording.lever.aside}
-    unknown = " and ".join(word for word, known in parts.items() if not known)
-    what = f"how far {unknown} the body's origin the position is measured is not known"
-    lever = "in the row of the controller numbers it is a constant of this log"
-    return [f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it"] if unknown else []
 
 
 def models_of(run: Run) -> tuple[Model, ...]:
