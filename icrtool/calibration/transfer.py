@@ -8,7 +8,7 @@ single run, by a fit to the rest of the drive.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -85,7 +85,11 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> GroupComparison:
         raise ConfigError("groups", "only one is given", "name two or more to compare")
     results = {name: calibrate_runs(runs) for name, runs in groups.items()}
     recordings = {name: one.table.recordings for name, one in results.items()}
-    _check_apart(recordings)
+    seen: dict[str, str] = {}
+    for name, one in ((name, one) for name, group in recordings.items() for one in group):
+        if one.sha256 and seen.setdefault(one.sha256, name) != name:
+            why = f"it is in {seen[one.sha256]} and in {name}"
+            raise ConfigError(one.name, why, "a calibration would be tested on what it was fitted to")
     return compare_calibrations(results, recordings)
 
 
@@ -94,39 +98,40 @@ def compare_calibrations(
 ) -> GroupComparison:
     """Compare calibrations of groups of recordings; see `compare_groups`."""
     tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
+    cells, costs = [], []
     for (row, result), (column, own) in product(results.items(), results.items()):
-        if _of_one_robot(result.calibration, own.calibration):
-            tested.setdefault((row, column), _test(result, recordings[column], own=False))
-        else:
-            held_out = tested[column, column]
-            tested[row, column] = held_out._replace(errors=np.full_like(held_out.errors, np.nan))
-    cells = [cell for row, column in product(results, results) for cell in _cells(row, column, tested[row, column])]
-    costs = [
-        TransferCost(*astuple(errors), calibrated_on=row, tested_on=column)
-        for row, column in product(results, results) if row != column
-        for errors in _differences(tested[column, column], tested[row, column], paired=True)
-    ]  # fmt: skip
+        held_out = found = tested[column, column]
+        if row != column:
+            # Parameters that refer to another track width or wheel radius are those of another robot.
+            ours, theirs = result.calibration, own.calibration
+            same_width = math.isclose(ours.width_m, theirs.width_m, rel_tol=1e-3)
+            found = held_out._replace(errors=np.full_like(held_out.errors, np.nan))
+            if same_width and ours.robot.wheel_radius_m == theirs.robot.wheel_radius_m:
+                found = _test(result, recordings[column], own=False)
+            differences = _differences(held_out, found, paired=True)
+            costs += [TransferCost(*astuple(one), calibrated_on=row, tested_on=column) for one in differences]
+        for h, horizon in enumerate(HORIZONS_M):
+            errors, _ = _sum_up(found.errors[:, h], found.path, horizon)
+            trials = int(np.count_nonzero(np.isfinite(found.errors[:, h])))
+            cells.append(TransferCell(*astuple(errors), calibrated_on=row, tested_on=column, trials=trials))
     first, *others = results
     pairs = []
     for other in others:
-        (one, *_), (two, *_) = groups = recordings[first], recordings[other]
-        paired = len(groups[0]) == len(groups[1]) == 1 and same_route(one.track, two.track)
+        groups = recordings[first], recordings[other]
+        paired = len(groups[0]) == len(groups[1]) == 1 and same_route(groups[0][0].track, groups[1][0].track)
         parameters = _parameter_differences(results[first].calibration, results[other].calibration)
-        found = _differences(tested[first, first], tested[other, other], paired=paired)
+        differences = _differences(tested[first, first], tested[other, other], paired=paired)
         at_choice = (first, other, CHOICE_HORIZON_M)
         cost = next(one for one in costs if (one.calibrated_on, one.tested_on, one.horizon_m) == at_choice)
         sentence = _verdict(first, other, parameters, cost)
-        errors = tuple(ErrorDifference(*astuple(one), paired=paired) for one in found)
-        pairs.append(ComparedPair(first, other, parameters, errors, sentence))
+        errors_of_pair = tuple(ErrorDifference(*astuple(one), paired=paired) for one in differences)
+        pairs.append(ComparedPair(first, other, parameters, errors_of_pair, sentence))
+    calibrations = {name: one.calibration for name, one in results.items()}
     return GroupComparison(
         schema=COMPARE_SCHEMA, tool_version=__version__,
-        groups={name: _group(one.calibration) for name, one in results.items()},
+        groups={name: ComparedGroup(one.recommended, one.logs, one.geometry) for name, one in calibrations.items()},
         pairs=tuple(pairs), transfer=tuple(cells), costs=tuple(costs),
     )  # fmt: skip
-
-
-def _group(calibration: Calibration) -> ComparedGroup:
-    return ComparedGroup(calibration.recommended, calibration.logs, calibration.geometry)
 
 
 def _verdict(first: str, second: str, parameters: Sequence[ParameterDifference], cost: TransferCost) -> str:
@@ -142,12 +147,6 @@ def _verdict(first: str, second: str, parameters: Sequence[ParameterDifference],
     if low is not None and high is not None and low <= 0.0 <= high:
         sentence += ", which may be chance"
     return f"The multiplier of {second} differs from that of {first} {change}; a calibration of {first} {sentence}."
-
-
-def _of_one_robot(one: Calibration, other: Calibration) -> bool:
-    """Return whether the parameters of two calibrations refer to the same track width and wheel radius."""
-    same_width = math.isclose(one.width_m, other.width_m, rel_tol=1e-3)
-    return same_width and one.robot.wheel_radius_m == other.robot.wheel_radius_m
 
 
 class _Tested(NamedTuple):
@@ -169,20 +168,14 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
     return _Tested(np.concatenate(errors), np.concatenate(path))
 
 
-class _Sums(NamedTuple):
-    """The trials of one horizon: p95 and mean [m] with their intervals, and the sums of blocks of path."""
-
-    errors: ErrorsAt
-    blocks: BlockSums | None
-
-
-def _sum_up(errors_m: Floats, path_m: Floats, horizon_m: float) -> _Sums:
+def _sum_up(errors_m: Floats, path_m: Floats, horizon_m: float) -> tuple[ErrorsAt, BlockSums | None]:
+    """Return p95 and mean [m] of trials (k,) of one horizon with their intervals, and the sums of blocks of path."""
     summary = error_summary(errors_m[:, None])
     p50, p95, expected = (float(one[0]) for one in (summary.p50, summary.p95, summary.expected))
     blocks = cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
     sums = block_sums(errors_m, blocks, sort_trials(errors_m), p50, p95)
     low, high, p95_low, p95_high = error_intervals(errors_m, blocks, sums, p95)
-    return _Sums(ErrorsAt(horizon_m, *map(known, (p95, p95_low, p95_high, expected, low, high))), sums)
+    return ErrorsAt(horizon_m, *map(known, (p95, p95_low, p95_high, expected, low, high))), sums
 
 
 def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[ErrorsAt]:
@@ -194,24 +187,17 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[Error
         if same:
             both = np.isfinite(sides[0]) & np.isfinite(sides[1])
             sides = [np.where(both, one, np.nan) for one in sides]
-        before, after = (_sum_up(side, one.path, horizon) for side, one in zip(sides, (first, second), strict=True))
+        (before, old), (after, new) = (
+            _sum_up(side, one.path, horizon) for side, one in zip(sides, (first, second), strict=True)
+        )
         numbers: list[float | None] = []
         for metric, name in (("p95", "p95_m"), ("expected", "expected_m")):
-            then, now = getattr(before.errors, name), getattr(after.errors, name)
+            then, now = getattr(before, name), getattr(after, name)
             more = math.nan if then is None or now is None else now - then
-            half = difference_half_width(after.blocks, before.blocks, metric, 1.0, paired=paired)
+            half = difference_half_width(new, old, metric, 1.0, paired=paired)
             numbers += [known(more), known(more - half), known(more + half)]
         found.append(ErrorsAt(horizon, *numbers))
     return found
-
-
-def _cells(row: str, column: str, tested: _Tested) -> Iterator[TransferCell]:
-    """Yield the cells of one row and column, a horizon each."""
-    for h, horizon in enumerate(HORIZONS_M):
-        errors = tested.errors[:, h]
-        trials = int(np.count_nonzero(np.isfinite(errors)))
-        sums = _sum_up(errors, tested.path, horizon)
-        yield TransferCell(*astuple(sums.errors), calibrated_on=row, tested_on=column, trials=trials)
 
 
 def same_route(first: Track, second: Track) -> bool:
@@ -223,15 +209,6 @@ def same_route(first: Track, second: Track) -> bool:
     places = [np.interp(at, one.distance, one.north) + 1j * np.interp(at, one.distance, one.east)
               for one in (first, second)]  # fmt: skip
     return bool(np.abs(places[1] - places[0]).max() < SAME_ROUTE_M)
-
-
-def _check_apart(recordings: Mapping[str, Sequence[Recording]]) -> None:
-    seen: dict[str, str] = {}
-    for name, group in recordings.items():
-        for one in group:
-            if one.sha256 and seen.setdefault(one.sha256, name) != name:
-                why = f"it is in {seen[one.sha256]} and in {name}"
-                raise ConfigError(one.name, why, "a calibration would be tested on what it was fitted to")
 
 
 def _parameter_differences(first: Calibration, second: Calibration) -> tuple[ParameterDifference, ...]:

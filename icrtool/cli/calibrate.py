@@ -18,8 +18,7 @@ from icrtool.cli.printing import Printer
 with when_used():
     from icrtool import errors
     from icrtool.alignment import align, corrections, estimator, wheel_units
-    from icrtool.calibration import forecast as forecasting
-    from icrtool.calibration import one_log, run_recording
+    from icrtool.calibration import error_growth, pooled, sensor_findings
     from icrtool.logs import read_log
     from icrtool.output import run_directory
     from icrtool.output.figures import calibrations as figures
@@ -85,7 +84,7 @@ def calibrate_command(
     sensors = None
     if len(runs) == 1:
         printer.warn_of(runs[0])
-        sensors = one_log.calibrate_log(runs[0], x_icr_m=x_icr)
+        sensors = sensor_findings.calibrate_log(runs[0], x_icr_m=x_icr)
     result = None
     try:
         result = calibrate_runs(runs, allow_unusable=allow_unusable)
@@ -97,7 +96,7 @@ def calibrate_command(
     texts = []
     document: CalibrationFile | None = sensors
     if result is not None:
-        document = result.calibration if sensors is None else one_log.with_sensors(result.calibration, sensors)
+        document = result.calibration if sensors is None else sensor_findings.with_sensors(result.calibration, sensors)
     if output is not None and document is not None:
         texts.append(f"written to {formats.write_calibration(document, output)}")
     if plot is not None:
@@ -162,11 +161,11 @@ def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast
     """Forecast along a run's path or the points of a table: wheels alone, and with a gyro where both have one."""
     with_gyro = calibration.gyro is not None and calibration.gyro.error_sources is not None
     if run_directory.is_run_directory(path):
-        recording = run_recording.turning_recording_of(run_directory.open_run(path))
+        recording = pooled.turning_recording_of(run_directory.open_run(path))
         with_gyro = with_gyro and recording.track.gyro is not None
-        forecast = partial(forecasting.forecast_drive, calibration, recording)
+        forecast = partial(error_growth.forecast_drive, calibration, recording)
     else:
         plan = formats.read_numbers(path, ("east_m", "north_m"), ("speed_mps",), most_bytes=LARGEST_PLAN_BYTES)
         points = plan["east_m"], plan["north_m"], plan.get("speed_mps")
-        forecast = partial(forecasting.forecast_plan, calibration, *points)
+        forecast = partial(error_growth.forecast_plan, calibration, *points)
     return forecast(), forecast(with_gyro=True) if with_gyro else None

@@ -20,7 +20,7 @@ from icrtool.records.text import LogText, escaped
 with when_used():
     from icrtool import errors
     from icrtool.alignment import wheel_units
-    from icrtool.calibration import fit as fitting
+    from icrtool.calibration import run_models
     from icrtool.fleet import one_log
     from icrtool.logs import describe, read_log
     from icrtool.logs.streams import assembly
@@ -147,7 +147,7 @@ def _examine(
                 survey = read_log.survey_log(log, config, stages.share, start=span.start, end=span.end)
                 measured = assembly.assemble(survey, config)
             measured = wheel_units.with_wheel_speeds(measured, config)
-            run = fitting.fit(measured, config, watch=stages.begin)
+            run = run_models.fit(measured, config, watch=stages.begin)
     except errors.IcrToolError as err:
         problem = err
     holds = describe.survey_document(survey) if survey is not None else None

@@ -205,7 +205,8 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
     Notes
     -----
     An antenna off the centre line and sides that slip unequally look the same: only the difference shows
-    (`icrtool.calibration.one_log`). So do an antenna ahead of the body origin and an x_icr behind it. Nothing is moved.
+    (`icrtool.calibration.sensor_findings`). So do an antenna ahead of the body origin and an x_icr behind it. Nothing
+    is moved.
     """
     settled = slice(len(table) // 2, None)
     middle = float(np.median(table.y_icr_right_m[settled] + table.y_icr_left_m[settled])) / 2

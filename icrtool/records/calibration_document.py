@@ -203,7 +203,8 @@ class SensorDocument(CalibrationFile, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    parameters : as `alignment`: the estimates, then those derived from them, by `icrtool.calibration.one_log.LABELS`
+    parameters : as `alignment`: the estimates, then those derived from them, by the keys of
+        `icrtool.calibration.sensor_findings.LABELS`
     """
 
     log: str

@@ -10,9 +10,9 @@ from msgspec import UNSET
 from icrtool import __version__
 from icrtool.calibration.error_growth import Forecast
 from icrtool.calibration.held_out import HeldOut, HeldOutRow
-from icrtool.calibration.one_log import LABELS
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration
+from icrtool.calibration.sensor_findings import LABELS
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS

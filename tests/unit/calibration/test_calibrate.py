@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from icrtool.calibration.one_log import calibrate_log
+from icrtool.calibration.sensor_findings import calibrate_log
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit

@@ -26,36 +26,33 @@ from icrtool.records.calibration_document import (
     SensorParameter,
     SensorVerdict,
 )
-from icrtool.records.measurements import RESPONSE_S
+from icrtool.records.measurements import RESPONSE_S, Finding
 from icrtool.records.plain_data import known
 from icrtool.records.run import Run
 
 
 class _Kind(NamedTuple):
-    """A parameter: its key in files, its name in run.json, words for it, and a useful standard deviation."""
+    """A parameter: words for it, a useful standard deviation, and its name in run.json where that is not its key."""
 
-    key: str
-    finding: str
     label: str
     useful: float
+    finding: str = ""
 
 
-AHEAD = _Kind("antenna_forward_minus_x_icr_m", "antenna_forward_minus_x_icr_m", "antenna forward − x ICR", 0.03)
-ASIDE = _Kind(
-    "antenna_right_minus_icr_middle_m", "antenna_right_minus_icr_middle_m", "antenna right − middle of the ICRs", 0.03
-)
-SEPARATION = _Kind("icr_separation_m", "icr_separation_m", "ICR separation y right − y left", 0.05)
-KINDS = (
-    AHEAD,
-    ASIDE,
-    _Kind("heading_offset_deg", "heading_offset_deg", "heading offset", 1.0),
-    _Kind("gnss_delay_s", "position_delay_s", "position lags the wheels by", 0.05),
-    _Kind("heading_delay_s", "heading_delay_s", "heading lags the wheels by", 0.05),
-    _Kind("gnss_delay_against_heading_s", "position_delay_against_heading_s", "position lags the heading by", 0.03),
-    _Kind("left_scale", "left_scale", "left wheel scale", 0.01),
-    _Kind("right_scale", "right_scale", "right wheel scale", 0.01),
-    SEPARATION,
-)
+AHEAD, ASIDE, SEPARATION = "antenna_forward_minus_x_icr_m", "antenna_right_minus_icr_middle_m", "icr_separation_m"
+KINDS = {
+    AHEAD: _Kind("antenna forward − x ICR", 0.03),
+    ASIDE: _Kind("antenna right − middle of the ICRs", 0.03),
+    "heading_offset_deg": _Kind("heading offset", 1.0),
+    "gnss_delay_s": _Kind("position lags the wheels by", 0.05, "position_delay_s"),
+    "heading_delay_s": _Kind("heading lags the wheels by", 0.05),
+    "gnss_delay_against_heading_s": _Kind("position lags the heading by", 0.03, "position_delay_against_heading_s"),
+    "left_scale": _Kind("left wheel scale", 0.01),
+    "right_scale": _Kind("right wheel scale", 0.01),
+    SEPARATION: _Kind("ICR separation y right − y left", 0.05),
+}
+"""By their keys in files."""
+
 WEAK = 3.0
 """A standard deviation up to so many times the useful one is weak; above it, the drive does not show the parameter."""
 
@@ -73,7 +70,7 @@ MOVING_MPS, TURNING_DEGPS = 0.05, 2.0
 SETTING_SIGMAS = 3.0
 
 
-LABELS = {kind.key: kind.label for kind in KINDS} | {
+LABELS = {key: kind.label for key, kind in KINDS.items()} | {
     "antenna_forward_m": "antenna forward", "antenna_right_m": "antenna right", "y_icr_right_m": "y ICR right",
     "y_icr_left_m": "y ICR left", "x_icr_m": "x ICR",
 }  # fmt: skip
@@ -92,13 +89,22 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> SensorDocument:
     DataError
         The drive is too short for an estimate.
     """
-    wheels, drive = run.document.wheels, run.document.drive
-    if not {kind.finding for kind in KINDS} <= run.document.alignment.keys():
-        why = f"{drive.distance_m:.0f} m of driven distance are too few windows, or an older version made the run"
+    wheels, found = run.document.wheels, run.document.alignment
+    if not {kind.finding or key for key, kind in KINDS.items()} <= found.keys():
+        metres = run.document.drive.distance_m
+        why = f"{metres:.0f} m of driven distance are too few windows, or an older version made the run"
         raise DataError(run.name, why, "drive longer, or fit the log again")
-    driven = _drive(run)
-    direct = {kind.key: _direct(run, kind, driven) for kind in KINDS}
-    parameters = direct | _derive(run, direct, x_icr_m)
+    driven, parameters = _drive(run), {}
+    for key, kind in KINDS.items():
+        value, std = _numbers(found[kind.finding or key])
+        verdict: SensorVerdict = "not shown"
+        if std <= WEAK * kind.useful:
+            verdict = "shown" if std <= kind.useful else "weak"
+        note = RESPONSE_PART if key in DELAYS else ""
+        if verdict != "shown":
+            note = _reason(key, driven)
+        parameters[key] = _parameter(value, std, verdict, note)
+    parameters |= _derive(run, parameters, x_icr_m)
     return SensorDocument(
         schema=CALIBRATION_SCHEMA, log=run.name, inputs=run.document.inputs, windows=wheels.windows,
         independent_stretches=wheels.stretches, window_miss_m=wheels.residual_m, drive=driven,
@@ -118,7 +124,7 @@ def _drive(run: Run) -> SensorDrive:
     )
     moving = np.abs(left) + np.abs(right) > MOVING_MPS
     speed = (left + right)[moving] / 2
-    rate = np.degrees(np.abs(left - right)[moving] / max(_finding(run, SEPARATION.finding)[0], 1e-3))
+    rate = np.degrees(np.abs(left - right)[moving] / max(_numbers(run.document.alignment[SEPARATION])[0], 1e-3))
     turning = rate[rate > TURNING_DEGPS]
     return SensorDrive(
         run.document.drive.distance_m,
@@ -130,52 +136,34 @@ def _drive(run: Run) -> SensorDrive:
     )
 
 
-def _finding(run: Run, name: str) -> tuple[float, float]:
-    """Return value and standard deviation of an estimate of the alignment, NaN where the drive does not show it."""
-    found = run.document.alignment[name]
-    value, std = found.value, found.std
-    return math.nan if value is None else value, math.nan if std is None else std
-
-
-def _direct(run: Run, kind: _Kind, driven: SensorDrive) -> SensorParameter:
-    """Return one estimate with a verdict by its standard deviation, and the reason if it is not "shown"."""
-    value, std = _finding(run, kind.finding)
-    verdict: SensorVerdict = "not shown"
-    if std <= kind.useful:
-        verdict = "shown"
-    elif std <= WEAK * kind.useful:
-        verdict = "weak"
-    note = "" if verdict == "shown" else _reason(kind, driven)
-    if kind.key in DELAYS and verdict == "shown":
-        note = RESPONSE_PART
-    return _parameter(value, std, verdict, note)
+def _numbers(one: Finding | SensorParameter) -> tuple[float, float]:
+    """Return an estimate and its standard deviation, NaN where the drive does not show it."""
+    return math.nan if one.value is None else one.value, math.nan if one.std is None else one.std
 
 
 def _parameter(value: float, std: float, verdict: SensorVerdict, note: str = "") -> SensorParameter:
     return SensorParameter(known(value), known(std), verdict, note)
 
 
-def _reason(kind: _Kind, driven: SensorDrive) -> str:
+def _reason(key: str, driven: SensorDrive) -> str:
     """Return why the drive does not determine a parameter well, and what to drive."""
-    if kind.key.startswith("gnss_delay") and driven.speed_std_mps < STEADY * driven.speed_mean_mps:
-        return (
-            f"speed hardly changes ({driven.speed_mean_mps:.2f} ± {driven.speed_std_mps:.2f} m/s): add stops and starts"
-        )
+    mean, std = driven.speed_mean_mps, driven.speed_std_mps
+    if key.startswith("gnss_delay") and std < STEADY * mean:
+        return f"speed hardly changes ({mean:.2f} ± {std:.2f} m/s): add stops and starts"
     right, left = math.radians(driven.turned_right_deg), math.radians(driven.turned_left_deg)
     lacks = lacking_turns(right, left)
-    if lacks and (kind.key not in SHOWN_STRAIGHT or right + left >= TURNS_NEEDED_RAD):
+    if lacks and (key not in SHOWN_STRAIGHT or right + left >= TURNS_NEEDED_RAD):
         return lacks
-    if kind.key in DELAYS:
+    if key in DELAYS:
         return RESPONSE_PART
     return f"too short a drive for this noise: {driven.distance_m:.0f} m"
 
 
 def _derive(run: Run, direct: Mapping[str, SensorParameter], x_icr_m: float | None) -> dict[str, SensorParameter]:
     """Return antenna and ICRs, as far as one of them is known; else the middle of the ICRs is assumed at y = 0."""
-    (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = (
-        _finding(run, kind.finding) for kind in (AHEAD, ASIDE, SEPARATION)
-    )
-    of_ahead, of_aside, of_separation = (direct[kind.key].verdict for kind in (AHEAD, ASIDE, SEPARATION))
+    of_antenna_and_icrs = [direct[key] for key in (AHEAD, ASIDE, SEPARATION)]
+    (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, of_antenna_and_icrs)
+    of_ahead, of_aside, of_separation = (one.verdict for one in of_antenna_and_icrs)
     forward, right = known_antenna_m(run)
     if forward is not None:
         antenna_forward = _parameter(forward, 0.0, "given")
@@ -190,7 +178,7 @@ def _derive(run: Run, direct: Mapping[str, SensorParameter], x_icr_m: float | No
     if right is not None:
         antenna_right = _parameter(right, 0.0, "given")
         middle, note = right - aside, "with the antenna as given"
-        stds = [_finding(run, name)[1] for name in ("y_icr_right_m", "y_icr_left_m")]
+        stds = [_numbers(run.document.alignment[name])[1] for name in ("y_icr_right_m", "y_icr_left_m")]
         verdict = max((of_separation, of_aside), key=("given", "shown", "weak", "not shown").index)
     else:
         middle, note = 0.0, "if the ICRs lie symmetrically about the middle of the body"
@@ -208,24 +196,24 @@ def _derive(run: Run, direct: Mapping[str, SensorParameter], x_icr_m: float | No
 
 def _settings(parameters: Mapping[str, SensorParameter], run: Run) -> dict[str, float]:
     """Return the settings of parameters that are known well enough, and are large enough, to be configured."""
-    settings = {}
-
-    def add(key: str, name: str, *, neutral: float, least: float, times: float = 1.0) -> None:
-        one = parameters[name]
-        if one.verdict != "shown" or one.value is None or one.std is None:
-            return
-        if abs(one.value - neutral) > max(SETTING_SIGMAS * one.std, least):
-            settings[key] = round(times * one.value, 4)
-
-    add("frames.heading_offset_deg", "heading_offset_deg", neutral=0.0, least=0.3)
-    for key, name in (("frames.reference_delay_s", "gnss_delay_s"), ("frames.heading_delay_s", "heading_delay_s")):
-        # a stream that seems to lead shows a robot that follows its wheels with a delay
-        if (parameters[name].value or 0.0) > 0.0:
-            add(key, name, neutral=0.0, least=RESPONSE_S)
-    add("frames.antenna_forward_m", "antenna_forward_m", neutral=0.0, least=0.02)
-    add("frames.antenna_right_m", "antenna_right_m", neutral=0.0, least=0.02)
     wheels = run.config.wheels
-    for side, given in (("left", wheels.left_scale), ("right", wheels.right_scale)):
-        times = 1.0 if given == "auto" else given
-        add(f"wheels.{side}_scale", f"{side}_scale", neutral=1.0, least=0.005, times=times)
+    left, right = (1.0 if given == "auto" else given for given in (wheels.left_scale, wheels.right_scale))
+    # the parameter of each, the value that changes nothing, the least difference, and what the setting is multiplied by
+    rows = (
+        ("frames.heading_offset_deg", "heading_offset_deg", 0.0, 0.3, 1.0),
+        ("frames.reference_delay_s", "gnss_delay_s", 0.0, RESPONSE_S, 1.0),
+        ("frames.heading_delay_s", "heading_delay_s", 0.0, RESPONSE_S, 1.0),
+        ("frames.antenna_forward_m", "antenna_forward_m", 0.0, 0.02, 1.0),
+        ("frames.antenna_right_m", "antenna_right_m", 0.0, 0.02, 1.0),
+        ("wheels.left_scale", "left_scale", 1.0, 0.005, left),
+        ("wheels.right_scale", "right_scale", 1.0, 0.005, right),
+    )
+    settings = {}
+    for key, name, neutral, least, times in rows:
+        value, std = _numbers(parameters[name])
+        large = abs(value - neutral) > max(SETTING_SIGMAS * std, least)
+        # a stream that seems to lead shows a robot that follows its wheels with a delay
+        leads = name in DELAYS and value <= 0.0
+        if parameters[name].verdict == "shown" and large and not leads:
+            settings[key] = round(times * value, 4)
     return settings
