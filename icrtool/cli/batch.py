@@ -23,7 +23,7 @@ from icrtool.records.text import LogText, counted, escaped, shortened
 
 with when_used():
     from icrtool.fleet import batch as batches
-    from icrtool.fleet import fleet_files, one_log, roll_up
+    from icrtool.fleet import fleet_files, one_log
     from icrtool.output.files import remote_place
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def batch_command(
     with remote_place.on_disk(output, parts=fleet_files.FOLDERS) as folder:
         calibrations = []
         if asked.ladder:
-            pooled = roll_up.pooled_calibrations(rows, folder, output, allow_unusable=asked.allow_unusable)
+            pooled = fleet_files.pooled_calibrations(rows, folder, output, allow_unusable=asked.allow_unusable)
             calibrations = list(pooled)
         new = any((row.status, row.this_time) == ("done", "processed") for row in rows)
         plots = asked.plots if new or not (folder / fleet_files.PLOTS).is_dir() else ()

@@ -17,7 +17,7 @@ with when_used():
     from icrtool import errors
     from icrtool.calibration import pooled
     from icrtool.estimation import fit
-    from icrtool.fleet import recordings, roll_up
+    from icrtool.fleet import fleet_files, recordings
     from icrtool.logs import read_log
     from icrtool.output import run_directory
     from icrtool.output.files import formats
@@ -42,8 +42,8 @@ def runs_or_logs(place: Path) -> list[Path]:
     if not isinstance(place, UrlPath):
         if run_directory.is_run_directory(place) or not place.is_dir():
             return [place]
-        if roll_up.is_fleet(place):
-            return [run for runs in roll_up.runs_of_fleet(place).values() for run in runs]
+        if fleet_files.is_fleet(place):
+            return [run for runs in fleet_files.runs_of_fleet(place).values() for run in runs]
         runs = sorted(file.parent for file in place.rglob(run_directory.RUN_FILE))
         if found := [run for run in runs if run_directory.is_run_directory(run)]:
             return found

@@ -20,7 +20,7 @@ with when_used():
     from icrtool import errors
     from icrtool.calibration import transfer
     from icrtool.dropout_analysis import dropout_report
-    from icrtool.fleet import roll_up
+    from icrtool.fleet import fleet_files
     from icrtool.output import run_directory
     from icrtool.output.figures import calibrations as figures
     from icrtool.output.files import atomic, formats
@@ -163,8 +163,8 @@ def groups_of(sources: tuple[str, ...]) -> dict[LogText, list[Path]]:
     places: dict[LogText, list[Path]] = {}
     for source in sources:
         name, path = named_place(source)
-        if len(sources) == 1 and roll_up.is_fleet(path):
-            places = {LogText(group): runs for group, runs in roll_up.runs_of_fleet(path).items()}
+        if len(sources) == 1 and fleet_files.is_fleet(path):
+            places = {LogText(group): runs for group, runs in fleet_files.runs_of_fleet(path).items()}
         else:
             places.setdefault(name, []).append(path)
     if len(places) < 2:

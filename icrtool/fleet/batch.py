@@ -15,13 +15,12 @@ import msgspec
 from msgspec.structs import replace
 
 from icrtool import __version__
-from icrtool.config import Config, ConfigSources, builtin_robots
+from icrtool.config import ConfigSources, builtin_robots
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
-from icrtool.fleet.manifest import About, about, is_manifest, read_manifest
 from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
-from icrtool.fleet.recordings import FoundRecording, as_text, find_recordings, logs_among
+from icrtool.fleet.recordings import about, as_text, find_recordings, is_manifest, logs_among, read_manifest
 from icrtool.logs.containers.recording_files import files_of_log
 from icrtool.logs.containers.source import RemoteFile
 from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
@@ -56,9 +55,7 @@ class BatchOptions:
     baseline: Path | None = None
 
 
-def plan(
-    places: Sequence[Path], output: Path, options: BatchOptions, folder: Path | None = None
-) -> list[Request]:  # fmt: skip
+def plan(places: Sequence[Path], output: Path, options: BatchOptions, folder: Path | None = None) -> list[Request]:
     """Return a request for each recording among logs, folders and manifests.
 
     Parameters
@@ -99,7 +96,30 @@ def plan(
         if options.baseline.resolve() == output.resolve():
             raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")
         baseline = open_baseline(options.baseline).digest
-    return [_request(one, about(one.path, entries), output, options, baseline) for one in find_recordings(searched)]
+    requests = []
+    for one in find_recordings(searched):
+        known, settings, report = about(one.path, entries), options.settings, options.report
+        builtin = known.robot in builtin_robots()
+        # A robot that is not built in is a name, which needs a configuration of its own.
+        if known.robot and not builtin and known.config is None and settings.file is None:
+            advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
+            raise ConfigError(f"{one.log}: robot {known.robot!r}", "not a built-in robot", advice)
+        robot = known.robot if builtin else settings.robot if not known.robot else None
+        config = settings._replace(file=known.config or settings.file, robot=robot).load()
+        # Whether the page is there is seen by its file.
+        asked = [config.effective(), __version__, dataclasses.replace(report, page=True), known.robot, baseline]
+        row = FleetLog(
+            one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot or config.robot.name or "", group=known.group,
+            tags=known.tags, key=sha256(msgspec.json.encode(asked, order="sorted")).hexdigest(),
+        )  # fmt: skip
+        # Workers of a cluster may have another working directory.
+        request = Request(
+            path=os.fsencode(one.path.absolute()), known=row, folder=os.fsencode(output.absolute()),
+            config=config, report=report, overwrite=options.overwrite,
+            baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
+        )  # fmt: skip
+        requests.append(request)
+    return requests
 
 
 def finished(request: Request, folder: Path) -> FleetLog | None:
@@ -176,7 +196,12 @@ def _all_of(
         while waiting:
             done, waiting = wait(waiting, POLL_S, FIRST_COMPLETED)
             for future in done:
-                yield pending[future], _row_of(future, pending[future])
+                try:
+                    row = future.result()
+                except (CancelledError, OSError) as err:
+                    reason = f"lost by the cluster ({str(err) or type(err).__name__})"
+                    row = failed(pending[future], reason, repeatable=False)
+                yield pending[future], row
             if waiting and (why := lost()):
                 for future in waiting:
                     future.cancel()
@@ -189,66 +214,24 @@ def _all_of(
         raise
 
 
-def _row_of(future: Future[FleetLog], request: Request) -> FleetLog:
-    """Return the row of a log, also where a cluster lost the work on it."""
-    try:
-        return future.result()
-    except (CancelledError, OSError) as err:
-        return failed(request, f"lost by the cluster ({str(err) or type(err).__name__})", repeatable=False)
-
-
-def _request(one: FoundRecording, known: About, output: Path, options: BatchOptions, baseline: str) -> Request:
-    config = _config(one, known, options)
-    report = options.report
-    # Whether the page is there is seen by its file.
-    asked = [config.effective(), __version__, dataclasses.replace(report, page=True), known.robot, baseline]
-    key = sha256(msgspec.json.encode(asked, order="sorted")).hexdigest()
-    row = FleetLog(
-        one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot or config.robot.name or "", group=known.group,
-        tags=known.tags, key=key,
-    )  # fmt: skip
-    # Workers of a cluster may have another working directory.
-    return Request(
-        path=os.fsencode(one.path.absolute()), known=row, folder=os.fsencode(output.absolute()),
-        config=config, report=report, overwrite=options.overwrite,
-        baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
-    )  # fmt: skip
-
-
-def _config(one: FoundRecording, known: About, options: BatchOptions) -> Config:
-    """Return a log's configuration; a robot that is not built in is a name, which needs a configuration of its own."""
-    builtin = known.robot in builtin_robots()
-    if known.robot and not builtin and known.config is None and options.settings.file is None:
-        advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
-        raise ConfigError(f"{one.log}: robot {known.robot!r}", "not a built-in robot", advice)
-    robot = known.robot if builtin else options.settings.robot if not known.robot else None
-    return options.settings._replace(file=known.config or options.settings.file, robot=robot).load()
-
-
 def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
     """Return whether a log's files are those of an earlier batch; content is compared where their time differs."""
     if isinstance(path, UrlPath):
-        return bool(stored) and _is_unchanged(stored[0], path)
+        try:
+            now = RemoteFile(path)
+        except LogError:
+            return False
+        version = next(iter(now.version.values()), "")
+        return bool(stored and version) and (now.size, version) == (stored[0].bytes, stored[0].version)
     try:
         files = files_of_log(path)
         if [as_text(file.name) for file in files] != [Path(file.path).name for file in stored]:
             return False
         for file, before in zip(files, stored, strict=True):
             status = file.stat()
-            if status.st_size != before.bytes:
-                return False
-            if status.st_mtime_ns != before.mtime_ns and files_of(file)[0].sha256 != before.sha256:
+            same_time = status.st_mtime_ns == before.mtime_ns
+            if status.st_size != before.bytes or not (same_time or files_of(file)[0].sha256 == before.sha256):
                 return False
     except OSError:
         return False
     return True
-
-
-def _is_unchanged(before: FleetFile, path: UrlPath) -> bool:
-    """Return whether what lies at an address has the size and version that it had."""
-    try:
-        now = RemoteFile(path)
-    except LogError:
-        return False
-    version = next(iter(now.version.values()), "")
-    return bool(version) and (now.size, version) == (before.bytes, before.version)

@@ -1,39 +1,35 @@
-"""What a batch leaves: its tables and figures, and acceptance limits for machines that watch pull requests."""
+"""What a batch leaves: tables, figures, acceptance limits for machines that watch pull requests, and calibrations.
+
+There is one calibration per robot and group, tested on each log left out.
+"""
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
+import numpy as np
+from msgspec.structs import replace
 
 from icrtool import __version__
-from icrtool.errors import OutputError
-from icrtool.fleet.recordings import as_text
-from icrtool.fleet.roll_up import CALIBRATIONS, MOST_POOLED_S
+from icrtool.errors import IcrToolError, OutputError
+from icrtool.fleet.recordings import as_text, unique_name
 from icrtool.output.figure_catalogue import FIGURES
+from icrtool.output.files import formats
 from icrtool.output.files.atomic import atomic_file, check_place, is_page, make_folders, write_file
-from icrtool.output.files.formats import PLOT_FORMATS, csv_bytes, json_bytes, schema_of
 from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.text_format import MODEL_WORDS
-from icrtool.records.fleet_document import (
-    FLEET_FAMILY,
-    FLEET_FILE,
-    FLEET_SCHEMA,
-    ROWS,
-    RUNS,
-    SHOWN_ERROR,
-    SHOWN_WITHOUT,
-    FleetCalibration,
-    FleetCounts,
-    FleetDocument,
-    FleetLog,
-)
+from icrtool.records import fleet_document as documents
+from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog
 from icrtool.records.process_resources import remove
-from icrtool.records.run import ICR_COLUMNS
+from icrtool.records.regular_file import is_regular
+from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.text import LogText, counted, escaped
 
 if TYPE_CHECKING:
@@ -50,12 +46,18 @@ FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
 
 PLOTS = "plots"
 
+CALIBRATIONS = "calibrations"
+"""Folder of the calibration files below that of the batch."""
+
+MOST_POOLED_S = 86_400.0
+"""Of the logs of a robot and group, so much time is calibrated together, evenly spaced over all: about 1 GB."""
+
 FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
 """Of a batch."""
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
 
-SHOWN_ERRORS = {MODEL_WORDS["recommended"]: SHOWN_ERROR, MODEL_WORDS["icr"]: SHOWN_WITHOUT}
+SHOWN_ERRORS = {MODEL_WORDS["recommended"]: documents.SHOWN_ERROR, MODEL_WORDS["icr"]: documents.SHOWN_WITHOUT}
 """By whose errors the picture shows: the first that a log has."""
 
 
@@ -73,22 +75,27 @@ def check_tables(folder: Path, *, page: bool) -> None:
     """
     if page and folder.is_dir():
         check_place(folder / PAGE_FILE, folder, is_page)
-    if schema_of(folder / FLEET_FILE, folder).startswith(FLEET_FAMILY) or (folder / ROWS).is_dir():
+    stated = formats.schema_of(folder / FLEET_FILE, folder)
+    if stated.startswith(documents.FLEET_FAMILY) or (folder / ROWS).is_dir():
         return
-    pictures = [f"{PLOTS}/{name}.{form}" for name in FIGURES for form in PLOT_FORMATS if FIGURES[name].of == "fleet"]
-    for name in (*TABLES, *pictures):
-        file = folder / name
+    for file in (*(folder / name for name in TABLES), *pictures_in(folder)):
         if file.exists() and not file.is_symlink():
             raise OutputError(file, "a file that no batch wrote is there", "it is left alone; name another folder")
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """Return where the pictures of a batch are in its folder, in every format."""
+    names = [name for name, entry in FIGURES.items() if entry.of == "fleet"]
+    return [folder / PLOTS / f"{name}.{form}" for name in names for form in formats.PLOT_FORMATS]
 
 
 def fleet_document(rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibration] = ()) -> FleetDocument:
     """Return what fleet.json holds: how many logs were done or failed, all of each, and the pooled calibrations."""
     counts = Counter(row.status for row in rows) + Counter(row.this_time for row in rows)
     return FleetDocument(
-        schema=FLEET_SCHEMA,
+        schema=documents.FLEET_SCHEMA,
         tool_version=__version__,
-        counts=FleetCounts(counts["done"], counts["failed"], counts["skipped"]),
+        counts=documents.FleetCounts(counts["done"], counts["failed"], counts["skipped"]),
         gates_failed=sum(row.gates_failed for row in rows),
         calibrations=tuple(calibrations),
         logs=tuple(rows),
@@ -98,21 +105,20 @@ def fleet_document(rows: Sequence[FleetLog], calibrations: Sequence[FleetCalibra
 def fleet_rows(rows: Sequence[FleetLog]) -> list[dict[str, object]]:
     """Return the rows of fleet.csv by the names of its columns; errors in the order of models and horizons."""
     errors = list(dict.fromkeys(name for row in rows for name in row.errors))
-    return [_fleet_row(row, errors) for row in rows]
-
-
-def _fleet_row(row: FleetLog, errors: Sequence[str]) -> dict[str, object]:
-    found: dict[str, object] = {name: getattr(row, name) for name in BEFORE_ICRS}
-    found |= {name: row.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{one}" for one in ICR_COLUMNS))}
-    found |= {"multiplier": row.multiplier, "multiplier_std": row.multiplier_std}
-    for name in errors:
-        found[name] = row.errors.get(name)
-        if WITHIN in name:
-            is_bound = None if found[name] is None else int(name in row.bounds)
-            found[f"{name.removesuffix('_m')}{IS_BOUND}"] = is_bound
-    found |= {name: getattr(row, name) for name in AFTER_ERRORS}
-    limits = row.gates_failed if row.status != "failed" else None
-    return found | {"tags": ";".join(row.tags), "gates_failed": limits, "took_s": row.took_s}
+    table = []
+    for row in rows:
+        found: dict[str, object] = {name: getattr(row, name) for name in BEFORE_ICRS}
+        found |= {name: row.icr.get(name) for name in (*ICR_COLUMNS, *(f"std_{one}" for one in ICR_COLUMNS))}
+        found |= {"multiplier": row.multiplier, "multiplier_std": row.multiplier_std}
+        for name in errors:
+            found[name] = row.errors.get(name)
+            if WITHIN in name:
+                is_bound = None if found[name] is None else int(name in row.bounds)
+                found[f"{name.removesuffix('_m')}{IS_BOUND}"] = is_bound
+        found |= {name: getattr(row, name) for name in AFTER_ERRORS}
+        limits = row.gates_failed if row.status != "failed" else None
+        table.append(found | {"tags": ";".join(row.tags), "gates_failed": limits, "took_s": row.took_s})
+    return table
 
 
 def write_fleet(
@@ -136,18 +142,18 @@ def write_fleet(
         The disk does not take them.
     """
     cells = fleet_rows(rows)
-    write_file(directory / "fleet.csv", csv_bytes(cells[0], (row.values() for row in cells)), directory)
+    write_file(directory / "fleet.csv", formats.csv_bytes(cells[0], (row.values() for row in cells)), directory)
     failures = [[getattr(row, name) for name in FAILURES] for row in rows if row.status == "failed"]
-    write_file(directory / "failures.csv", csv_bytes(FAILURES, failures), directory)
+    write_file(directory / "failures.csv", formats.csv_bytes(FAILURES, failures), directory)
     with atomic_file(directory / "fleet.parquet", directory) as file:
         _write_parquet(cells, file)
     if calibrations:
         write_file(directory / "calibrations.txt", calibrations_text(calibrations), directory)
     if plots:
-        write_figures(rows, directory, tuple(plots))
+        write_figures(rows, directory, plots)
     document = fleet_document(rows, calibrations)
     # After the tables: where it is, these are of the same batch.
-    write_file(directory / FLEET_FILE, json_bytes(document), directory)
+    write_file(directory / FLEET_FILE, formats.json_bytes(document), directory)
     if page:
         from icrtool.output.page.group_pages import fleet_page
 
@@ -173,7 +179,7 @@ def calibrations_text(calibrations: Sequence[FleetCalibration], *, tables: bool 
     return ("\n\n" if tables else "\n").join(parts) + "\n"
 
 
-def write_figures(rows: Sequence[FleetLog], folder: Path, formats: tuple[str, ...]) -> None:
+def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Sequence[str]) -> None:
     """Draw the ICRs by robot and date, and the error of each log; older pictures are removed.
 
     Parameters
@@ -182,12 +188,11 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, formats: tuple[str, ..
     """
     from icrtool.output.figure_catalogue import figures_of
     from icrtool.output.figures.fleet import FleetNumbers
-    from icrtool.output.files.formats import save_picture
 
     points: list[FleetLog] = []
     errors: dict[str, dict[str, float]] = {}
     known = {name for row in rows for name in row.errors}
-    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", SHOWN_WITHOUT))
+    model, error_name = next((one for one in SHOWN_ERRORS.items() if one[1] in known), ("", documents.SHOWN_WITHOUT))
     for row in sorted(rows, key=lambda row: row.start_utc):
         shown = all(row.icr.get(name) is not None for name in ("y_icr_right_m", "y_icr_left_m"))
         if shown and row.start_utc:
@@ -195,15 +200,15 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, formats: tuple[str, ..
         if (error := row.errors.get(error_name)) is not None:
             name = ", ".join(part for part in (row.robot, row.group) if part) or "robot not named"
             errors.setdefault(name, {})[row.log] = error
-    directory = folder / PLOTS
-    make_folders(directory, folder)
+    make_folders(folder / PLOTS, folder)
     numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model)
-    drawn = {directory / f"{name}.{form}": figure for name, figure in figures_of("fleet", numbers) for form in formats}
-    for file, figure in drawn.items():
-        save_picture(figure, file, folder)
-    for name in (name for name, entry in FIGURES.items() if entry.of == "fleet"):
-        for old in {directory / f"{name}.{form}" for form in PLOT_FORMATS} - set(drawn):
-            remove(old)
+    old = set(pictures_in(folder))
+    for name, figure in figures_of("fleet", numbers):
+        for file in (folder / PLOTS / f"{name}.{form}" for form in picture_formats):
+            formats.save_picture(figure, file, folder)
+            old.discard(file)
+    for file in old:
+        remove(file)
 
 
 def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
@@ -260,8 +265,9 @@ def format_fleet_markdown(rows: Sequence[FleetLog], missing: Sequence[str] = ())
             errors.append([escaped_markdown(row.log), f"could not be used: {escaped_markdown(row.reason)}", "", ""])
             continue
         now, before = row.shown_error(), row.shown_error(baseline=True)
+        both = ["-" if one is None else f"{one:.3f} m" for one in (now, before)]
         difference = f"{now - before:+.3f} m" if now is not None and before is not None else "-"
-        errors.append([escaped_markdown(row.log), _metres(now), _metres(before), difference])
+        errors.append([escaped_markdown(row.log), *both, difference])
     lines += markdown_table(("log", "95 % after 10 m", "baseline", "difference"), errors)
     changes = changes_of(rows, missing)
     return "\n".join([*lines, *([""] if changes else []), *(f"- {escaped_markdown(change)}" for change in changes), ""])
@@ -284,5 +290,111 @@ def changes_of(rows: Sequence[FleetLog], missing: Sequence[str]) -> list[str]:
     return found
 
 
-def _metres(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f} m"
+def pooled_calibrations(
+    rows: Sequence[FleetLog], directory: Path, place: Path | None = None, *, allow_unusable: bool = False
+) -> Iterator[FleetCalibration]:
+    """Yield the calibration of each robot in each group; one of the same logs as before is not fitted again.
+
+    Parameters
+    ----------
+    directory : of the batch, on disk; calibration files are written below it
+    place : the address that it stands for, where the runs are
+    allow_unusable : also from runs that are not usable
+    """
+    try:
+        before = {one.key: one for one in formats.read_fleet(directory).calibrations}
+    except (OSError, ValueError, RecursionError):
+        before = {}
+    groups: dict[tuple[str, str], list[FleetLog]] = {}
+    for row in rows:
+        if row.status != "failed":
+            groups.setdefault((row.robot, row.group), []).append(row)
+    names: set[str] = set()
+    for (robot, group), members in sorted(groups.items()):
+        key = sha256(
+            msgspec.json.encode([__version__, allow_unusable, [(row.log, row.key, row.inputs) for row in members]])
+        ).hexdigest()
+        text = "-".join(part for part in (robot, group) if part)
+        name = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in text)[:100].strip(".")
+        name = unique_name(name or "all", names)
+        known = before.get(key)
+        if known is not None and (not known.file or is_regular(directory / known.file, directory)):
+            yield known
+        else:
+            empty = FleetCalibration(robot, group, tuple(row.log for row in members), key=key)
+            yield _pooled(empty, members, directory, place or directory, name, allow_unusable=allow_unusable)
+
+
+def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
+    """Return the usable runs of a batch by the name of their group: of the manifest, else of the robot.
+
+    Robots that are in the same group of the manifest are distinguished. Of copies in a group, the first one counts.
+
+    Raises
+    ------
+    RunError
+        The folder does not hold the result of a batch.
+    """
+    logs = [one for one in formats.logs_of_fleet(directory) if one.usable]
+    robots = {one.robot for one in logs}
+    found: dict[str, dict[tuple[str, ...], Path]] = {}
+    for one in logs:
+        name = one.group if one.group and len(robots) == 1 else f"{one.robot} {one.group}".strip() or directory.name
+        found.setdefault(name, {}).setdefault(_content(one.inputs), directory / one.run)
+    return {name: list(runs.values()) for name, runs in found.items()}
+
+
+def is_fleet(directory: Path) -> bool:
+    """Return whether a folder is that of a batch."""
+    return is_regular(directory / FLEET_FILE, directory)
+
+
+def _pooled(
+    one: FleetCalibration, members: Sequence[FleetLog], directory: Path, place: Path, name: str, *, allow_unusable: bool
+) -> FleetCalibration:
+    from icrtool.calibration.pooled import calibrate_runs
+    from icrtool.output.run_directory import open_run
+    from icrtool.output.tables.calibration import held_out_blocks
+    from icrtool.output.text_blocks import format_blocks
+
+    # A copy of a log would be tested on itself.
+    distinct = {_content(row.inputs): row for row in reversed(members)}
+    ordered = sorted(distinct.values(), key=lambda row: (row.start_utc, row.log))
+    total_s = sum(row.duration_s or 0.0 for row in ordered)
+    count = math.ceil(len(ordered) * min(1.0, MOST_POOLED_S / max(total_s, 1.0)))
+    spaced = {ordered[i].log for i in np.linspace(0, len(ordered) - 1, count).round().astype(int)}
+    file = f"{CALIBRATIONS}/{name}.json"
+    opened: dict[str, str] = {}
+
+    def usable() -> Iterator[Run]:
+        for row in members:
+            if row.log in spaced and (row.usable or allow_unusable):
+                run = open_run(place / row.run)
+                opened[row.log] = run.name
+                yield run
+
+    try:
+        result = calibrate_runs(usable(), allow_unusable=allow_unusable)
+        make_folders(directory / CALIBRATIONS, directory)
+        formats.write_calibration(result.calibration, directory / file, directory)
+    except IcrToolError as err:
+        left_out = tuple(log for log in one.logs if log not in opened)
+        return replace(one, left_out=left_out, reason=str(err))
+    numbers = result.calibration.controller
+    table = format_blocks(held_out_blocks(result.table))
+    reached = result.table.score("recommended").within(result.table.horizons_m, documents.BUDGET_M)
+    short = {name for name, _ in result.left_out}
+    used = tuple(log for log, run_name in opened.items() if run_name not in short)
+    return replace(
+        one, logs=used, left_out=tuple(log for log in one.logs if log not in used), file=file,
+        recommended=result.calibration.recommended, multiplier=float(numbers.multiplier),
+        multiplier_std=float(numbers.multiplier_std), table=table,
+        icrs_m=tuple(result.calibration.geometry[name] for name in ICR_COLUMNS),
+        within_m=None if reached is None else float(reached.distance_m),
+        within_beyond=reached is not None and reached.beyond,
+    )  # fmt: skip
+
+
+def _content(inputs: Sequence[FleetFile]) -> tuple[str, ...]:
+    """Return what copies of a log have in common, whatever their names; of content that is not known, the place."""
+    return tuple(sorted(file.sha256 or f"at {file.path}" for file in inputs))

@@ -26,6 +26,9 @@ from icrtool.errors import IcrToolError, LogChangedError, OutputError
 from icrtool.fleet.recordings import as_text
 from icrtool.logs.containers.container import truncation
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, log_name
+from icrtool.output.files.formats import open_calibration
+from icrtool.output.files.remote_place import on_disk, write_below
+from icrtool.output.run_directory import PAGE_FILE, check_target, new_run, open_run, replaced_log
 from icrtool.records.dropout import DEFAULT_SEED
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.plain_data import plain
@@ -38,9 +41,8 @@ if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
     from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
     from icrtool.dropout_analysis.trials import ErrorSink
-    from icrtool.records.dropout import BudgetDistance
+    from icrtool.records.dropout_document import EarlierModel, ModelDocument
     from icrtool.records.run import Run, WarmStart
-    from icrtool.records.run_document import RunDocument
 
 HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 """Distances whose errors a batch collects."""
@@ -143,9 +145,6 @@ def fitted(
     share : called with the share of the log that was read
     note, inside : as in `icrtool.output.run_directory.new_run`
     """
-    from icrtool.output.files.remote_place import on_disk
-    from icrtool.output.run_directory import check_target, new_run, replaced_log
-
     start = _warm_start(asked.warm_start, config, note)
     with on_disk(directory, begin=begin) as place:
         inside = inside if place is directory else None
@@ -171,14 +170,7 @@ def _warm_start(source: Path | None, config: Config, note: Callable[[str], None]
     """Return the ICRs that a run ended with, or those of a calibration file; note where its track width is another."""
     if source is None:
         return None
-    if source.is_file():
-        from icrtool.output.files.formats import open_calibration
-
-        start = open_calibration(source).warm_start()
-    else:
-        from icrtool.output.run_directory import open_run
-
-        start = open_run(source).ended_with
+    start = open_calibration(source).warm_start() if source.is_file() else open_run(source).ended_with
     theirs, ours = start.track_width_m, config.robot.track_width_m
     if note is not None and theirs is not None and ours is not None and not math.isclose(theirs, ours, rel_tol=0.01):
         note(f"{source}: made with a track width of {theirs:g} m, not {ours:g} m: are its ICRs this robot's?")
@@ -205,7 +197,6 @@ def report_and_write(
     """
     from icrtool.dropout_analysis.dropout_report import dropout_report
     from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, write_report
-    from icrtool.output.run_directory import PAGE_FILE
 
     of_trials = {} if further is None else {field.name: getattr(further, field.name) for field in fields(further)}
 
@@ -283,20 +274,17 @@ def process(request: Request, stage: Stage) -> FleetLog:
     ----------
     stage : called with what is done next
     """
-    from icrtool.output.files.remote_place import write_below
-
     begun = time.monotonic()
-    folder = path_of(request.folder)
+    path, folder = path_of(request.path), path_of(request.folder)
     try:
         row = _results(request, stage)
     except IcrToolError as err:
         # A full disk may not be full the next time, nor a log be written to; the log's own errors come again.
-        path = path_of(request.path)
         reason = err.beside(str(path), str(folder / request.known.run), log_name(path))
         row = failed(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
     except OSError as err:
         # The log was removed meanwhile, or its disk fails.
-        place = escaped(str(err.filename or path_of(request.path)))
+        place = escaped(str(err.filename or path))
         row = failed(request, f"{place}: {err.strerror or err}", repeatable=False)
     row = replace(row, took_s=round(time.monotonic() - begun, 3), tool_version=__version__)
     try:
@@ -336,73 +324,55 @@ def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, .
 
 
 def _results(request: Request, stage: Stage) -> FleetLog:
-    """Fit and analyse a log, write run and report."""
+    """Fit and analyse a log, write run and report, and return its row."""
     from icrtool.output.files.baseline_file import open_baseline
 
-    folder, place = path_of(request.folder), path_of(request.baseline) if request.baseline else None
+    path, folder = path_of(request.path), path_of(request.folder)
     asked = FitOptions(request.overwrite, request.report.plots, request.report.figures)
-    with fitted(path_of(request.path), folder / request.known.run, request.config, asked, stage, inside=folder) as (
-        run,
-        partial,
-    ):
-        baseline = open_baseline(place).find(request.known.log, run.document.content) if place is not None else None
-        report = report_and_write(run, partial, request.report, stage, baseline=baseline)
-    return _row(request, run.document, int(run.table.stamp_ns[0]), report)
-
-
-def _row(request: Request, summary: RunDocument, first_ns: int, report: DropoutReport) -> FleetLog:
+    with fitted(path, folder / request.known.run, request.config, asked, stage, inside=folder) as (run, partial):
+        before = None
+        if request.baseline:
+            before = open_baseline(path_of(request.baseline)).find(request.known.log, run.document.content)
+        report = report_and_write(run, partial, request.report, stage, baseline=before)
+    summary = run.document
     icrs = {name: summary.icr_of_drive(name) or (None, None) for name in ICR_COLUMNS}
     controller = summary.controller
     if controller is None and report.calibration is not None:
         controller = report.calibration.controller
     unusable = f"not usable: {summary.unusable_because}" if not summary.usable else ""
     cut = truncation(summary.warnings)
+    within = [(f"{one.model}_within_{one.budget_m:g}m_m", one) for one in report.document.budgets]
+    earlier = report.baseline.document.models if report.baseline is not None else ()
     return replace(
         request.known,
         status="done",
         reason="; ".join(filter(None, [unusable, f"truncated: {cut}" if cut else ""])),
         usable=summary.usable,
-        start_utc=datetime.fromtimestamp(first_ns // 10**9, UTC).isoformat().replace("+00:00", "Z"),
+        start_utc=datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary.drive.duration_s,
         distance_m=summary.drive.distance_m,
         icr={name: value for name, (value, _) in icrs.items()}
         | {f"std_{name}": std for name, (_, std) in icrs.items()},
         multiplier=None if controller is None else controller.multiplier,
         multiplier_std=None if controller is None else controller.multiplier_std,
-        errors=_errors(report),
-        bounds=tuple(_within_name(one) for one in report.document.budgets if one.beyond),
+        errors=_errors(report.document.models) | {name: plain(one.distance_m) for name, one in within},
+        bounds=tuple(name for name, one in within if one.beyond),
         events=len(summary.events),
         outages=len(report.outages),
         warnings=len(summary.warnings),
         verdicts=tuple(fleet_verdict(one, request.known.log) for one in report.document.gates),
-        baseline=_baseline_numbers(report),
+        baseline=_errors(one for one in earlier if report.result(one.name) is not None),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),
-        inputs=files_of(path_of(request.path), summary.inputs),
+        inputs=files_of(path, summary.inputs),
     )
 
 
-def _errors(report: DropoutReport) -> dict[str, float | None]:
-    errors: dict[str, float | None] = {}
-    for model in report.document.models:
-        for row in model.by_horizon:
-            if row.horizon_m in HORIZONS_M:
-                errors[f"{model.name}_p95_{row.horizon_m:g}m_m"] = row.p95_m
-                errors[f"{model.name}_expected_{row.horizon_m:g}m_m"] = row.expected_error_m
-    for budget in report.document.budgets:
-        errors[_within_name(budget)] = plain(budget.distance_m)
-    return errors
-
-
-def _within_name(one: BudgetDistance) -> str:
-    return f"{one.model}_within_{one.budget_m:g}m_m"
-
-
-def _baseline_numbers(report: DropoutReport) -> dict[str, float | None]:
-    """Return the baseline's p95 and expected errors under the names of `_errors`."""
-    models = report.baseline.document.models if report.baseline is not None else ()
+def _errors(models: Iterable[ModelDocument | EarlierModel]) -> dict[str, float | None]:
+    """Return p95 and expected errors of the models of a report, by the names of columns."""
     return {
         f"{one.name}_{metric}_{row.horizon_m:g}m_m": number
-        for one in models if report.result(one.name) is not None
-        for row in one.by_horizon if row.horizon_m in HORIZONS_M
+        for one in models
+        for row in one.by_horizon
+        if row.horizon_m in HORIZONS_M
         for metric, number in (("p95", row.p95_m), ("expected", row.expected_error_m))
-    }  # fmt: skip
+    }

@@ -5,7 +5,7 @@ travel as lines of JSON through its standard input, stages (texts) and rows (obj
 same function per log serves the threads of a batch on this machine and those of the workers of a cluster.
 
 `pebble.ProcessPool` and `concurrent.futures` are not used: an exception that cannot be unpickled, or a process killed
-while it starts, ends all logs of their pools (pebble 5.2), and the second ends no log that takes too long.
+while it starts, ends all logs of their pools (pebble 5.2.3), and the second ends no log that takes too long.
 """
 
 from __future__ import annotations
@@ -183,14 +183,11 @@ class _ClusterWatch:
 def default_jobs(logs: Sequence[Path]) -> int:
     """Return the number of cores, or of the largest logs that the free memory holds at once."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    largest = max(map(_size, logs), default=0)
+    sizes = [sum(file.stat().st_size for file in files_of_log(log) if file.is_file()) for log in logs]
+    largest = max(sizes, default=0)
     each = PROCESS_BYTES + min(LOG_FACTOR * largest, LOG_BYTES)
     free = _free_bytes()
     return max(1, min(cores, len(logs), int(free // each) if free is not None else cores))
-
-
-def _size(path: Path) -> int:
-    return sum(file.stat().st_size for file in files_of_log(path) if file.is_file())
 
 
 def _free_bytes() -> int | None:
@@ -216,7 +213,9 @@ class Worker:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
             env={**inherited, **ENVIRONMENT, "PYTHONPATH": paths}, start_new_session=True,
         )  # fmt: skip
-        assert self._process.stdout is not None  # noqa: S101 - for the type checker
+        assert self._process.stdin is not None  # noqa: S101 - for the type checker
+        assert self._process.stdout is not None  # noqa: S101 - as above
+        self._requests = self._process.stdin
         # At its end, a line that is no answer.
         self._answers = _lines_of(self._process.stdout, lambda lines: lines.put(b""))
         _all.add(self)
@@ -224,10 +223,15 @@ class Worker:
     def run(self, request: Request, timeout_s: float, stage: Stage | None) -> FleetLog:
         """Process a log, as `process_apart`."""
         begun, begin_of_errors = time.monotonic(), self._errors.seek(0, os.SEEK_END)
-        details = ""
+        why = details = ""
         try:
-            self._ask(request)
-            while not isinstance(answer := self._answer(begun + timeout_s), FleetLog):
+            self._requests.write(request.encode() + b"\n")
+            self._requests.flush()
+            while True:
+                left_s = begun + timeout_s - time.monotonic()
+                answer = _ANSWER.decode(self._answers.get(timeout=max(left_s, 0.0)))
+                if isinstance(answer, FleetLog):
+                    return answer
                 if stage is not None:
                     stage(answer)
         except queue.Empty:
@@ -238,17 +242,14 @@ class Worker:
                 self._errors.seek(begin_of_errors)
                 details = self._errors.read().decode(errors="replace").strip()[-LONGEST_DETAILS:]
             why += f": {details.splitlines()[-1]}" if details else ""
-        else:
-            return answer
         self.close()
         took_s = round(time.monotonic() - begun, 3)
         return replace(failed(request, why, details=details, repeatable=False), took_s=took_s)
 
     def ask_to_end(self) -> None:
         """Close its input: it removes what it is writing, and ends."""
-        if self._process.stdin is not None:
-            with suppress(OSError):  # its other end is gone
-                self._process.stdin.close()
+        with suppress(OSError):  # its other end is gone
+            self._requests.close()
 
     def close(self, grace_s: float = GRACE_S) -> None:
         """End the process, after some time whatever it does."""
@@ -259,14 +260,6 @@ class Worker:
         self._process.kill()
         self._process.wait()
         self._errors.close()
-
-    def _ask(self, request: Request) -> None:
-        assert self._process.stdin is not None  # noqa: S101 - for the type checker
-        self._process.stdin.write(request.encode() + b"\n")
-        self._process.stdin.flush()
-
-    def _answer(self, end_s: float) -> str | FleetLog:
-        return _ANSWER.decode(self._answers.get(timeout=max(end_s - time.monotonic(), 0.0)))
 
     def _how_it_ended(self) -> str:
         try:

@@ -1,16 +1,24 @@
-"""Find the recordings in files and folders, by content, and name the run of each."""
+"""Which logs: the recordings in files and folders, found by content, with a name for the run of each; and manifests.
+
+A manifest states which logs are of which robot, with which configuration, in which group (CSV or TOML).
+"""
 
 from __future__ import annotations
 
+import csv
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Annotated, Any
 
-from icrtool.errors import LogError
+import msgspec
+
+from icrtool.config import parse_toml
+from icrtool.errors import ConfigError, LogError
 from icrtool.logs.containers.open_log import container_of, open_log
 from icrtool.logs.containers.recording_files import (
     LEAST_OVERLAP_S,
@@ -26,7 +34,8 @@ from icrtool.logs.containers.recording_files import (
 )
 from icrtool.logs.containers.source import find
 from icrtool.logs.containers.sqlite_bag import SqliteBag
-from icrtool.records.urls import UrlPath
+from icrtool.records.regular_file import read_regular
+from icrtool.records.urls import UrlPath, place_of
 
 RUN_FILE = "run.json"
 
@@ -105,41 +114,30 @@ def _consecutive(files: Sequence[NumberedFile]) -> list[list[Path]]:
     extents = [_extent(one.path) for one in files]
     groups: list[list[Path]] = [[files[0].path]]
     for (one, before), (other, after) in pairwise(zip(files, extents, strict=True)):
+        goes_on = False
         counted = not one.is_count or other.order[0] == one.order[0] + 1
-        if counted and before is not None and after is not None and before.goes_on_in(after):
+        if counted and before is not None and after is not None:
+            (_, end_ns, topics), (begin_ns, _, others) = before, after
+            pause_s = (begin_ns - end_ns) / 1e9
+            in_common = 2 * len(topics & others) >= min(len(topics), len(others)) > 0
+            goes_on = in_common and -LEAST_OVERLAP_S < pause_s <= LONGEST_RESTART_S
+        if goes_on:
             groups[-1].append(other.path)
         else:
             groups.append([other.path])
     return [group for group in groups if len(group) > 1]
 
 
-class Extent(NamedTuple):
-    """When a file was recorded [ns], and its topics with their types."""
-
-    begin_ns: int
-    end_ns: int
-    topics: frozenset[tuple[str, str]]
-
-    def goes_on_in(self, other: Extent) -> bool:
-        """Return whether another file continues where this one ends, with at least half of the topics in common."""
-        pause_s = (other.begin_ns - self.end_ns) / 1e9
-        fewer = min(len(self.topics), len(other.topics))
-        in_common = 2 * len(self.topics & other.topics) >= fewer > 0
-        return -LEAST_OVERLAP_S < pause_s <= LONGEST_RESTART_S and in_common
-
-
-def _extent(path: Path) -> Extent | None:
-    """Return when a file was recorded, by its index; None where it has none or cannot be read."""
+def _extent(path: Path) -> tuple[int, int, frozenset[tuple[str, str]]] | None:
+    """Return begin and end of a file [ns], by its index, and its topics with their types; None: it has no index."""
     try:
         container = open_log(path)
     except LogError:
         return None
-    try:
+    with closing(container):
         span = container.span_ns()
         topics = frozenset((channel.topic, channel.message_type) for channel in container.channels)
-    finally:
-        container.close()
-    return Extent(*span, topics) if span is not None else None
+    return (*span, topics) if span is not None else None
 
 
 def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -161,14 +159,14 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     logs = list(found.values())
     recordings = [path for path in logs if path.is_dir() or is_recording(path)]
     stems = {_absolute(path).parent / f"{log_name(path)}." for path in recordings}
-    beside = [path for path in logs if path not in recordings and _is_beside(_absolute(path), stems)]
+    beside = []
+    for path in logs:
+        # A file with a recording's name and another suffix: drive.truth.csv beside drive.bag.
+        file, parts = _absolute(path), path.name.split(".")
+        named = {file.parent / f"{'.'.join(parts[:k])}." for k in range(1, len(parts))}
+        if path not in recordings and file.is_file() and not stems.isdisjoint(named):
+            beside.append(path)
     return [path for path in logs if path not in beside], beside
-
-
-def _is_beside(file: Path, stems: set[Path]) -> bool:
-    """Return whether a file has a recording's name and another suffix: ``drive.truth.csv`` beside ``drive.bag``."""
-    parts = file.name.split(".")
-    return file.is_file() and any(file.parent / f"{'.'.join(parts[:k])}." in stems for k in range(1, len(parts)))
 
 
 def distinct_names(logs: Sequence[Path]) -> list[str]:
@@ -266,3 +264,144 @@ def _absolute(path: Path) -> Path:
 def as_text(path: object) -> str:
     """Return a path as text that every file takes: bytes of its name that are no UTF-8 as escapes."""
     return str(path).encode("utf-8", errors="backslashreplace").decode()
+
+
+COLUMNS = ("log", "robot", "config", "group", "tags")
+
+MANIFEST_SUFFIXES = {".csv", ".toml"}
+
+LARGEST_MANIFEST_BYTES = 10_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a manifest states about a log.
+
+    Attributes
+    ----------
+    robot : a built-in robot, or the name of one that `config` describes
+    config : configuration file
+    """
+
+    robot: str = ""
+    config: Path | None = None
+    group: str = ""
+    tags: tuple[str, ...] = ()
+
+
+class _Line(msgspec.Struct, forbid_unknown_fields=True):
+    """A line as it is written."""
+
+    log: Annotated[str, msgspec.Meta(min_length=1)]
+    robot: str = ""
+    config: str = ""
+    group: str = ""
+    tags: list[str] = []
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line of a manifest: the files and folders that its pattern matches, and what holds for them.
+
+    `targets` are the places with links followed.
+    """
+
+    places: tuple[Path, ...]
+    about: About
+    targets: frozenset[Path]
+
+
+def is_manifest(path: Path) -> bool:
+    """Return whether a path is a manifest, by its suffix."""
+    return path.suffix.lower() in MANIFEST_SUFFIXES and path.is_file()
+
+
+def read_manifest(path: Path) -> list[Entry]:
+    """Read a manifest: CSV with the columns of `COLUMNS`, or TOML with a table ``[[logs]]`` each.
+
+    Paths and patterns are relative to the manifest's folder. Tags in a CSV are separated by semicolons.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, has an unknown column, a log that does not exist or a pattern that matches nothing.
+    """
+    try:
+        text = read_regular(path, most_bytes=LARGEST_MANIFEST_BYTES).decode("utf-8-sig")
+        rows = _toml_rows(path, text) if path.suffix.lower() == ".toml" else _csv_rows(path, text)
+    except OSError as err:
+        raise ConfigError(path, "cannot be read", err.strerror or str(err)) from err
+    except (ValueError, RecursionError, csv.Error) as err:
+        raise ConfigError(path, "not a manifest", str(err) or "nested too deep") from err
+    if not rows:
+        raise ConfigError(path, "an empty manifest", "give it a line for each log or pattern")
+    return [_entry(path, row) for row in rows]
+
+
+def about(path: Path, entries: Sequence[Entry]) -> About:
+    """Return what a manifest states about a recording; a later line adds to and replaces an earlier one."""
+    found = About()
+    whole = _target(path)
+    around = {whole, *whole.parents}
+    for entry in entries:
+        if not around.isdisjoint(entry.targets):
+            stated = {key: value for key in ("robot", "config", "group") if (value := getattr(entry.about, key))}
+            found = replace(found, **stated, tags=tuple(dict.fromkeys((*found.tags, *entry.about.tags))))
+    return found
+
+
+def _target(place: Path) -> Path:
+    """Return a place with links followed."""
+    return place if isinstance(place, UrlPath) else place.resolve()
+
+
+def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
+    reader = csv.DictReader(text.splitlines(), strict=True)
+    if "log" not in (reader.fieldnames or ()):
+        raise ConfigError(path, "not a manifest", f"its first line must name the column log, of {', '.join(COLUMNS)}")
+    rows: list[Mapping[str, Any]] = []
+    for number, row in enumerate(reader, start=2):
+        if None in row or None in row.values():
+            raise ConfigError(
+                f"{path}:{number}", "has more or fewer values than the first line has names", "give one each"
+            )
+        rows.append({**row, "tags": [tag.strip() for tag in (row.get("tags") or "").split(";") if tag.strip()]})
+    return rows
+
+
+def _toml_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
+    document = parse_toml(text)
+    rows = document.get("logs")
+    if set(document) - {"logs"} or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ConfigError(path, "not a manifest", "it holds tables [[logs]] and nothing else")
+    return rows
+
+
+def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
+    try:
+        line = msgspec.convert(row, _Line)
+    except msgspec.ValidationError as err:
+        what = f"each line has a log or a pattern, and texts; of {', '.join(COLUMNS)}"
+        raise ConfigError(f"{path}: log", what, str(err)) from err
+    config = path.parent / line.config.strip() if line.config.strip() else None
+    about = About(line.robot.strip(), config, line.group.strip(), tuple(line.tags))
+    places = _matching(path, line.log)
+    return Entry(places, about, frozenset(_target(place) for place in places))
+
+
+def _matching(path: Path, pattern: str) -> tuple[Path, ...]:
+    """Return what a pattern matches; a name with a bracket or a star of its own is taken as it is, if it is there."""
+    if isinstance(address := place_of(pattern), UrlPath):
+        return tuple(find(address))
+    named = path.parent / pattern
+    try:
+        if named.exists():
+            return (named,)
+        base = Path(named.anchor) if Path(pattern).is_absolute() else path.parent
+        relative = str(Path(pattern).relative_to(base)) if Path(pattern).is_absolute() else pattern
+        found = tuple(sorted(base.glob(relative)))
+    except (ValueError, NotImplementedError, OSError, RecursionError) as err:
+        raise ConfigError(f"{path}: log", f"{pattern!r} is not a pattern", str(err)) from err
+    if not found:
+        raise ConfigError(f"{path}: log", f"{pattern!r} matches nothing", f"it is relative to {path.parent}")
+    return found

@@ -15,8 +15,7 @@ import pytest
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import BaselineReport, DropoutReport, check_gate, parse_gate
 from icrtool.errors import ConfigError, IcrToolError
-from icrtool.fleet.fleet_files import fleet_document
-from icrtool.fleet.roll_up import runs_of_fleet
+from icrtool.fleet.fleet_files import fleet_document, runs_of_fleet
 from icrtool.kernels.error_statistics import (
     BlockSums,
     block_sums,

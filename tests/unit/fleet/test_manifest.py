@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from icrtool.errors import ConfigError
-from icrtool.fleet.manifest import About, about, read_manifest
+from icrtool.fleet.recordings import About, about, read_manifest
 
 
 @pytest.fixture

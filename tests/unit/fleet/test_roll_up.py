@@ -13,8 +13,7 @@ from icrtool.cli.batch import line_of, summary_of
 from icrtool.cli.inputs import runs_or_logs
 from icrtool.cli.report import groups_of
 from icrtool.errors import RunError
-from icrtool.fleet.fleet_files import calibrations_text, write_fleet
-from icrtool.fleet.roll_up import pooled_calibrations, runs_of_fleet
+from icrtool.fleet.fleet_files import calibrations_text, pooled_calibrations, runs_of_fleet, write_fleet
 from icrtool.output.files.formats import open_calibration
 from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog
 from icrtool.records.run import Run
@@ -71,7 +70,7 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
 
 
 def test_of_many_logs_some_are_calibrated_together(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("icrtool.fleet.roll_up.MOST_POOLED_S", 300.0)
+    monkeypatch.setattr("icrtool.fleet.fleet_files.MOST_POOLED_S", 300.0)
     (one,) = pooled_calibrations(rows("a", "b", "copy", duration_s=300.0), place)
     assert (one.logs, one.left_out, one.reason) == (("a",), ("b", "copy"), "")
 

@@ -428,7 +428,7 @@ def test_a_header_of_empty_fields_costs_no_time(tmp_path: Path) -> None:
 
 def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool import config
-    from icrtool.fleet import manifest
+    from icrtool.fleet import recordings
     from icrtool.logs.containers import bag_directory, chunk, open_log, sqlite_bag, unpack
     from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf, schema
     from icrtool.logs.streams import wheel_pairs, wheels
@@ -446,7 +446,7 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
         bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheels.MOST_WHEELS,
             wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PAIRS,
-        LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, manifest.LARGEST_BYTES,
+        LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, recordings.LARGEST_MANIFEST_BYTES,
     ]  # fmt: skip
 
 

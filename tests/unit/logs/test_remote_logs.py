@@ -23,9 +23,8 @@ from icrtool.cli import main
 from icrtool.cli.report import named_place
 from icrtool.config import load_config
 from icrtool.errors import LogError
-from icrtool.fleet.manifest import read_manifest
-from icrtool.fleet.recordings import find_recordings
-from icrtool.fleet.roll_up import _content
+from icrtool.fleet.fleet_files import _content
+from icrtool.fleet.recordings import find_recordings, read_manifest
 from icrtool.logs.containers import source
 from icrtool.logs.containers.container import Block
 from icrtool.logs.containers.open_log import open_log
