@@ -36,7 +36,7 @@ VAGUE_NAMES = {"utils", "util", "tools", "common", "helpers", "misc"}
 LONGEST_MODULE_LINES = 420
 
 ONLY_IN = {"click": "cli", "matplotlib": "output"}
-KERNEL_LIBRARIES = {"numpy", "numba"}
+KERNEL_LIBRARIES = {"numpy", "numba", "llvmlite"}
 LATE_LIBRARIES = {"pandas"}
 """Imported inside the function that needs them, so that ``--help`` is instant."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -19,7 +18,7 @@ from icrtool.records.text import LogText, escaped
 
 with when_used():
     from icrtool import errors
-    from icrtool.dropout_analysis import dropout_report, trials
+    from icrtool.dropout_analysis import dropout_report
     from icrtool.fleet import one_log
     from icrtool.output import run_directory, text_blocks
     from icrtool.output.exports import acceptance
@@ -186,11 +185,8 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
 def _run_of(source: Path, place: RunPlace | None, request: Request) -> Iterator[tuple[Run, Path]]:
     """Give the run of a source, and the folder on disk that the report goes into."""
     if place is None:
-        with remote_place.on_disk(source, needed=bool) as folder, ThreadPoolExecutor(1) as pool:
-            reading = pool.submit(run_directory.open_run, folder)
-            # What the analysis needs is loaded beside it.
-            trials.load_kernels()
-            yield reading.result(), folder
+        with remote_place.on_disk(source, needed=bool) as folder:
+            yield run_directory.open_run(folder), folder
         return
     # One result: where the report fails, an old run in this place stays, with its report.
     smooth = request.further.reference == "smoothed"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import pkgutil
 import tempfile
 import time
@@ -89,27 +88,21 @@ def warm(*, quiet: bool) -> None:
     """  # noqa: D301 - click reads the escape
     import icrtool
     from icrtool.errors import OutputError
-    from icrtool.kernels.compiled import all_kernels, processor
+    from icrtool.kernels.compiled import all_kernels, places, processor, writable_place
 
     begin = time.perf_counter()
     for module in pkgutil.walk_packages(icrtool.__path__, "icrtool."):
         # Python keeps what it compiled of a module that is imported
         importlib.import_module(module.name)
-    kernels = list(all_kernels())
-    place = Path(kernels[0].stats.cache_path or os.devnull)
-    wanted = Path(os.environ.get("NUMBA_CACHE_DIR") or place)
-    try:
-        tempfile.TemporaryFile(dir=place).close()
-        # numba takes another place where it cannot use the one that it was given
-        place.relative_to(wanted)
-    except (OSError, ValueError) as err:
-        raise OutputError(wanted, "cannot be written", "set NUMBA_CACHE_DIR to a directory that can") from err
+    place = writable_place()
+    if place is None:
+        raise OutputError(places()[0], "cannot be written", "set NUMBA_CACHE_DIR to a directory that can")
     call_all_kernels()
     if not quiet:
-        compiled = sum(bool(one.stats.cache_misses) for one in kernels)
+        compiled = [bool(one.compiled) for one in all_kernels()]
         click.echo(
-            f"{compiled} of {len(kernels)} kernels compiled for {processor()}, in {time.perf_counter() - begin:.1f} s; "
-            f"kept in {wanted}"
+            f"{sum(compiled)} of {len(compiled)} kernels compiled for {processor()[0]}, "
+            f"in {time.perf_counter() - begin:.1f} s; kept in {place}"
         )
 
 

@@ -215,15 +215,6 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
     return horizons
 
 
-def load_kernels() -> None:
-    """Have the compiled kernels ready, to be called while a run is still being read."""
-    path, one = np.arange(20.0), np.ones(20)
-    track = Track.of_states(path, one, one, one, path, 0.0 * path, 0.0 * path, path)
-    icrs = FrozenIcrs.constant(1.0, -1.0, 0.0)
-    ends = trial_ends(track, np.array([1.0]))
-    open_loop_errors(track, icrs, ends)
-
-
 def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
     """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
     states, find = len(track.distance), ends_finder(track)

@@ -1,32 +1,216 @@
-"""One decorator for every compiled kernel, and where its machine code is kept."""
+"""One decorator for every compiled kernel, and where its machine code is kept.
+
+numba compiles a kernel when it is first called on a computer. The object file is kept, and later processes run it
+through llvmlite, on which numba stands: to import numba takes longer than all else that a command loads.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import hashlib
 import importlib
+import os
 import pkgutil
 import sys
-from collections.abc import Callable, Iterator
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast
+from types import ModuleType
+from typing import Any, NamedTuple, TypeVar, cast
 
-import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
-from numba.core.dispatcher import Dispatcher
-from numba.core.registry import cpu_target
-from numba.extending import overload
+import llvmlite
+import llvmlite.binding as llvm
+import numpy as np
 
-Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable[..., Any])
+Result = float | None
+
+_OPTIONS = {"nogil": True, "error_model": "numpy"}
+"""``error_model="numpy"`` makes a division by zero an inf, as in the NumPy twins, and lets loops vectorise; ``nogil``
+lets another thread read files while a kernel runs."""
+
+_BARE = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
+"""Options of machine code that `Kernel` calls itself: without the wrappers by which Python and C would, which take a
+fifth of the time to compile. No kernel allocates an array, so none counts references to them (``_nrt``): that took a
+third of the filter's time."""
+
+_MATHEMATICS = {"atan2", "ceil", "cos", "exp", "floor", "fmod", "hypot", "log", "pow", "sin", "sqrt", "tan"}
+"""Functions of the C library, which every process has. Machine code that calls others runs only beside numba."""
+
+_POINTER, _INTEGER, _FLOAT, _BOOL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_bool
+_LLVM_TYPES = {_POINTER: "ptr", _INTEGER: "i64", _FLOAT: "double", _BOOL: "i8"}
+_SCALARS = {"bool": _BOOL, "int": _INTEGER, "float": _FLOAT, "NoneType": _POINTER}
+_RESULTS = {"none": None, "int64": _INTEGER, "float64": _FLOAT}
+_RETURNED = (0, -2)
+"""What machine code returns where it raised no exception: it has a result, or None."""
+
+_parts: list[Callable[..., Any]] = []
+_lock = threading.RLock()
 
 
-def _load_compiler() -> None:
-    """Load what numba compiles with, except scipy's BLAS.
+class _Arguments:
+    """Arguments as machine code of numba's takes them.
 
-    To look for it takes longer than all the rest. No kernel multiplies matrices; numba finds it again when someone
+    Attributes
+    ----------
+    types : what the machine code depends on, one for each array, tuple and number
+    words, forms : the values in order, tuples unpacked, and their C types
+    """
+
+    def __init__(self, values: Sequence[object]) -> None:
+        self.types: list[object] = []
+        self.words: list[object] = []
+        self.forms: list[Any] = []
+        for value in values:
+            self._add(value)
+
+    def _add(self, value: object) -> None:
+        if isinstance(value, np.ndarray):
+            if not value.flags.carray:
+                raise TypeError("a kernel takes arrays that are contiguous and can be written")
+            self.types.append((value.dtype.str, value.ndim))
+            # owner, parent, size, size of an item, address, shape, strides
+            self.words += [None, None, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides]
+            self.forms += [_POINTER, _POINTER, _INTEGER, _INTEGER, _POINTER, *[_INTEGER] * (2 * value.ndim)]
+        elif isinstance(value, tuple):
+            self.types.append((type(value).__qualname__, len(value)))
+            for one in value:
+                self._add(one)
+        else:
+            plain = value.item() if isinstance(value, np.generic) else value
+            name = type(plain).__name__
+            self.types.append(name)
+            self.words.append(plain)
+            self.forms.append(_SCALARS[name])
+
+
+class MachineCode(NamedTuple):
+    """A compiled kernel: the name of its function, what that returns (a key of `_RESULTS`), target, and object file."""
+
+    name: str
+    result: str
+    target: str
+    content: bytes
+
+    def written(self) -> bytes:
+        """Return the bytes of its file: a digest of what follows, a line for each text, the object file."""
+        rest = b"\n".join([*(text.encode() for text in self[:3]), self.content])
+        return hashlib.sha256(rest).digest() + rest
+
+    @classmethod
+    def read(cls, file: Path) -> MachineCode | None:
+        """Return what a file holds; None where it is not there, or damaged."""
+        with suppress(OSError):
+            data = file.read_bytes()
+            if hashlib.sha256(data[32:]).digest() == data[:32]:
+                name, result, target, content = data[32:].split(b"\n", 3)
+                return cls(name.decode(), result.decode(), target.decode(), content)
+        return None
+
+    def function(self, forms: Sequence[Any]) -> Callable[[Sequence[object]], Result]:
+        """Return what runs it, given the words of its arguments, which have these C types."""
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(self.target))
+        engine.add_object_file(llvm.ObjectFileRef.from_data(self.content))
+        engine.finalize_object()
+        run = ctypes.CFUNCTYPE(ctypes.c_int32, _POINTER, _POINTER, *forms)(engine.get_function_address(self.name))
+        result = _RESULTS[self.result]
+
+        def call(words: Sequence[object], _: object = engine) -> Result:
+            returned, raised = (result or _INTEGER)(), _POINTER()
+            if run(ctypes.byref(returned), ctypes.byref(raised), *words) not in _RETURNED:
+                raise RuntimeError(f"{self.name} raised an exception")
+            return returned.value if result else None
+
+        return call
+
+
+class Kernel:
+    """A function that runs as machine code.
+
+    Its parameters are contiguous arrays, numbers, None, and tuples of these; it returns a number or None.
+
+    Attributes
+    ----------
+    py_func : the plain Python function
+    compiled : how often numba compiled it in this process
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.py_func, self.compiled = function, 0
+        self._functions: dict[tuple[object, ...], Callable[[Sequence[object]], Result] | None] = {}
+        functools.update_wrapper(self, function)
+
+    def __call__(self, *values: object) -> Result:
+        """Run the machine code for arguments of these types."""
+        arguments = _Arguments(values)
+        types = tuple(arguments.types)
+        if types not in self._functions:
+            with _lock:
+                code = self._machine_code(types, values, arguments)
+                self._functions[types] = code and code.function(arguments.forms)
+        run = self._functions[types]
+        return run(arguments.words) if run else self._by_numba(*values)
+
+    @functools.cached_property
+    def _by_numba(self) -> Callable[..., Result]:
+        """Return the function as numba itself calls it, which keeps nothing."""
+        by_numba: Callable[..., Result] = _numba().njit(**_OPTIONS)(self.py_func)
+        return by_numba
+
+    def _machine_code(
+        self, types: tuple[object, ...], values: Sequence[object], arguments: _Arguments
+    ) -> MachineCode | None:
+        """Return the machine code that is kept, or that numba makes now; None where numba alone can run it."""
+        name = f"{self.py_func.__module__.rpartition('.')[2]}.{self.py_func.__qualname__}"
+        file = f"{name}-{hashlib.sha256(repr((_stamp(), types)).encode()).hexdigest()[:24]}.o"
+        for place in places():
+            if kept := MachineCode.read(place / file):
+                return kept
+        self.compiled += 1
+        numba = _numba()
+        dispatcher = numba.njit(**_BARE)(self.py_func)
+        dispatcher.compile(tuple(numba.typeof(_writable(one)) for one in values))
+        [signature] = dispatcher.nopython_signatures
+        module, result = llvm.parse_assembly(dispatcher.inspect_llvm(signature.args)), signature.return_type
+        called = {one.name for one in module.functions if one.is_declaration and not one.name.startswith("llvm.")}
+        # where a version of numba passes arguments otherwise, there is no such function
+        expected = [_LLVM_TYPES[form] for form in [_POINTER, _POINTER, *arguments.forms]]
+        entries = [
+            one.name
+            for one in module.functions
+            if not one.is_declaration
+            and ["ptr" if word.type.is_pointer else str(word.type) for word in one.arguments] == expected
+        ]
+        returned = str(numba.types.unliteral(result))
+        if not called <= _MATHEMATICS or len(entries) != 1 or returned not in _RESULTS:
+            return None
+        content = _machine(module.triple, numba.config.OPT).emit_object(module)
+        code = MachineCode(entries[0], returned, module.triple, content)
+        _keep(file, code.written())
+        return code
+
+
+def _writable(value: object) -> object:
+    """Return a value of the same type to numba, without its contents."""
+    if isinstance(value, np.ndarray):
+        return np.empty((0,) * value.ndim, value.dtype)
+    if isinstance(value, tuple):
+        made = tuple(_writable(one) for one in value)
+        return value._make(made) if hasattr(value, "_make") else made
+    return value
+
+
+def _numba() -> ModuleType:
+    """Return numba, without scipy's BLAS, which knows the parts of kernels that were marked until now.
+
+    To look for BLAS takes longer than all the rest. No kernel multiplies matrices; numba finds it again when someone
     else's does.
     """
+    numba, extending = (importlib.import_module(name) for name in ("numba", "numba.extending"))
+
     blas = "scipy.linalg.cython_blas"
     if blas not in sys.modules:
         sys.modules[blas] = None  # type: ignore[assignment]  # Python's mark for "cannot be imported"
@@ -34,106 +218,94 @@ def _load_compiler() -> None:
             importlib.import_module("numba.np.arraymath")
         finally:
             del sys.modules[blas]
+    while _parts:
+        part = _parts.pop()
+        extending.overload(part, jit_options=_BARE, strict=False, prefer_literal=True)(lambda *_, part=part: part)
+    return numba
+
+
+def _machine(target: str, level: int = 0) -> llvm.TargetMachine:
+    """Return what makes machine code for a target, with a level of optimisation."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    name, features = processor()
+    return llvm.Target.from_triple(target).create_target_machine(
+        cpu=name, features=features, opt=level, codemodel="jitdefault", jit=True
+    )
+
+
+def processor() -> tuple[str, str]:
+    """Return the name of the processor that is compiled for, and its features, as numba chooses them."""
+    name = os.environ.get("NUMBA_CPU_NAME") or llvm.get_host_cpu_name()
+    own = "" if name == "generic" else llvm.get_host_cpu_features().flatten()
+    return name, os.environ.get("NUMBA_CPU_FEATURES", own)
 
 
 @functools.cache
-def _stamp() -> str:
-    """Return a digest of all kernels: the machine code of one holds that of those it calls, in whichever file."""
+def _stamp() -> tuple[str, ...]:
+    """Return what machine code depends on: the compiler, the processor, and all kernels, as one holds what it calls."""
     files = sorted(Path(__file__).parent.rglob("*.py"))
-    return hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
+    kernels = hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
+    return kernels, llvmlite.__version__, *processor()
 
 
-class _Place:
-    """One of numba's places for machine code; a directory that holds some is used where it cannot be written, too."""
-
-    def get_source_stamp(self) -> str:
-        """Return what the machine code was compiled from; numba compiles again where it changed."""
-        return _stamp()
-
-    def ensure_cache_path(self) -> None:
-        """Raise OSError where the directory can neither be written nor be read with profit."""
-        try:
-            super().ensure_cache_path()  # type: ignore[misc]  # of numba's class, beside this one
-        except OSError:
-            if not (numba.config.CACHE_DIR and any(Path(self.get_cache_path()).glob("*.nbi"))):  # type: ignore[attr-defined]
-                raise
+def places() -> list[Path]:
+    """Return where machine code may be kept: ``NUMBA_CACHE_DIR``, else beside the package, or in the user's cache."""
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        return [Path(given)]
+    users = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    return [Path(__file__).parent / "__pycache__", Path(users) / "icrtool"]
 
 
-class _Places(CompileResultCacheImpl):  # type: ignore[misc]
-    """``NUMBA_CACHE_DIR``, else beside the package, else the user's cache: numba's order, its other places left out."""
-
-    _locator_classes: ClassVar[list[type]] = [
-        type(one.__name__, (_Place, one), {})
-        for one in CompileResultCacheImpl._locator_classes[:3]  # noqa: SLF001 - numba has no public list
-    ]
-
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """Machine code of a kernel, kept where it can be."""
-
-    _impl_class = _Places
-
-    def load_overload(self, sig: object, target_context: object) -> object:
-        """Return the machine code of a kernel, None where it is to be compiled.
-
-        Without what numba compiles with, which its own method loads before it looks: that takes longer than to import
-        numba.
-        """
-        with self._guard_against_spurious_io_errors():
-            kept = self._load_overload(sig, target_context)
-        if kept is None:
-            _load_compiler()
-        return kept
-
-    def save_overload(self, sig: object, data: object) -> None:
-        """Keep newly compiled code; on a full disk or in a read-only directory it serves this process alone."""
+def writable_place() -> Path | None:
+    """Return the first place that can be written, made where it is not there; None where none can."""
+    for place in places():
         with suppress(OSError):
-            super().save_overload(sig, data)
+            place.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=place).close()
+            return place
+    return None
 
 
-_OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
-"""``error_model="numpy"`` makes a division by zero an inf, as in the NumPy twins, and lets loops vectorise; ``nogil``
-lets another thread read files while a kernel runs. No kernel is called from C: that wrapper takes time to compile.
-No kernel allocates an array, so none counts references to them (``_nrt``): that took a third of the filter's time."""
+def _keep(name: str, content: bytes) -> None:
+    """Keep a file where it can be; on a full disk, or where nothing can be written, it serves this process alone."""
+    place = writable_place()
+    if place is None:
+        return
+    with suppress(OSError), tempfile.NamedTemporaryFile(dir=place, delete=False) as file:
+        try:
+            file.write(content)
+            file.close()
+            Path(file.name).replace(place / name)
+        except OSError:
+            Path(file.name).unlink()
 
 
-def njit(function: Kernel) -> Kernel:
-    """Compile `function` with numba, cached on disk where a cache can be written or was.
+def njit(function: Function) -> Function:
+    """Compile `function` with numba when it is first called; its machine code is kept where it can be.
 
     Notes
     -----
-    Where neither ``NUMBA_CACHE_DIR``, the package's folder nor the user's cache folder is writable (read-only
-    containers, CI sandboxes), the kernel compiles in memory, once a process.
-    The plain Python function stays reachable as ``.py_func``.
+    Where no place for it is writable (read-only containers, CI sandboxes), it is compiled once a process.
     """
-    dispatcher = numba.njit(**_OPTIONS)(function)
-    try:
-        dispatcher._cache = _Cache(function)  # noqa: SLF001 - as numba's own `cache=True` does, with its class
-    except RuntimeError:
-        _load_compiler()
-    return cast(Kernel, dispatcher)
+    return cast(Function, Kernel(function))
 
 
-def njit_part(function: Kernel) -> Kernel:
+def njit_part(function: Function) -> Function:
     """Mark a function as part of kernels: compiled with those that call it, plain Python where Python calls it.
 
-    The wrapper by which Python would call compiled code takes a fifth of the time to compile. A plain number in a call
-    is a constant to the compiled function, of which there is one copy for each.
+    Notes
+    -----
+    A plain number in a call is a constant to the compiled function, of which there is one copy for each.
     """
-    overload(function, jit_options=_OPTIONS, strict=False, prefer_literal=True)(lambda *_: function)
+    _parts.append(function)
     return function
 
 
-def all_kernels() -> Iterator[Any]:
+def all_kernels() -> Iterator[Kernel]:
     """Import every module of kernels; yield each compiled function once."""
     package = importlib.import_module(__name__.rpartition(".")[0])
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
         for found in vars(importlib.import_module(module.name)).values():
-            if isinstance(found, Dispatcher) and found.py_func.__module__ == module.name:
+            if isinstance(found, Kernel) and found.py_func.__module__ == module.name:
                 yield found
-
-
-def processor() -> str:
-    """Return the name of the processor that is compiled for; ``generic`` is any of this architecture."""
-    name: str = cpu_target.target_context.codegen().magic_tuple()[1]
-    return name

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -266,16 +264,6 @@ def test_standing_states_are_counted(make_run: Callable[..., Run]) -> None:
     assert dropout(make_run(duration_s=20.0, troubles=False), [1.0]).standing == 0
     parked = make_run(duration_s=20.0, **PARKED)
     assert dropout(parked, [1.0]).standing == len(parked.table) - 1
-
-
-def test_loading_leaves_no_kernel_to_be_loaded_later() -> None:
-    code = (
-        "from icrtool.dropout_analysis.trials import load_kernels; load_kernels()\n"
-        "from icrtool.kernels import open_loop as fast\n"
-        "kernels = [fast.sum_moments, fast.fill_errors]\n"
-        "print([kernel.__name__ for kernel in kernels if len(kernel.signatures) != 1])"
-    )
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 
 
 def test_two_models_of_one_name_are_refused(run: Run) -> None:

@@ -4,55 +4,125 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import numba
+import numpy as np
 import pytest
 
 from icrtool.kernels import compiled
-from icrtool.kernels.compiled import njit
+from icrtool.kernels.compiled import all_kernels, njit, places
 
 CALL = """
+import sys
 import numpy as np
 from icrtool.kernels.kinematics import lag
 speed = np.array([1.0, 2.0, 2.0])
 lag(speed, np.array([1.0, 0.5]))
-print(speed[2], lag.stats.cache_path)
+print(speed[2], lag.compiled, "numba" in sys.modules)
 """
 
 
+def called(cache: str | Path) -> list[str]:
+    """Return what a process prints that calls a kernel with machine code in a folder."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    done = subprocess.run([sys.executable, "-c", CALL], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
 def test_kernels_compile_where_no_cache_can_be_written() -> None:
-    nowhere = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "NUMBA_CACHE_DIR": os.devnull + "/cache"}
-    done = subprocess.run(
-        [sys.executable, "-c", CALL], env={**os.environ, **nowhere}, capture_output=True, text=True, check=False
-    )
-    assert done.stdout.split() == ["1.5", "None"], done.stderr
+    assert called(os.devnull + "/cache") == ["1.5", "1", "True"]
 
 
-def double(x: float) -> float:
-    return 2.0 * x
+def test_a_process_needs_no_compiler_where_machine_code_is_kept(tmp_path: Path) -> None:
+    assert [called(tmp_path), called(tmp_path)] == [["1.5", "1", "True"], ["1.5", "0", "False"]]
 
 
-def compilations() -> int:
-    """Return how often a kernel is compiled that an earlier process may have compiled."""
-    kernel = njit(double)
-    assert kernel(2.0) == 4.0
-    return sum(kernel.stats.cache_misses.values())
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:-100], lambda data: data + b"x", lambda _: b""], ids=("cut", "longer", "empty")
+)
+def test_damaged_machine_code_is_compiled_again(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    called(tmp_path)
+    [file] = tmp_path.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    assert called(tmp_path) == ["1.5", "1", "True"]
+    assert file.read_bytes() == whole
+
+
+class Two(NamedTuple):
+    matrix: np.ndarray[Any, Any]
+    flag: bool
+
+
+def weigh(values: np.ndarray[Any, Any], two: Two, pair: tuple[int, float], more: float | None) -> float:
+    total = 0.0 if more is None else more
+    for i in range(len(values)):
+        for j in range(two.matrix.shape[1]):
+            total += pair[0] * values[i] * two.matrix[i, j] + pair[1] * np.sin(values[i])
+    return total if two.flag else -total
+
+
+def arguments(*, flag: bool = True, more: float | None = 0.5) -> tuple[Any, ...]:
+    rng = np.random.default_rng(3)
+    return rng.random(4), Two(rng.random((4, 3)), flag), (2, np.float64(0.25)), more
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Machine code of the tests' own functions is kept nowhere else."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+
+
+@pytest.mark.parametrize(
+    "given", [arguments(), arguments(flag=False), arguments(more=None)], ids=("all", "flag", "none")
+)
+def test_machine_code_takes_what_the_python_function_takes(given: tuple[Any, ...]) -> None:
+    for _ in range(2):
+        kernel = njit(weigh)
+        assert kernel(*given) == pytest.approx(weigh(*given), abs=1e-12)
+    assert kernel.compiled == 0
+
+
+def test_numba_runs_what_machine_code_cannot_do_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    # as where a version of numba passes arguments in another way, or its code calls functions of its own
+    monkeypatch.setattr(compiled, "_MATHEMATICS", set())
+    monkeypatch.setitem(compiled._LLVM_TYPES, compiled._INTEGER, "i128")
+    kernel = njit(weigh)
+    assert kernel(*arguments()) == pytest.approx(weigh(*arguments()), abs=1e-12)
+    assert not list(places()[0].glob("*"))
+
+
+def test_an_array_that_machine_code_would_misread_is_refused() -> None:
+    values, two, *rest = arguments()
+    fixed = values.copy()
+    fixed.flags.writeable = False
+    for wrong in (np.repeat(values, 2)[::2], fixed):
+        with pytest.raises(TypeError, match="contiguous"):
+            njit(weigh)(wrong, two, *rest)
 
 
 def test_a_kernel_compiles_again_where_any_file_of_kernels_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # the machine code of a kernel holds that of those it calls; numba itself looks at the kernel's own file alone
+    # the machine code of a kernel holds that of those it calls, whatever file they are in
     kernels = tmp_path / "kernels"
     shutil.copytree(Path(compiled.__file__).parent, kernels, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(compiled, "__file__", str(kernels / "compiled.py"))
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     found = []
     for changed in ("", "\n", ""):
         with (kernels / "open_loop.py").open("a", encoding="utf-8") as file:
             file.write(changed)
         compiled._stamp.cache_clear()
-        found.append(compilations())
+        kernel = njit(weigh)
+        kernel(*arguments())
+        found.append(kernel.compiled)
     compiled._stamp.cache_clear()
     assert found == [1, 1, 0]
+
+
+def test_every_kernel_is_found() -> None:
+    names = {one.py_func.__qualname__ for one in all_kernels()}
+    assert {"filter_events", "integrate_trials", "fill_errors"} <= names
