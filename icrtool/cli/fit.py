@@ -22,7 +22,7 @@ with when_used():
     from icrtool.alignment import wheel_units
     from icrtool.calibration import run_models
     from icrtool.fleet import one_log
-    from icrtool.logs import describe, read_log
+    from icrtool.logs import read_log
     from icrtool.logs.streams import assembly
     from icrtool.output import text_format
     from icrtool.output.tables import overview
@@ -150,7 +150,7 @@ def _examine(
             run = run_models.fit(measured, config, watch=stages.begin)
     except errors.IcrToolError as err:
         problem = err
-    holds = describe.survey_document(survey) if survey is not None else None
+    holds = read_log.survey_document(survey) if survey is not None else None
     # What errors and warnings of the log begin with: its name, or its path.
     names = (survey.name if survey is not None else LogText(log.stem), escaped(str(log)))
     command = overview.next_command(escaped(str(log)), given, run)

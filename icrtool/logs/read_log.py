@@ -1,6 +1,7 @@
 """Read a log: open it, read the columns of all candidates in one pass, choose, convert to the frames of `icrtool`.
 
-A log may also be one CSV file (columns: `icrtool.RobotLog.from_frames`).
+A log may also be one CSV file (columns: `icrtool.RobotLog.from_frames`). What a log holds before anything is chosen is
+a record of its own, which `icrtool info` prints.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,8 +27,10 @@ from icrtool.logs.containers.recording_files import PACKED, log_name
 from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable, collector_for
 from icrtool.logs.streams.assembly import Survey, assemble, longest_part
 from icrtool.logs.streams.headings import GYRO_AXES
+from icrtool.logs.streams.positions import TRANSFORM_FIELDS, TRANSFORM_TYPES, is_static, transform_pose
 from icrtool.logs.streams.select import fields_to_take, find_candidates
-from icrtool.logs.streams.transforms import FIELDS, is_static, transform_channels, transform_pose
+from icrtool.records.plain_data import Record
+from icrtool.records.samples import InputFile, Role, rate_and_jitter
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText, escaped
 from icrtool.records.urls import UrlPath, place_of
@@ -106,7 +109,7 @@ def survey_log(
 def drop_used_columns(tables: list[TopicTable]) -> None:
     """Remove the columns that only candidates were made of: half of what a log takes."""
     for table in tables:
-        for name in table.columns.keys() - {*HEADER, *GYRO_AXES, *FIELDS}:
+        for name in table.columns.keys() - {*HEADER, *GYRO_AXES, *TRANSFORM_FIELDS}:
             del table.columns[name]
 
 
@@ -158,10 +161,8 @@ def _collect(
     by_id = {channel.id: channel for channel in container.channels}
     topics = {channel.id: (channel.topic, channel.message_type) for channel in container.channels}
     wanted = fields_to_take(container.channels, config)
-    static = {channel.id: FIELDS for channel in container.channels if is_static(channel)}
-    moving = transform_channels(container.channels, config.topics)
-    wanted |= static | moving
-    cut = cut._replace(whole=frozenset(static)) if cut != WHOLE else cut
+    static = frozenset(channel.id for channel in container.channels if is_static(channel))
+    cut = cut._replace(whole=static) if cut != WHOLE else cut
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
         for whole in blocks:
             block = cut.of(whole)
@@ -187,8 +188,11 @@ def _collect(
     tables = [
         by_topic[topic].table() for topic in dict.fromkeys(topics[number] for number in wanted) if topic in by_topic
     ]
+    poses = {by_id[number].topic for number in wanted if by_id[number].message_type in TRANSFORM_TYPES} - {
+        by_id[number].topic for number in static
+    }
     for place, table in enumerate(tables):
-        if table.topic in {by_id[number].topic for number in moving} and len(table):
+        if table.topic in poses and len(table):
             try:
                 tables[place] = transform_pose(table)
             except DefinitionError as err:
@@ -204,25 +208,20 @@ def moment(given: Moment | None, key: str) -> float | datetime | None:
     LogError
         Neither a finite number nor a time in ISO 8601.
     """
-    if given is None:
-        return None
     if isinstance(given, str):
-        given = _parsed(given, key)
-    if isinstance(given, datetime):
-        return given if given.tzinfo is not None else given.replace(tzinfo=UTC)
+        text = given
+        with contextlib.suppress(ValueError):
+            given = float(text)
+        try:
+            given = datetime.fromisoformat(text) if isinstance(given, str) else given
+        except ValueError as err:
+            why = f"{text!r} is neither a number of seconds nor a time in ISO 8601"
+            raise LogError(key, why, "for example 12.5, or 2026-05-04T09:30:00") from err
+    if given is None or isinstance(given, datetime):
+        return given if given is None or given.tzinfo is not None else given.replace(tzinfo=UTC)
     if not math.isfinite(given):
         raise LogError(key, f"{given} is not a number of seconds")
     return float(given)
-
-
-def _parsed(text: str, key: str) -> float | datetime:
-    with contextlib.suppress(ValueError):
-        return float(text)
-    try:
-        return datetime.fromisoformat(text)
-    except ValueError as err:
-        why = f"{text!r} is neither a number of seconds nor a time in ISO 8601"
-        raise LogError(key, why, "for example 12.5, or 2026-05-04T09:30:00") from err
 
 
 def cut_of(container: Container, start: float | datetime | None, end: float | datetime | None, log: Path) -> Cut:
@@ -237,7 +236,11 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
         return WHOLE
     first = 0
     if isinstance(start, float) or isinstance(end, float):
-        first = _first_ns(container)
+        if (span := container.span_ns()) is not None:
+            first = span[0]
+        else:  # without an index all messages are read for it
+            blocks = container.blocks(frozenset(channel.id for channel in container.channels))
+            first = min((int(block.log_time_ns.min()) for block in blocks if len(block.log_time_ns)), default=0)
     begin_ns = max(nanoseconds(start, first), 0) if start is not None else 0
     end_ns = nanoseconds(end, first) if end is not None else LATEST_NS
     if begin_ns >= end_ns:
@@ -251,15 +254,6 @@ def nanoseconds(given: float | datetime, first_ns: int) -> int:
         passed = given - datetime(1970, 1, 1, tzinfo=UTC)
         return (passed.days * 86_400 + passed.seconds) * 1_000_000_000 + passed.microseconds * 1000
     return first_ns + round(max(min(given, 1e9), -1e9) * 1e9)
-
-
-def _first_ns(container: Container) -> int:
-    """Return the log time of the first message [ns]; without an index all messages are read for it."""
-    if (span := container.span_ns()) is not None:
-        return span[0]
-    numbers = frozenset(channel.id for channel in container.channels)
-    begins = (int(block.log_time_ns.min()) for block in container.blocks(numbers) if len(block.log_time_ns))
-    return min(begins, default=0)
 
 
 def is_table(path: Path) -> bool:
@@ -322,3 +316,80 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
             table = table[inside]
     log = RobotLog.from_frames(table, table, table, table, log_name(path))
     return longest_part(replace(log, inputs=(read,)))
+
+
+GAP_IN_INTERVALS, SHORTEST_GAP_S = 5.0, 0.1
+"""A gap is longer than so many times the median interval, and than this."""
+
+
+class SurveyedTopic(Record, frozen=True, kw_only=True):
+    """A topic of a log.
+
+    Attributes
+    ----------
+    messages : how many; None where nothing counts them
+    read : whether it may have a role, so that its messages were read
+    rate_hz : 1 / median interval; None where it was not read
+    gaps : intervals far longer than the median, with the `longest_gap_s`
+    unreadable : messages that do not fit their type
+    not_read_because : of a type that has a role
+    """
+
+    topic: str
+    message_type: str
+    messages: int | None
+    read: bool = False
+    rate_hz: float | None = None
+    gaps: int = 0
+    longest_gap_s: float | None = None
+    unreadable: int = 0
+    not_read_because: str | None = None
+
+
+class SurveyedSource(Record, frozen=True):
+    """A candidate of a role; `problem`: why it cannot be used; `stamps`: what is known of its clock."""
+
+    topic: str
+    message_type: str
+    why: str
+    problem: str | None
+    stamps: str
+
+
+class SurveyDocument(Record, frozen=True):
+    """What `icrtool info` states of a log as it lies there; `transfer`: how much came over a connection."""
+
+    inputs: tuple[InputFile, ...]
+    transfer: str | None
+    topics: tuple[SurveyedTopic, ...]
+    candidates: dict[Role, tuple[SurveyedSource, ...]]
+
+
+def survey_document(survey: Survey) -> SurveyDocument:
+    """Return the files of a log, its topics, and the candidates of each role with the reason for or against each."""
+    tables = {table.topic: table for table in survey.tables}
+    topics = []
+    for channel in {channel.topic: channel for channel in survey.channels}.values():
+        found: dict[str, Any] = {"messages": channel.count}
+        if (table := tables.get(channel.topic)) is not None:
+            rate_hz, _ = rate_and_jitter(table.log_time_ns)
+            found = {"messages": len(table), "read": True, "rate_hz": rate_hz, "unreadable": table.unreadable}
+            interval = np.diff(table.log_time_ns) / 1e9
+            if len(interval) > 1:
+                long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), SHORTEST_GAP_S)
+                found["gaps"] = int(np.count_nonzero(long))
+                found["longest_gap_s"] = float(interval.max()) if long.any() else None
+        why = survey.candidates.unread.get(channel.topic)
+        topic, message_type = str(channel.topic), str(channel.message_type)
+        topics.append(SurveyedTopic(topic=topic, message_type=message_type, not_read_because=why, **found))
+    candidates: dict[Role, tuple[SurveyedSource, ...]] = {}
+    for role, sources in survey.candidates.by_role().items():
+        clocks = (
+            one.stamps.note or f"header stamps, {round(one.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms before log time"
+            for one in sources
+        )
+        candidates[role] = tuple(
+            SurveyedSource(str(one.topic), str(one.message_type), one.why, one.problem or None, clock)
+            for one, clock in zip(sources, clocks, strict=True)
+        )
+    return SurveyDocument(survey.inputs, survey.transfer or None, tuple(topics), candidates)

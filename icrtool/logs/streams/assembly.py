@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -12,16 +13,26 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.headings import GYRO_TYPE, find_gyro, find_gyros
+from icrtool.logs.messages.topic_table import NEAR_NS, TopicTable
+from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE, find_gyro, inertial_units
+from icrtool.logs.streams.positions import antenna_place
 from icrtool.logs.streams.select import Candidates, Choice, choose_streams, ignored_joints, other_references
-from icrtool.logs.streams.sources import Convention, HeadingSource, Pair, PositionSource, Source, Unit, WheelMotion
-from icrtool.logs.streams.stamps import StampedRows, clock_notes, common_clock, increasing, usable_rows
-from icrtool.logs.streams.transforms import antenna_place
+from icrtool.logs.streams.sources import (
+    Convention,
+    HeadingSource,
+    Pair,
+    PositionSource,
+    Source,
+    StampedRows,
+    Unit,
+    WheelMotion,
+    increasing,
+)
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.records.samples import (
     NO_HEADINGS,
     Datum,
+    GyroAxes,
     HeadingSamples,
     InputFile,
     OtherReceiver,
@@ -36,6 +47,12 @@ from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText
 
 Clock = Literal["header", "log"]
+
+MOST_PIECES = 10.0
+"""Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
+
+FAR_NS = 100_000_000
+"""Header stamps that log time follows by less are used together with log times of other streams."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,45 +117,101 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         if topic in unreadable
     ]
     antenna = antenna_place(survey.tables, position.topic)
-    place = "" if antenna is None else f"antenna {antenna[0]:+.2f} m forward, {antenna[1]:+.2f} m right of the base"
     samples: dict[Role, Samples] = {"wheels": wheels, "gnss": gnss, "heading": heading}
     details: dict[Role, str] = {
         "wheels": "; position" if wheels.from_position else "; speed",
-        "gnss": f"; {place} (/tf_static)" if place else "",
+        "gnss": "",
         "heading": f"; {convention}",
     }
-    stamps: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
+    if antenna is not None:
+        details["gnss"] = f"; antenna {antenna[0]:+.2f} m forward, {antenna[1]:+.2f} m right of the base (/tf_static)"
+    streams = []
+    for role, one in chosen.items():
+        stamps, used = samples[role].stamp_ns, clock if one.stamps.header_ns is not None else "log"
+        rate, jitter = rate_and_jitter(stamps)
+        why = one.why + details[role]
+        streams.append(StreamChoice(role, one.topic, one.message_type, len(stamps), rate, used, jitter, why))
+    # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
+    others = (
+        other
+        for other in found.gnss
+        if other.topic != position.topic and other.geodetic is not None and not other.is_empty and not other.problem
+    )
+    receivers = [OtherReceiver(one.topic, _fixes(one, config, clock, name, datum)[0]) for one in others if datum]
+    known: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
+    units = inertial_units(survey.tables, GYRO_AXES, clock, known)
     log = RobotLog(
-        name, wheels, gnss, heading, datum,
-        tuple(
-            _stream(role, one, samples[role].stamp_ns, clock, one.why + details[role])
-            for role, one in chosen.items()
-        ),
-        survey.inputs, dict(position.rejected), tuple(warnings), antenna,
-        find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, stamps),
-        find_gyros(survey.tables, clock, stamps),
-        _other_receivers(found, position, datum, config, clock, name),
+        name, wheels, gnss, heading, datum, tuple(streams), survey.inputs, dict(position.rejected), tuple(warnings),
+        antenna, find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, known),
+        tuple(GyroAxes(table.topic, stamps, np.array(rates).T) for table, stamps, rates in units), tuple(receivers),
     )  # fmt: skip
     return longest_part(log)
 
 
-def _other_receivers(
-    found: Candidates, chosen: PositionSource, datum: Datum | None, config: Config, clock: Clock, name: str
-) -> tuple[OtherReceiver, ...]:
-    """Return the fixes of the other GNSS receivers, in the local plane of the chosen one."""
-    if datum is None:
-        return ()
-    return tuple(
-        OtherReceiver(source.topic, _fixes(source, config, clock, name, datum)[0])
-        for source in found.gnss
-        if source.topic != chosen.topic and source.geodetic is not None and source.usable.any() and not source.problem
-    )
+def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
+    """Yield sentences about clocks of streams that were set, one for all, and that cannot be used, one for each.
+
+    Raises
+    ------
+    DataError
+        The clock was set back, and times came again: nothing shows which of two samples came first.
+    """
+    yield from _set_back_note(streams, name)
+    if found := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:
+        size_ns, is_back, before_ns = max(found)[0]
+        sense = "back" if is_back else "ahead"
+        yield (
+            f"{name}: header stamps go {sense} by {size_ns / 1e9:.1f} s after {_time_of_day(before_ns)} "
+            f"({', '.join(role for _, role in found)}): their clock was set {'back' if is_back else 'forward'} while "
+            "recording; the later ones are moved by as much, which log time shows"
+        )
+    for role, rows in streams:
+        if rows.note and rows.note != "no header":
+            yield f"{name}: {role}: {rows.note}; log time is used"
+        if rows.replaced > 1:
+            counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
+            yield f"{name}: {role}: {counted}; log time is used for them"
 
 
-def _stream(role: Role, source: Source, stamps: Ints, clock: Clock, why: str) -> StreamChoice:
-    rate, jitter = rate_and_jitter(stamps)
-    used: Clock = clock if source.stamps.header_ns is not None else "log"
-    return StreamChoice(role, source.topic, source.message_type, len(stamps), rate, used, jitter, why)
+def _set_back_note(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
+    """Yield the sentence on the log's clock, with the largest step of the streams that show one."""
+    back = [
+        (rows.set_back, role)
+        for role, rows in streams
+        if rows.set_back.pieces > MOST_PIECES or rows.set_back.step_ns > NEAR_NS
+    ]
+    if not back:
+        return
+    # Of streams in which times come again, the largest step: they decide what can be done.
+    largest = max(back, key=lambda one: (one[0].pieces > MOST_PIECES, one[0].step_ns))[0]
+    moment = _time_of_day(largest.before_ns)
+    why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment} ({', '.join(role for _, role in back)})"
+    far = largest.step_ns > NEAR_NS
+    if largest.pieces > MOST_PIECES and far:
+        raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
+    if largest.pieces > MOST_PIECES:
+        yield (
+            f"{name}: {why}: the clock was set back while recording, and samples of that time are mixed, which makes "
+            "errors there too large; fit each part alone (--from, --to)"
+        )
+    else:
+        yield (
+            f"{name}: {why}: the clock was set back, or messages are stored out of order; all are used, sorted by "
+            "time; if it was set back, fit each part alone (--from, --to)"
+        )
+
+
+def _time_of_day(stamp_ns: int) -> str:
+    return f"{np.datetime64(stamp_ns // 1_000_000_000, 's')}Z"
+
+
+def common_clock(streams: Sequence[StampedRows]) -> Literal["header", "log"]:
+    """Return the clock for streams that are used together: header stamps or log time.
+
+    Where some stream has only log times and another's header is far from them, all go by log time.
+    """
+    delays = [rows.delay_ns for rows in streams if rows.header_ns is not None]
+    return "log" if len(delays) < len(streams) and any(abs(delay) > FAR_NS for delay in delays) else "header"
 
 
 def _fixes(
@@ -180,7 +253,7 @@ def _headings(source: HeadingSource, config: Config, clock: Clock, name: str) ->
     if config.frames.heading != "auto":
         convention, why = config.frames.heading, "configured"
     stamps = source.stamps.on(clock)
-    rows = usable_rows(stamps, source.usable)
+    rows, _, _ = increasing(stamps, source.usable)
     samples = HeadingSamples(stamps[rows], source.heading_rad(convention)[rows], source.variance[rows])
     return samples, f"{convention.upper()} ({why})"
 
@@ -228,7 +301,13 @@ def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: s
         with np.errstate(over="ignore"):
             left, right = (np.append(np.diff(side) / interval, 0.0) for side in (left, right))
         left[-1], right[-1] = left[-2], right[-2]
-    warnings += [f"{log_name}: {note}" for note in _assumptions(motion, config)]
+    if motion.twist is not None and config.wheels.twist_width_m is None:
+        undone = f"converted to wheel speeds with {config.robot.track_width_m:g} m (robot.track_width_m)"
+        advice = "if its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
+        warnings.append(
+            f"{log_name}: {motion.topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close "
+            "together"
+        )
     return WheelSamples(stamps, left, right, unit, is_position), warnings
 
 
@@ -259,15 +338,6 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
     return *positions, unit, True
 
 
-def _assumptions(motion: WheelMotion, config: Config) -> list[str]:
-    """Return a warning with the width assumed for a body twist, and the option that sets it."""
-    if motion.twist is None or config.wheels.twist_width_m is not None:
-        return []
-    undone = f"converted to wheel speeds with {config.robot.track_width_m:g} m (robot.track_width_m)"
-    advice = "if its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
-    return [f"{motion.topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close together"]
-
-
 def _alive(positions: Pair, speeds: Pair | None) -> bool:
     """Return whether the positions change where the speeds do: some drivers leave the position at zero."""
     finite = np.isfinite(positions[0]) & np.isfinite(positions[1])
@@ -289,33 +359,28 @@ def longest_part(log: RobotLog) -> RobotLog:
 
     Of parts that are `LONGEST_PAUSE_S` and more apart, that with the most wheel samples, and positions, is kept.
     """
-    stamps, fixes = log.wheels.stamp_ns, log.gnss.stamp_ns
-    ends = np.append(np.flatnonzero(np.diff(stamps) > LONGEST_PAUSE_S * 1e9), len(stamps) - 1)
+    stamps, fixes, pause_ns = log.wheels.stamp_ns, log.gnss.stamp_ns, int(LONGEST_PAUSE_S * 1e9)
+    ends = np.append(np.flatnonzero(np.diff(stamps) > pause_ns), len(stamps) - 1)
     begins = np.append(0, ends[:-1] + 1)
     positions = np.searchsorted(fixes, stamps[ends], side="right") - np.searchsorted(fixes, stamps[begins])
     longest = int(np.argmax((ends - begins) * (positions > 1)))
+    first, last = stamps[begins[longest]], stamps[ends[longest]]
     parts: dict[str, Any] = {}
-    for role, margin_s in (("wheels", 0.0), ("gnss", LONGEST_PAUSE_S), ("heading", LONGEST_PAUSE_S)):
-        margin_ns = int(margin_s * 1e9)
-        first, last = stamps[begins[longest]] - margin_ns, stamps[ends[longest]] + margin_ns
-        parts[role] = _between(getattr(log, role), first, last)
-    counts = {role: (len(kept.stamp_ns), len(getattr(log, role).stamp_ns)) for role, kept in parts.items()}
+    lost, paused = [], []
+    for role, margin_ns in (("wheels", 0), ("gnss", pause_ns), ("heading", pause_ns)):
+        samples: Samples = getattr(log, role)
+        inside = (samples.stamp_ns >= first - margin_ns) & (samples.stamp_ns <= last + margin_ns)
+        kept = parts[role] = samples if inside.all() else samples.cut(inside)
+        if kept is not samples:
+            lost.append(f"{len(inside) - len(kept.stamp_ns)} of {len(inside)} ({role})")
+        longest_s = np.diff(kept.stamp_ns).max(initial=0) / 1e9
+        if longest_s > PAUSE_S:
+            why = "the recording was paused, or its clock was set forward"
+            paused.append(f"{log.name}: {role}: no samples for {longest_s:.0f} s: {why}")
     warnings = list(log.warnings)
-    if lost := [f"{every - kept} of {every} ({role})" for role, (kept, every) in counts.items() if kept < every]:
+    if lost:
         warnings.append(
             f"{log.name}: more than a day apart from the other samples, and left out: {', '.join(lost)}; if the clock "
             "was set, --from and --to read that part"
         )
-    for role, kept in parts.items():
-        longest_s = np.diff(kept.stamp_ns).max(initial=0) / 1e9
-        if longest_s > PAUSE_S:
-            why = "the recording was paused, or its clock was set forward"
-            warnings.append(f"{log.name}: {role}: no samples for {longest_s:.0f} s: {why}")
-            break
-    return replace(log, warnings=tuple(warnings), **parts)
-
-
-def _between(samples: Samples, begin_ns: int, end_ns: int) -> Samples:
-    """Return the samples with stamps in [begin_ns, end_ns]."""
-    inside = (samples.stamp_ns >= begin_ns) & (samples.stamp_ns <= end_ns)
-    return samples if inside.all() else samples.cut(inside)
+    return replace(log, warnings=(*warnings, *paused[:1]), **parts)

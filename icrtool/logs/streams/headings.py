@@ -12,14 +12,21 @@ from typing import Literal
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints
-from icrtool.logs.messages.decoded_values import HDT
 from icrtool.logs.messages.topic_table import FRAME, TopicTable
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
-from icrtool.logs.streams.sources import Convention, HeadingSource, all_valid, fields_in, number, of_topic
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows, usable_rows
-from icrtool.records.samples import GyroAxes, GyroSamples
+from icrtool.logs.streams.sources import (
+    Convention,
+    HeadingSource,
+    StampedRows,
+    all_valid,
+    fields_in,
+    increasing,
+    number,
+    of_topic,
+    stamp_rows,
+)
+from icrtool.records.samples import GyroSamples
 
 FUSED_WORTH = 30.0
 """Of a heading that is fused with the wheels."""
@@ -56,40 +63,28 @@ class Bearing:
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
         """Return its headings."""
-        angle = number(self.angle).of(table, needed=True)
+        angle, variance = number(table, self.angle, needed=True), np.full(len(table), np.nan)
         if self.variance:
-            variance = number(self.variance).of(table)
-        else:
-            variance = squared(number(self.std).of(table)) if self.std else np.full(len(table), np.nan)
+            variance = number(table, self.variance)
+        elif self.std:
+            variance = _squared(number(table, self.std))
         worth = min(self.worth, FUSED_WORTH) if is_fused(table, self.independent) else self.worth
-        return stated(replace(self, worth=worth), table, angle, variance, all_valid(table, self.valid))
+        return replace(self, worth=worth).of(table, angle, variance, all_valid(table, self.valid))
+
+    def of(self, table: TopicTable, angle: Floats, variance: Floats, valid: Bools) -> HeadingSource:
+        """Return headings of angles [rad] (n,), their variances [rad^2] (n,), and which are valid (n,)."""
+        yaw, stated = np.where(np.isfinite(angle), angle, np.nan), np.where(variance > 0, variance, np.nan)
+        usable = valid & np.isfinite(angle)
+        problem = "" if usable.any() else "no valid heading"
+        return HeadingSource(
+            **of_topic(table), yaw_rad=yaw, variance=stated, usable=usable, convention=self.convention,
+            convention_why=self.known_by, score=self.worth, why=self.what, problem=problem,
+        )  # fmt: skip
 
 
-def squared(std: Floats) -> Floats:
-    """Return variances (n,) of standard deviations, NaN where these are not positive."""
-    return np.where(std > 0, std, np.nan) ** 2
-
-
-def stated(row: Bearing, table: TopicTable, angle: Floats, variance: Floats, valid: Bools) -> HeadingSource:
-    """Return the headings of a type: angles [rad] (n,), variances [rad^2] (n,), and which are valid (n,)."""
-    finite = np.isfinite(angle)
-    usable = valid & finite
-    return HeadingSource(
-        **of_topic(table), yaw_rad=np.where(finite, angle, np.nan), variance=np.where(variance > 0, variance, np.nan),
-        usable=usable, convention=row.convention, convention_why=row.known_by, score=row.worth, why=row.what,
-        problem="" if usable.any() else "no valid heading",
-    )  # fmt: skip
-
-
-TRUE_HEADING = Bearing("heading of the GNSS receiver (HDT)", 88.0, known_by="NMEA: clockwise from true north")
-
-
-def read_sentences(table: TopicTable, config: Config) -> HeadingSource:
-    """Return the true headings of HDT."""
-    headings = table.rows(table.column("sentence_kind") == HDT)
-    if not len(headings):
-        raise DefinitionError(table.topic, "none of its sentences is HDT")
-    return TRUE_HEADING.read(headings, config)
+def _squared(std: Floats) -> Floats:
+    """Return variances (n,) of standard deviations, not positive where these are not."""
+    return std * np.abs(std)
 
 
 _NORTHS = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
@@ -107,7 +102,7 @@ def read_azimuths(table: TopicTable, _: Config) -> HeadingSource:
     yaw = np.where((orientation == 1) == ned, yaw, np.pi / 2 - yaw)
     north = _NORTHS.get(float(np.median(table.floats("reference"))), "unknown")
     row = replace(_AZIMUTH, what=f"{_AZIMUTH.what}, {north} north", convention="ned" if ned else "enu")
-    return stated(row, table, yaw, table.floats("variance") * factor**2, np.ones(len(table), np.bool_))
+    return row.of(table, yaw, table.floats("variance") * factor**2, np.ones(len(table), np.bool_))
 
 
 BASELINE = Bearing(
@@ -127,13 +122,13 @@ LEAST_BASELINE_CM = 0.005
 
 def read_baselines(table: TopicTable, _: Config) -> HeadingSource:
     """Return the bearings of the antenna baseline of ublox_msgs/NavRELPOSNED, which states its components."""
-    north, east = (number(one).of(table, needed=True) for one in _COMPONENTS)
+    north, east = (number(table, one, needed=True) for one in _COMPONENTS)
     length = np.hypot(north, east)
     measured = (length > LEAST_BASELINE_CM) & np.isfinite(length)
-    accuracy = np.maximum(*(number(one).of(table) for one in _ACCURACIES))
+    accuracy = np.maximum(*(number(table, one) for one in _ACCURACIES))
     std = np.divide(accuracy, length, out=np.full(len(table), np.nan), where=measured)
     valid = all_valid(table, _BASELINE_VALID) & measured
-    return stated(BASELINE, table, np.arctan2(east, north), squared(std), valid)
+    return BASELINE.of(table, np.arctan2(east, north), _squared(std), valid)
 
 
 INS_WORDS = re.compile(r"\bins\b|vectornav|novatel|sbg|microstrain|xsens|gnss|gps|global|map|filtered", re.IGNORECASE)
@@ -321,8 +316,7 @@ def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:
     """Return whether yaw changes correlate with the gyro's; True where there is no gyro or it does not turn."""
     if yaw_rate_radps is None or not np.isfinite(yaw_rate_radps).all() or np.ptp(yaw_rate_radps) == 0:
         return True
-    x, y, z, w = unit.T
-    yaw = np.unwrap(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
+    yaw = np.unwrap(_bearing(0, *unit.T))
     # Over many samples: from one to the next there is more noise than turning.
     edges = np.unique(np.linspace(0, len(yaw) - 1, STRETCHES + 1).astype(np.int64))
     turned, measured = np.diff(yaw[edges]), np.add.reduceat(yaw_rate_radps, edges[:-1])
@@ -341,15 +335,12 @@ MOST_BAD = 0.01
 """A topic is not used where a larger share of its rates is not finite."""
 
 
-NOTHING_KNOWN: Mapping[str, StampedRows] = {}
-
-
 def find_gyro(
     tables: Sequence[TopicTable],
     wheels_topic: str,
     heading_topic: str,
     clock: Literal["header", "log"],
-    known: Mapping[str, StampedRows] = NOTHING_KNOWN,
+    known: Mapping[str, StampedRows] = {},
 ) -> GyroSamples | None:
     """Return the turn rates of the best inertial unit, None without one.
 
@@ -363,21 +354,13 @@ def find_gyro(
     """
     home = wheels_topic.strip("/").split("/")[0]
     found = []
-    for table, stamps, (rate,) in _units(tables, GYRO_AXES[2:], clock, known):
+    for table, stamps, (rate,) in inertial_units(tables, GYRO_AXES[2:], clock, known):
         near = table.topic == heading_topic, table.topic.strip("/").split("/")[0] == home, len(table)
         found.append((near, table.topic, stamps, rate if frame_convention(table)[0] == "ned" else -rate))
     return GyroSamples(*max(found, key=lambda one: one[:2])[1:]) if found else None
 
 
-def find_gyros(
-    tables: Sequence[TopicTable], clock: Literal["header", "log"], known: Mapping[str, StampedRows] = NOTHING_KNOWN
-) -> tuple[GyroAxes, ...]:
-    """Return the turn rates of every inertial unit, about all three axes; parameters as of `find_gyro`."""
-    units = _units(tables, GYRO_AXES, clock, known)
-    return tuple(GyroAxes(table.topic, stamps, np.array(rates).T) for table, stamps, rates in units)
-
-
-def _units(
+def inertial_units(
     tables: Sequence[TopicTable], axes: Sequence[str], clock: Literal["header", "log"], known: Mapping[str, StampedRows]
 ) -> Iterator[tuple[TopicTable, Ints, list[Floats]]]:
     """Yield the inertial units that measure about some axes, with the stamps (n,) and the sound rates about each."""
@@ -388,5 +371,5 @@ def _units(
         sound: Bools = np.logical_and.reduce([np.abs(one) <= FASTEST_RADPS for one in rates])
         if np.count_nonzero(~sound) <= MOST_BAD * len(sound) and any(np.ptp(one[sound]) for one in rates):
             stamps = (known.get(table.topic) or stamp_rows(table)).on(clock)
-            rows = usable_rows(stamps, sound)
+            rows, _, _ = increasing(stamps, sound)
             yield table, stamps[rows], [one[rows] for one in rates]

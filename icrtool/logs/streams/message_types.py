@@ -5,26 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from icrtool.config import Config
-from icrtool.logs.messages.decoded_values import NMEA_SENTENCE
+from icrtool.errors import DefinitionError
+from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams import headings, positions, wheels
+from icrtool.logs.streams import headings, wheels
 from icrtool.logs.streams.headings import Bearing, Orientation
-from icrtool.logs.streams.positions import (
-    GBAS,
-    GPSFIX_STATUS,
-    NOVATEL_TYPES,
-    SEPTENTRIO_MODE,
-    UBLOX_CARRIER,
-    UBLOX_FLAGS,
-    XBOT_FLAGS,
-    Fix,
-    Pose,
-    Solution,
-)
+from icrtool.logs.streams.positions import Fix, Solution
 from icrtool.logs.streams.sources import Source
-from icrtool.logs.streams.wheels import FixedWheels, Joints, Twist, body_twist
-from icrtool.records.samples import OTHER_FIX, RTK_FIX, Role
+from icrtool.logs.streams.wheels import FixedWheels, Joints, Twist
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX, RTK_FIX, Role
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +27,7 @@ class OwnRow:
     read: Callable[[TopicTable, Config], Source]
 
 
-Row = Fix | Pose | Bearing | Orientation | Joints | FixedWheels | Twist | OwnRow
+Row = Fix | Bearing | Orientation | Joints | FixedWheels | Twist | OwnRow
 """What a message type carries for a role: the fields to take beside those of a header, and how they are read."""
 
 # Wheels: Drive.msg of jackal_msgs and of clearpath_platform_msgs has 0 for left, 1 for right.
@@ -61,43 +53,115 @@ _SEGWAY_STAMPED = replace(
     speed=tuple(f"segway.{path}" for path in _SEGWAY.speed),
 )  # fmt: skip
 
-# Positions: -2 is the default of ROS 2's NavSatStatus; err_horz is a 95 % radius, 2.45 standard deviations.
+_TWIST = Twist("body twist", 50.0, fused=45.0)
+
+# Positions
+_GBAS = 2
+"""NavSatStatus: 2 is fixed or float, drivers differ. A log without any of these states nothing about the solution."""
+
+_GPSFIX_STATUS = {
+    0: OTHER_FIX, 1: OTHER_FIX, _GBAS: RTK_FIX, 18: OTHER_FIX, 19: FIXED_FIX, 20: FLOAT_FIX, 33: OTHER_FIX,
+}  # fmt: skip
+"""GPSStatus of gps_msgs: 18 DGPS, 19 and 20 RTK, 33 WAAS."""
+
+_UBLOX_CARRIER = {0: OTHER_FIX, 1: FLOAT_FIX, 2: FIXED_FIX}
+"""carrSoln of u-blox."""
+
+_UBLOX_FLAGS = {carrier << 6: fix_class for carrier, fix_class in _UBLOX_CARRIER.items()}
+"""Bits 6 and 7 of NavPVT.flags: the same."""
+
+_NMEA_QUALITY = {1: OTHER_FIX, 2: OTHER_FIX, 3: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 8: OTHER_FIX, 9: OTHER_FIX}
+"""Quality of GGA: single, differential, PPS, RTK fixed and float, simulated, SBAS of NovAtel.
+
+The others are no fixes: 0 none, 6 dead reckoning, 7 typed in.
+"""
+
+_XBOT_FLAGS = {0: OTHER_FIX, 1: OTHER_FIX, 2: FIXED_FIX, 3: FIXED_FIX, 4: FLOAT_FIX, 5: FLOAT_FIX}
+"""Low bits of the flags of xbot_msgs/AbsolutePose: 1 corrections, 2 RTK fixed, 4 RTK float."""
+
+_SEPTENTRIO_MODE = {1: OTHER_FIX, 2: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 6: OTHER_FIX, 7: FIXED_FIX, 8: FLOAT_FIX}
+"""Low bits of the mode: stand-alone, DGPS, RTK fixed and float, SBAS, moving-base fixed and float."""
+
+_NOVATEL_TYPES = {32: FLOAT_FIX, 33: FLOAT_FIX, 34: FLOAT_FIX, 48: FIXED_FIX, 49: FIXED_FIX, 50: FIXED_FIX,
+                 51: FIXED_FIX, 55: FLOAT_FIX, 56: FIXED_FIX}  # fmt: skip
+"""Position types of NovAtel, numbered as in novatel_oem7_msgs; all others have neither fixed nor float ambiguities."""
+
+# -2 is the default of ROS 2's NavSatStatus; err_horz is a 95 % radius, 2.45 standard deviations.
 _NAVSATFIX = Fix(
     "GNSS fix", 100.0, covariance=("position_covariance[4]", "position_covariance[0]", "position_covariance[1]"),
     valid=("status.status >= 0 unless -2",),
-    solution=Solution("status.status", {GBAS: RTK_FIX}, OTHER_FIX, informative=True),
+    solution=Solution("status.status", {_GBAS: RTK_FIX}, OTHER_FIX, informative=True),
 )  # fmt: skip
 _GPSFIX = replace(
     _NAVSATFIX, worth=92.0, std=("err_horz * 0.40816326530612246",),
-    solution=Solution("status.status", GPSFIX_STATUS, informative=True),
+    solution=Solution("status.status", _GPSFIX_STATUS, informative=True),
 )  # fmt: skip
-_UBLOX = Fix("u-blox position", 85.0, "lat * 1e-7", "lon * 1e-7", "height * 1e-3", ("hAcc|h_acc * 1e-3",))
+_UBLOX = Fix("u-blox position", 85.0, ("lat * 1e-7", "lon * 1e-7", "height * 1e-3"), ("hAcc|h_acc * 1e-3",))
 # low bits of a mode of 0: no solution
 _SEPTENTRIO = Fix(
-    "Septentrio position", 85.0, "latitude * rad", "longitude * rad", "height", ("h_accuracy < 65535 * 0.01",),
-    valid=("mode & 15 != 0", "error == 0"), solution=Solution("mode", SEPTENTRIO_MODE, OTHER_FIX, 15),
+    "Septentrio position", 85.0, ("latitude * rad", "longitude * rad", "height"), ("h_accuracy < 65535 * 0.01",),
+    valid=("mode & 15 != 0", "error == 0"), solution=Solution("mode", _SEPTENTRIO_MODE, OTHER_FIX, 15),
 )  # fmt: skip
 # A height above mean sea level comes with the undulation of the geoid.
 _SOLVED = "SOL_COMPUTED|0"
 _INS_SOLVED = "INS_SOLUTION_GOOD|INS_SOLUTION_FREE|INS_ALIGNMENT_COMPLETE|3|6|7"
 """What NovAtel calls a solution, in words (novatel_gps_msgs) and as numbers (novatel_oem7_msgs)."""
 
-_WORD, _NUMBER = (Solution(name, NOVATEL_TYPES, OTHER_FIX) for name in ("position_type", "pos_type.type"))
+_WORD, _NUMBER = (Solution(name, _NOVATEL_TYPES, OTHER_FIX) for name in ("position_type", "pos_type.type"))
 _BESTPOS = Fix(
-    "NovAtel position", 85.0, "lat", "lon", "hgt + undulation", ("lat_stdev", "lon_stdev"),
+    "NovAtel position", 85.0, ("lat", "lon", "hgt + undulation"), ("lat_stdev", "lon_stdev"),
     valid=(f"sol_status.status == {_SOLVED}",), solution=_NUMBER,
 )  # fmt: skip
 _INSPVAX = Fix(
-    "NovAtel INS position", 84.0, height="height + undulation", std=("latitude_stdev", "longitude_stdev"),
-    valid=(f"ins_status.status == {_INS_SOLVED}",), solution=_NUMBER,
+    "NovAtel INS position", 84.0, ("latitude", "longitude", "height + undulation"),
+    ("latitude_stdev", "longitude_stdev"), valid=(f"ins_status.status == {_INS_SOLVED}",), solution=_NUMBER,
 )  # fmt: skip
-_METRIC = Pose("metric pose", 70.0)
-_OF_X_AND_Y = "pose.covariance[7]", "pose.covariance[0]", "pose.covariance[1]"
+_METRIC = Fix("metric pose", 70.0, ("pose.position.x", "pose.position.y", "pose.position.z"), metric=True)
+_METRIC_OF_POSE = replace(
+    _METRIC, place=("pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z"),
+    covariance=("pose.covariance[7]", "pose.covariance[0]", "pose.covariance[1]"),
+)  # fmt: skip
 _XBOT_INDEPENDENT = ("source != 100",)
 """xbot_msgs/AbsolutePose of source 100 is fused with the wheels."""
 
+_GST_NEAR_NS = 1_500_000_000
+"""Receivers send GST with each fix, or once a second."""
+
+_SENTENCE_FIX = Fix(
+    "GNSS fix", 84.0, std=("north_std", "east_std"), valid=(f"quality == {'|'.join(map(str, _NMEA_QUALITY))}",),
+    solution=Solution("quality", _NMEA_QUALITY),
+)  # fmt: skip
+
+
+def _read_fixes(table: TopicTable, config: Config) -> Source:
+    """Return the fixes of GGA, with the deviations of the nearest GST; of RMC where there is no GGA."""
+    kinds = table.column("sentence_kind")
+    kind, name = (GGA, "GGA") if (kinds == GGA).any() else (RMC, "RMC")
+    fixes, deviations = table.rows(kinds == kind), table.rows(kinds == GST)
+    if not len(fixes):
+        raise DefinitionError(table.topic, "none of its sentences is GGA or RMC")
+    if len(deviations):
+        times_ns = deviations.log_time_ns
+        nearest = np.searchsorted(times_ns[:-1] + np.diff(times_ns) // 2, fixes.log_time_ns)
+        near = np.abs(times_ns[nearest] - fixes.log_time_ns) < _GST_NEAR_NS
+        stds = {one: np.where(near, deviations.column(one)[nearest], np.nan) for one in ("north_std", "east_std")}
+        fixes = replace(fixes, columns=fixes.columns | stds)
+    return replace(_SENTENCE_FIX, what=f"{_SENTENCE_FIX.what} ({name})").read(fixes, config)
+
+
 # Headings
 _OF_POSE = Orientation("orientation of the pose", 50.0, "pose.orientation")
+_TRUE_HEADING = Bearing("heading of the GNSS receiver (HDT)", 88.0, known_by="NMEA: clockwise from true north")
+
+
+def _read_true_headings(table: TopicTable, config: Config) -> Source:
+    """Return the true headings of HDT."""
+    true = table.rows(table.column("sentence_kind") == HDT)
+    if not len(true):
+        raise DefinitionError(table.topic, "none of its sentences is HDT")
+    return _TRUE_HEADING.read(true, config)
+
+
 _AZIMUTH = OwnRow(headings.AZIMUTH_FIELDS, headings.read_azimuths)
 # ENU unless `use_ros_axis_orientation` was off, which no message states.
 _ATTITUDE = Bearing(
@@ -135,12 +199,12 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
         "segway_interfaces/Segwaystatus": _SEGWAY,
         # its motor rpm is integer, and before the gearbox
         "scout_msgs/ScoutStatus": Twist(
-            "the base's own speed and turn rate", 70.0, "linear_velocity", "lateral_velocity", "angular_velocity"
+            "the base's own speed and turn rate", 70.0, "", "linear_velocity", "lateral_velocity", "angular_velocity"
         ),
-        "nav_msgs/Odometry": body_twist("twist.twist.", 60.0, "twist of the wheel odometry", fused=50.0),
-        "geometry_msgs/TwistStamped": body_twist("twist.", 50.0),
-        "geometry_msgs/TwistWithCovarianceStamped": body_twist("twist.twist.", 50.0),
-        "geometry_msgs/Twist": body_twist("", 40.0),
+        "nav_msgs/Odometry": Twist("twist of the wheel odometry", 60.0, "twist.twist.", fused=50.0),
+        "geometry_msgs/TwistStamped": replace(_TWIST, path="twist."),
+        "geometry_msgs/TwistWithCovarianceStamped": replace(_TWIST, path="twist.twist."),
+        "geometry_msgs/Twist": replace(_TWIST, worth=40.0),
     },
     "gnss": {
         "sensor_msgs/NavSatFix": _NAVSATFIX,
@@ -148,32 +212,34 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
         "gps_common/GPSFix": _GPSFIX,
         "gps_msgs/GPSFix": _GPSFIX,
         "ublox_msgs/NavPVT": replace(
-            _UBLOX, valid=("flags & 1 == 1",), solution=Solution("flags", UBLOX_FLAGS, mask=192)
+            _UBLOX, valid=("flags & 1 == 1",), solution=Solution("flags", _UBLOX_FLAGS, mask=192)
         ),
         # fix types without a place: none, dead reckoning only, time only
         "ublox_ubx_msgs/UBXNavPVT": replace(
             _UBLOX, std=("h_acc * 1e-3",),
             valid=("gnss_fix_ok != 0", "invalid_llh != 1", "gps_fix.fix_type != 0|1|5"),
-            solution=Solution("carr_soln.status", UBLOX_CARRIER),
+            solution=Solution("carr_soln.status", _UBLOX_CARRIER),
         ),
         "ublox_msgs/NavHPPOSLLH": Fix(
-            "u-blox high precision position", 86.0, "lat * 1e-7 + latHp|lat_hp * 1e-9",
-            "lon * 1e-7 + lonHp|lon_hp * 1e-9", "height * 1e-3 + heightHp|height_hp * 1e-4", ("hAcc|h_acc * 1e-4",),
+            "u-blox high precision position", 86.0,
+            ("lat * 1e-7 + latHp|lat_hp * 1e-9", "lon * 1e-7 + lonHp|lon_hp * 1e-9",
+             "height * 1e-3 + heightHp|height_hp * 1e-4"),
+            ("hAcc|h_acc * 1e-4",),
             valid=("invalid_llh|invalidLlh|flags & 1 != 1",),
         ),
-        NMEA_SENTENCE: OwnRow(("sentence",), positions.read_sentences),
+        NMEA_SENTENCE: OwnRow(("sentence",), _read_fixes),
         "septentrio_gnss_driver/PVTGeodetic": _SEPTENTRIO,
         "septentrio_gnss_driver/INSNavGeod": replace(
             _SEPTENTRIO, what="Septentrio INS position", worth=84.0, std=("latitude_std_dev", "longitude_std_dev"),
             valid=("gnss_mode & 15 != 0", "error == 0"),
-            solution=Solution("gnss_mode", SEPTENTRIO_MODE, OTHER_FIX, 15),
+            solution=Solution("gnss_mode", _SEPTENTRIO_MODE, OTHER_FIX, 15),
         ),
         "novatel_gps_msgs/NovatelPosition": replace(
-            _BESTPOS, height="height + undulation", std=("lat_sigma", "lon_sigma"),
+            _BESTPOS, place=("lat", "lon", "height + undulation"), std=("lat_sigma", "lon_sigma"),
             valid=(f"solution_status == {_SOLVED}",), solution=_WORD,
         ),
         "novatel_gps_msgs/Inspvax": replace(
-            _INSPVAX, height="altitude + undulation", std=("latitude_std", "longitude_std"),
+            _INSPVAX, place=("latitude", "longitude", "altitude + undulation"), std=("latitude_std", "longitude_std"),
             valid=(f"ins_status == {_INS_SOLVED}",), solution=_WORD,
         ),
         "novatel_oem7_msgs/BESTPOS": _BESTPOS,
@@ -181,17 +247,17 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
         "novatel_oem7_msgs/INSPVAX": _INSPVAX,
         "geographic_msgs/GeoPoseStamped": Fix(
             "position of an autopilot or navigation filter", 80.0,
-            "pose.position.latitude", "pose.position.longitude", "pose.position.altitude",
+            ("pose.position.latitude", "pose.position.longitude", "pose.position.altitude"),
         ),
         "geometry_msgs/PoseStamped": _METRIC,
         "foxglove.PoseInFrame": _METRIC,
-        "geometry_msgs/PoseWithCovarianceStamped": replace(_METRIC, path="pose.pose", covariance=_OF_X_AND_Y),
-        "xbot_msgs/AbsolutePose": Pose(
-            "GNSS position of OpenMower", 90.0, "pose.pose", _OF_X_AND_Y, ("position_accuracy",),
-            ("flags & 8 == 0",), Solution("flags", XBOT_FLAGS, mask=7), independent=_XBOT_INDEPENDENT,
+        "geometry_msgs/PoseWithCovarianceStamped": _METRIC_OF_POSE,
+        "xbot_msgs/AbsolutePose": replace(
+            _METRIC_OF_POSE, what="GNSS position of OpenMower", worth=90.0, std=("position_accuracy",),
+            valid=("flags & 8 == 0",), solution=Solution("flags", _XBOT_FLAGS, mask=7), independent=_XBOT_INDEPENDENT,
         ),
-        "nav_msgs/Odometry": Pose(
-            "metric position of an odometry message", 60.0, "pose.pose", _OF_X_AND_Y, odometry=True
+        "nav_msgs/Odometry": replace(
+            _METRIC_OF_POSE, what="metric position of an odometry message", worth=60.0, odometry=True
         ),
     },
     "heading": {
@@ -215,7 +281,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
             "heading of the GNSS receiver", 88.0, "heading", variance="heading_variance",
             known_by="Foxglove: clockwise from north",
         ),
-        NMEA_SENTENCE: OwnRow(("sentence",), headings.read_sentences),
+        NMEA_SENTENCE: OwnRow(("sentence",), _read_true_headings),
         "xbot_msgs/AbsolutePose": Bearing(
             "OpenMower's heading", 90.0, "vehicle_heading", "orientation_accuracy", valid=("orientation_valid != 0",),
             convention="enu", known_by="REP-103", independent=_XBOT_INDEPENDENT,
@@ -245,7 +311,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
     },
 }  # fmt: skip
 """By role and type. A number is read as ``lat|latitude * 1e-7 + lat_hp * 1e-9`` states (`sources.number`), a check as
-``flags & 1 == 1`` (`sources.check`)."""
+``flags & 1 == 1`` (`sources.check_of`)."""
 
 
 def fields_of(role: Role, message_type: str) -> tuple[str, ...]:

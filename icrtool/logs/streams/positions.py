@@ -1,10 +1,10 @@
-"""Messages that hold the robot's position: geodetic fixes, and poses that are metric already, in their own frame."""
+"""Messages that hold the robot's position: fixes, poses, and transforms: of the antenna, or of the robot itself."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -12,41 +12,12 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Bytes, Floats
-from icrtool.logs.messages.decoded_values import GGA, GST, RMC
-from icrtool.logs.messages.topic_table import FRAME, TopicTable
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
+from icrtool.logs.containers.container import Channel
+from icrtool.logs.messages.topic_table import FRAME, STAMPS, TopicTable
 from icrtool.logs.streams.sources import NEVER_MOVES, PositionSource, all_valid, fields_in, number, of_topic
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
-
-GBAS = 2
-"""NavSatStatus: 2 is fixed or float, drivers differ. A log without any of these states nothing about the solution."""
-
-GPSFIX_STATUS = {
-    0: OTHER_FIX, 1: OTHER_FIX, GBAS: RTK_FIX, 18: OTHER_FIX, 19: FIXED_FIX, 20: FLOAT_FIX, 33: OTHER_FIX,
-}  # fmt: skip
-"""GPSStatus of gps_msgs: 18 DGPS, 19 and 20 RTK, 33 WAAS."""
-
-UBLOX_CARRIER = {0: OTHER_FIX, 1: FLOAT_FIX, 2: FIXED_FIX}
-"""carrSoln of u-blox."""
-
-UBLOX_FLAGS = {carrier << 6: fix_class for carrier, fix_class in UBLOX_CARRIER.items()}
-"""Bits 6 and 7 of NavPVT.flags: the same."""
-
-NMEA_QUALITY = {1: OTHER_FIX, 2: OTHER_FIX, 3: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 8: OTHER_FIX, 9: OTHER_FIX}
-"""Quality of GGA: single, differential, PPS, RTK fixed and float, simulated, SBAS of NovAtel.
-
-The others are no fixes: 0 none, 6 dead reckoning, 7 typed in.
-"""
-
-XBOT_FLAGS = {0: OTHER_FIX, 1: OTHER_FIX, 2: FIXED_FIX, 3: FIXED_FIX, 4: FLOAT_FIX, 5: FLOAT_FIX}
-"""Low bits of the flags of xbot_msgs/AbsolutePose: 1 corrections, 2 RTK fixed, 4 RTK float."""
-
-SEPTENTRIO_MODE = {1: OTHER_FIX, 2: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 6: OTHER_FIX, 7: FIXED_FIX, 8: FLOAT_FIX}
-"""Low bits of the mode: stand-alone, DGPS, RTK fixed and float, SBAS, moving-base fixed and float."""
-
-NOVATEL_TYPES = {32: FLOAT_FIX, 33: FLOAT_FIX, 34: FLOAT_FIX, 48: FIXED_FIX, 49: FIXED_FIX, 50: FIXED_FIX,
-                 51: FIXED_FIX, 55: FLOAT_FIX, 56: FIXED_FIX}  # fmt: skip
-"""Position types of NovAtel, numbered as in novatel_oem7_msgs; all others have neither fixed nor float ambiguities."""
+from icrtool.records.text import LogText
 
 
 class Solution(NamedTuple):
@@ -87,169 +58,6 @@ def _of_word(text: str) -> int:
     return FIXED_FIX if text.endswith(("_INT", "RTKFIXED", "RTK_DIRECT_INS")) else OTHER_FIX
 
 
-NO_SOLUTION = Solution("", {})
-COVARIANCE_TYPE = "position_covariance_type"
-
-
-def stated_variance(table: TopicTable, covariance: tuple[str, ...], std: tuple[str, ...]) -> Floats:
-    """Return north, east, covariance of both [m^2] (n, 3), NaN where not stated.
-
-    Parameters
-    ----------
-    covariance : its fields, which have precedence; those of axes that are not both positive state nothing
-    std : standard deviation to the north and to the east; one for both
-    """
-    variance = np.full((len(table), 3), np.nan)
-    if std:
-        north, east = number(std[0]).of(table), number(std[-1]).of(table)
-        stated = (north > 0) & (east > 0)
-        with np.errstate(over="ignore"):
-            variance[stated] = np.column_stack([north**2, east**2, np.zeros(len(table))])[stated]
-    if covariance:
-        found = np.column_stack([table.floats(path) for path in covariance])
-        # COVARIANCE_TYPE_UNKNOWN: drivers leave the numbers at 0, or write arbitrary ones.
-        stated = (found[:, 0] > 0) & (found[:, 1] > 0) & (table.floats(COVARIANCE_TYPE) != 0)
-        variance[stated] = found[stated]
-    return variance
-
-
-def _reject(table: TopicTable, reasons: Mapping[str, Bools]) -> tuple[Bools, dict[str, int]]:
-    """Return the rows (n,) that no reason excludes, and how many each one excludes of those that are left."""
-    usable, rejected = np.ones(len(table), np.bool_), dict[str, int]()
-    for reason, bad in reasons.items():
-        if count := int(np.count_nonzero(bad & usable)):
-            rejected[reason] = count
-        usable = usable & ~bad
-    return usable, rejected
-
-
-HIGHEST_M = 20_000.0
-"""A height beyond this means "unknown"; it is replaced by the median of the others."""
-
-FARTHEST_M = 200_000.0
-"""No robot drives further from the middle of its fixes."""
-
-STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
-"""A receiver whose fixes stay within this is that of a base station, or of a robot that stands."""
-
-GOOD_STD_M, NOT_GOOD = 0.3, 35.0
-"""A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference; taken off of others."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fix:
-    """A message type with geodetic positions.
-
-    Attributes
-    ----------
-    what, worth : what it is called where it is chosen, and how suitable it is as reference
-    latitude, longitude : to degrees; height : to m above the ellipsoid
-    std : standard deviation [m] to the north and to the east; one for both. These are as `number` reads them
-    covariance : the fields of the variances to the north and to the east and of their covariance, which have precedence
-    valid : checks that all must pass for a fix
-    solution : how it was solved
-    """
-
-    what: str
-    worth: float
-    latitude: str = "latitude"
-    longitude: str = "longitude"
-    height: str = "altitude"
-    std: tuple[str, ...] = ()
-    covariance: tuple[str, ...] = ()
-    valid: tuple[str, ...] = ()
-    solution: Solution = NO_SOLUTION
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """The fields that are read; an empty one is none."""
-        numbers = fields_in((self.latitude, self.longitude, self.height, *self.std), self.valid)
-        return (*numbers, *self.covariance, COVARIANCE_TYPE if self.covariance else "", self.solution.name)
-
-    def read(self, table: TopicTable, _: Config) -> PositionSource:
-        """Return its positions; rows without a fix, not finite, far from the others or at 0, 0 are not usable."""
-        latitude, longitude = (number(one).of(table, needed=True) for one in (self.latitude, self.longitude))
-        variance = stated_variance(table, self.covariance, self.std)
-        no_fix, finite = ~all_valid(table, self.valid), np.isfinite(latitude) & np.isfinite(longitude)
-        with np.errstate(invalid="ignore"):
-            possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 360.0)
-        places = np.column_stack([latitude, longitude])
-        usable, rejected = _reject(
-            table,
-            {
-                "no fix": no_fix,
-                "not finite": ~finite,
-                "not a place on earth": ~possible,
-                "at 0, 0": (latitude == 0) & (longitude == 0),
-                "far from the others": _far_away(places, possible & ~no_fix & finite),
-            },
-        )
-        height = number(self.height).of(table)
-        plausible = np.abs(height) < HIGHEST_M
-        known = height[plausible & usable]
-        height = np.where(plausible, height, float(np.median(known)) if len(known) else 0.0)
-        std = float("nan")
-        if np.isfinite(variance[usable, :2]).any():
-            std = float(np.sqrt(np.nanmedian(variance[usable, :2])))
-        what, score = self.what, self.worth - (NOT_GOOD if std > GOOD_STD_M else 0.0)
-        if _is_still(places[usable]):
-            what, score = f"{what} that never moves", score - NEVER_MOVES
-        counts = ", ".join(f"{reason} {count}" for reason, count in rejected.items())
-        return PositionSource(
-            **of_topic(table),
-            geodetic=np.column_stack([latitude, longitude, height]),
-            variance=variance, usable=usable, rejected=rejected, score=score,
-            why=f"{what}, states ±{std:.2g} m" if np.isfinite(std) else f"{what}, states no accuracy",
-            problem="" if usable.any() else f"no usable fix ({counts})",
-            stated_class=self.solution.of(table),
-        )  # fmt: skip
-
-
-def _far_away(places_deg: Floats, known: Bools) -> Bools:
-    """Return the known fixes (n,) of another place: a receiver that was switched on may send where it was last."""
-    far, places_deg = np.zeros(len(known), np.bool_), places_deg[known]
-    if len(places_deg):
-        away_deg = places_deg - places_deg[0]
-        away_deg[:, 1] = np.mod(away_deg[:, 1] + 180.0, 360.0) - 180.0  # not across the date line
-        away_deg -= np.median(away_deg, axis=0)
-        away_deg[:, 1] *= math.cos(math.radians(float(np.median(places_deg[:, 0]))))
-        far[known] = (np.abs(away_deg) * METRES_PER_DEGREE > FARTHEST_M).any(axis=1)
-    return far
-
-
-def _is_still(places_deg: Floats) -> bool:
-    """Return whether 95 % of the fixes (n, 2) lie within `STILL_M`, whatever the latitude."""
-    if len(places_deg) < 2:
-        return False
-    ends = np.percentile(places_deg, [2.5, 97.5], axis=0)
-    return bool((np.diff(ends, axis=0) * METRES_PER_DEGREE < STILL_M).all())
-
-
-GST_NEAR_NS = 1_500_000_000
-"""Receivers send GST with each fix, or once a second."""
-
-SENTENCE_FIX = Fix(
-    "GNSS fix", 84.0, std=("north_std", "east_std"), valid=(f"quality == {'|'.join(map(str, NMEA_QUALITY))}",),
-    solution=Solution("quality", NMEA_QUALITY),
-)  # fmt: skip
-
-
-def read_sentences(table: TopicTable, config: Config) -> PositionSource:
-    """Return the fixes of GGA, with the deviations of the nearest GST; of RMC where there is no GGA."""
-    kinds = table.column("sentence_kind")
-    kind, name = (GGA, "GGA") if (kinds == GGA).any() else (RMC, "RMC")
-    fixes, deviations = table.rows(kinds == kind), table.rows(kinds == GST)
-    if not len(fixes):
-        raise DefinitionError(table.topic, "none of its sentences is GGA or RMC")
-    if len(deviations):
-        times_ns = deviations.log_time_ns
-        nearest = np.searchsorted(times_ns[:-1] + np.diff(times_ns) // 2, fixes.log_time_ns)
-        near = np.abs(times_ns[nearest] - fixes.log_time_ns) < GST_NEAR_NS
-        stds = {one: np.where(near, deviations.column(one)[nearest], np.nan) for one in ("north_std", "east_std")}
-        fixes = replace(fixes, columns=fixes.columns | stds)
-    return replace(SENTENCE_FIX, what=f"{SENTENCE_FIX.what} ({name})").read(fixes, config)
-
-
 REFERENCE_WORDS = re.compile(
     r"gps|gnss|(?<![a-z])fix|map|icp|lidar|laser|slam|loam|\blio\b|mocap|vicon|optitrack|qualisys|ground|truth|\bgt\b|total|station|"
     r"prism|leica|utm|global|navsat|\bins\b|vectornav|novatel|sbg|ublox",
@@ -269,50 +77,124 @@ LEAST_AREA_M, FLAT, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
 LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
 """Of the earth; UTM coordinates far from the equator may be as large, but have a height near 0."""
 
+NO_SOLUTION = Solution("", {})
+COVARIANCE_TYPE = "position_covariance_type"
+
+HIGHEST_M = 20_000.0
+"""A height beyond this means "unknown"; it is replaced by the median of the others."""
+
+FARTHEST_M = 200_000.0
+"""No robot drives further from the middle of its fixes."""
+
+STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
+"""A receiver whose fixes stay within this is that of a base station, or of a robot that stands."""
+
+GOOD_STD_M, NOT_GOOD = 0.3, 35.0
+"""A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference; taken off of others."""
+
 
 @dataclass(frozen=True, slots=True)
-class Pose:
-    """A message type with metric positions: x is taken as east and y as north, in the topic's own frame.
+class Fix:
+    """A message type with positions.
 
     Attributes
     ----------
-    what, worth, covariance, std, valid, solution : as of `Fix`
-    path : the field of the pose
+    what, worth : what it is called where it is chosen, and how suitable it is as reference
+    place : latitude and longitude [deg], height above the ellipsoid [m]; where `metric` x, y, z [m]
+    std : standard deviation [m] to the north and to the east; one for both. These are as `number` reads them
+    covariance : the fields of the variances to the north and to the east and of their covariance, which have precedence
+    valid : checks that all must pass for a fix
+    solution : how it was solved
+    metric : x is taken as east and y as north, in the topic's own frame
     odometry : its name or frame must show that it is a reference
     independent : where half of the messages or more do not pass, they are fused with the wheels
     """
 
     what: str
     worth: float
-    path: str = "pose"
-    covariance: tuple[str, ...] = ()
+    place: tuple[str, str, str] = ("latitude", "longitude", "altitude")
     std: tuple[str, ...] = ()
+    covariance: tuple[str, ...] = ()
     valid: tuple[str, ...] = ()
     solution: Solution = NO_SOLUTION
+    metric: bool = False
     odometry: bool = False
     independent: tuple[str, ...] = ()
 
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read; an empty one is none."""
-        places = (f"{self.path}.position.{axis}" for axis in "xyz")
-        numbers = fields_in(self.std, (*self.valid, *self.independent))
-        return (*places, *self.covariance, *numbers, self.solution.name)
+        numbers = fields_in((*self.place, *self.std), (*self.valid, *self.independent))
+        covariance = (*self.covariance, COVARIANCE_TYPE) if self.covariance and not self.metric else self.covariance
+        return (*numbers, *covariance, self.solution.name)
 
     def read(self, table: TopicTable, _: Config) -> PositionSource:
-        """Return its positions; those of goals, of dead reckoning and of frames whose z is not up are refused."""
-        x, y = (table.column(f"{self.path}.position.{axis}").astype(np.float64) for axis in "xy")
-        usable, rejected = _reject(
-            table,
-            {"not finite": ~(np.isfinite(x) & np.isfinite(y)), "no fix": ~all_valid(table, self.valid)},
-        )
-        places = np.column_stack([x, y, table.floats(f"{self.path}.position.z")])[usable]
+        """Return its positions; rows without a fix, not finite, far from the others or at 0, 0 are not usable."""
+        first, second = (number(table, one, needed=True) for one in self.place[:2])
+        third = number(table, self.place[2])
+        no_fix, finite = ~all_valid(table, self.valid), np.isfinite(first) & np.isfinite(second)
+        if self.metric:
+            reasons = {"not finite": ~finite, "no fix": no_fix}
+        else:
+            with np.errstate(invalid="ignore"):
+                possible = (np.abs(first) <= 90.0) & (np.abs(second) <= 360.0)
+            reasons = {
+                "no fix": no_fix,
+                "not finite": ~finite,
+                "not a place on earth": ~possible,
+                "at 0, 0": (first == 0) & (second == 0),
+                "far from the others": _far_away(np.column_stack([first, second]), possible & ~no_fix & finite),
+            }
+        usable, rejected = np.ones(len(table), np.bool_), dict[str, int]()
+        for reason, bad in reasons.items():
+            if count := int(np.count_nonzero(bad & usable)):
+                rejected[reason] = count
+            usable &= ~bad
+        places, variance = np.column_stack([first, second, third]), self._variance(table)
+        geodetic = metric = None
+        if self.metric:
+            metric = np.column_stack([second, first])
+            score, why, problem = self.worth, self.what, self._problem(table, places[usable])
+        else:
+            plausible = np.abs(third) < HIGHEST_M
+            known = third[plausible & usable]
+            height = np.where(plausible, third, float(np.median(known)) if len(known) else 0.0)
+            geodetic = np.column_stack([first, second, height])
+            score, why = self._worth(places[usable, :2], variance[usable, :2])
+            counts = ", ".join(f"{reason} {count}" for reason, count in rejected.items())
+            problem = "" if usable.any() else f"no usable fix ({counts})"
         return PositionSource(
-            **of_topic(table), metric=np.column_stack([y, x]),
-            variance=stated_variance(table, self.covariance, self.std),
-            usable=usable, rejected=rejected, score=self.worth, why=self.what, problem=self._problem(table, places),
-            stated_class=self.solution.of(table),
+            **of_topic(table), geodetic=geodetic, metric=metric, variance=variance, usable=usable, rejected=rejected,
+            score=score, why=why, problem=problem, stated_class=self.solution.of(table),
         )  # fmt: skip
+
+    def _variance(self, table: TopicTable) -> Floats:
+        """Return north, east, covariance of both [m^2] (n, 3), NaN where not stated.
+
+        A covariance of axes that are not both positive states nothing.
+        """
+        variance = np.full((len(table), 3), np.nan)
+        if self.std:
+            north, east = number(table, self.std[0]), number(table, self.std[-1])
+            stated = (north > 0) & (east > 0)
+            with np.errstate(over="ignore"):
+                variance[stated] = np.column_stack([north**2, east**2, np.zeros(len(table))])[stated]
+        if self.covariance:
+            found = np.column_stack([table.floats(path) for path in self.covariance])
+            # COVARIANCE_TYPE_UNKNOWN: drivers leave the numbers at 0, or write arbitrary ones.
+            stated = (found[:, 0] > 0) & (found[:, 1] > 0) & (table.floats(COVARIANCE_TYPE) != 0)
+            variance[stated] = found[stated]
+        return variance
+
+    def _worth(self, places_deg: Floats, variance: Floats) -> tuple[float, str]:
+        """Return how suitable fixes (n, 2) are, and why: less where they are not accurate, or never move."""
+        std = float(np.sqrt(np.nanmedian(variance))) if np.isfinite(variance).any() else math.nan
+        what, score = self.what, self.worth - (NOT_GOOD if std > GOOD_STD_M else 0.0)
+        if len(places_deg) > 1:
+            spread = np.ptp(np.percentile(places_deg, [2.5, 97.5], axis=0), axis=0)
+            if (spread * METRES_PER_DEGREE < STILL_M).all():  # whatever the latitude
+                what, score = f"{what} that never moves", score - NEVER_MOVES
+        return score, f"{what}, states ±{std:.2g} m" if math.isfinite(std) else f"{what}, states no accuracy"
 
     def _problem(self, table: TopicTable, places: Floats) -> str:
         """Return why positions x, y, z (n, 3) are no reference, empty where they may be one."""
@@ -337,6 +219,18 @@ class Pose:
         return problem
 
 
+def _far_away(places_deg: Floats, known: Bools) -> Bools:
+    """Return the known fixes (n,) of another place: a receiver that was switched on may send where it was last."""
+    far, places_deg = np.zeros(len(known), np.bool_), places_deg[known]
+    if len(places_deg):
+        away_deg = places_deg - places_deg[0]
+        away_deg[:, 1] = np.mod(away_deg[:, 1] + 180.0, 360.0) - 180.0  # not across the date line
+        away_deg -= np.median(away_deg, axis=0)
+        away_deg[:, 1] *= math.cos(math.radians(float(np.median(places_deg[:, 0]))))
+        far[known] = (np.abs(away_deg) * METRES_PER_DEGREE > FARTHEST_M).any(axis=1)
+    return far
+
+
 def is_fused(table: TopicTable, independent: tuple[str, ...]) -> bool:
     """Return whether half of the messages or more do not pass the checks of independent ones."""
     return 2 * int(np.count_nonzero(all_valid(table, independent))) <= len(table)
@@ -352,3 +246,172 @@ def _is_level(places_m: Floats) -> bool:
     _, size, axes = np.linalg.svd(kept - kept.mean(axis=0), full_matrices=False)
     _, across_m, off_m = size / math.sqrt(len(some))
     return bool(across_m < LEAST_AREA_M or off_m > FLAT * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
+
+
+TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+BASE_FRAMES = ("base_link", "base_footprint", "chassis_link", "base")
+LARGEST_LEVER_ARM_M = 5.0
+"""No antenna is further from the body origin than this [m]: such a transform is ignored."""
+
+LARGEST_TRANSLATION_M = 1e9
+"""Beyond it a transform is damaged; UTM coordinates reach 1e7."""
+
+_PREFIX = "transforms[*]."
+TRANSFORM_FIELDS = (
+    f"{_PREFIX}header.frame_id",
+    f"{_PREFIX}child_frame_id",
+    *(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz"),
+    *(f"{_PREFIX}transform.rotation.{axis}" for axis in "xyzw"),
+)
+"""Of a transform: parent, child, translation, rotation."""
+
+TRANSFORM_STAMP = tuple(f"{_PREFIX}header.stamp.{part}" for part in ("sec", "nanosec"))
+_POSE = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw"))
+
+Transforms = dict[str, tuple[str, Floats, Floats]]
+"""Child frame to parent frame, and origin (3,) [m] and axes (3, 3) of the child in it."""
+
+
+def is_static(channel: Channel) -> bool:
+    """Return whether a channel carries static transforms."""
+    return channel.message_type in TRANSFORM_TYPES and channel.topic.rstrip("/").endswith("tf_static")
+
+
+def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[float, float] | None:
+    """Return the antenna's position in the body frame, forward and right [m]; None where the log has no transform.
+
+    Parameters
+    ----------
+    antenna_topic : topic of the fixes; its header names the antenna's frame
+    """
+    frame = next((table.text(FRAME).strip("/") for table in tables if table.topic == antenna_topic), "")
+    links: dict[str, _Link] = {}
+    for table in tables:
+        if table.message_type in TRANSFORM_TYPES and all(path in table.columns for path in TRANSFORM_FIELDS):
+            links |= _links(table)
+    if not frame or frame not in links:
+        return None
+    # of several messages for one child frame, the last
+    turns = np.array([one.turn[-1] for one in links.values()])
+    axes = _rotated(np.repeat(turns, 3, axis=0), np.tile(np.eye(3), (len(links), 1))).reshape(-1, 3, 3)
+    placed = _in_roots(
+        {name: (one.parent, one.place[-1], of) for (name, one), of in zip(links.items(), axes, strict=True)}
+    )
+    root, place, _ = placed[frame]
+    for base in (name for last in BASE_FRAMES for name in sorted(placed) if name.rsplit("/", 1)[-1] == last):
+        base_root, origin, base_axes = placed[base]
+        if base_root == root:
+            forward, left, _up = base_axes @ (place - origin)
+            if np.hypot(forward, left) <= LARGEST_LEVER_ARM_M:
+                return float(forward), -float(left)
+    return None
+
+
+def _in_roots(transforms: Transforms) -> Transforms:
+    """Return each frame's root, and its origin and axes in it; a frame in a circle of frames is its own root."""
+    placed: Transforms = {}
+    for name in transforms:
+        chain: dict[str, None] = {}
+        frame = name
+        while frame in transforms and frame not in placed and frame not in chain:
+            chain[frame] = None
+            frame = transforms[frame][0]
+        below = list(chain)
+        if frame in chain:
+            circle = below.index(frame)
+            placed |= {one: (one, np.zeros(3), np.eye(3)) for one in below[circle:]}
+            del below[circle:]
+        root, origin, axes = placed.setdefault(frame, (frame, np.zeros(3), np.eye(3)))
+        for one in reversed(below):
+            _, translation, turn = transforms[one]
+            origin, axes = translation @ axes + origin, turn @ axes
+            placed[one] = (root, origin, axes)
+    return placed
+
+
+class _Link(NamedTuple):
+    """A frame in its parent: the messages (n,) and places in them (n,), translations (n, 3), quaternions (n, 4)."""
+
+    parent: LogText
+    rows: Ints
+    places: Ints
+    place: Floats
+    turn: Floats
+
+
+def transform_pose(table: TopicTable) -> TopicTable:
+    """Return the poses of the robot's base in the root of the transforms, as messages of PoseStamped.
+
+    Where the base is an odometry's and the root moves against it, as a map does by each scan that is matched, there is
+    a pose at the first odometry after each such step: later ones differ by what the odometry alone added.
+
+    Raises
+    ------
+    DefinitionError
+        No base frame moves, or the root is no reference.
+    """
+    links = _links(table)
+    base = next((one for last in BASE_FRAMES for one in links if one.rsplit("/", 1)[-1] == last), None)
+    if base is None:
+        raise DefinitionError(table.topic, f"it moves none of the frames {', '.join(BASE_FRAMES)}")
+    root, rows, places, place, turn = links.pop(base)
+    step = np.zeros(len(rows), np.bool_)
+    lowest = True
+    while root in links:
+        above = links.pop(root)
+        held = np.searchsorted(above.rows, rows, side="right") - 1
+        known = held >= 0
+        rows, places, step, held = rows[known], places[known], step[known], held[known]
+        changed = np.diff(above.place, axis=0).any(axis=1) | np.diff(above.turn, axis=0).any(axis=1)
+        version = np.append(0, np.cumsum(changed))[held]
+        step[1:] |= version[1:] != version[:-1]
+        place = above.place[held] + _rotated(above.turn[held], place[known])
+        turn = _product(above.turn[held], turn[known])
+        root, lowest = above.parent, False
+    if not (REFERENCE_WORDS.search(root) or root in REFERENCE_FRAMES):
+        why = f"its root, {root}, does not show a position reference: it may be the wheels' dead reckoning"
+        raise DefinitionError(table.topic, why)
+    step |= lowest
+    if not step.any():
+        raise DefinitionError(table.topic, f"its {root} never moves against the odometry: that is dead reckoning")
+    stamps = (table.column(path)[rows[step], places[step]] for path in TRANSFORM_STAMP)
+    frame = np.zeros(np.count_nonzero(step), np.int64)
+    values = [*stamps, frame, *place[step].T, *turn[step].T]
+    columns = dict(zip((*STAMPS[0], FRAME, *_POSE), values, strict=True))
+    return replace(
+        table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[rows[step]],
+        columns=columns, texts={FRAME: [root]},
+    )  # fmt: skip
+
+
+def _links(table: TopicTable) -> dict[str, _Link]:
+    """Return the frames that a topic holds by name, without their leading slash."""
+    parents, parent_names = table.words(TRANSFORM_FIELDS[0])
+    children, child_names = table.words(TRANSFORM_FIELDS[1])
+    numbers = np.stack([table.floats(path) for path in TRANSFORM_FIELDS[2:]], axis=-1)
+    length, size = (np.abs(part).max(axis=-1) for part in (numbers[..., :3], numbers[..., 3:]))
+    sound = (length < LARGEST_TRANSLATION_M) & (size > 0.01) & (size < 100.0)  # a unit quaternion, or nearly
+    all_rows, all_places = np.nonzero((children >= 0) & sound)
+    order = np.argsort(children[all_rows, all_places], kind="stable")
+    ends = np.cumsum(np.bincount(children[all_rows, all_places], minlength=len(child_names)))
+    found: dict[str, _Link] = {}
+    for name, of_child in zip(child_names, np.split(order, ends[:-1]), strict=True):
+        if len(of_child):
+            rows, places = all_rows[of_child], all_places[of_child]
+            pose = numbers[rows, places]
+            parent = LogText(parent_names[parents[rows[-1], places[-1]]].strip("/"))
+            turn = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1)[:, None]
+            found[name.strip("/")] = _Link(parent, rows, places, pose[:, :3], turn)
+    return found
+
+
+def _product(a: Floats, b: Floats) -> Floats:
+    """Return the products (n, 4) of quaternions x, y, z, w."""
+    vector = a[:, 3:] * b[:, :3] + b[:, 3:] * a[:, :3] + np.cross(a[:, :3], b[:, :3])
+    return np.column_stack([vector, a[:, 3] * b[:, 3] - np.sum(a[:, :3] * b[:, :3], axis=1)])
+
+
+def _rotated(q: Floats, places: Floats) -> Floats:
+    """Return places (n, 3) rotated by quaternions (n, 4)."""
+    twice = 2.0 * np.cross(q[:, :3], places)
+    return places + q[:, 3:] * twice + np.cross(q[:, :3], twice)

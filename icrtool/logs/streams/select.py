@@ -13,6 +13,13 @@ from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import HEADER, READ_ENCODINGS, TopicTable
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE
 from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
+from icrtool.logs.streams.positions import (
+    REFERENCE_WORDS,
+    TRANSFORM_FIELDS,
+    TRANSFORM_STAMP,
+    TRANSFORM_TYPES,
+    is_static,
+)
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelMotion, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
 from icrtool.records.samples import ROLE_WORDS, Role
@@ -70,11 +77,20 @@ class Choice:
 
 
 def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tuple[str, ...]]:
-    """Return, by channel id, the fields that some role may need; other channels are absent."""
-    topics, wanted = config.topics, {}
+    """Return, by channel id, the fields that some role may need; other channels are absent.
+
+    Moving transforms are taken where no topic can be the position: reading them takes longer than the rest of a log. An
+    odometry that is no reference by name does not count.
+    """
+    topics, wanted, transforms = config.topics, {}, {}
     sides = side_fields(channels, topics)
+    has_position = any(
+        one.message_type in MESSAGE_TYPES["gnss"]
+        and (one.message_type != "nav_msgs/Odometry" or REFERENCE_WORDS.search(one.topic) is not None)
+        for one in channels
+    )
     for channel in channels:
-        paths = sorted(sides.get(channel.id, ()))
+        paths = sorted(sides[channel.id])
         for role in ROLE_WORDS:
             if (role != "wheels" or topics.wheel_left is None) and getattr(topics, role) in (None, channel.topic):
                 paths += fields_of(role, channel.message_type)
@@ -82,7 +98,13 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
             paths += GYRO_AXES
         if paths:
             wanted[channel.id] = tuple(dict.fromkeys([*HEADER, *paths]))
-    return wanted
+        if is_static(channel):
+            transforms[channel.id] = TRANSFORM_FIELDS
+        elif channel.message_type in TRANSFORM_TYPES and (
+            topics.gnss == channel.topic or not (has_position or topics.gnss)
+        ):
+            transforms[channel.id] = (*TRANSFORM_FIELDS, *TRANSFORM_STAMP)
+    return wanted | transforms
 
 
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
@@ -99,7 +121,14 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
     wheels = _ranked(wheels, topics.wheels, complete)
     near = {_namespace(wheels[0].topic): SAME_NAMESPACE} if wheels else {}
     others = _other_robots(wheels)
-    gnss = _ranked([_independent(source, wheels, topics) for source in gnss], topics.gnss, near, others)
+    # The position of the message whose twist is used for the wheels is refused, where it is not configured.
+    own = wheels[0].topic if wheels and not wheels[0].problem and wheels[0].twist is not None else None
+    dependent = "its twist is used for the wheels; a reference must be independent of them"
+    gnss = [
+        replace(one, problem=one.problem or dependent) if one.topic == own and topics.gnss != own else one
+        for one in gnss
+    ]
+    gnss = _ranked(gnss, topics.gnss, near, others)
     best = gnss[0] if gnss and not gnss[0].problem else None
     metric = best.topic if best is not None and best.metric is not None else ""
     others -= {_namespace(metric)} if metric else set()
@@ -127,14 +156,6 @@ def _read_all(tables: Sequence[TopicTable], role: Role, config: Config, kind: ty
             except DefinitionError as err:
                 sources.append(kind(**of_topic(table), problem=err.why))
     return sources
-
-
-def _independent(source: PositionSource, wheels: Sequence[WheelMotion], topics: TopicsConfig) -> PositionSource:
-    """Refuse the position of the message whose twist is used for the wheels: a reference must be independent."""
-    own = bool(wheels) and not wheels[0].problem and wheels[0].twist is not None and wheels[0].topic == source.topic
-    if not own or topics.gnss == source.topic or source.problem:
-        return source
-    return replace(source, problem="its twist is used for the wheels; a reference must be independent of them")
 
 
 def _ranked(
@@ -196,8 +217,14 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
     if wheels is None or gnss is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
         missing = [role for role, source in by_role.items() if source is None]
+        refused: dict[str, dict[str, None]] = {}
+        for role in missing:
+            for source in found.by_role()[role]:
+                for topic in map(topic_of_side, source.topic.split(" + ")):
+                    refused.setdefault(topic, {})[source.problem] = None
+        reasons = found.unread | {topic: ", ".join(problems) for topic, problems in refused.items()}
         needs = {ROLE_WORDS[role]: NEEDS[role] for role in missing}
-        raise MissingStreamError(log, needs, _listing(channels, found.unread | _refused(found, missing)))
+        raise MissingStreamError(log, needs, _listing(channels, reasons))
     return Choice(wheels, gnss, heading)
 
 
@@ -226,20 +253,18 @@ def other_references(found: Candidates, choice: Choice, config: Config) -> tuple
 
 def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
     """Refuse a configured pair of wheel topics that the log does not have or that cannot be used."""
-    for side in ("left", "right"):
-        name = getattr(topics, f"wheel_{side}")
+    for key, name in (("topics.wheel_left", topics.wheel_left), ("topics.wheel_right", topics.wheel_right)):
         if name is None:
             continue
         topic = topic_of_side(name)
-        key, needed = f"topics.wheel_{side}", f"name the field of one side as {topic}.left or {topic}.data[0]"
+        needed = f"name the field of one side as {topic}.left or {topic}.data[0]"
         if (kind := _type_in(log, channels, found.unread, key, topic)) not in PAIR_TYPES and topic == name:
             raise ConfigError(key, f"{topic}: {kind} is not the number of one side", needed)
         if topic in found.unread:
             raise ConfigError(key, f"{topic}: {found.unread[topic]}", needed)
     if topics.wheel_left is not None and found.wheels and found.wheels[0].is_empty:
-        raise ConfigError(
-            "topics.wheel_left", f"{found.wheels[0].topic}: {found.wheels[0].problem}", "name another pair"
-        )
+        why = f"{found.wheels[0].topic}: {found.wheels[0].problem}"
+        raise ConfigError("topics.wheel_left", why, "name another pair")
 
 
 def _check_configured(
@@ -283,16 +308,6 @@ def _chosen(sources: Sequence[Kind], configured: str | None) -> Kind | None:
     return replace(best, why=best.why + (over if configured is None else "; configured"))
 
 
-def _refused(found: Candidates, roles: Sequence[Role]) -> dict[str, str]:
-    """Return, by topic, why candidates for some roles were refused."""
-    problems: dict[str, dict[str, None]] = {}
-    for role in roles:
-        for source in found.by_role()[role]:
-            for topic in map(topic_of_side, source.topic.split(" + ")):
-                problems.setdefault(topic, {})[source.problem] = None
-    return {topic: ", ".join(reasons) for topic, reasons in problems.items()}
-
-
 def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[str]:
     """Return the log's topics with their types, refused candidates first."""
     entries: dict[str, str] = {}
@@ -301,7 +316,7 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
         if not reason and channel.encoding not in READ_ENCODINGS:
             reason = f": serialization {str(channel.encoding)!r} is not read"
         entries[channel.topic] = f"{channel.topic} ({channel.message_type}{reason})"
-    ordered = [*(entries[t] for t in entries if t in reasons), *(entries[t] for t in entries if t not in reasons)]
+    ordered = [entries[topic] for topic in sorted(entries, key=lambda topic: topic not in reasons)]
     more = len(ordered) - MOST_LISTED
     return ([*ordered[:MOST_LISTED], f"{more} more"] if more > 0 else ordered) or ["no topic at all"]
 
@@ -323,14 +338,16 @@ def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], 
         The first such joint, with those that are listed.
     """
     # If the chosen topic lists no joints, none of the others has the configured ones: name the closest one.
-    listing = [motion for motion in candidates if motion.joints]
-    if chosen is not None and chosen.joints:
-        listing = [chosen]
-    closest = min(listing, key=lambda motion: len(_unlisted(motion, config)), default=None)
-    if closest is not None and (unlisted := _unlisted(closest, config)):
-        key, name = unlisted[0]
-        why, advice = f"no message of {closest.topic} lists a joint {name}", f"its joints are {some_of(closest.joints)}"
-        raise ConfigError(f"wheels.{key}", why, advice)
+    listing = [chosen] if chosen is not None and chosen.joints else [motion for motion in candidates if motion.joints]
+    unlisted = [
+        [(key, name) for key in JOINT_KEYS for name in getattr(config.wheels, key) if name not in motion.joints]
+        for motion in listing
+    ]
+    closest = min(range(len(listing)), key=lambda place: len(unlisted[place]), default=None)
+    if closest is not None and unlisted[closest]:
+        key, name = unlisted[closest][0]
+        why, advice = f"no message of {listing[closest].topic} lists a joint {name}", some_of(listing[closest].joints)
+        raise ConfigError(f"wheels.{key}", why, f"its joints are {advice}")
 
 
 def ignored_joints(chosen: WheelMotion, config: Config) -> list[str]:
@@ -339,7 +356,3 @@ def ignored_joints(chosen: WheelMotion, config: Config) -> list[str]:
         return []
     why = f"{chosen.topic} ({chosen.message_type}) lists no joints by name"
     return [f"wheels.{key} is not used: {why}" for key in JOINT_KEYS if getattr(config.wheels, key)]
-
-
-def _unlisted(motion: WheelMotion, config: Config) -> list[tuple[str, str]]:
-    return [(key, name) for key in JOINT_KEYS for name in getattr(config.wheels, key) if name not in motion.joints]

@@ -1,18 +1,143 @@
-"""Topics that may feed a role: what was read of each, and the fields of messages that it is read from."""
+"""Topics that may feed a role: what was read of each, by which clock, and the fields of messages that it is read from.
+
+The clock of a topic is that of its header stamps where they can be used, else log time.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Bytes, Floats
-from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
+from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, STAMPS, SetBack, TopicTable
+
+LARGEST_SHARE_BACKWARDS = 0.01
+LARGEST_SHARE_ZERO = 0.01
+
+AROUND = 25
+"""Messages before and after a step of a clock whose median delay to log time shows its size."""
+
+
+class ClockSet(NamedTuple):
+    """The largest step by which the clock of header stamps was set: its size, its sense, the last stamp before."""
+
+    size_ns: int
+    back: bool
+    before_ns: int
+
+
+NEVER_SET = ClockSet(0, back=False, before_ns=0)
+
+
+@dataclass(frozen=True, slots=True)
+class StampedRows:
+    """The stamps of a topic's messages.
+
+    Attributes
+    ----------
+    header_ns : (n,) header stamps, None where they are absent or cannot be used
+    log_ns : (n,) log times
+    note : why the header's are not used, empty when they are
+    delay_ns : median of log time minus header stamp, 0 without header stamps
+    replaced : header stamps of another clock that log times stand for
+    set_back : as `TopicTable.set_back`
+    clock_set : of the headers; their stamps are those of a clock that was not set
+    """
+
+    header_ns: Ints | None
+    log_ns: Ints
+    note: str
+    delay_ns: int
+    replaced: int = 0
+    set_back: SetBack = NOT_SET_BACK
+    clock_set: ClockSet = NEVER_SET
+
+    def on(self, clock: Literal["header", "log"]) -> Ints:
+        """Return the stamps on a clock; the log's where the header's cannot be used."""
+        return self.header_ns if clock == "header" and self.header_ns is not None else self.log_ns
+
+
+def stamp_rows(table: TopicTable) -> StampedRows:
+    """Return the stamps of a topic; header stamps only where they are non-zero, near log time and increasing."""
+    log_ns = table.log_time_ns
+
+    def unusable(note: str, clock_set: ClockSet = NEVER_SET) -> StampedRows:
+        return StampedRows(None, log_ns, note, 0, set_back=table.set_back, clock_set=clock_set)
+
+    seconds, nanoseconds = (table.integers(*paths) for paths in zip(*STAMPS, strict=True))
+    if seconds is None or nanoseconds is None or not len(log_ns):
+        return unusable("no header")
+    header = seconds * 1_000_000_000 + nanoseconds
+    zeros = np.count_nonzero(header == 0)
+    if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
+        return unusable(f"{100 * zeros / len(header):.0f} % of the header stamps are 0")
+    header, clock_set = _without_clock_steps(header, log_ns)
+    delay = int(np.median(log_ns - header))
+    if abs(delay) > NEAR_NS:
+        return unusable(f"header stamps are {delay / 1e9:+.1f} s from log time", clock_set)
+    # A few stamps of another clock (a first message at 0) are replaced by their log times.
+    other = np.abs(log_ns - header - delay) > NEAR_NS
+    header[other] = log_ns[other] - delay
+    backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
+    if backwards > LARGEST_SHARE_BACKWARDS:
+        return unusable(f"{100 * backwards:.0f} % of the header stamps go back", clock_set)
+    return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)), table.set_back, clock_set)
+
+
+def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
+    """Return header stamps (n,) of a clock that was set as if it had not been, and the largest step.
+
+    Log time goes on, so the delay to it changes by the step and stays so; after a message out of place it does not.
+    A step ahead counts where the whole stretch before it was later, too: a connection that was slow for a while and
+    then lost messages is no clock.
+    """
+    jump = np.diff(header)
+    steps = np.flatnonzero((jump < 0) | (jump - np.diff(log_ns) > OUT_OF_ORDER_NS))
+    if not len(steps) or len(steps) > LARGEST_SHARE_BACKWARDS * len(header) + 1:
+        return header, NEVER_SET
+    delay = log_ns - header
+    rows = np.arange(AROUND)
+    before = np.median(delay[np.maximum(steps[:, None] - rows, 0)], axis=1)
+    after = np.median(delay[np.minimum(steps[:, None] + 1 + rows, len(delay) - 1)], axis=1)
+    grown = (after - before).astype(np.int64)
+    of_stretch = np.diff([np.median(part) for part in np.split(delay, steps + 1)])
+    # a few stamps of another clock, as a first one at 0, are replaced by their log times
+    many = np.diff(steps, prepend=-1) > max(1.0, LARGEST_SHARE_ZERO * len(header))
+    lasting = (grown > OUT_OF_ORDER_NS) | ((grown < -OUT_OF_ORDER_NS) & (of_stretch < grown / 2) & many)
+    lasting &= (grown > 0) == (jump[steps] < 0)
+    if not lasting.any():
+        return header, NEVER_SET
+    largest = int(np.argmax(np.where(lasting, np.abs(grown), 0)))
+    moved = np.zeros(len(header), np.int64)
+    moved[steps[lasting] + 1] = grown[lasting]
+    found = ClockSet(abs(int(grown[largest])), back=bool(grown[largest] > 0), before_ns=int(header[steps[largest]]))
+    return header + np.cumsum(moved), found
+
+
+def increasing(stamps: Ints, usable: Bools | None = None) -> tuple[Ints | slice, int, int]:
+    """Return the usable rows that make stamps strictly increasing, how many went back, and how many were equal.
+
+    Rows are sorted by stamp; of rows with the same stamp the last one stays. All rows in their order are a slice, which
+    copies nothing.
+    """
+    if usable is not None and not usable.all():
+        rows = np.flatnonzero(usable)
+        kept, backwards, equal = increasing(stamps[rows])
+        return rows[kept], backwards, equal
+    steps = np.diff(stamps)
+    if (steps > 0).all():
+        return slice(None), 0, 0
+    backwards = int(np.count_nonzero(steps < 0))
+    order = np.argsort(stamps, kind="stable") if backwards else np.arange(len(stamps))
+    keep = np.append(np.diff(stamps[order]) > 0, True)
+    return order[keep], backwards, int(np.count_nonzero(~keep))
+
 
 NEVER_MOVES = 60.0
 """Subtracted from the score of what never moves: another topic that moves is preferred."""
@@ -124,27 +249,33 @@ class WheelMotion(Source):
         return self.twist is None and self.position is None and self.speed is None
 
 
-def motion_of(motion: WheelMotion, position: Sides = (None, None), speed: Sides = (None, None)) -> WheelMotion:
-    """Return a motion with what left and right recorded; without what one side lacks, or has no finite value of."""
-    motion = replace(motion, position=_of_both(position), speed=_of_both(speed))
-    if motion.is_empty:
-        return replace(motion, problem=motion.problem or "has neither position nor speed of both sides")
-    changes = any(float(np.ptp(side[np.isfinite(side)])) > 0.0 for side in motion.position or ())
-    if changes or any(nonzero(values) for values in (*(motion.speed or ()), motion.twist) if values is not None):
-        return motion
-    return replace(motion, score=motion.score - NEVER_MOVES, why=f"{motion.why}, never moves")
+def motion_of(
+    *,
+    position: Sides = (None, None),
+    speed: Sides = (None, None),
+    twist: Floats | None = None,
+    score: float = 0.0,
+    why: str = "",
+    problem: str = "",
+    **others: Any,
+) -> WheelMotion:
+    """Return the motion of what left and right recorded; without what one side lacks, or has no finite value of."""
+    both: list[Pair | None] = [None, None]
+    for place, (left, right) in enumerate((position, speed)):
+        if left is not None and right is not None and np.isfinite(left).any() and np.isfinite(right).any():
+            both[place] = left, right
+    travelled, speeds = both
+    changes = any(float(np.ptp(side[np.isfinite(side)])) > 0.0 for side in travelled or ())
+    if travelled is None and speeds is None and twist is None:
+        problem = problem or "has neither position nor speed of both sides"
+    elif not changes and not any(moves(values) for values in (*(speeds or ()), twist) if values is not None):
+        score, why = score - NEVER_MOVES, f"{why}, never moves"
+    return WheelMotion(position=travelled, speed=speeds, twist=twist, score=score, why=why, problem=problem, **others)
 
 
-def _of_both(sides: Sides) -> Pair | None:
-    left, right = sides
-    if left is None or right is None or not (np.isfinite(left).any() and np.isfinite(right).any()):
-        return None
-    return left, right
-
-
-def nonzero(values: Floats) -> bool:
-    """Return whether any finite value is not 0."""
-    return bool(np.any(values[np.isfinite(values)] != 0.0))
+def moves(speeds: Floats) -> bool:
+    """Return whether any finite speed is not 0."""
+    return bool(np.any(speeds[np.isfinite(speeds)] != 0.0))
 
 
 def of_topic(table: TopicTable) -> dict[str, Any]:
@@ -152,59 +283,57 @@ def of_topic(table: TopicTable) -> dict[str, Any]:
     return {"topic": table.topic, "message_type": table.message_type, "stamps": stamp_rows(table)}
 
 
-_NUMBER = re.compile(r"(\S+?)(?: < (\S+))?((?: \* \S+)*)(?: \+ (.+))?")
+_TERM = re.compile(r"(\S+?)(?: < (\S+))?((?: \* \S+)*)")
 _CHECK = re.compile(r"(\S+?)(?: & (\d+))? (==|!=|>=) (\S+)(?: unless (\S+))?")
 UNITS = {"deg": math.radians(1.0), "rad": math.degrees(1.0)}
 """Of a bearing that is recorded in degrees, and of a latitude that is recorded in radians."""
 
 
-class Number(NamedTuple):
-    """A number in the messages of a type.
+class Term(NamedTuple):
+    """A field of numbers.
 
     Attributes
     ----------
-    names : its field, in each spelling that drivers use
+    names : in each spelling that drivers use
     largest : recorded numbers as large, of either sign, stand for "not known"
     unit : what 1 means: in m, radians, degrees of latitude or longitude
-    fine : added where it is known: further digits, or the height of the geoid
     """
 
     names: list[str]
     largest: float
     unit: float
-    fine: Number | None
-
-    @property
-    def fields(self) -> list[str]:
-        """The fields that it is read from."""
-        return [*self.names, *(self.fine.fields if self.fine is not None else ())]
-
-    def of(self, table: TopicTable, *, needed: bool = False) -> Floats:
-        """Return its values (n,); NaN where unknown, or where the type lacks it.
-
-        Raises
-        ------
-        DefinitionError
-            It is needed, and the type, as the log defines it, lacks it.
-        """
-        values = table.column(*self.names).astype(np.float64) if needed else table.floats(*self.names)
-        if math.isfinite(self.largest):
-            values = np.where(np.abs(values) < self.largest, values, np.nan)
-        values = values if self.unit == 1.0 else values * self.unit
-        if self.fine is not None:
-            fine = self.fine.of(table)
-            values = values + np.where(np.isfinite(fine), fine, 0.0)
-        return values
 
 
 @cache
-def number(text: str) -> Number:
-    """Return the number that a text describes: ``h_accuracy < 65535 * 0.01``, ``lat * 1e-7 + latHp|lat_hp * 1e-9``."""
-    if (found := _NUMBER.fullmatch(text)) is None:
-        raise ValueError(f"{text!r} describes no number")
-    names, largest, units, fine = found.groups()
-    unit = math.prod(UNITS[one] if one in UNITS else float(one) for one in units.split(" * ") if one)
-    return Number(names.split("|"), float(largest or "inf"), unit, number(fine) if fine else None)
+def terms_of(text: str) -> list[Term]:
+    """Return the sum that a text describes: ``h_accuracy < 65535 * 0.01``, ``lat * 1e-7 + latHp|lat_hp * 1e-9``."""
+    terms = []
+    for one in text.split(" + "):
+        if (found := _TERM.fullmatch(one)) is None:
+            raise ValueError(f"{text!r} describes no number")
+        names, largest, units = found.groups()
+        unit = math.prod(UNITS[one] if one in UNITS else float(one) for one in units.split(" * ") if one)
+        terms.append(Term(names.split("|"), float(largest or "inf"), unit))
+    return terms
+
+
+def number(table: TopicTable, text: str, *, needed: bool = False) -> Floats:
+    """Return the values (n,) of a number as a text describes it; NaN where unknown, or where the type lacks it.
+
+    What stands behind a plus is added where it is known: further digits, or the height of the geoid.
+
+    Raises
+    ------
+    DefinitionError
+        It is needed, and the type, as the log defines it, lacks it.
+    """
+    total: Floats | None = None
+    for names, largest, unit in terms_of(text):
+        values = table.column(*names).astype(np.float64) if needed and total is None else table.floats(*names)
+        values = np.where(np.abs(values) < largest, values, np.nan) if math.isfinite(largest) else values
+        values = values if unit == 1.0 else values * unit
+        total = values if total is None else total + np.where(np.isfinite(values), values, 0.0)
+    return np.asarray(total)
 
 
 class Check(NamedTuple):
@@ -224,23 +353,9 @@ class Check(NamedTuple):
     values: list[int | str]
     unset: float
 
-    def of(self, table: TopicTable) -> Bools:
-        """Return which messages (n,) are valid."""
-        if (path := self.names[0]) in table.texts:
-            codes, texts = table.words(path)
-            return np.array([*(text in self.values for text in texts), False])[codes]
-        values = table.find(*self.names) if self.mask is None else table.integers(*self.names)
-        if values is None or np.all(values == self.unset):
-            return np.ones(len(table), np.bool_)
-        values = values if self.mask is None else values & self.mask
-        numbers = [one for one in self.values if isinstance(one, int)]
-        if self.relation == ">=":
-            return ~np.asarray(values < numbers[0])
-        return np.isin(values, numbers, invert=self.relation == "!=")
-
 
 @cache
-def check(text: str) -> Check:
+def check_of(text: str) -> Check:
     """Return the check that a text describes: ``flags & 1 == 1``, ``ins_status == INS_SOLUTION_GOOD|3``."""
     if (found := _CHECK.fullmatch(text)) is None:
         raise ValueError(f"{text!r} describes no check")
@@ -249,15 +364,27 @@ def check(text: str) -> Check:
     return Check(names.split("|"), int(mask) if mask else None, relation, of_any, float(unset or "nan"))
 
 
-def all_valid(table: TopicTable, checks: tuple[str, ...]) -> Bools:
+def all_valid(table: TopicTable, checks: Sequence[str]) -> Bools:
     """Return which messages (n,) pass all checks."""
     valid = np.ones(len(table), np.bool_)
-    for one in checks:
-        valid &= check(one).of(table)
+    for names, mask, relation, wanted, unset in map(check_of, checks):
+        if (path := names[0]) in table.texts:
+            codes, texts = table.words(path)
+            valid &= np.array([*(text in wanted for text in texts), False])[codes]
+            continue
+        values = table.find(*names) if mask is None else table.integers(*names)
+        if values is None or np.all(values == unset):
+            continue
+        values = values if mask is None else values & mask
+        numbers = [one for one in wanted if isinstance(one, int)]
+        if relation == ">=":
+            valid &= ~np.asarray(values < numbers[0])
+        else:
+            valid &= np.isin(values, numbers, invert=relation == "!=")
     return valid
 
 
-def fields_in(numbers: tuple[str, ...], checks: tuple[str, ...] = ()) -> tuple[str, ...]:
+def fields_in(numbers: Sequence[str], checks: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the fields that numbers and checks are read from; an empty text is no number."""
-    fields = [name for one in numbers if one for name in number(one).fields]
-    return (*fields, *(name for one in checks for name in check(one).names))
+    fields = [name for one in numbers if one for term in terms_of(one) for name in term.names]
+    return (*fields, *(name for one in checks for name in check_of(one).names))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -14,13 +13,12 @@ from numpy.typing import NDArray
 
 from icrtool.config import Config, TopicsConfig
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Ints
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.definitions import number_fields
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
-from icrtool.logs.streams.sources import Unit, WheelMotion, motion_of, of_topic
-from icrtool.logs.streams.stamps import StampedRows, stamp_rows
+from icrtool.logs.streams.sources import StampedRows, Unit, WheelMotion, motion_of, of_topic, stamp_rows
 from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTE, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
 from icrtool.records.text import LogText
 
@@ -45,8 +43,11 @@ _ONLY_SIDE = re.compile(
 )
 """A field that names a side alone: its topic or message states of what."""
 
-_DRIVER_WORDS = re.compile(r"tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|roboteq|roboclaw", re.IGNORECASE)
-"""Words of a message about wheels, beside those of `WHEEL_WORDS`; the last ones are makes of motor controllers."""
+_OF_WHEELS = re.compile(
+    rf"{WHEEL_WORDS.pattern}|tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|roboteq|roboclaw", re.IGNORECASE
+)
+"""Words of a message about wheels; the last ones are makes of motor controllers."""
+
 MOST_SEARCHED = 1 << 19
 """Characters of the definitions in a log whose fields are searched for sides: those of some hundred types."""
 
@@ -103,26 +104,26 @@ def _name(topic: str, path: str) -> str:
 
 def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, set[str]]:
     """Return, by channel id, the fields that may be one side, or that hold all wheels."""
-    found: dict[int, set[str]] = {}
+    found: dict[int, set[str]] = {channel.id: set() for channel in channels}
     if topics.wheel_left is not None and topics.wheel_right is not None:
         for topic, _, path in (topics.wheel_left.partition("."), topics.wheel_right.partition(".")):
             for channel in channels:
                 if channel.topic == topic:
-                    found.setdefault(channel.id, set()).update(elements(path or "data")[:1])
+                    found[channel.id].add(elements(path or "data")[0])
         return found
     names: dict[str, dict[str, list[tuple[int, str]]]] = {}
     searched: set[tuple[str, str]] = set()
     for channel in channels:
         if topics.wheels in (None, channel.topic):
+            alike = names.setdefault(channel.message_type, {})
             for path in _fields_of(channel, searched):
-                names.setdefault(channel.message_type, {}).setdefault(_name(channel.topic, path), []).append(
-                    (channel.id, path)
-                )
+                alike.setdefault(_name(channel.topic, path), []).append((channel.id, path))
     for alike in names.values():
         for left, places in alike.items():
             right = right_twin(left, alike)
-            for number, path in [*places, *alike[right]] if right is not None else places if "[" in left else ():
-                found.setdefault(number, set()).add(path)
+            if right is not None or "[" in left:
+                for number, path in [*places, *alike.get(right or "", [])]:
+                    found[number].add(path)
     return found
 
 
@@ -133,25 +134,26 @@ def _fields_of(channel: Channel, searched: set[tuple[str, str]]) -> list[str]:
     ----------
     searched : the types whose definitions were parsed for that; this one joins them
     """
-    if channel.message_type in PAIR_TYPES:
+    topic, message_type = channel.topic, channel.message_type
+    if message_type in PAIR_TYPES:
         return ["data"]
-    if channel.message_type in ARRAY_TYPES:
-        return ["data[*]"] if _of_wheels(channel.topic) and not _OTHER_WORDS.search(channel.topic) else []
-    words = f"{channel.topic} {channel.message_type} {channel.definition}"
-    if _is_known(channel.message_type) or not (_SIDE_WORDS.search(words) and _of_wheels(words)):
+    if message_type in ARRAY_TYPES:
+        return ["data[*]"] if _OF_WHEELS.search(topic) and not _OTHER_WORDS.search(topic) else []
+    words = f"{topic} {message_type} {channel.definition}"
+    if _is_known(message_type) or not (_SIDE_WORDS.search(words) and _OF_WHEELS.search(words)):
         return []
-    one = (channel.message_type, channel.definition)
+    one = (message_type, channel.definition)
     if sum(len(text) for _, text in searched | {one}) > MOST_SEARCHED:
         return []
     searched.add(one)
-    return [path for path in number_fields(channel) if _may_be_side(channel.topic, channel.message_type, path)]
+    return [path for path in number_fields(channel) if _may_be_side(topic, message_type, path)]
 
 
 def _may_be_side(topic: str, message_type: str, path: str) -> bool:
     """Return whether a field may be a wheel's motion: a driver's messages hold currents and states, too."""
     if message_type in PAIR_TYPES:
         return path == "data"
-    if not _of_wheels(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
+    if not _OF_WHEELS.search(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
         return False
     field = path.rpartition(".")[2]
     only_side = bool(_ONLY_SIDE.fullmatch(field) and _SIDE_WORDS.search(field))
@@ -161,10 +163,6 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
 def _is_known(message_type: str) -> bool:
     """Return whether a type has a row of its own: nothing is looked for by the names of its fields."""
     return any(message_type in types for types in MESSAGE_TYPES.values())
-
-
-def _of_wheels(name: str) -> bool:
-    return bool(WHEEL_WORDS.search(name) or _DRIVER_WORDS.search(name))
 
 
 def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
@@ -181,12 +179,14 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelM
             if _may_be_side(table.topic, table.message_type, path):
                 side = Side(table, path)
                 found.setdefault(table.message_type, {})[side.name] = side
-    twins = (
-        (left, alike.get(right_twin(name, alike) or "")) for alike in found.values() for name, left in alike.items()
+    pairs = (
+        (left, alike[right])
+        for alike in found.values()
+        for name, left in alike.items()
+        if (right := right_twin(name, alike)) is not None
     )
-    first = islice(((left, right) for left, right in twins if right is not None), MOST_PAIRS)
-    pairs = [pair_motion(left, right, config) for left, right in first]
-    return pairs + [
+    motions = [pair_motion(left, right, config) for left, right in islice(pairs, MOST_PAIRS)]
+    return motions + [
         _array_motion(table, config) for table in tables if table.message_type in ARRAY_TYPES and len(table)
     ]
 
@@ -213,37 +213,40 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
 
     Positions are interpolated, speeds are held.
     """
-    kind = LogText(" + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right))))
-    topic = LogText(f"{left.name.raw} + {right.name.raw}")
-    commanded = bool(COMMANDED.search(left.name))
-    score, why = 80.0 - (COMMAND if commanded else 0.0), "a number of each side" + (" (commanded)" if commanded else "")
-    note = COMMAND_NOTE if commanded else ""
     stamps, times, held = _common_stamps(left.table, right.table)
-
-    def unusable(problem: str) -> WheelMotion:
-        return WheelMotion(topic=topic, message_type=kind, stamps=stamps, score=score, problem=problem)
-
+    commanded = bool(COMMANDED.search(left.name))
+    why = "a number of each side" + (" (commanded)" if commanded else "")
+    of: dict[str, Any] = {
+        "topic": LogText(f"{left.name.raw} + {right.name.raw}"),
+        "message_type": LogText(
+            " + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right)))
+        ),
+        "score": 80.0 - (COMMAND if commanded else 0.0),
+    }
     if not (len(times) and len(held)):
-        return unusable(f"{(right if len(times) else left).table.topic} holds no message")
+        problem = f"{(right if len(times) else left).table.topic} holds no message"
+        return WheelMotion(**of, stamps=stamps, problem=problem)
     try:
         values = left.values(), right.values()
     except DefinitionError as err:
-        return unusable(err.why)
-    both = _while_both(times, held)
+        return WheelMotion(**of, stamps=stamps, problem=err.why)
+    # While both were recorded: a side that is held for long would look like a turn.
+    slack = max(_half_interval(times), _half_interval(held))
+    both = (times >= held[0] - slack) & (times <= held[-1] + max(slack, _HOLD_NS))
     if not both.any():
-        return unusable("the two sides were not recorded at the same time")
-    moments, header = times[both], None if stamps.header_ns is None else stamps.header_ns[both]
-    stamps = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both])
-    pair = WheelMotion(topic=topic, message_type=kind, stamps=stamps, unit="unknown", score=score, why=why, note=note)
+        return WheelMotion(**of, stamps=stamps, problem="the two sides were not recorded at the same time")
+    moments, first = times[both], values[0][both].astype(np.float64)
+    header = None if stamps.header_ns is None else stamps.header_ns[both]
+    of["stamps"] = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both])
+    of["note"] = COMMAND_NOTE if commanded else ""
     integer = values[0].dtype.kind == "i"
     if _is_position(left, values[0], config, integer=integer):
         unit: Unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
         what = "ticks" if unit == "counts" else "angles or distances"
-        pair = replace(pair, unit=unit, why=f"{why}: {what}")
-        return motion_of(pair, (values[0][both].astype(np.float64), np.interp(moments, held, values[1])))
+        return motion_of(**of, unit=unit, why=f"{why}: {what}", position=(first, np.interp(moments, held, values[1])))
     place = np.clip(np.searchsorted(held, moments + _half_interval(times), side="right") - 1, 0, None)
-    speeds = values[0][both].astype(np.float64), values[1][place].astype(np.float64)
-    return motion_of(replace(pair, why=f"{why}: speeds"), speed=speeds)
+    second = values[1][place].astype(np.float64)
+    return motion_of(**of, unit="unknown", why=f"{why}: speeds", speed=(first, second))
 
 
 def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, Ints, Ints]:
@@ -263,29 +266,17 @@ def _half_interval(times: Ints) -> int:
     return int(np.median(np.diff(times))) // 2 if len(times) > 1 else 0
 
 
-def _while_both(left: Ints, right: Ints) -> Bools:
-    """Return the left rows (n,) recorded while the right side was, too: a side held for long would look like a turn."""
-    slack = max(_half_interval(left), _half_interval(right))
-    both: Bools = np.logical_and(left >= right[0] - slack, left <= right[-1] + max(slack, _HOLD_NS))
-    return both
-
-
 def _unwrapped(values: NDArray[Any]) -> NDArray[Any]:
     """Return a counter (n,) without its wraps: of the least of 16 and 32 bits that holds all its numbers."""
     if values.dtype.kind == "f" or not len(values):
         return values
-    bits = next((bits for bits in (16, 32) if _fits(values, bits)), 64)
-    if bits == 64:
-        return values
-    span = 1 << bits
-    steps = np.mod(np.diff(values) + span // 2, span) - span // 2
-    return np.cumsum(np.concatenate([values[:1], steps]))
-
-
-def _fits(values: Ints, bits: int) -> bool:
-    """Return whether numbers fit into a word, with or without sign."""
     low, high = int(values.min()), int(values.max())
-    return (low >= 0 and high < 1 << bits) or (low >= -(1 << bits - 1) and high < 1 << bits - 1)
+    for bits in (16, 32):
+        half = 1 << (bits - 1)
+        if (low >= 0 and high < 2 * half) or (low >= -half and high < half):  # without or with sign
+            steps = np.mod(np.diff(values) + half, 2 * half) - half
+            return np.cumsum(np.concatenate([values[:1], steps]))
+    return values
 
 
 def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: bool) -> bool:
@@ -308,15 +299,14 @@ _LONE_L = re.compile(r"(?<![^\W\d_])[lL]|(?<=[^\W\d_A-Z])L|[lL](?![^\W\d_])")
 """A letter that begins or ends a word: ``/lwheel``, ``enc_L``, ``/WL``, ``frontL``."""
 
 
-def right_twin(left_topic: str, topics: Iterable[str]) -> str | None:
-    """Return the topic whose name is `left_topic` with left replaced by right; None when there is none."""
-    existing = topics if isinstance(topics, AbstractSet | Mapping) else set(topics)
+def right_twin(left: str, names: Container[str]) -> str | None:
+    """Return the name that is `left` with left replaced by right; None when there is none."""
     for old, new in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
-        if old in left_topic:
-            twin = left_topic.replace(old, new)
-            return twin if twin in existing else None
-    for found in _LONE_L.finditer(left_topic):
-        twin = f"{left_topic[: found.start()]}{'r' if found[0] == 'l' else 'R'}{left_topic[found.end() :]}"
-        if twin in existing:
+        if old in left:
+            twin = left.replace(old, new)
+            return twin if twin in names else None
+    for found in _LONE_L.finditer(left):
+        twin = f"{left[: found.start()]}{'r' if found[0] == 'l' else 'R'}{left[found.end() :]}"
+        if twin in names:
             return twin
     return None

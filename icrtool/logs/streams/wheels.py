@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -16,41 +16,42 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
-from icrtool.logs.streams.sources import Sides, Unit, WheelMotion, motion_of, nonzero, of_topic
+from icrtool.logs.streams.sources import Sides, Unit, WheelMotion, motion_of, moves, of_topic
 from icrtool.records.text import some_of
 
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
 """Positions that stay within one turn, and jump by nearly one turn this often, are recorded modulo a turn."""
 
 Quantity = Literal["position", "speed"]
-QUANTITIES: tuple[Quantity, ...] = ("position", "speed")
 
 MOST_WHEELS = 32
 """Of a side. A message that lists more is not of wheels, or was made to take time."""
 
 
 def of_wheels(
-    motion: WheelMotion, wheels: Callable[[Quantity], NDArray[Any] | None], lefts: int, names: Sequence[str]
+    wheels: Callable[[Quantity], NDArray[Any] | None], lefts: int, names: Sequence[str], unit: Unit, **others: Any
 ) -> WheelMotion:
-    """Return a motion with the mean over the wheels of each side, those left out that have no encoder, or a dead one.
+    """Return the mean over the wheels of each side, those left out that have no encoder, or a dead one.
 
     Parameters
     ----------
     wheels : returns the positions, or the speeds, of each wheel (n, k), the left ones first; None where not recorded
     lefts : how many are left
     names : (k,)
+    others : what else `motion_of` takes
     """
-    means: dict[str, Sides] = {}
+    means: dict[Quantity, Sides] = {"position": (None, None), "speed": (None, None)}
     dead: set[int] = set()
     # One after the other: the columns of all wheels of a long log are large.
-    for quantity in QUANTITIES:
+    for quantity in means:
         values = wheels(quantity)
         if values is not None:
-            turns_modulo = quantity == "position" and motion.unit == "rad"
+            turns_modulo = quantity == "position" and unit == "rad"
             means[quantity], stuck = _side_means(_unwound(values) if turns_modulo else values, lefts)
             dead |= stuck
     note = f"{some_of([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
-    return motion_of(replace(motion, note=note if dead else ""), **means)
+    note = note if dead else ""
+    return motion_of(position=means["position"], speed=means["speed"], unit=unit, note=note, **others)
 
 
 def _side_means(values: NDArray[Any], lefts: int) -> tuple[Sides, set[int]]:
@@ -122,45 +123,43 @@ class Joints:
     def read(self, table: TopicTable, config: Config) -> WheelMotion:
         """Return the motion of those joints that are wheels."""
         codes, texts = table.words(self.names)
-        motion = WheelMotion(**of_topic(table), joints=tuple(texts))
         left, right = _wheels_among(texts, config)
+        lefts, rights, alike = len(left), len(right), np.zeros(0, np.bool_)
+        problem, wheels = "", codes
         if not (left and right):
             advice = "name them in wheels.{left,right}_joints"
             named = f"no left and right wheel among its joints {some_of(texts)}; {advice}"
-            return replace(motion, problem=named if texts else "lists no joints")
-        lefts, rights = len(left), len(right)
-        if max(lefts, rights) > MOST_WHEELS:
+            problem = named if texts else "lists no joints"
+        elif max(lefts, rights) > MOST_WHEELS:
             problem = f"lists {lefts} left and {rights} right wheels; at most {MOST_WHEELS} of a side are read"
-            return replace(motion, problem=problem)
-        # Joints by their place among the wheels, left ones first; -1 for all others.
-        wheel = np.full(len(texts) + 1, -1)
-        wheel[left + right] = np.arange(lefts + rights)
-        # All messages list the same joints in the same order: one row stands for them.
-        same = codes.strides[0] == 0
-        wheels = np.broadcast_to(wheel[codes[:1]], codes.shape) if same else wheel[codes]
-        alike = _rows_alike(wheels[:1] if same else wheels, lefts, rights)
-        if not alike.any():
-            return replace(motion, problem="left and right wheels come in different messages")
+        else:
+            # Joints by their place among the wheels, left ones first; -1 for all others.
+            wheel = np.full(len(texts) + 1, -1)
+            wheel[left + right] = np.arange(lefts + rights)
+            # All messages list the same joints in the same order: one row stands for them.
+            same = codes.strides[0] == 0
+            wheels = np.broadcast_to(wheel[codes[:1]], codes.shape) if same else wheel[codes]
+            alike = _rows_alike(wheels[:1] if same else wheels, lefts, rights)
+            problem = "" if alike.any() else "left and right wheels come in different messages"
+        if problem:
+            return WheelMotion(**of_topic(table), joints=tuple(texts), problem=problem)
         if not alike.all():
             table, wheels = table.rows(alike), wheels[alike]
-            motion = replace(motion, **of_topic(table))
         why = f"{self.what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
-        paths = {"position": self.position, "speed": self.speed}
+        paths, names = {"position": self.position, "speed": self.speed}, [texts[i] for i in left + right]
         return of_wheels(
-            replace(motion, score=self.worth, why=why),
-            lambda quantity: _by_wheel(table.find(paths[quantity]), wheels, lefts + rights),
-            lefts,
-            [texts[i] for i in left + right],
-        )
+            lambda quantity: _by_wheel(table.find(paths[quantity]), wheels, lefts + rights), lefts, names, "rad",
+            **of_topic(table), joints=tuple(texts), score=self.worth, why=why,
+        )  # fmt: skip
 
 
 def _wheels_among(texts: Sequence[str], config: Config) -> tuple[list[int], list[int]]:
-    left, right = wheel_joints(texts)
-    given = config.wheels
-    if given.left_joints:
-        left = [i for i, name in enumerate(texts) if name in given.left_joints]
-    if given.right_joints:
-        right = [i for i, name in enumerate(texts) if name in given.right_joints]
+    """Return the places of the left and of the right wheels among joints, the configured ones first."""
+    given = config.wheels.left_joints, config.wheels.right_joints
+    left, right = (
+        [i for i, name in enumerate(texts) if name in configured] if configured else named
+        for configured, named in zip(given, wheel_joints(texts), strict=True)
+    )
     return left, right
 
 
@@ -235,24 +234,29 @@ class FixedWheels:
         return tuple(elements(path)[0] for path in (*self.position, *self.speed))
 
     def read(self, table: TopicTable, _: Config) -> WheelMotion:
-        """Return the motion of both sides."""
-        motion = WheelMotion(**of_topic(table), unit=self.unit, score=self.worth, why=self.what)
+        """Return the motion of both sides.
+
+        Raises
+        ------
+        DefinitionError
+            A list holds fewer elements than there are wheels.
+        """
         paths = {"position": self.position, "speed": self.speed}
+
+        def wheels_of(quantity: Quantity) -> Floats | None:
+            wheels: list[NDArray[Any]] = []
+            for column, places in map(elements, paths[quantity]):
+                values = table.find(column)
+                if values is None:
+                    return None
+                if places and (values.ndim != 2 or max(places) >= values.shape[1]):
+                    raise DefinitionError(table.topic, f"{column} holds fewer than {max(places) + 1} elements")
+                wheels += [values[:, place] for place in places] or [values]
+            return (np.array(wheels, np.float64) * self.factor).T if wheels else None
+
         lefts, rights = (len(elements(path)[1]) or 1 for path in self.position or self.speed)
         names = [f"wheel {i}" for i in range(lefts + rights)]
-        return of_wheels(motion, lambda quantity: self._wheels(table, paths[quantity]), lefts, names)
-
-    def _wheels(self, table: TopicTable, paths: tuple[str, ...]) -> Floats | None:
-        """Return the values (n, k) of each wheel, the left ones first, None where the type lacks a side."""
-        wheels: list[NDArray[Any]] = []
-        for column, places in map(elements, paths):
-            values = table.find(column)
-            if values is None:
-                return None
-            if places and (values.ndim != 2 or max(places) >= values.shape[1]):
-                raise DefinitionError(table.topic, f"{column} holds fewer than {max(places) + 1} elements")
-            wheels += [values[:, place] for place in places] or [values]
-        return (np.array(wheels, np.float64) * self.factor).T if wheels else None
+        return of_wheels(wheels_of, lefts, names, self.unit, **of_topic(table), score=self.worth, why=self.what)
 
 
 _HALF_COUNTER = 1 << 31
@@ -280,13 +284,14 @@ def read_ticks(table: TopicTable, _: Config) -> WheelMotion:
         steps = np.abs(np.mod(np.diff(ticks) + _HALF_COUNTER, 2 * _HALF_COUNTER) - _HALF_COUNTER)
         return np.concatenate([[0.0], np.cumsum(np.where(direction[1:] != 0, -steps, steps))])
 
-    per_metre = float(np.median(table.floats("wheel_tick_factor")))
+    with np.errstate(invalid="ignore"):  # infinite ones of both signs have no median
+        per_metre = float(np.median(table.floats("wheel_tick_factor")))
     known = per_metre > 0
     sides = [sum(travelled(f"{axle}{side}") for axle in axles) / len(axles) for side in "lr"]
     left, right = (np.asarray(side) / (per_metre if known else 1.0) for side in sides)
     unit: Unit = "m" if known else "counts"
     why = f"ticks of the {' and '.join({'f': 'front', 'r': 'rear'}[axle] for axle in axles)} wheels"
-    return motion_of(WheelMotion(**of_topic(table), unit=unit, score=90.0, why=why), (left, right))
+    return motion_of(**of_topic(table), position=(left, right), unit=unit, score=90.0, why=why)
 
 
 _BOTH = ("data[0]", "data[1]")
@@ -325,12 +330,14 @@ class Twist:
     Attributes
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is
-    forward, sideways, turn : fields of the speeds [m/s] and of the turn rate [rad/s, counter-clockwise]
+    path : the field of the twist, with its dot
+    forward, sideways, turn : fields of it: the speeds [m/s] and the turn rate [rad/s, counter-clockwise]
     fused : taken off where the name is that of a topic fused with others; 0: a base's own, whatever its name
     """
 
     what: str
     worth: float
+    path: str = ""
     forward: str = "linear.x"
     sideways: str = "linear.y"
     turn: str = "angular.z"
@@ -339,30 +346,23 @@ class Twist:
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields that are read."""
-        return self.forward, self.sideways, self.turn
+        return tuple(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn))
 
     def read(self, table: TopicTable, _: Config) -> WheelMotion:
         """Return the twist; that of a position reference, or in east and north, is refused."""
-        twist = np.column_stack([table.column(self.forward), table.column(self.turn)]).astype(np.float64)
-        across = table.floats(self.sideways)
-        forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], across))
+        forward, sideways, turn = self.fields
+        twist = np.column_stack([table.column(forward), table.column(turn)]).astype(np.float64)
+        forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], table.floats(sideways)))
         score, why, note = self.worth, f"{self.what}, converted to wheel speeds with the track width", ""
         score -= self.fused if _FUSED.search(table.topic) else 0.0
         if COMMANDED.search(table.topic):
             score, why, note = score - COMMAND, f"{why} (commanded)", COMMAND_NOTE
         problem = ""
-        if not nonzero(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
+        if not moves(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
             problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
         elif self.fused and REFERENCE_WORDS.search(table.topic):
             problem = "its name is that of a position reference, not of wheels"
-        return motion_of(
-            WheelMotion(**of_topic(table), unit="m", twist=twist, score=score, why=why, note=note, problem=problem)
-        )
-
-
-def body_twist(prefix: str, worth: float, what: str = "body twist", fused: float = 45.0) -> Twist:
-    """Return the row of a type that has a twist at a path."""
-    return Twist(what, worth, f"{prefix}linear.x", f"{prefix}linear.y", f"{prefix}angular.z", fused)
+        return motion_of(**of_topic(table), twist=twist, unit="m", score=score, why=why, note=note, problem=problem)
 
 
 WHEEL_WORDS = re.compile(r"wheel|track(?!er|ing)|sprocket|drive|motor|tire|tyre", re.IGNORECASE)
@@ -379,18 +379,16 @@ _RIGHT_TOKENS = {"r", "right", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh", "
 def side_of(name: str) -> str:
     """Return ``left``, ``right`` or an empty string for a joint's name."""
     lowered = name.lower()
-    if ("left" in lowered) != ("right" in lowered):
-        return "left" if "left" in lowered else "right"
-    tokens = set(_words(name))
-    left, right = bool(tokens & _LEFT_TOKENS), bool(tokens & _RIGHT_TOKENS)
+    left, right = "left" in lowered, "right" in lowered
     if left == right:
-        return ""
-    return "left" if left else "right"
+        tokens = words_of(name)
+        left, right = bool(tokens & _LEFT_TOKENS), bool(tokens & _RIGHT_TOKENS)
+    return "" if left == right else "left" if left else "right"
 
 
-def _words(name: str) -> list[str]:
+def words_of(name: str) -> set[str]:
     """Return the words of a name, lower case: ``wheel_FL_joint``, ``frontLeftWheel``, ``panther/rl_wheel_joint``."""
-    return [word.lower() for word in _TOKENS.findall(name.replace("_", " "))]
+    return {word.lower() for word in _TOKENS.findall(name.replace("_", " "))}
 
 
 def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
@@ -404,5 +402,5 @@ def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
 @lru_cache(4096)
 def _side_of_wheel(name: str) -> tuple[str, bool]:
     """Return the side of a joint that may be a wheel, empty for others, and whether its name is that of a wheel."""
-    elsewhere = any(_OTHER_JOINTS.fullmatch(word) for word in _words(name))
+    elsewhere = any(_OTHER_JOINTS.fullmatch(word) for word in words_of(name))
     return "" if elsewhere else side_of(name), bool(WHEEL_WORDS.search(name))

@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
-from icrtool.logs.describe import SurveyDocument, SurveyedSource, SurveyedTopic
+from icrtool.logs.read_log import SurveyDocument, SurveyedSource, SurveyedTopic
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.output.tables.run import Row, excitation_check, gravest, next_line
 from icrtool.output.text_blocks import VERBOSE, Block, Facts, Section, Table

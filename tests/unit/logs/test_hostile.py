@@ -31,7 +31,7 @@ from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_la
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.logs.read_log import LONGEST_HEAD_BYTES, moment, read_log, survey_log
 from icrtool.logs.streams.message_types import read_source
-from icrtool.logs.streams.stamps import stamp_rows
+from icrtool.logs.streams.sources import stamp_rows
 from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
 from icrtool.records.text import LogText
 from support.tables import block_of, channel_of, collected

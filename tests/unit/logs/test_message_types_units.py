@@ -12,8 +12,7 @@ from icrtool.config import Config
 from icrtool.errors import DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import read_source
-from icrtool.logs.streams.sources import HeadingSource, PositionSource
-from icrtool.logs.streams.stamps import increasing, stamp_rows
+from icrtool.logs.streams.sources import HeadingSource, PositionSource, increasing, stamp_rows
 from support.tables import START_NS, STEP_NS, table_of
 
 ROUNDING_DEG = 1e-12

@@ -12,7 +12,7 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, MissingStreamError
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.assembly import Survey, assemble
+from icrtool.logs.streams.assembly import Survey, assemble, common_clock
 from icrtool.logs.streams.select import (
     Candidates,
     Choice,
@@ -22,7 +22,7 @@ from icrtool.logs.streams.select import (
     ignored_joints,
     other_references,
 )
-from icrtool.logs.streams.stamps import StampedRows, common_clock
+from icrtool.logs.streams.sources import StampedRows
 from icrtool.records.text import LogText
 
 COUNT = 50

@@ -8,7 +8,8 @@ import pytest
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.messages.topic_table import TopicTable, set_back_of
-from icrtool.logs.streams.stamps import NEVER_SET, StampedRows, clock_notes, stamp_rows
+from icrtool.logs.streams.assembly import clock_notes
+from icrtool.logs.streams.sources import NEVER_SET, StampedRows, stamp_rows
 from icrtool.records.text import LogText
 
 TIMES = np.arange(0, 100_000_000_000, 20_000_000)

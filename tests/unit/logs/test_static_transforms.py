@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import survey_log
-from icrtool.logs.streams.transforms import FIELDS, antenna_place
+from icrtool.logs.streams.positions import TRANSFORM_FIELDS, antenna_place
 from icrtool.records.text import LogText
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -115,10 +115,10 @@ def test_base_and_antenna_in_one_circle_give_nothing(tmp_path: Path) -> None:
 def test_a_long_chain_of_frames_is_followed_once() -> None:
     count = 20_000
     names = ["base_link", *(f"f{k}" for k in range(1, count)), "gps"]
-    columns = {FIELDS[0]: np.arange(count)[None], FIELDS[1]: np.arange(1, count + 1)[None]}
-    columns |= {path: np.full((1, count), float(path.endswith("rotation.w"))) for path in FIELDS[2:]}
-    columns[FIELDS[2]] = np.full((1, count), 1e-4)
-    texts = {path: [LogText(name) for name in names] for path in FIELDS[:2]}
+    columns = {TRANSFORM_FIELDS[0]: np.arange(count)[None], TRANSFORM_FIELDS[1]: np.arange(1, count + 1)[None]}
+    columns |= {path: np.full((1, count), float(path.endswith("rotation.w"))) for path in TRANSFORM_FIELDS[2:]}
+    columns[TRANSFORM_FIELDS[2]] = np.full((1, count), 1e-4)
+    texts = {path: [LogText(name) for name in names] for path in TRANSFORM_FIELDS[:2]}
     static = TopicTable(LogText("/tf_static"), LogText("tf2_msgs/TFMessage"), np.array([0]), columns, texts, 0)
     fix = {"header.frame_id": np.array([0])}
     fixes = TopicTable(

@@ -11,8 +11,7 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.assembly import wheel_samples
 from icrtool.logs.streams.message_types import read_source
-from icrtool.logs.streams.sources import WheelMotion, motion_of
-from icrtool.logs.streams.stamps import StampedRows
+from icrtool.logs.streams.sources import StampedRows, WheelMotion, motion_of
 from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog
 
@@ -23,8 +22,8 @@ NOTHING = PositionFixes(np.empty(0, np.int64), *(np.empty(0) for _ in range(5)))
 
 def speeds_of(left: Floats, right: Floats) -> tuple[Ints, Floats, Floats, list[str]]:
     stamps = STEP_NS * np.arange(len(left), dtype=np.int64)
-    empty = WheelMotion(topic="/wheels", message_type="some/Type", stamps=StampedRows(None, stamps, "", 0))
-    motion = motion_of(empty, position=(left, right))
+    clock = StampedRows(None, stamps, "", 0)
+    motion = motion_of(topic="/wheels", message_type="some/Type", stamps=clock, position=(left, right))
     raw, _ = wheel_samples(motion, stamps, CONFIG, "log")
     log = with_wheel_speeds(RobotLog("log", raw, NOTHING, NO_HEADINGS, None, (), (), {}, ()), CONFIG)
     return log.wheels.stamp_ns, log.wheels.v_left_mps, log.wheels.v_right_mps, list(log.warnings)
