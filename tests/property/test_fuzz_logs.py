@@ -222,7 +222,6 @@ def fuzz(good_logs, folder: Path, kind: str, examples: int) -> None:
     @settings(
         max_examples=examples,
         derandomize=True,
-        deadline=None,
         database=None,
         suppress_health_check=list(HealthCheck),
     )

@@ -65,7 +65,7 @@ def assert_equal(errors, expected):
     np.testing.assert_allclose(errors, expected, rtol=0.0, atol=EQUAL_M)
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(drives(), st.sampled_from([8, 37, 2048]))
 def test_fast_equals_direct_integration(drive_and_icrs, block):
     drive, icrs = drive_and_icrs
@@ -77,7 +77,7 @@ def test_fast_equals_direct_integration(drive_and_icrs, block):
     assert np.array_equal(np.isfinite(errors), ends >= 0)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(drives(), st.floats(0.2, 2.0))
 def test_fast_equals_direct_integration_for_one_triple(drive_and_icrs, track_width):
     drive, _ = drive_and_icrs
@@ -86,7 +86,7 @@ def test_fast_equals_direct_integration_for_one_triple(drive_and_icrs, track_wid
     assert_equal(open_loop_errors(drive, no_slip, ends), open_loop_errors_direct(drive, no_slip, ends))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(drives(least_separation=0.1), st.floats(-20.0, 20.0), st.floats(-1e5, 1e5), st.floats(-1e5, 1e5))
 @pytest.mark.parametrize("solve", [open_loop_errors, open_loop_errors_direct])
 def test_rotating_and_shifting_the_world_changes_nothing(solve, drive_and_icrs, angle, north, east):
@@ -101,7 +101,7 @@ def test_rotating_and_shifting_the_world_changes_nothing(solve, drive_and_icrs, 
     assert_equal(solve(moved, icrs, ends), solve(drive, icrs, ends))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(drives(least_separation=0.1))
 def test_swapping_left_and_right_mirrors(drive_and_icrs):
     drive, icrs = drive_and_icrs
@@ -111,7 +111,7 @@ def test_swapping_left_and_right_mirrors(drive_and_icrs):
     assert_equal(open_loop_errors(mirrored, mirrored_icrs, ends), open_loop_errors(drive, icrs, ends))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(drives(least_separation=0.1), st.permutations(range(4)))
 def test_order_of_horizons_changes_nothing(drive_and_icrs, order):
     drive, icrs = drive_and_icrs
@@ -120,7 +120,7 @@ def test_order_of_horizons_changes_nothing(drive_and_icrs, order):
     assert_equal(open_loop_errors(drive, icrs, shuffled), open_loop_errors(drive, icrs, ends)[:, order])
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(drives(least_separation=0.1), st.data())
 def test_ranges_of_starts_make_up_the_whole(drive_and_icrs, data):
     drive, icrs = drive_and_icrs

@@ -21,7 +21,7 @@ from support.tables import channel_of, collected
 
 ROUNDING_DEG = 1e-12
 STEP_NS = 100_000_000
-PATIENT = settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
+PATIENT = settings(suppress_health_check=[HealthCheck.too_slow])
 """On a busy machine the first drawing takes seconds."""
 
 FIXES = st.tuples(
