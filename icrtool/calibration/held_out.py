@@ -18,15 +18,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from icrtool.calibration.error_growth import (
-    PathErrors,
-    Spread,
-    fit_variances,
-    mean_error,
-    nonnegative,
-    path_errors,
-    radius,
-)
+from icrtool.calibration import error_growth
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.error_statistics import Summary, error_summary, within_budget
@@ -340,10 +332,10 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent, shrunk towards one
     in their logarithm (James and Stein 1961): one short drive shows its largest error, not a quantile.
     """
-    found: list[tuple[Floats, PathErrors, Floats, Complexes]] = []
+    found: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
     tested = [np.empty((0, 3))]
     for i, windows, some, (begin, end), (fitted, own), steps in _left_out_windows(table, name, LENGTHS_M):
-        errors = path_errors(steps, begin, end, fitted, table.recordings[i].width_m, own)
+        errors = error_growth.path_errors(steps, begin, end, fitted, table.recordings[i].width_m, own)
         reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
         length_m = windows.length_m[some]
         found.append((length_m, errors, errors.turned - windows.turned[some], errors.moved - reference))
@@ -358,16 +350,16 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
         return None
     of_sources, of_parameters = ([getattr(one[1], name) for one in found] for name in ("of_sources", "of_parameters"))
     sources, stated = (
-        Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
+        error_growth.Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
         for parts in (of_sources, of_parameters)
     )
     turned, missed = (np.concatenate([one[k] for one in found])[used] for k in (2, 3))
-    variances = fit_variances(length, sources, stated, turned, missed)
+    variances = error_growth.fit_variances(length, sources, stated, turned, missed)
     spread, far = sources.combined(variances).plus(stated), length >= SCALED_FROM_M
     error, count = np.abs(missed)[far], max(stretches[CHOICE_HORIZON_M], 1)
     level = min(95.0 * (1.0 + 1.0 / count), 100.0)
-    share = np.percentile(error / np.maximum(radius(spread, 0.95)[far], 1e-9), level)
-    mean = error.mean() / max(float(mean_error(spread)[far].mean()), 1e-9)
+    share = np.percentile(error / np.maximum(error_growth.radius(spread, 0.95)[far], 1e-9), level)
+    mean = error.mean() / max(float(error_growth.mean_error(spread)[far].mean()), 1e-9)
     # measured over normal: the fewer stretches show it, the nearer to normal
     factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
     return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
@@ -403,7 +395,7 @@ def _variances(errors: Floats) -> tuple[float, float, float]:
 def _shares(missed: Floats, first: Floats, second: Floats) -> tuple[float, float]:
     """Return a, b >= 0 with missed^2 about a first^2 + b second^2, by least squares."""
     columns = np.column_stack([first**2, second**2])
-    a, b = np.maximum(nonnegative(columns.T @ columns, columns.T @ missed**2), SMALLEST_VARIANCE).tolist()
+    a, b = np.maximum(error_growth.nonnegative(columns.T @ columns, columns.T @ missed**2), SMALLEST_VARIANCE).tolist()
     return a, b
 
 

@@ -14,14 +14,7 @@ from msgspec import UNSET
 from msgspec.structs import asdict
 
 from icrtool import __version__
-from icrtool.calibration.held_out import (
-    GYRO,
-    HeldOut,
-    errors_without,
-    hold_out,
-    measure_controller_errors,
-    measure_error_sources,
-)
+from icrtool.calibration import held_out
 from icrtool.calibration.record import Calibration, fitted_document, parameter_documents
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
@@ -29,16 +22,7 @@ from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, Lever
 from icrtool.motion.recording import ErrorsOf, GyroLine, Recording, cut_windows, fit_gyro_line
 from icrtool.motion.window_fit import Fold, Prediction, own_constants
-from icrtool.records.calibration_document import (
-    CALIBRATION_SCHEMA,
-    CalibratedRobot,
-    CalibrationLog,
-    ControllerDocument,
-    FittedDocument,
-    GyroDocument,
-    HeldOutScore,
-    PooledScore,
-)
+from icrtool.records import calibration_document as documents
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
@@ -142,13 +126,13 @@ class CalibrationResult(NamedTuple):
     """A calibration with the table that it was tested by."""
 
     calibration: Calibration
-    table: HeldOut
+    table: held_out.HeldOut
     notes: tuple[str, ...]
     left_out: tuple[LeftOut, ...] = ()
 
 
 def calibrate_recordings(
-    recordings: Sequence[Recording], robot: CalibratedRobot | None = None, warnings: tuple[str, ...] = ()
+    recordings: Sequence[Recording], robot: documents.CalibratedRobot | None = None, warnings: tuple[str, ...] = ()
 ) -> CalibrationResult:
     """Fit the motion models to all recordings, and test each on what it was not fitted to.
 
@@ -172,14 +156,14 @@ def calibrate_recordings(
     known = [one for one in recordings if one.sha256]
     if twice := {one.name for one in known if sum(one.sha256 == other.sha256 for other in known) > 1}:
         raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
-    table = hold_out(recordings)
+    table = held_out.hold_out(recordings)
     turnless = ", ".join(one.name for one in recordings if one.track.gyro is None)
     notes = (f"no gyro that turns with the robot in {turnless}: wheels alone",) if turnless else ()
     return CalibrationResult(calibration_from(table, robot, warnings), table, notes)
 
 
 def calibration_from(
-    table: HeldOut, robot: CalibratedRobot | None = None, warnings: tuple[str, ...] = ()
+    table: held_out.HeldOut, robot: documents.CalibratedRobot | None = None, warnings: tuple[str, ...] = ()
 ) -> Calibration:
     """Return the calibration of the recordings that a held-out table is of."""
     recordings, best = table.recordings, table.fits[RECOMMENDED]
@@ -187,7 +171,7 @@ def calibration_from(
     for i, one in enumerate(recordings):
         own, metres = best.constants(i), float(one.track.distance[-1])
         offset_deg, delay_s = math.degrees(own.heading_offset_rad), -own.wheels_later_s
-        logs.append(CalibrationLog(one.name, one.path, one.sha256, metres, offset_deg, delay_s, one.begin_ns))
+        logs.append(documents.CalibrationLog(one.name, one.path, one.sha256, metres, offset_deg, delay_s, one.begin_ns))
     by_fold, together = [], []
     for row in table.scores:
         # A score without trials is left out.
@@ -195,33 +179,35 @@ def calibration_from(
             for h, horizon in enumerate(table.horizons_m):
                 if summary.trials[h]:
                     p95, expected = float(summary.p95[h]), float(summary.expected[h])
-                    by_fold.append(HeldOutScore(row.name, horizon, p95, expected, fold.name))
+                    by_fold.append(documents.HeldOutScore(row.name, horizon, p95, expected, fold.name))
         for h, horizon in enumerate(table.horizons_m):
             if row.together.trials[h]:
                 p95, expected = float(row.together.p95[h]), float(row.together.expected[h])
-                together.append(PooledScore(row.name, horizon, p95, expected))
+                together.append(documents.PooledScore(row.name, horizon, p95, expected))
     gyro = None
     if table.has_gyro:
-        turned = table.fits[f"{RECOMMENDED}{GYRO}"].fitted
-        sources = measure_error_sources(table, f"{RECOMMENDED}{GYRO}")
-        gyro = GyroDocument(turned.model.name, *parameter_documents(turned), sources)
-    robot = robot if robot is not None else CalibratedRobot(track_width_m=recordings[0].width_m)
+        turned = table.fits[f"{RECOMMENDED}{held_out.GYRO}"].fitted
+        sources = held_out.measure_error_sources(table, f"{RECOMMENDED}{held_out.GYRO}")
+        gyro = documents.GyroDocument(turned.model.name, *parameter_documents(turned), sources)
+    robot = robot if robot is not None else documents.CalibratedRobot(track_width_m=recordings[0].width_m)
     geometry, covariance = table.fits[FIVE].fitted.geometry(robot.track_width_m)
-    found, errors = fitted_document(best.fitted, geometry, covariance, robot), measure_controller_errors(table)
+    found, errors = fitted_document(best.fitted, geometry, covariance, robot), held_out.measure_controller_errors(table)
     return Calibration(
-        schema=CALIBRATION_SCHEMA,
+        schema=documents.CALIBRATION_SCHEMA,
         tool_version=__version__,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         robot=robot,
         recommended=found.model,
         **{name: getattr(found, name) for name in RecommendedDocument.__struct_fields__[1:-1]},
-        controller=ControllerDocument(**asdict(found.controller), **({} if errors is None else asdict(errors))),
+        controller=documents.ControllerDocument(
+            **asdict(found.controller), **({} if errors is None else asdict(errors))
+        ),
         gyro=gyro,
-        models={name: FittedDocument(*parameter_documents(table.fits[name].fitted)) for name in MODELS},
+        models={name: documents.FittedDocument(*parameter_documents(table.fits[name].fitted)) for name in MODELS},
         logs=tuple(logs),
         held_out=tuple(by_fold),
         held_out_pooled=tuple(together),
-        error_sources=measure_error_sources(table, RECOMMENDED),
+        error_sources=held_out.measure_error_sources(table, RECOMMENDED),
         warnings=warnings,
     )
 
@@ -230,7 +216,7 @@ def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool
     """Return what gives the errors of a calibration in any trials of a recording; see `calibrated`."""
     found = calibrated(calibration, recording, with_gyro=with_gyro)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]
-    return lambda trials: errors_without(recording, trials, folds, 0, lambda _: found)
+    return lambda trials: held_out.errors_without(recording, trials, folds, 0, lambda _: found)
 
 
 def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> Prediction:
@@ -329,7 +315,7 @@ class _Taken(NamedTuple):
 
     recording: Recording
     positions: Complexes
-    robot: CalibratedRobot
+    robot: documents.CalibratedRobot
     warnings: tuple[str, ...]
 
 
@@ -367,10 +353,10 @@ def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unus
     return ""
 
 
-def robot_of(run: Run, width_m: float) -> CalibratedRobot:
+def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
     """Return what a calibration holds of the robot of a run, of track width `width_m`."""
     robot = run.config.robot
-    return CalibratedRobot(
+    return documents.CalibratedRobot(
         name=robot.name,
         wheel_radius_m=robot.wheel_radius_m,
         encoder_counts_per_rev=robot.encoder_counts_per_rev or UNSET,

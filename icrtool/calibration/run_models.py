@@ -14,15 +14,8 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from icrtool.calibration import pooled
 from icrtool.calibration.held_out import GYRO, HeldOut, fit_models, hold_out
-from icrtool.calibration.pooled import (
-    calibration_from,
-    recording_of,
-    robot_of,
-    scaled_gyro,
-    use_warnings,
-    with_turn_rate,
-)
 from icrtool.calibration.record import Calibration, controller_numbers, fitted_document
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -94,7 +87,7 @@ def with_motion(run: Run) -> RunDocument:
     ICRs and controller numbers come from one fit of `FIVE` to the windows of the drive, so that
     (right - left) / b is the multiplier. With preset ``paper`` they are those of the filter at the end.
     """
-    recording = recording_of(run, width_m=width_or_usual_m(run.track_width_m))
+    recording = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     try:
         fits = fit_models([recording], (FIVE, RECOMMENDED))
     except DataError:
@@ -112,7 +105,7 @@ def with_motion(run: Run) -> RunDocument:
         geometry, covariance = fits[FIVE].geometry(width)
     else:
         return run.document
-    robot = robot_of(run, width)
+    robot = pooled.robot_of(run, width)
     found = None
     if run.usable and run.track_width_m is not None and RECOMMENDED in fits:
         found = fitted_document(fits[RECOMMENDED], geometry, covariance, robot)
@@ -218,7 +211,7 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
     calibration = None
     if run.track_width_m is not None:
-        calibration = calibration_from(found, robot_of(run, recording.width_m), use_warnings(run))
+        calibration = pooled.calibration_from(found, pooled.robot_of(run, recording.width_m), pooled.use_warnings(run))
     return ComparedModels(
         tuple(rows), found.trials[0],
         recording.track._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps),
@@ -234,9 +227,9 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, list[str]]:
     """Return the recording with the first measured heading that turns with the robot, its kind, and notes."""
     notes = []
-    plain = recording_of(run, width_m=width_or_usual_m(run.track_width_m))
+    plain = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     for one in headings:
-        found = with_turn_rate(plain, one)
+        found = pooled.with_turn_rate(plain, one)
         if found.track.gyro is not None:
             if found.gyro_reversed:
                 notes.append(f"the {one.kind} counts turns in the other direction: its sign was changed")
@@ -276,7 +269,7 @@ def models_of(run: Run) -> tuple[Model, ...]:
 
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
-    psi, last = recording.track.cumulate(scaled_gyro(recording)), len(recording.track.t) - 1
+    psi, last = recording.track.cumulate(pooled.scaled_gyro(recording)), len(recording.track.t) - 1
     give_back_freed()
     held, place = recording.track.held, np.zeros(last + 1, np.complex128)
     for lo in range(0, last, ROWS_AT_ONCE):

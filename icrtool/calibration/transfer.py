@@ -19,30 +19,12 @@ from icrtool import __version__
 from icrtool.calibration.pooled import CalibrationResult, calibrate_runs, predictor
 from icrtool.calibration.record import Calibration
 from icrtool.errors import ConfigError
+from icrtool.kernels import error_statistics as statistics
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import (
-    BlockSums,
-    block_sums,
-    cut_blocks,
-    difference_half_width,
-    error_intervals,
-    error_summary,
-    sort_trials,
-)
 from icrtool.kernels.track import Track
 from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Recording, cut_trials
-from icrtool.records.calibration_document import (
-    COMPARE_SCHEMA,
-    ComparedGroup,
-    ComparedPair,
-    ErrorDifference,
-    ErrorsAt,
-    GroupComparison,
-    ParameterDifference,
-    TransferCell,
-    TransferCost,
-)
+from icrtool.records import calibration_document as documents
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
 from icrtool.records.run import Run
@@ -59,7 +41,7 @@ SAME_ROUTE_M = 1.0
 COMPARED = ("y_icr_right_m", "y_icr_left_m", "x_icr_m", "multiplier", "radius_left", "radius_right")
 
 
-def compare_groups(groups: Mapping[str, Sequence[Run]]) -> GroupComparison:
+def compare_groups(groups: Mapping[str, Sequence[Run]]) -> documents.GroupComparison:
     """Calibrate each group of runs and compare the groups.
 
     Parameters
@@ -95,7 +77,7 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> GroupComparison:
 
 def compare_calibrations(
     results: Mapping[str, CalibrationResult], recordings: Mapping[str, Sequence[Recording]]
-) -> GroupComparison:
+) -> documents.GroupComparison:
     """Compare calibrations of groups of recordings; see `compare_groups`."""
     tested = {(name, name): _test(result, recordings[name], own=True) for name, result in results.items()}
     cells, costs = [], []
@@ -109,11 +91,11 @@ def compare_calibrations(
             if same_width and ours.robot.wheel_radius_m == theirs.robot.wheel_radius_m:
                 found = _test(result, recordings[column], own=False)
             differences = _differences(held_out, found, paired=True)
-            costs += [TransferCost(*astuple(one), calibrated_on=row, tested_on=column) for one in differences]
+            costs += [documents.TransferCost(*astuple(one), calibrated_on=row, tested_on=column) for one in differences]
         for h, horizon in enumerate(HORIZONS_M):
             errors, _ = _sum_up(found.errors[:, h], found.path, horizon)
             trials = int(np.count_nonzero(np.isfinite(found.errors[:, h])))
-            cells.append(TransferCell(*astuple(errors), calibrated_on=row, tested_on=column, trials=trials))
+            cells.append(documents.TransferCell(*astuple(errors), calibrated_on=row, tested_on=column, trials=trials))
     first, *others = results
     pairs = []
     for other in others:
@@ -124,17 +106,21 @@ def compare_calibrations(
         at_choice = (first, other, CHOICE_HORIZON_M)
         cost = next(one for one in costs if (one.calibrated_on, one.tested_on, one.horizon_m) == at_choice)
         sentence = _verdict(first, other, parameters, cost)
-        errors_of_pair = tuple(ErrorDifference(*astuple(one), paired=paired) for one in differences)
-        pairs.append(ComparedPair(first, other, parameters, errors_of_pair, sentence))
-    calibrations = {name: one.calibration for name, one in results.items()}
-    return GroupComparison(
-        schema=COMPARE_SCHEMA, tool_version=__version__,
-        groups={name: ComparedGroup(one.recommended, one.logs, one.geometry) for name, one in calibrations.items()},
+        errors_of_pair = tuple(documents.ErrorDifference(*astuple(one), paired=paired) for one in differences)
+        pairs.append(documents.ComparedPair(first, other, parameters, errors_of_pair, sentence))
+    compared = {}
+    for name, result in results.items():
+        one = result.calibration
+        compared[name] = documents.ComparedGroup(one.recommended, one.logs, one.geometry)
+    return documents.GroupComparison(
+        schema=documents.COMPARE_SCHEMA, tool_version=__version__, groups=compared,
         pairs=tuple(pairs), transfer=tuple(cells), costs=tuple(costs),
     )  # fmt: skip
 
 
-def _verdict(first: str, second: str, parameters: Sequence[ParameterDifference], cost: TransferCost) -> str:
+def _verdict(
+    first: str, second: str, parameters: Sequence[documents.ParameterDifference], cost: documents.TransferCost
+) -> str:
     """Return one sentence: how the multiplier differs, and what the calibration of the first costs on the second."""
     one = next(one for one in parameters if one.quantity == "multiplier")
     change = f"by {with_std(one.difference, one.std)}"
@@ -168,17 +154,19 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
     return _Tested(np.concatenate(errors), np.concatenate(path))
 
 
-def _sum_up(errors_m: Floats, path_m: Floats, horizon_m: float) -> tuple[ErrorsAt, BlockSums | None]:
+def _sum_up(
+    errors_m: Floats, path_m: Floats, horizon_m: float
+) -> tuple[documents.ErrorsAt, statistics.BlockSums | None]:
     """Return p95 and mean [m] of trials (k,) of one horizon with their intervals, and the sums of blocks of path."""
-    summary = error_summary(errors_m[:, None])
+    summary = statistics.error_summary(errors_m[:, None])
     p50, p95, expected = (float(one[0]) for one in (summary.p50, summary.p95, summary.expected))
-    blocks = cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
-    sums = block_sums(errors_m, blocks, sort_trials(errors_m), p50, p95)
-    low, high, p95_low, p95_high = error_intervals(errors_m, blocks, sums, p95)
-    return ErrorsAt(horizon_m, *map(known, (p95, p95_low, p95_high, expected, low, high))), sums
+    blocks = statistics.cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
+    sums = statistics.block_sums(errors_m, blocks, statistics.sort_trials(errors_m), p50, p95)
+    low, high, p95_low, p95_high = statistics.error_intervals(errors_m, blocks, sums, p95)
+    return documents.ErrorsAt(horizon_m, *map(known, (p95, p95_low, p95_high, expected, low, high))), sums
 
 
-def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[ErrorsAt]:
+def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[documents.ErrorsAt]:
     """Return the difference of errors at each horizon, second minus first; of the same trials only where both are."""
     found = []
     same = np.array_equal(first.path, second.path)
@@ -194,9 +182,9 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[Error
         for metric, name in (("p95", "p95_m"), ("expected", "expected_m")):
             then, now = getattr(before, name), getattr(after, name)
             more = math.nan if then is None or now is None else now - then
-            half = difference_half_width(new, old, metric, 1.0, paired=paired)
+            half = statistics.difference_half_width(new, old, metric, 1.0, paired=paired)
             numbers += [known(more), known(more - half), known(more + half)]
-        found.append(ErrorsAt(horizon, *numbers))
+        found.append(documents.ErrorsAt(horizon, *numbers))
     return found
 
 
@@ -211,10 +199,12 @@ def same_route(first: Track, second: Track) -> bool:
     return bool(np.abs(places[1] - places[0]).max() < SAME_ROUTE_M)
 
 
-def _parameter_differences(first: Calibration, second: Calibration) -> tuple[ParameterDifference, ...]:
+def _parameter_differences(first: Calibration, second: Calibration) -> tuple[documents.ParameterDifference, ...]:
     found = []
     for name in COMPARED:
         before, after = first.geometry[name], second.geometry[name]
         difference, std = after - before, math.hypot(first.geometry_std[name], second.geometry_std[name])
-        found.append(ParameterDifference(name, before, after, difference, std, abs(difference) > TWO_SIDED * std))
+        found.append(
+            documents.ParameterDifference(name, before, after, difference, std, abs(difference) > TWO_SIDED * std)
+        )
     return tuple(found)

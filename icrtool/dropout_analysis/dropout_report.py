@@ -16,6 +16,7 @@ from icrtool import __version__
 from icrtool.calibration.pooled import predictor, turning_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_models import FITTED_TO, ComparedModels, ComparedRow, Model, compare_models
+from icrtool.dropout_analysis import shown_paths
 from icrtool.dropout_analysis.report import (
     BaselineReport,
     DropoutReport,
@@ -25,42 +26,21 @@ from icrtool.dropout_analysis.report import (
     parse_gate,
     verdict_on,
 )
-from icrtool.dropout_analysis.shown_paths import (
-    example_trials,
-    force_outages,
-    plan_outages,
-    real_outages,
-    worst_trials,
-)
 from icrtool.dropout_analysis.starts import Starts, split_by_turning, with_smoothed_reference
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
 from icrtool.kernels.open_loop import TOLERANCE_M
+from icrtool.records import dropout_document as documents
 from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.dropout import DEFAULT_SEED, BudgetDistance, Gate, TurningSplit, UsedCalibration, Verdict
-from icrtool.records.dropout_document import (
-    DROPOUT_SCHEMA,
-    BaselineDocument,
-    CountDocument,
-    DropoutDocument,
-    ErrorRow,
-    EventCostDocument,
-    ExampleTrial,
-    FitDocument,
-    IntervalsDocument,
-    LadderDocument,
-    Outage,
-    RunOfReport,
-    ScoreDocument,
-)
 from icrtool.records.plain_data import plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type
 from icrtool.records.text import distance_text
 
-ERRORS = len(ErrorRow.__struct_fields__)
+ERRORS = len(documents.ErrorRow.__struct_fields__)
 
 
 def dropout(
@@ -178,8 +158,8 @@ def dropout_report(
     lengths_s = forced_lengths_s(run, outage_s)
     if outage_at_s and not lengths_s:
         raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
-    plans = [plan_outages(run, length, outage_at_s) for length in lengths_s]
-    forced = [outage for plan in plans for outage in force_outages(run, plan)]
+    plans = [shown_paths.plan_outages(run, length, outage_at_s) for length in lengths_s]
+    forced = [outage for plan in plans for outage in shown_paths.force_outages(run, plan)]
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
     unusable = "" if run.usable or allow_unusable else str(run.document.unusable_because)
     used, further = _calibration_rows(compared, () if unusable else calibrations)
@@ -212,9 +192,9 @@ def dropout_report(
         calibrations=used,
         smoothed=reference == "smoothed",
         with_jumps=with_jumps,
-        examples=example_trials(compared),
-        worst=worst_trials(compared, found, starts=starts),
-        outages=(*forced, *real_outages(compared)),
+        examples=shown_paths.example_trials(compared),
+        worst=shown_paths.worst_trials(compared, found, starts=starts),
+        outages=(*forced, *shown_paths.real_outages(compared)),
         budgets=() if unusable else tuple(one for budget in budgets_m for one in budget_distances(errors, budget)),
         gates=tuple(
             verdict_on(gate, run.name, passed=False, unusable=unusable)
@@ -233,8 +213,8 @@ def _report(
     with_events: OpenLoopErrors | None = None, calibrations: tuple[UsedCalibration, ...] = (),
     budgets: tuple[BudgetDistance, ...] = (), gates: tuple[Verdict, ...] = (),
     by_turning: tuple[TurningSplit, ...] = (), compared_models: ComparedModels | None = None, no_comparison: str = "",
-    worst: tuple[ExampleTrial, ...] = (), examples: tuple[ExampleTrial, ...] = (), outages: tuple[Outage, ...] = (),
-    baseline: BaselineReport | None = None, usable: bool = True,
+    worst: tuple[documents.ExampleTrial, ...] = (), examples: tuple[documents.ExampleTrial, ...] = (),
+    outages: tuple[documents.Outage, ...] = (), baseline: BaselineReport | None = None, usable: bool = True,
 ) -> DropoutReport:  # fmt: skip
     """Return the report of a run.
 
@@ -247,16 +227,18 @@ def _report(
     cost = None
     if with_events is not None:
         all_rows = {one.name: one.document.by_horizon for one in with_events.results}
-        numbers = {name: [ErrorRow(*astuple(row)[:ERRORS]) for row in found] for name, found in all_rows.items()}
-        cost = EventCostDocument(len(run.sensors.events), numbers)
+        numbers = {
+            name: [documents.ErrorRow(*astuple(row)[:ERRORS]) for row in rows] for name, rows in all_rows.items()
+        }
+        cost = documents.EventCostDocument(len(run.sensors.events), numbers)
     earlier = None
     if baseline is not None:
         same, changes = baseline.is_of(run.document), baseline.changes(run.document)
-        earlier = BaselineDocument(baseline.path, baseline.log, baseline.tool_version, same, changes)
-    document = DropoutDocument(
-        schema=DROPOUT_SCHEMA,
+        earlier = documents.BaselineDocument(baseline.path, baseline.log, baseline.tool_version, same, changes)
+    document = documents.DropoutDocument(
+        schema=documents.DROPOUT_SCHEMA,
         tool_version=__version__,
-        run=RunOfReport(*(getattr(run.document, key) for key in RunOfReport.__struct_fields__)),
+        run=documents.RunOfReport(*(getattr(run.document, key) for key in documents.RunOfReport.__struct_fields__)),
         usable=run.usable,
         unusable_because=run.document.unusable_because,
         reference=f"the {'smoother' if smoothed else 'filter'}'s estimate at the end of the trial",
@@ -268,7 +250,7 @@ def _report(
         without_events=cost,
         tolerance_m=TOLERANCE_M,
         # the key and its parts keep their names; nothing is resampled
-        bootstrap=IntervalsDocument(
+        bootstrap=documents.IntervalsDocument(
             method="Student's t over blocks of path",
             block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",
             resamples=0,
@@ -299,7 +281,7 @@ def _report(
     )  # fmt: skip
 
 
-def _counts(errors: OpenLoopErrors, with_events: OpenLoopErrors | None) -> Iterator[CountDocument]:
+def _counts(errors: OpenLoopErrors, with_events: OpenLoopErrors | None) -> Iterator[documents.CountDocument]:
     """Yield how many starts were a trial at each horizon, and why the others were none."""
     # starts at a gap, at an outage or at a standstill are counted as without the option
     counts = (with_events or errors).counts
@@ -318,15 +300,15 @@ def _counts(errors: OpenLoopErrors, with_events: OpenLoopErrors | None) -> Itera
         why = ", ".join(f"{text} ({starts[key]:,} starts)" for key, (text, _) in reasons.items() if starts[key])
         if starts["too_little_way_left"] == errors.states:
             why = reasons["too_little_way_left"][0]
-        yield CountDocument(horizon_m, trials, starts, None if trials else why)
+        yield documents.CountDocument(horizon_m, trials, starts, None if trials else why)
 
 
 def _ladder(
     errors: OpenLoopErrors, calibrations: Sequence[UsedCalibration], found: ComparedModels | None, why_none: str
-) -> LadderDocument:
+) -> documents.LadderDocument:
     """Return how the models were compared; why there is no comparison where it was left out."""
     if found is None:
-        return LadderDocument(left_out=why_none)
+        return documents.LadderDocument(left_out=why_none)
     given, turned = {one.name for one in calibrations}, f"_{found.heading}"
     models = []
     for one in errors.results:
@@ -335,12 +317,14 @@ def _ladder(
             fitted = FITTED_TO.get(one.name.removesuffix(turned) if with_heading else one.name, "held out")
             rows = [astuple(row)[1:ERRORS] for row in one.document.by_horizon]
             heading = found.heading if with_heading else "wheels"
-            models.append(ScoreDocument(one.name, one.label, fitted, heading, *map(list, zip(*rows, strict=True))))
+            models.append(
+                documents.ScoreDocument(one.name, one.label, fitted, heading, *map(list, zip(*rows, strict=True)))
+            )
     fits = {}
     for name, fit in found.fits.items():
-        columns = (fit.parameters, fit.std)
-        fits[name] = FitDocument(*(plain(dict(zip(fit.model.terms, column, strict=True))) for column in columns))
-    return LadderDocument(
+        value, std = (dict(zip(fit.model.terms, column.tolist(), strict=True)) for column in (fit.parameters, fit.std))
+        fits[name] = documents.FitDocument(plain(value), plain(std))
+    return documents.LadderDocument(
         horizons_m=errors.horizons_m.tolist(),
         blocks=found.blocks,
         starts=int(np.count_nonzero((found.trials.ends >= 0).any(axis=1))),

@@ -25,19 +25,8 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import BlockSums, difference_half_width, within_budget
 from icrtool.kernels.track import TrialCounts
 from icrtool.motion.models import FAMILY
+from icrtool.records import dropout_document as documents
 from icrtool.records.dropout import METRICS, BudgetDistance, Gate, Verdict
-from icrtool.records.dropout_document import (
-    DropoutDocument,
-    EarlierReport,
-    ErrorRow,
-    ExampleTrial,
-    LearnedDocument,
-    ModelResult,
-    Outage,
-    ReferenceRow,
-    SummaryRow,
-    column_of,
-)
 from icrtool.records.plain_data import plain
 from icrtool.records.run import FigureSet, call_output
 from icrtool.records.run_document import RunDocument, known_content
@@ -80,14 +69,14 @@ class OpenLoopErrors:
 
     run_document: RunDocument
     horizons_m: Floats
-    results: tuple[ModelResult, ...]
+    results: tuple[documents.ModelResult, ...]
     counts: TrialCounts
     states: int
     standing: int
-    reference: tuple[ReferenceRow, ...]
-    by_learning: LearnedDocument | None
+    reference: tuple[documents.ReferenceRow, ...]
+    by_learning: documents.LearnedDocument | None
 
-    def result(self, model: str) -> ModelResult | None:
+    def result(self, model: str) -> documents.ModelResult | None:
         """Return the result of a model, None when it was not computed."""
         return next((result for result in self.results if result.name == model), None)
 
@@ -109,14 +98,14 @@ class DropoutReport(OpenLoopErrors):
     baseline : an earlier report that this one is compared with
     """
 
-    document: DropoutDocument
+    document: documents.DropoutDocument
     run_directory: Path | None
     reference_north_m: Floats
     reference_east_m: Floats
     usable: bool = True
-    worst: tuple[ExampleTrial, ...] = ()
-    examples: tuple[ExampleTrial, ...] = ()
-    outages: tuple[Outage, ...] = ()
+    worst: tuple[documents.ExampleTrial, ...] = ()
+    examples: tuple[documents.ExampleTrial, ...] = ()
+    outages: tuple[documents.Outage, ...] = ()
     calibration: Calibration | None = None
     baseline: BaselineReport | None = None
 
@@ -137,7 +126,7 @@ class DropoutReport(OpenLoopErrors):
 
         h, models = len(self.horizons_m), self.document.models
         rows = [row for one in models for row in one.by_horizon]
-        columns = {name: column_of(rows, name) for name in SummaryRow.__struct_fields__}
+        columns = {name: documents.column_of(rows, name) for name in documents.SummaryRow.__struct_fields__}
         columns["trials"] = columns["trials"].astype(np.int64)
         return pd.DataFrame({"model": [one.name for one in models for _ in range(h)], **columns})
 
@@ -186,7 +175,7 @@ class BaselineReport:
 
     log: str
     path: str
-    document: EarlierReport
+    document: documents.EarlierReport
 
     @property
     def sha256(self) -> tuple[str, ...]:
@@ -198,7 +187,7 @@ class BaselineReport:
         """Version that made it."""
         return escaped(self.document.tool_version)
 
-    def at(self, model: str, horizon_m: float) -> tuple[ErrorRow | None, BlockSums | None]:
+    def at(self, model: str, horizon_m: float) -> tuple[documents.ErrorRow | None, BlockSums | None]:
         """Return the numbers of a model at a horizon, and their block sums; None for what the report does not have."""
         for one in self.document.models:
             for row in one.by_horizon:
@@ -208,7 +197,7 @@ class BaselineReport:
                         return row, None
                     counts = (np.array(column, np.int64) for column in (found.trials, found.above_p50, found.above_p95))
                     trials, above_p50, above_p95 = counts
-                    growth = (float(column_of([found], name)[0]) for name in ("p50_slope_m", "p95_slope_m"))
+                    growth = (float(documents.column_of([found], name)[0]) for name in ("p50_slope_m", "p95_slope_m"))
                     return row, BlockSums(trials, np.array(found.errors_m, np.float64), above_p50, above_p95, *growth)
         return None, None
 
@@ -225,12 +214,14 @@ class BaselineReport:
             if row is None:
                 what = f"no {gate.model} over {gate.horizon_m:g} m in the baseline {self.path}"
                 raise ConfigError(f"gate {gate.text!r}", what, "make the baseline again")
-            return float(column_of([row], METRICS[gate.metric])[0]), sums
+            return float(documents.column_of([row], METRICS[gate.metric])[0]), sums
         rows = [row for one in self.document.models if one.name == gate.model for row in one.by_horizon]
         if not rows:
             raise ConfigError(f"gate {gate.text!r}", f"no {gate.model} in the baseline {self.path}", "make it again")
         rows.sort(key=lambda row: row.horizon_m)
-        reached = within_budget(column_of(rows, "horizon_m"), column_of(rows, "p95_m"), gate.budget_m)
+        reached = within_budget(
+            documents.column_of(rows, "horizon_m"), documents.column_of(rows, "p95_m"), gate.budget_m
+        )
         return (math.nan if reached is None else reached[0]), None
 
     def changes(self, run_document: RunDocument) -> tuple[str, ...]:
@@ -278,7 +269,7 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
             )
             # An end that stays within the budget as far as there are intervals has no such distance.
             low, high = (None if end is None or end[1] else end[0] for end in ends)
-            quiet = column_of(result.without_events, "p95_m")
+            quiet = documents.column_of(result.without_events, "p95_m")
             free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
             without = (None, False) if free is None else free[:2]
             found.append(BudgetDistance(result.name, result.label, budget_m, *reached, low, high, *without))

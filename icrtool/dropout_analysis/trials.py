@@ -14,33 +14,13 @@ from icrtool.calibration.run_models import ComparedRow, Model, models_of
 from icrtool.dropout_analysis.report import OpenLoopErrors
 from icrtool.dropout_analysis.starts import Starts, first_learned, reference_error, standing_states
 from icrtool.errors import ConfigError, DataError
+from icrtool.kernels import error_statistics as statistics
 from icrtool.kernels.arrays import Bools, Floats, Ints
-from icrtool.kernels.error_statistics import (
-    Blocks,
-    BlockSums,
-    Histogram,
-    block_sums,
-    cut_blocks,
-    error_intervals,
-    error_summary,
-    histogram_sorted,
-    round_bin_width,
-    sort_trials,
-    summary_of_sorted,
-)
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop import open_loop_errors
 from icrtool.kernels.track import STANDING, FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
 from icrtool.motion.recording import MOST_TRIALS, Trials
-from icrtool.records.dropout_document import (
-    BlocksDocument,
-    ErrorRow,
-    LearnedDocument,
-    ModelDocument,
-    ModelResult,
-    ReferenceRow,
-    SummaryRow,
-)
+from icrtool.records import dropout_document as documents
 from icrtool.records.plain_data import known, plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import Run, track_of
@@ -97,34 +77,34 @@ def measure_errors(
     if len({model.name for model in predictors}) < len(predictors):
         raise ValueError("two models have the same name")
     standing, learned = standing_states(track), first_learned(run)
-    left_out = standing if starts == "moving" else np.zeros_like(standing)
     sparse = starts_of_further
     if sparse is None:
         moving = np.flatnonzero(~standing)
         sparse = moving[:: max(len(moving) // MOST_TRIALS, 1)]
     counts: list[TrialCounts] = []
-    reference: list[ReferenceRow] = []
+    reference: list[documents.ReferenceRow] = []
     found: list[list[_AtHorizon]] = [[] for _ in predictors]
-    before: list[ErrorRow] = []
-    after: list[ErrorRow] = []
+    before: list[documents.ErrorRow] = []
+    after: list[documents.ErrorRow] = []
     together = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
     with ThreadPoolExecutor(THREADS) as pool:
         for begin in range(0, len(horizons), together):
             group = horizons[begin : begin + together]
-            ends, of_group = _ends(track, group, left_out, pool)
+            ends, of_group = _ends(track, group, standing if starts == "moving" else np.zeros_like(standing), pool)
             counts.append(of_group)
             trials = Trials(sparse, ends[:, sparse].T.astype(np.int64))
-            blocks, slipping = _blocks(track.distance, group, ends, pool), _slipping_trials(run, ends)
+            blocks = _blocks(track.distance, group, (one >= 0 for one in ends))
+            slipping = _slipping_trials(run, ends)
             for model, rows in zip(predictors, found, strict=True):
                 give_back_freed()
                 if isinstance(model, ComparedRow):
                     errors, turned = model.errors_of(trials)
-                    tested = _blocks(track.distance[sparse], group, np.isfinite(errors.T) - 1, pool)
-                    touching = None if slipping is None else slipping[sparse]
+                    tested = _blocks(track.distance[sparse], group, np.isfinite(errors.T))
+                    touching = [None if one is None else one[sparse] for one in slipping]
                 else:
                     errors, turned = _errors(track, model, ends, pool), _turn_errors(track, model.icrs, trials)
                     tested, touching = blocks, slipping
-                rows.extend(_at_horizons(group, errors, turned, tested, touching, pool))
+                rows.extend(pool.map(_at_horizon, group.tolist(), errors.T, turned.T, tested, touching))
                 if model.name == "icr":
                     first = len(errors) if learned is None else learned
                     before += _rows(group, errors[:first])
@@ -139,7 +119,7 @@ def measure_errors(
     by_learning = None
     if before:
         at, driven = (None if learned is None else float(one[learned]) for one in (run.table.t_s, run.table.distance_m))
-        by_learning = LearnedDocument("icr", at, driven, before, after)
+        by_learning = documents.LearnedDocument("icr", at, driven, before, after)
     return OpenLoopErrors(
         run_document=run.document,
         horizons_m=horizons,
@@ -155,18 +135,18 @@ def measure_errors(
 class _AtHorizon(NamedTuple):
     """The errors of one model at one horizon; `free`: of the trials that touch no slip event."""
 
-    row: SummaryRow
-    bins: Histogram
-    sums: BlockSums | None
-    free: ErrorRow | None
+    row: documents.SummaryRow
+    bins: statistics.Histogram
+    sums: statistics.BlockSums | None
+    free: documents.ErrorRow | None
 
 
-def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> Bools | None:
-    """Return which trials (n, h) touch a slip event, by their ends (h, n); None where the run has no event."""
+def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> list[Bools | None]:
+    """Return which trials (n,) of each horizon touch a slip event, by their ends (h, n); None where there is none."""
     if not run.sensors.events:
-        return None
+        return [None] * len(ends)
     before: Ints = np.cumsum(run.slipping) - run.slipping
-    return np.asarray((before[np.maximum(ends, 0)] > before).T)
+    return list(before[np.maximum(ends, 0)] > before)
 
 
 def _turn_errors(track: Track, icrs: FrozenIcrs, trials: Trials) -> Floats:
@@ -231,19 +211,17 @@ def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tu
     return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
 
 
-def _rows(horizons: Floats, errors: Floats) -> list[ErrorRow]:
+def _rows(horizons: Floats, errors: Floats) -> list[documents.ErrorRow]:
     """Return errors (n, h) [m] in numbers, a row a horizon."""
-    found = error_summary(errors)
-    return list(map(ErrorRow, *plain([horizons, found.trials, found.expected, found.p50, found.p95, found.largest])))
+    found = statistics.error_summary(errors)
+    return list(
+        map(documents.ErrorRow, *plain([horizons, found.trials, found.expected, found.p50, found.p95, found.largest]))
+    )
 
 
-def _blocks(path_m: Floats, horizons: Floats, ends: NDArray[np.signedinteger], pool: Executor) -> list[Blocks | None]:
-    """Return the blocks of path of each horizon; `ends` (h, n) are negative where there is no trial."""
-
-    def cut(h: int) -> Blocks | None:
-        return cut_blocks(ends[h] >= 0, path_m, float(horizons[h]))
-
-    return list(pool.map(cut, range(len(horizons))))
+def _blocks(path_m: Floats, horizons: Floats, tried: Iterable[Bools]) -> list[statistics.Blocks | None]:
+    """Return the blocks of path of each horizon; `tried` (n,) of each marks the starts with a trial."""
+    return [statistics.cut_blocks(one, path_m, metres) for one, metres in zip(tried, horizons.tolist(), strict=True)]
 
 
 def _errors(track: Track, model: Model, ends: NDArray[np.int32], pool: Executor) -> Floats:
@@ -258,41 +236,36 @@ def _errors(track: Track, model: Model, ends: NDArray[np.int32], pool: Executor)
     return errors.T
 
 
-def _at_horizons(
-    horizons: Floats, errors: Floats, turned: Floats, blocks: Sequence[Blocks | None], slipping: Bools | None,
-    pool: Executor,
-) -> list[_AtHorizon]:  # fmt: skip
-    """Return the errors of one model in numbers, horizon by horizon; `turned` are those of its turns [rad].
+def _at_horizon(
+    metres: float, errors: Floats, turned: Floats, blocks: statistics.Blocks | None, slipping: Bools | None
+) -> _AtHorizon:
+    """Return the errors (n,) of one model at one horizon in numbers; `turned` (k,) are those of its turns [rad].
 
-    `slipping` (n, h) marks the trials that touch a slip event.
+    `slipping` (n,) marks the trials that touch a slip event.
     """
-
-    def at_horizon(h: int) -> _AtHorizon:
-        column, metres = errors[:, h : h + 1], float(horizons[h])
-        ordered = sort_trials(column[:, 0])
-        trials, *found = (one[0] for one in summary_of_sorted([ordered]))
-        expected, p50, p95, largest = map(float, found)
-        # Bins that show the bulk of the trials, few outliers apart, in at most some hundred bins.
-        shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
-        bins = histogram_sorted(ordered, round_bin_width(shown_m))
-        sums = block_sums(column[:, 0], blocks[h], ordered, p50, p95)
-        intervals = error_intervals(column[:, 0], blocks[h], sums, p95)
-        of_turns = error_summary(np.degrees(turned[:, h : h + 1]))
-        shares = 100.0 * expected / metres, 100.0 * p95 / metres
-        turns = float(of_turns.expected[0]), float(of_turns.p95[0])
-        row = SummaryRow(metres, int(trials), *map(known, (expected, p50, p95, largest, *shares, *intervals, *turns)))
-        free = None if slipping is None else _rows(horizons[h : h + 1], column[~slipping[:, h]])[0]
-        return _AtHorizon(row, bins, sums, free)
-
-    return list(pool.map(at_horizon, range(len(blocks))))
+    ordered = statistics.sort_trials(errors)
+    trials, *found = (one[0] for one in statistics.summary_of_sorted([ordered]))
+    expected, p50, p95, largest = map(float, found)
+    # Bins that show the bulk of the trials, few outliers apart, in at most some hundred bins.
+    shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
+    bins = statistics.histogram_sorted(ordered, statistics.round_bin_width(shown_m))
+    sums = statistics.block_sums(errors, blocks, ordered, p50, p95)
+    intervals = statistics.error_intervals(errors, blocks, sums, p95)
+    of_turns = statistics.error_summary(np.degrees(turned[:, None]))
+    shares = 100.0 * expected / metres, 100.0 * p95 / metres
+    numbers = (expected, p50, p95, largest, *shares, *intervals, of_turns.expected[0], of_turns.p95[0])
+    row = documents.SummaryRow(metres, int(trials), *(known(float(number)) for number in numbers))
+    free = None if slipping is None else _rows(np.array([metres]), errors[~slipping, None])[0]
+    return _AtHorizon(row, bins, sums, free)
 
 
-def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> ModelResult:
+def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> documents.ModelResult:
     """Return the errors of one model from those at each horizon."""
     rows, bins, sums, free = zip(*found, strict=True)
-    blocks = [
-        BlocksDocument(row.horizon_m, **plain(one._asdict() | {"errors_m": [float(f"{e:.6g}") for e in one.errors_m]}))
-        for row, one in zip(rows, sums, strict=True) if one is not None
-    ]  # fmt: skip
-    document = ModelDocument(model.name, model.label, model.knows, list(rows), blocks)
-    return ModelResult(document, bins, sums, tuple(row for row in free if row is not None))
+    blocks = []
+    for row, one in zip(rows, sums, strict=True):
+        if one is not None:
+            errors_m = [float(f"{error:.6g}") for error in one.errors_m]
+            blocks.append(documents.BlocksDocument(row.horizon_m, **plain(one._asdict() | {"errors_m": errors_m})))
+    document = documents.ModelDocument(model.name, model.label, model.knows, list(rows), blocks)
+    return documents.ModelResult(document, bins, sums, tuple(row for row in free if row is not None))

@@ -85,7 +85,8 @@ class BudgetDistance(Record, frozen=True):
         """``14.1 m``, ``about 14 m`` or ``less than 1 m`` between far horizons, or ``more than 20 m``."""
         if self.beyond:
             return f"more than {self.distance_m:g} m"
-        if not self._far:
+        low, high = self.between_m
+        if high - low <= NEAR_HORIZONS_M:
             return f"{self.distance_m:.1f} m"
         # The error grows faster than the distance: on a straight line between far horizons it comes out too long.
         return f"about {self.distance_m:.0f} m" if self.distance_m >= 1.0 else "less than 1 m"
@@ -103,14 +104,9 @@ class BudgetDistance(Record, frozen=True):
     def reach_text(self) -> str:
         """As `short_text`, with the horizons that it was interpolated between where they are far."""
         low, high = self.between_m
-        if self.beyond or not self._far:
+        if self.beyond or high - low <= NEAR_HORIZONS_M:
             return self.short_text
         return f"{self.distance_m:.1f} m (interpolated between {low:g} and {high:g} m)"
-
-    @property
-    def _far(self) -> bool:
-        low, high = self.between_m
-        return high - low > NEAR_HORIZONS_M
 
     @property
     def interval_text(self) -> str:
@@ -184,18 +180,15 @@ class Verdict(Gate, frozen=True, kw_only=True):
         if self.value_m is None:
             length = f" of {self.horizon_m:g} m" if self.horizon_m is not None else ""
             return f"{word}  {self.text}: no trial{length} in this log{log}"
-        return f"{word}  {self.text}: {self.value_m:.4g} m{self._bound_text()}{log}"
-
-    def _bound_text(self) -> str:
         numbers = (self.margin_m, self.value_bound_m, self.baseline_m)
         margin_m, bound_m, baseline_m = (math.nan if one is None else one for one in numbers)
-        margin = f", margin {margin_m:+.4g} m"
-        if not self.relative:
-            return margin
-        interval = ", no interval"
-        if self.margin_low_m is not None:
-            interval = f" (95 %: {self.margin_low_m:+.4g} to {self.margin_high_m:+.4g} m)"
-        return f", bound {bound_m:.4g} m (baseline {baseline_m:.4g} m){margin}{interval}"
+        bound = f"margin {margin_m:+.4g} m"
+        if self.relative:
+            interval = ", no interval"
+            if self.margin_low_m is not None:
+                interval = f" (95 %: {self.margin_low_m:+.4g} to {self.margin_high_m:+.4g} m)"
+            bound = f"bound {bound_m:.4g} m (baseline {baseline_m:.4g} m), {bound}{interval}"
+        return f"{word}  {self.text}: {self.value_m:.4g} m, {bound}{log}"
 
 
 class TurningSplit(Record, frozen=True):

@@ -175,7 +175,7 @@ class Run:
     def convergence_s(self) -> dict[IcrColumn, tuple[float, float] | None]:
         """By ICR column, first and last second of the 10-90 % convergence, or None."""
         spans = self.document.icr.convergence_span_s
-        return {name: getattr(spans, name) for name in ICR_COLUMNS}
+        return {name: spans[name] for name in ICR_COLUMNS}
 
     @property
     def settled_s(self) -> float:

@@ -6,7 +6,7 @@ A key that a later version adds has a default, so that older runs can still be r
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Literal
+from typing import Annotated, Generic, Literal, TypeVar
 
 import msgspec
 
@@ -20,6 +20,7 @@ RUN_SCHEMA: Literal["icrtool/run/1"] = "icrtool/run/1"
 
 Excited = Literal["shown", "weak", "not shown"]
 IcrColumn = Literal["y_icr_right_m", "y_icr_left_m", "x_icr_m"]
+Value = TypeVar("Value")
 Spans = tuple[tuple[int, int], ...]
 Three = msgspec.Meta(min_length=3, max_length=3)
 Matrix = Annotated[list[Annotated[list[float], Three]], Three]
@@ -43,36 +44,28 @@ def known_content(content: Iterable[str | None]) -> tuple[str, ...]:
     return () if None in found else tuple(map(str, found))
 
 
-class NumberByIcr(Record, frozen=True):
+class ByIcr(Record, Generic[Value], frozen=True):
+    """A value of each ICR."""
+
+    y_icr_right_m: Value
+    y_icr_left_m: Value
+    x_icr_m: Value
+
+    def __getitem__(self, column: IcrColumn) -> Value:
+        value: Value = getattr(self, column)
+        return value
+
+
+class NumberByIcr(ByIcr[float | None], frozen=True):
     """A number of each ICR, null where there is none."""
 
-    y_icr_right_m: float | None
-    y_icr_left_m: float | None
-    x_icr_m: float | None
 
-    def __getitem__(self, column: IcrColumn) -> float | None:
-        number: float | None = getattr(self, column)
-        return number
-
-
-class SpanByIcr(Record, frozen=True):
+class SpanByIcr(ByIcr[tuple[float, float] | None], frozen=True):
     """Begin and end of each ICR's convergence [s], null where it did not converge."""
 
-    y_icr_right_m: tuple[float, float] | None
-    y_icr_left_m: tuple[float, float] | None
-    x_icr_m: tuple[float, float] | None
 
-
-class VerdictByIcr(Record, frozen=True):
+class VerdictByIcr(ByIcr[Excited], frozen=True):
     """Whether each ICR was shown."""
-
-    y_icr_right_m: Excited
-    y_icr_left_m: Excited
-    x_icr_m: Excited
-
-    def __getitem__(self, column: IcrColumn) -> Excited:
-        verdict: Excited = getattr(self, column)
-        return verdict
 
     @property
     def all_shown(self) -> bool:
