@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.fleet.one_log import ReportOptions, TrialOptions
-    from icrtool.output.files.baseline_file import Baseline
+    from icrtool.output.dropout_directory import Baseline
     from icrtool.records.run import Run
 
 EPILOG_GATE = (

@@ -29,13 +29,14 @@ with when_used():
     from icrtool import config, errors
     from icrtool.dropout_analysis import report
     from icrtool.logs.containers import open_log
+    from icrtool.output import dropout_directory
     from icrtool.output.exports import acceptance
-    from icrtool.output.files import atomic, baseline_file, formats
+    from icrtool.output.files import atomic, formats
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
+    from icrtool.output.dropout_directory import Baseline
     from icrtool.output.exports.acceptance import Suite
-    from icrtool.output.files.baseline_file import Baseline
     from icrtool.records.dropout import Verdict
     from icrtool.records.fleet_document import FleetVerdict
 
@@ -327,7 +328,7 @@ def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
     """Find the reports of --baseline; refuse gates that cannot be read, or need one where there is none."""
     relative = [gate.text for gate in map(report.parse_gate, gates) if gate.baseline_factor]
     if place is not None:
-        return baseline_file.open_baseline(place)
+        return dropout_directory.open_baseline(place)
     if relative:
         advice = "name it with --baseline REPORT.json|DIR"
         raise errors.ConfigError(f"gate {relative[0]!r}", "needs an earlier report", advice)

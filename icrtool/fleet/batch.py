@@ -91,7 +91,7 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions, folder: Pa
     searched += [place for entry in entries for place in entry.places]
     baseline = ""
     if options.baseline is not None:
-        from icrtool.output.files.baseline_file import open_baseline
+        from icrtool.output.dropout_directory import open_baseline
 
         if options.baseline.resolve() == output.resolve():
             raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")

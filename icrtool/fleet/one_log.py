@@ -325,7 +325,7 @@ def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, .
 
 def _results(request: Request, stage: Stage) -> FleetLog:
     """Fit and analyse a log, write run and report, and return its row."""
-    from icrtool.output.files.baseline_file import open_baseline
+    from icrtool.output.dropout_directory import open_baseline
 
     path, folder = path_of(request.path), path_of(request.folder)
     asked = FitOptions(request.overwrite, request.report.plots, request.report.figures)

@@ -1,23 +1,33 @@
-"""``RUN/dropout/``: what `icrtool dropout-report` leaves behind, whole or not at all, and what report.json holds."""
+"""``RUN/dropout/``: what `icrtool dropout-report` leaves behind, whole or not at all, and what report.json holds.
+
+And the reports that a later one is compared with: a report.json, those of runs, or those of a batch.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.dropout_analysis.trials import ErrorSink
-from icrtool.kernels.arrays import Ints
+from icrtool.errors import ConfigError
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.output.files.atomic import atomic_directory, files_in
-from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, schema_of
-from icrtool.output.files.states_file import trials_file
+from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, logs_of_fleet, read_document, schema_of
 from icrtool.output.run_directory import is_run_directory
-from icrtool.records.dropout_document import DropoutDocument, SummaryRow, TrialDocument
+from icrtool.records.dropout_document import DropoutDocument, EarlierReport, SummaryRow
+from icrtool.records.fleet_document import FLEET_FILE
+from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
 from icrtool.records.run import FigureSet
+from icrtool.records.run_document import known_content
+from icrtool.records.text import escaped
 
 REPORT_FILE = "report.json"
 TRIALS_FILE = "trials.parquet"
@@ -84,8 +94,16 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
     document = report.document
     summary = ((one.name, *msgspec.structs.astuple(row)) for one in document.models for row in one.by_horizon)
     (directory / "summary.csv").write_bytes(csv_bytes(("model", *SummaryRow.__struct_fields__), summary))
-    (directory / "histogram.csv").write_bytes(csv_bytes(HISTOGRAM_COLUMNS, _histogram_rows(report)))
-    (directory / "worst.csv").write_bytes(csv_bytes(WORST_COLUMNS, _worst_rows(document.worst)))
+    histogram: list[tuple[Any, ...]] = []
+    for result in report.results:
+        for horizon, bins in zip(report.horizons_m, result.histograms, strict=True):
+            histogram += [(result.name, horizon, *row) for row in zip(*bins, strict=True)]
+    (directory / "histogram.csv").write_bytes(csv_bytes(HISTOGRAM_COLUMNS, histogram))
+    worst: list[tuple[Any, ...]] = []
+    for rank, trial in enumerate(document.worst, start=1):
+        *columns, errors = msgspec.structs.astuple(trial)
+        worst.append((rank, *columns, *(errors.get(model) for model in ERROR_COLUMNS)))
+    (directory / "worst.csv").write_bytes(csv_bytes(WORST_COLUMNS, worst))
     if document.ladder.models:
         (directory / "ladder.csv").write_bytes(csv_bytes(COMPARISON_COLUMNS, comparison_rows(document)))
     (directory / REPORT_FILE).write_bytes(json_bytes(document))
@@ -114,14 +132,159 @@ def comparison_rows(report: DropoutDocument) -> Iterator[tuple[Any, ...]]:
             yield score.name, score.fitted, score.heading, *numbers
 
 
-def _histogram_rows(report: DropoutReport) -> Iterator[tuple[Any, ...]]:
-    for result in report.results:
-        for horizon, bins in zip(report.horizons_m, result.histograms, strict=True):
-            for row in zip(*bins, strict=True):
-                yield result.name, horizon, *row
+ROWS_A_GROUP = 1 << 18
+"""Trials written at a time: 6 MB."""
 
 
-def _worst_rows(worst: Sequence[TrialDocument]) -> Iterator[tuple[Any, ...]]:
-    for rank, trial in enumerate(worst, start=1):
-        *columns, errors = msgspec.structs.astuple(trial)
-        yield rank, *columns, *(errors.get(model) for model in ERROR_COLUMNS)
+@contextmanager
+def trials_file(path: Path, stamp_ns: Ints) -> Iterator[ErrorSink]:
+    """Give a sink that appends trials to a new Parquet file; starts without a trial are left out.
+
+    Parameters
+    ----------
+    path : the file to make
+    stamp_ns : (n,) of the starts
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = pa.dictionary(pa.int8(), pa.string())
+    schema = pa.schema({"model": names, "stamp_ns": pa.int64(), "horizon_m": pa.float64(), "error_m": pa.float64()})
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+
+        def append(model: str, horizons_m: Floats, errors_m: Floats) -> None:
+            for h, horizon in enumerate(horizons_m):
+                for lo in range(0, len(stamp_ns), ROWS_A_GROUP):
+                    error = errors_m[lo : lo + ROWS_A_GROUP, h]
+                    tried = ~np.isnan(error)
+                    rows = int(np.count_nonzero(tried))
+                    model_column = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int8)), [model])
+                    columns = [
+                        model_column,
+                        pa.array(stamp_ns[lo : lo + ROWS_A_GROUP][tried]),
+                        pa.array(np.full(rows, float(horizon))),
+                        pa.array(error[tried]),
+                    ]
+                    writer.write_table(pa.table(columns, schema=schema))
+
+        yield append
+
+
+BASELINE_ADVICE = "name a report.json, a run with a dropout report, or the folder of a batch"
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """The reports of a baseline, read when they are needed.
+
+    Attributes
+    ----------
+    path : as it was named
+    reports : report.json by name of the log
+    sha256 : of each log's files
+    sources : the files that name the reports: fleet.json of a batch, else the reports
+    """
+
+    path: Path
+    reports: Mapping[str, Path]
+    sha256: Mapping[str, tuple[str, ...]]
+    sources: tuple[Path, ...]
+
+    @property
+    def folder(self) -> Path | None:
+        """The directory that was named; None where it was one report."""
+        return None if self.path.is_file() else self.path
+
+    @property
+    def digest(self) -> str:
+        """A text that changes with the content."""
+        return sha256(b"".join(read_regular(file, self.folder) for file in self.sources)).hexdigest()
+
+    def missing(self, logs: Iterable[str]) -> list[str]:
+        """Return the logs of the baseline that are not among some others, by name."""
+        return sorted(set(self.reports) - set(logs))
+
+    def find(self, name: str, content: Collection[str]) -> BaselineReport | None:
+        """Return the report of a log: that of the same content, else of the same name; None where there is none.
+
+        `content` is the SHA-256 of each of its files. A baseline that is one report file is that of any log.
+
+        Raises
+        ------
+        ConfigError
+            The report cannot be read.
+        """
+        found = next((log for log, files in self.sha256.items() if content and set(content) <= set(files)), None)
+        if found is None and self.path.is_file():
+            found = next(iter(self.reports))
+        found = found if found is not None else name if name in self.reports else None
+        return read_report(self.reports[found], found, self.folder) if found is not None else None
+
+
+def open_baseline(path: Path) -> Baseline:
+    """Find the reports of a baseline.
+
+    Raises
+    ------
+    ConfigError
+        There is none, or one cannot be read.
+    RunError
+        The fleet.json of a batch cannot be read.
+    """
+    if not path.is_file() and (path / FLEET_FILE).is_file():
+        logs = {one.log: (path / one.run / DROPOUT_DIRECTORY / REPORT_FILE, one) for one in logs_of_fleet(path)}
+        present = {log: found for log, found in logs.items() if is_regular(found[0], path)}
+        reports = {log: file for log, (file, _) in present.items()}
+        files = {log: known_content(file.sha256 for file in one.inputs) for log, (_, one) in present.items()}
+        sources: tuple[Path, ...] = (path / FLEET_FILE,)
+    else:
+        reports, files = {}, {}
+        for file in [path] if path.is_file() else _report_files(path):
+            one = read_report(file, inside=None if file == path else path)
+            if one.log in reports:
+                why = f"two reports of logs named {one.log}"
+                raise ConfigError(f"--baseline {path}", why, f"{reports[one.log]} and {file}")
+            reports[one.log], files[one.log] = file, one.sha256
+        sources = tuple(reports.values())
+    if not reports:
+        raise ConfigError(f"--baseline {path}", "no dropout report in it", BASELINE_ADVICE)
+    return Baseline(path, reports, files, sources)
+
+
+def read_report(path: Path, log: str = "", inside: Path | None = None) -> BaselineReport:
+    """Read a report.json as a baseline.
+
+    Parameters
+    ----------
+    log : its name in a batch; default: that in the report
+    inside : as in `open_regular`
+
+    Raises
+    ------
+    ConfigError
+        It is not a dropout report.
+    """
+    try:
+        document = read_document(path, EarlierReport, inside, escape=False)
+        if not document.schema.startswith(SCHEMA_FAMILY):
+            raise ValueError(document.schema)
+        return BaselineReport(escaped(log or document.run.log), str(path), document)
+    except OSError as err:
+        raise ConfigError(f"--baseline {path}", "cannot be read", err.strerror or str(err)) from err
+    except (ValueError, RecursionError) as err:
+        raise ConfigError(f"--baseline {path}", "not a complete dropout report", BASELINE_ADVICE) from err
+
+
+def _report_files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        if is_special(path):
+            raise ConfigError(f"--baseline {path}", NOT_REGULAR, SAVE_IT)
+        raise ConfigError(f"--baseline {path}", "no such file or directory", BASELINE_ADVICE)
+    if (path / REPORT_FILE).is_file():
+        return [path / REPORT_FILE]
+    return sorted(path.glob(f"**/{DROPOUT_DIRECTORY}/{REPORT_FILE}"))

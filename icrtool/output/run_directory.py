@@ -15,22 +15,10 @@ import numpy as np
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, OutputError, RunError
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, numbered_file, split_path
+from icrtool.output.files import formats, run_columns
 from icrtool.output.files.atomic import atomic_directory, check_directory, own_files
-from icrtool.output.files.formats import (
-    CHECKSUM_FILE,
-    PLOT_FORMATS,
-    csv_bytes,
-    file_b2sum,
-    json_bytes,
-    parse_json,
-    read_document,
-    read_sums,
-    schema_of,
-    write_sums,
-)
-from icrtool.output.files.measurements_file import MEASUREMENTS_FILE, read_measurements, spans_of, write_measurements
 from icrtool.output.files.remote_place import fetched, lies_there
-from icrtool.output.files.states_file import StatesFileError, StatesFormat, read_states, write_states
+from icrtool.output.files.run_columns import MEASUREMENTS_FILE, StatesFileError, StatesFormat
 from icrtool.records.plain_data import Record
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_regular
@@ -130,8 +118,8 @@ def new_run(
     OutputError
         A file or a foreign directory is there, or the disk does not take it.
     """
-    if unknown := set(plots) - set(PLOT_FORMATS):
-        raise ValueError(f"plots: {unknown} are not among {PLOT_FORMATS}")
+    if unknown := set(plots) - set(formats.PLOT_FORMATS):
+        raise ValueError(f"plots: {unknown} are not among {formats.PLOT_FORMATS}")
     if states is None:
         states = "csv" if len(run.table) <= MOST_CSV_STATES else "parquet"
         if states != "csv" and note is not None:
@@ -150,21 +138,22 @@ def new_run(
         ThreadPoolExecutor(1) as pool,
     ):
         states_name = f"states.{states}"
-        states_sum = pool.submit(write_states, run.table, partial / states_name, states)
+        states_sum = pool.submit(run_columns.write_states, run.table, partial / states_name, states)
         if plots:
             from icrtool.output.figure_catalogue import draw_figures
 
             draw_figures("run", run, partial / "plots", plots, figures)
         sums: dict[str, str] = {}
         if run.smoothed is not None:
-            sums[f"smoothed.{states}"] = write_states(run.smoothed, partial / f"smoothed.{states}", states)
-        write_measurements(run, partial / MEASUREMENTS_FILE)
-        (partial / RUN_FILE).write_bytes(json_bytes(run.document))
+            sums[f"smoothed.{states}"] = run_columns.write_states(run.smoothed, partial / f"smoothed.{states}", states)
+        run_columns.write_measurements(run, partial / MEASUREMENTS_FILE)
+        (partial / RUN_FILE).write_bytes(formats.json_bytes(run.document))
         (partial / EVENTS_FILE).write_bytes(events_csv(run.document.events))
         pictures = [f"plots/{file.name}" for file in sorted((partial / "plots").glob("*"))]
-        sums |= {name: file_b2sum(partial / name) for name in (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE, *pictures)}
+        others = (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE, *pictures)
+        sums |= {name: formats.file_b2sum(partial / name) for name in others}
         sums[states_name] = states_sum.result()
-        write_sums(partial, sums)
+        formats.write_sums(partial, sums)
         yield partial
 
 
@@ -182,7 +171,7 @@ class _Inputs(Record, frozen=True):
 def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
     """Return the inputs in a run.json that nobody checked yet."""
     try:
-        return read_document(directory / RUN_FILE, _Inputs, directory, escape=False).inputs
+        return formats.read_document(directory / RUN_FILE, _Inputs, directory, escape=False).inputs
     except (OSError, ValueError, RecursionError):
         return ()
 
@@ -191,12 +180,12 @@ def is_run_directory(directory: Path) -> bool:
     """Return whether a directory, or an address, is a run of ours, of whatever version."""
     if isinstance(directory, UrlPath):
         return lies_there(directory, RUN_FILE)
-    return schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
+    return formats.schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
 
 
 def events_csv(events: Sequence[EventDocument]) -> bytes:
     """Return events.csv: a row an event."""
-    return csv_bytes(EVENT_COLUMNS, map(msgspec.structs.astuple, events))
+    return formats.csv_bytes(EVENT_COLUMNS, map(msgspec.structs.astuple, events))
 
 
 FIT_AGAIN = "fit the log again"
@@ -227,7 +216,7 @@ def open_run(path: str | Path) -> Run:
 def _run_in(directory: Path, place: Path) -> Run:
     """Return the run in a directory on disk; `place`: that it stands for."""
     stored = _read_document(directory)
-    sums = read_sums(directory)
+    sums = formats.read_sums(directory)
     check_sum(directory, RUN_FILE, sums)
     if MEASUREMENTS_FILE not in sums:
         raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
@@ -236,19 +225,19 @@ def _run_in(directory: Path, place: Path) -> Run:
         document = msgspec.convert(stored | {"config": config}, RunDocument)
         table = _read_states(directory, STATES_FILES, sums)
         if table is None:
-            raise RunError(directory, f"{CHECKSUM_FILE} names no states", FIT_AGAIN)
+            raise RunError(directory, f"{formats.CHECKSUM_FILE} names no states", FIT_AGAIN)
         if table.fault:
             raise ValueError(table.fault)
         check_sum(directory, MEASUREMENTS_FILE, sums)
-        table, sensors, gnss, heading = read_measurements(directory, table, document)
+        table, sensors, gnss, heading = run_columns.read_measurements(directory, table, document)
         smoothed = _read_states(directory, SMOOTHED_FILES, sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
         run = Run(
             document=document,
             table=table,
-            in_gap=np.isin(table.stamp_ns, spans_of(document.wheel_gaps_ns)[:, 0]),
-            outages_ns=spans_of(document.outages_ns),
+            in_gap=np.isin(table.stamp_ns, run_columns.spans_of(document.wheel_gaps_ns)[:, 0]),
+            outages_ns=run_columns.spans_of(document.outages_ns),
             sensors=sensors,
             gnss=gnss,
             heading=heading,
@@ -277,9 +266,8 @@ def log_of(run: Run) -> Path:
     gone = [file for file in files if not file.is_file()]
     if gone or not files:
         what = gone[0] if gone else "a list of inputs"
-        raise RunError(
-            run.directory or run.name, f"the log it was made from is gone ({what})", "put it back, or name it"
-        )
+        why = f"the log it was made from is gone ({what})"
+        raise RunError(run.directory or run.name, why, "put it back, or name it")
     folder = files[0].parent
     series = [numbered_file(file) for file in files]
     if len(files) > 1 and len({one.series for one in series if one is not None}) == 1 and None not in series:
@@ -312,16 +300,15 @@ def _read_document(directory: Path) -> dict[str, Any]:
         why = "not a run directory" if directory.is_dir() else "no such run directory"
         raise RunError(directory, why, f"it holds no readable {RUN_FILE}; icrtool fit makes one") from err
     try:
-        document = parse_json(raw)
+        document = formats.parse_json(raw)
     except (ValueError, RecursionError) as err:
         raise RunError(directory, f"{RUN_FILE} is not JSON", FIT_AGAIN) from err
     schema = document.get("schema") if isinstance(document, dict) else None
     if not (isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)):
         raise RunError(directory, "not a run directory", f"its {RUN_FILE} is not icrtool's")
     if schema != RUN_SCHEMA:
-        raise RunError(
-            directory, f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}", FIT_AGAIN
-        )
+        why = f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}"
+        raise RunError(directory, why, FIT_AGAIN)
     # What a log wrote there is printed from here on.
     return {key: value if key == "inputs" else escaped_texts(value, NAMES) for key, value in document.items()}
 
@@ -335,7 +322,7 @@ def _read_states(directory: Path, names: Mapping[str, StatesFormat], sums: Mappi
         # Both read the file from end to end; hashing leaves the interpreter to the other.
         checked = pool.submit(check_sum, directory, name, sums)
         try:
-            return read_states(directory / name, names[name], directory)
+            return run_columns.read_states(directory / name, names[name], directory)
         finally:
             checked.result()
 
@@ -349,7 +336,7 @@ def check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
         It is not, or the file cannot be read.
     """
     try:
-        found = file_b2sum(directory / name, directory)
+        found = formats.file_b2sum(directory / name, directory)
     except OSError as err:
         raise RunError(directory, f"{name} is missing or unreadable ({err.strerror})", FIT_AGAIN) from err
     if found != sums.get(name):

@@ -80,24 +80,20 @@ def _place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> P
     if place.exists():
         if not place.is_file():
             raise OutputError(path, "is a device or pipe, which would be replaced", "name a file")
-        _check_content(path, place, ours)
+        from icrtool.logs.containers.open_log import container_of
+
+        try:
+            with open_regular(place) as stream:
+                first = stream.read(FIRST_BYTES)
+                is_log = container_of(stream) is not None and EXPORTED_MCAP not in first[:64]
+        except PermissionError:
+            return place  # it may be replaced without being read
+        if is_log or first.startswith(PACKED):
+            raise OutputError(path, "a log is there", "it is left alone; name another file")
+        if ours is not None and first and not ours(first):
+            why = "a file that icrtool did not write is there"
+            raise OutputError(path, why, "it is left alone; name another place")
     return place
-
-
-def _check_content(path: Path, place: Path, ours: IsOurFile | None) -> None:
-    """Refuse to replace a log, or what is not ours."""
-    from icrtool.logs.containers.open_log import container_of
-
-    try:
-        with open_regular(place) as stream:
-            first = stream.read(FIRST_BYTES)
-            is_log = container_of(stream) is not None and EXPORTED_MCAP not in first[:64]
-    except PermissionError:
-        return  # it may be replaced without being read
-    if is_log or first.startswith(PACKED):
-        raise OutputError(path, "a log is there", "it is left alone; name another file")
-    if ours is not None and first and not ours(first):
-        raise OutputError(path, "a file that icrtool did not write is there", "it is left alone; name another place")
 
 
 def is_page(first: bytes) -> bool:
@@ -125,7 +121,8 @@ def check_directory(directory: Path, ours: IsOurs, *, kind: str, inside: Path | 
     with reported(directory):
         if inside is not None:
             check_links(directory, inside)
-        place = real_place(directory)
+        # Unlike `Path.resolve`, this takes a link that leads to itself as it is.
+        place = Path(os.path.realpath(directory))
         restore(place, ours)
         if outer := next((parent for parent in place.parents if ours(parent)), None):
             why, advice = f"lies inside the {kind} {outer}", "name a place outside it"
@@ -144,11 +141,6 @@ def check_directory(directory: Path, ours: IsOurs, *, kind: str, inside: Path | 
         raise OutputError(directory, why, advice)
 
 
-def real_place(directory: Path) -> Path:
-    """Return a place without links; unlike `Path.resolve` it takes a link that leads to itself as it is."""
-    return Path(os.path.realpath(directory))
-
-
 def restore(directory: Path, ours: IsOurs) -> None:
     """Rename an old directory back to its place, where a killed process left it aside and put nothing there.
 
@@ -157,7 +149,7 @@ def restore(directory: Path, ours: IsOurs) -> None:
     OSError
         It cannot be renamed.
     """
-    place = real_place(directory)
+    place = Path(os.path.realpath(directory))
     if not os.path.lexists(place):
         aside = [path for path in disk.hidden(place, ".old") if ours(path) or own_files(path).kind]
         if aside:
@@ -219,14 +211,9 @@ def _keep_foreign(place: Path, partial: Path, names: Collection[str]) -> str:
         One has the name of a directory of ours, or ours of one of its directories.
     """
     new, there = files_in(partial), files_in(place)
-    lists = {parent: own_files(place / parent).files for path in there for parent in path.parents}
-    own = {
-        path
-        for path in there
-        if path.name == OWN_FILES
-        or str(path) in names
-        or any(str(path.relative_to(parent)) in lists[parent] for parent in path.parents)
-    }
+    parents = {parent for path in there for parent in path.parents}
+    listed = {parent / name for parent in parents for name in own_files(place / parent).files}
+    own = {path for path in there if path.name == OWN_FILES or str(path) in names or path in listed}
     removed = [path for path in there if path in own and path not in new and path.name != OWN_FILES]
     foreign = [path for path in there if path not in own]
     kept = [path for path in foreign if not os.path.lexists(partial / path)]
@@ -338,7 +325,7 @@ def atomic_directory(
         As `check_directory`, and for every OSError of the block (disk full, no permission).
     """
     check_directory(directory, ours, kind=kind, inside=inside)
-    place = real_place(directory)
+    place = Path(os.path.realpath(directory))
     with reported(directory), with_parents(place) as made, disk.beside(place, Path.mkdir) as partial:
         for parent in made:
             disk.sync(parent.parent)

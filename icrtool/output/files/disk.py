@@ -74,14 +74,25 @@ def beside(place: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     """
     # What was renamed aside is needed as long as nothing is in its place.
     for left in hidden(place, ".partial") + (hidden(place, ".old") if place.exists() else []):
-        if is_abandoned(left):
-            remove(left)
+        try:
+            handle = _lock(left)
+        except BlockingIOError:
+            continue  # a living process writes it
+        if handle is not None:
+            os.close(handle)
+        elif not left.exists() or time.time() - left.stat().st_mtime < LONGEST_WRITE_S:
+            continue
+        remove(left)
     partial = hidden_name(place)
     with unfinished(partial):
         try:
             make(partial)
-            with locked(partial):
+            handle = _lock(partial)
+            try:
                 yield partial
+            finally:
+                if handle is not None:
+                    os.close(handle)
         finally:
             remove(partial)
 
@@ -113,31 +124,16 @@ def put(partial: Path, place: Path) -> None:
         remove(old)
 
 
-@contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """Lock a file or directory, where that is possible, until the block or the process ends."""
-    handle = _lock(path)
-    try:
-        yield
-    finally:
-        if handle is not None:
-            os.close(handle)
-
-
-def is_abandoned(path: Path) -> bool:
-    """Return whether no living process writes what `locked` locked; where there are no locks its age decides."""
-    try:
-        handle = _lock(path)
-    except BlockingIOError:
-        return False
-    if handle is None:
-        return path.exists() and time.time() - path.stat().st_mtime > LONGEST_WRITE_S
-    os.close(handle)
-    return True
-
-
 def _lock(path: Path) -> int | None:
-    """Return the handle that holds a lock; None where there are no locks, or the path is not ours to open."""
+    """Lock a file or directory until its handle, which is returned, is closed, or the process ends.
+
+    None where there are no locks, or the path is not ours to open.
+
+    Raises
+    ------
+    BlockingIOError
+        A living process has locked it.
+    """
     if sys.platform == "win32":
         return None
     handle = None

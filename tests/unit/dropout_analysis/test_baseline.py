@@ -24,7 +24,7 @@ from icrtool.kernels.error_statistics import (
     error_summary,
     sort_trials,
 )
-from icrtool.output.files.baseline_file import open_baseline, read_report
+from icrtool.output.dropout_directory import open_baseline, read_report
 from icrtool.output.files.formats import json_bytes
 from icrtool.records.dropout_document import EarlierInput
 from icrtool.records.fleet_document import FleetFile, FleetLog

@@ -19,12 +19,12 @@ from icrtool.errors import OutputError
 from icrtool.output.dropout_directory import (
     TRIALS_FILE,
     is_dropout_directory,
+    trials_file,
     write_report,
     write_tables,
 )
 from icrtool.output.files import disk
 from icrtool.output.files.formats import json_bytes
-from icrtool.output.files.states_file import trials_file
 from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.run import Run
 from support.contract import SUMMARY_COLUMNS

@@ -16,7 +16,7 @@ import pytest
 import icrtool
 from icrtool.errors import IcrToolError
 from icrtool.output.files.formats import json_bytes, open_calibration
-from icrtool.output.files.states_file import COLUMNS, INTEGER_COLUMNS
+from icrtool.output.files.run_columns import COLUMNS, INTEGER_COLUMNS
 from icrtool.output.run_directory import events_csv, log_of
 from icrtool.output.tables.run import format_run
 from support.edits import edited

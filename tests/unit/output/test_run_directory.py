@@ -13,8 +13,8 @@ import pytest
 import icrtool
 from icrtool.errors import OutputError
 from icrtool.output import figure_catalogue as catalogue
-from icrtool.output import run_directory
 from icrtool.output.dropout_directory import write_report
+from icrtool.output.files import run_columns
 from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.formats import file_b2sum, json_bytes, read_sums
 from icrtool.output.run_directory import check_target, open_run, write_run
@@ -155,7 +155,7 @@ def test_a_run_of_a_later_version_may_be_replaced(tmp_path: Path, run: Run) -> N
     assert open_run(tmp_path).name == "barn"
 
 
-@pytest.mark.parametrize(("module", "where"), [(run_directory, "write_states"), (catalogue, "draw_figures")])
+@pytest.mark.parametrize(("module", "where"), [(run_columns, "write_states"), (catalogue, "draw_figures")])
 def test_a_full_disk_is_said_and_leaves_the_old_run(
     written: Path, run: Run, monkeypatch: pytest.MonkeyPatch, module: Any, where: str
 ) -> None:

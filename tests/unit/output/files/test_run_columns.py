@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from icrtool.output.files.states_file import CHUNK_ROWS, StatesFileError, StatesFormat, read_states, write_states
+from icrtool.output.files.run_columns import CHUNK_ROWS, StatesFileError, StatesFormat, read_states, write_states
 from icrtool.records.run import Run
 from icrtool.records.tables import States
 

@@ -1,0 +1,319 @@
+"""The columns of a run as files: its states and smoothed states, and its measurements with their outcomes.
+
+States are CSV with every bit of every number, or Parquet. ``measurements.npz`` holds the sensors as the filter used
+them, and the outcome of each measurement; of the wheel samples only those before the first recorded state, since the
+others are columns of the states.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from functools import partial
+from pathlib import Path
+from tokenize import TokenError
+from typing import TYPE_CHECKING, Any, Literal
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
+
+import msgspec
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from icrtool.kernels.arrays import Ints
+from icrtool.logs.containers.chunk import LARGEST_RATIO
+from icrtool.output.files.formats import file_b2sum
+from icrtool.records.measurements import Fixes, ReferenceJump, SensorData, SlipEvent
+from icrtool.records.regular_file import open_regular
+from icrtool.records.run import MeasurementOutcome, Run
+from icrtool.records.run_document import RunDocument
+from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, thin
+from icrtool.records.tables import LARGEST, States
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+StatesFormat = Literal["csv", "parquet"]
+
+COLUMNS = tuple(field.name for field in fields(States))
+INTEGER_COLUMNS = frozenset({"stamp_ns"})
+FLOAT_COLUMNS = tuple(name for name in COLUMNS if name not in INTEGER_COLUMNS)
+
+CHUNK_ROWS = 1024
+"""Rows formatted at a time: their text stays in the processor's cache, and memory does not grow with the log."""
+
+PARQUET_ROWS = 1 << 17
+"""Rows of a row group: a group is held in memory until it is written."""
+
+FREE_STATES_BYTES = 1 << 29
+"""States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
+
+
+class StatesFileError(ValueError):
+    """A file that does not hold the columns of the states. Only `read_run` sees it, and raises a clearer one."""
+
+
+def write_states(table: States, path: Path, states: StatesFormat) -> str:
+    """Write the states to a new file.
+
+    Parameters
+    ----------
+    table : the recorded states
+    path : the file to make
+    states : its format
+
+    Returns
+    -------
+    str
+        Sum of the file, as `file_b2sum`.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+
+    Notes
+    -----
+    CSV numbers have the shortest form that reads back to the same double; whole numbers keep a ``.0``, so that pandas
+    does not take them for integers.
+    """
+    if states == "parquet":
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        # Arrays that share the memory of the columns: to convert these, pyarrow would import pandas.
+        arrays = {
+            name: pa.Array.from_buffers(
+                pa.int64() if name in INTEGER_COLUMNS else pa.float64(),
+                len(values),
+                [None, pa.py_buffer(np.ascontiguousarray(values))],
+            )
+            for name, values in table.columns().items()
+        }
+        with path.open("xb") as file:
+            pq.write_table(
+                pa.table(arrays), file, compression="zstd", row_group_size=PARQUET_ROWS,
+                use_dictionary=False, use_byte_stream_split=list(FLOAT_COLUMNS),
+            )  # fmt: skip
+        return file_b2sum(path)
+    digest = hashlib.blake2b()
+    # A chunk is summed and written while it is in the processor's cache: a thread for that takes longer.
+    with path.open("xb") as file:
+        for chunk in _csv_chunks(table):
+            digest.update(chunk)
+            file.write(chunk)
+    return digest.hexdigest()
+
+
+def read_states(path: Path, states: StatesFormat, inside: Path | None = None) -> States:
+    """Read what `write_states` wrote.
+
+    Parameters
+    ----------
+    inside : as in `open_regular`
+
+    Raises
+    ------
+    StatesFileError
+        The columns are not those of the states.
+    OSError
+        The file cannot be read.
+    """
+    import pyarrow as pa
+
+    types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS}
+    try:
+        if states == "parquet":
+            import pyarrow.parquet as pq
+
+            with open_regular(path, inside) as source, pq.ParquetFile(source) as file:
+                numbers = file.metadata.num_rows * len(COLUMNS)
+                if 8 * numbers > FREE_STATES_BYTES + LARGEST_RATIO * os.fstat(source.fileno()).st_size:
+                    raise StatesFileError(f"it claims {numbers} numbers, too many for its size")
+                _check_columns(file.schema_arrow, types)
+                # One at a time: each one's memory is used again for the next.
+                read = partial(file.read, use_threads=False)
+                return States(**{name: _array(read([name]).column(0)) for name in COLUMNS})
+        import pyarrow.csv as pc
+
+        options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])
+        with open_regular(path, inside) as source:
+            stored = pc.read_csv(source, convert_options=options)
+        _check_columns(stored.schema, types)
+        columns = dict(zip(stored.schema.names, stored.columns, strict=True))
+        del stored
+        # Each column's memory goes back before the next is copied.
+        return States(**{name: _array(columns.pop(name)) for name in COLUMNS})
+    except pa.ArrowException as err:
+        raise StatesFileError(" ".join(str(err).split())) from err
+
+
+def _check_columns(schema: pa.Schema, types: dict[str, pa.DataType]) -> None:
+    if {name: schema.field(name).type for name in schema.names if name in types} != types:
+        raise StatesFileError("its columns are not those of the states")
+
+
+def _array(column: pa.ChunkedArray) -> NDArray[Any]:
+    """Return a column without nulls as an array; pyarrow's own conversion would import pandas."""
+    if column.null_count:
+        raise StatesFileError("a cell is empty")
+    return np.concatenate([np.from_dlpack(chunk) for chunk in column.chunks])
+
+
+def _csv_chunks(table: States) -> Iterator[bytes]:
+    yield (",".join(COLUMNS) + "\n").encode()
+    columns = table.columns()
+    for begin in range(0, len(table), CHUNK_ROWS):
+        rows = slice(begin, begin + CHUNK_ROWS)
+        stamps = np.ascontiguousarray(table.stamp_ns[rows])
+        numbers = np.stack([columns[name][rows] for name in FLOAT_COLUMNS], 1, dtype=np.float64)
+        if np.isfinite(numbers).all():
+            texts = orjson.dumps(numbers, option=orjson.OPT_SERIALIZE_NUMPY)[2:-2].split(b"],[")
+        else:  # JSON has no word for what is not finite
+            texts = [",".join(map(repr, row)).encode() for row in numbers.tolist()]
+        stamp_texts = orjson.dumps(stamps, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].split(b",")
+        yield b"\n".join([*map(b",".join, zip(stamp_texts, texts, strict=True)), b""])
+
+
+MEASUREMENTS_FILE = "measurements.npz"
+
+OUTCOME_COLUMNS = ("nis", "code", "difference")
+
+KINDS = {
+    "stamp_ns": np.int64,
+    "fix_class": np.uint8,
+    "misreported": np.bool_,
+    "down_weighted": np.bool_,
+    "code": np.uint8,
+}
+"""Types of the columns that are not float64."""
+
+
+WHEEL_COLUMNS = ("stamp_ns", "v_left_mps", "v_right_mps")
+"""Stored for the samples before the first state; the states hold the others."""
+
+
+def write_measurements(run: Run, path: Path) -> None:
+    """Write the measurements of a run as arrays that `numpy.load` reads.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    sensors, before = run.sensors, len(run.sensors.wheels.stamp_ns) - len(run.table)
+    columns: dict[str, NDArray[Any]] = {}
+    for name in WHEEL_COLUMNS:
+        columns[f"wheels_{name}"] = getattr(sensors.wheels, name)[:before]
+    for group, record in (("fixes", sensors.fixes), ("headings", sensors.headings)):
+        columns |= {f"{group}_{name}": getattr(record, name) for name in _names(type(record))}
+    for group, outcome in (("fixes", run.gnss), ("headings", run.heading)):
+        columns |= {f"{group}_{name}": getattr(outcome, name) for name in OUTCOME_COLUMNS}
+    if sensors.gyro is not None:
+        columns["gyro_topic"] = np.frombuffer(sensors.gyro.topic.encode("utf-8", "surrogatepass"), np.uint8)
+        columns |= {"gyro_stamp_ns": sensors.gyro.stamp_ns, "gyro_rate_radps": sensors.gyro.rate_radps}
+    if sensors.attitude is not None:
+        columns |= {f"attitude_{name}": getattr(sensors.attitude, name) for name in _names(HeadingSamples)}
+    with path.open("xb") as file:
+        np.savez(file, **columns)  # type: ignore[arg-type]  # numpy's stub takes the columns for its own flag
+
+
+def read_measurements(
+    directory: Path, table: States, document: RunDocument
+) -> tuple[States, SensorData, MeasurementOutcome, MeasurementOutcome]:
+    """Read what `write_measurements` wrote: the sensors, and the outcome of fixes and headings.
+
+    The states come back with the columns of the wheels in the wheels' memory.
+
+    Parameters
+    ----------
+    directory : of the run
+    table : the states of the run; `document`: its run.json, which holds what is no column
+
+    Raises
+    ------
+    ValueError
+        It is no such file, or its columns do not belong together.
+    OSError
+        The file cannot be read.
+    """
+    facts = document.filter
+    try:
+        with open_regular(directory / MEASUREMENTS_FILE, directory) as file, ZipFile(file) as stored:
+            if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
+                raise ValueError(f"{MEASUREMENTS_FILE} is compressed")  # its size would have no bound
+            columns = {}
+            for member in stored.infolist():
+                with stored.open(member) as array:
+                    read: NDArray[Any] = np.lib.format.read_array(array, allow_pickle=False)
+                    columns[member.filename.removesuffix(".npy")] = read
+        before = _columns(columns, "wheels", WHEEL_COLUMNS)
+        stamps, left, right = (np.concatenate([before[name], getattr(table, name)]) for name in WHEEL_COLUMNS)
+        fixes = Fixes(**_columns(columns, "fixes", _names(Fixes)))
+        headings = HeadingSamples(**_columns(columns, "headings", _names(HeadingSamples)))
+        gyro = None
+        if "gyro_topic" in columns:
+            topic = columns["gyro_topic"].astype(np.uint8).tobytes().decode("utf-8", "surrogatepass")
+            gyro = GyroSamples(topic, *(_checked(columns, f"gyro_{name}", name) for name in ("stamp_ns", "rate_radps")))
+        attitude = None
+        if "attitude_stamp_ns" in columns:
+            attitude = HeadingSamples(**_columns(columns, "attitude", _names(HeadingSamples)))
+            attitude = replace(attitude, var_rad2=thin(attitude.var_rad2))
+        sensors = SensorData(
+            name=document.log,
+            wheels=WheelSamples(stamps, left, right),
+            fixes=fixes,
+            headings=headings,
+            gyro=gyro,
+            heading_from_position=facts.heading_from_position,
+            heading_correlation_s=facts.heading_correlation_s,
+            antenna_m=facts.antenna_m,
+            losses_ns=spans_of(document.rtk_losses_ns),
+            events=tuple(SlipEvent(*(getattr(one, name) for name in SlipEvent._fields)) for one in document.events),
+            jumps=tuple(ReferenceJump(*msgspec.structs.astuple(one)[:-2]) for one in document.reference_jumps),
+            icr_start=facts.icr_start,
+            heading_is_estimated=facts.heading_is_estimated,
+            heading_is_measured=facts.heading_is_measured,
+            turn_wander_rad=math.inf if facts.turn_wander_rad is None else facts.turn_wander_rad,
+            attitude=attitude,
+        )
+        outcomes = []
+        for group, stamps_ns in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns)):
+            found = [_checked(columns, f"{group}_{name}", name) for name in OUTCOME_COLUMNS]
+            if {len(column) for column in found} != {len(stamps_ns)}:
+                raise ValueError(f"the outcomes of the {group} are not as many as those")
+            outcomes.append(MeasurementOutcome(stamps_ns, (stamps_ns - table.stamp_ns[0]) / 1e9, *found))
+    except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError, SyntaxError, TokenError) as err:
+        raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
+    first = len(stamps) - len(table)
+    states = replace(table, stamp_ns=stamps[first:], v_left_mps=left[first:], v_right_mps=right[first:])
+    return states, sensors, outcomes[0], outcomes[1]
+
+
+def spans_of(pairs: object) -> Ints:
+    """Return the spans of a run.json as an array (k, 2) [ns]."""
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def _names(record: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(record))
+
+
+def _columns(columns: dict[str, NDArray[Any]], group: str, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Return the columns of a group, all of one length and of their types."""
+    found = {name: _checked(columns, f"{group}_{name}", name) for name in names}
+    if len({len(column) for column in found.values()}) > 1:
+        raise ValueError(f"the columns of the {group} differ in length")
+    return found
+
+
+def _checked(columns: dict[str, NDArray[Any]], key: str, name: str) -> NDArray[Any]:
+    column, kind = columns[key], KINDS.get(name, np.float64)
+    if column.ndim != 1 or column.dtype != kind:
+        raise ValueError(f"{key} is no column of {np.dtype(kind)}")
+    if kind is np.float64 and name not in OUTCOME_COLUMNS and (np.abs(column) > LARGEST).any():
+        raise ValueError(f"{key} holds a number beyond {LARGEST:g}")
+    return column
