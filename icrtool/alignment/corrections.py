@@ -14,7 +14,6 @@ import numpy as np
 
 from icrtool.alignment.conventions import (
     AS_NAMED,
-    Convention,
     Decision,
     apply_convention,
     convention_notes,
@@ -48,9 +47,7 @@ from icrtool.alignment.wheel_alignment import (
     refuse_standing,
     scaled,
 )
-from icrtool.alignment.wheel_units import refuse_parked
 from icrtool.config import Config
-from icrtool.errors import DataError
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S
 from icrtool.records.run import width_or_usual_m
@@ -291,9 +288,10 @@ def _name_streams(
     corrects, derived, senses = config.filter.preset == "field", None, AS_NAMED
     log = scaled(log, *configured_scales(config))
     if not len(log.heading.stamp_ns) and corrects:
-        senses = _senses_without_heading(log)
+        if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) > 1:
+            senses = senses_by_distance(track_of_log(log))
         log = apply_convention(log, senses)
-        derived = _derived_heading(log, width_m)
+        derived = derive_heading(log, width_m)
         log = derived.apply(log)
     check_streams(log)
     faults = dead_or_copied(log)
@@ -306,7 +304,7 @@ def _name_streams(
     if named is not log:
         if derived is not None:
             # it was made with wheels whose sides are exchanged, or run backwards
-            derived = _derived_heading(named, width_m)
+            derived = derive_heading(named, width_m)
             named = derived.apply(named)
         windows = windows_of_log(named, width_m, None if derived is None else derived.smoothed)
     notes = [
@@ -319,17 +317,3 @@ def _name_streams(
         if free_hand.convention.heading < 0:
             notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
     return named if corrects else log, derived, decision, windows, notes, not faults
-
-
-def _senses_without_heading(log: RobotLog) -> Convention:
-    few = min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < 2
-    return AS_NAMED if few else senses_by_distance(track_of_log(log))
-
-
-def _derived_heading(log: RobotLog, width_m: float) -> DerivedHeading:
-    """Return the heading of a log without one; a robot that stands is refused as such."""
-    try:
-        return derive_heading(log, width_m)
-    except DataError:
-        refuse_parked(log)
-        raise

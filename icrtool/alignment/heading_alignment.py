@@ -10,7 +10,7 @@ import numpy as np
 
 from icrtool.alignment.conventions import Convention
 from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
-from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading, stated_source
+from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
 from icrtool.alignment.log_track import FEWEST_WINDOWS, STARTS_A_WINDOW, DriveWindows
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
@@ -106,6 +106,8 @@ def _declination_deg(datum: Datum, stamp_ns: int) -> float | None:
         # Stamps that count from the robot's start are 1970: there is no model of that year, and no date either.
         return None
 
+
+DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING", "Heading2", "HEADING2")
 
 SMALLEST_OFFSET_RAD = math.radians(1.0)
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
@@ -223,8 +225,11 @@ def align_heading(
             notes = [_offset_note(text, offset)]
     elif derived is not None:
         notes = [f"the heading is estimated: {derived.why}"]
+    stated_type = next((stream.message_type for stream in log.streams if stream.role == "heading"), "")
+    of_antennas = any(name in stated_type for name in DUAL_ANTENNA_TYPES)
+    source = "dual_antenna_message" if of_antennas else "orientation"
     facts = HeadingFacts(
-        source=stated_source(log) if derived is None else derived.source,
+        source=source if derived is None else derived.source,
         parts=None if derived is None else derived.why,
         windows=course.windows,
         applied_mirror=mirrored and corrects,

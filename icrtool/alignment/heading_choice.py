@@ -21,6 +21,7 @@ from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensor_noise import is_hole
 from icrtool.alignment.turn_rates import TurnRate, gyro_rate, wheel_rate
 from icrtool.alignment.wheel_alignment import compare_turns
+from icrtool.alignment.wheel_units import refuse_parked
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import mad_std
@@ -30,7 +31,6 @@ from icrtool.records.samples import (
     GyroAxes,
     GyroSamples,
     HeadingSamples,
-    PositionFixes,
     StreamChoice,
     thin,
 )
@@ -43,36 +43,26 @@ SHORTEST_BASELINE_M = 0.2
 LEAST_ATTITUDE_STD_RAD = math.radians(0.01)
 
 
-def attitude_heading(track: Track, turn: TurnRate) -> AbsoluteHeading:
-    """Return the heading of a drive, with the white noise that it shows beside the turn rate."""
-    found = _averaged(track.heading_t, track.heading, turn, ATTITUDE_CELL_S)
-    step = np.diff(found.heading - np.interp(found.t, turn.t, turn.integrated()))
-    noise = mad_std(np.angle(np.exp(1j * (step - np.median(step))))) / math.sqrt(2.0) if len(step) else 0.0
-    return found._replace(std=np.full(len(found.t), max(noise, LEAST_ATTITUDE_STD_RAD)))
-
-
-def antenna_heading(log: RobotLog, other: PositionFixes, turn: TurnRate) -> tuple[AbsoluteHeading, float] | None:
-    """Return the bearing from the chosen antenna to another one, and the length of the baseline [m]; None if short."""
-    mine = log.gnss
-    if min(len(mine.stamp_ns), len(other.stamp_ns)) < 2:
-        return None
-    epoch = int(log.wheels.stamp_ns[0])
-    t, s = (mine.stamp_ns - epoch) / 1e9, (other.stamp_ns - epoch) / 1e9
-    after = np.clip(np.searchsorted(s, t), 1, len(s) - 1)
-    near = (t >= s[0]) & (t <= s[-1]) & ~is_hole(np.diff(s))[after - 1]
-    there = np.interp(t, s, other.north_m) + 1j * np.interp(t, s, other.east_m)
-    line = (there - (mine.north_m + 1j * mine.east_m))[near]
-    if len(line) < 2:
-        return None
-    length = float(np.median(np.abs(line)))
-    noise = math.hypot(fix_std_m(mine), fix_std_m(other))
-    if length < max(SHORTEST_BASELINE_M, 4.0 * noise):
-        return None
-    good = np.abs(np.abs(line) - length) < max(5.0 * noise, 0.05 * length)
-    if np.count_nonzero(good) < len(good) / 2:
-        return None
-    found = _averaged(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
-    return found._replace(std=noise / length * found.std), length
+def antenna_heading(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]:
+    """Return the bearing from the chosen antenna to the furthest other one, and the baseline's length [m]; None, 0."""
+    mine, epoch = log.gnss, int(log.wheels.stamp_ns[0])
+    best: tuple[AbsoluteHeading | None, float] = None, 0.0
+    for other in (receiver.fixes for receiver in log.other_receivers):
+        if min(len(mine.stamp_ns), len(other.stamp_ns)) < 2:
+            continue
+        t, s = (mine.stamp_ns - epoch) / 1e9, (other.stamp_ns - epoch) / 1e9
+        after = np.clip(np.searchsorted(s, t), 1, len(s) - 1)
+        near = (t >= s[0]) & (t <= s[-1]) & ~is_hole(np.diff(s))[after - 1]
+        there = np.interp(t, s, other.north_m) + 1j * np.interp(t, s, other.east_m)
+        line = (there - (mine.north_m + 1j * mine.east_m))[near]
+        length = float(np.median(np.abs(line))) if len(line) > 1 else 0.0
+        noise = math.hypot(fix_std_m(mine), fix_std_m(other))
+        good = np.abs(np.abs(line) - length) < max(5.0 * noise, 0.05 * length)
+        short = length < max(SHORTEST_BASELINE_M, 4.0 * noise, best[1])
+        if not short and np.count_nonzero(good) >= len(good) / 2:
+            found = _averaged(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
+            best = found._replace(std=noise / length * found.std), length
+    return best
 
 
 def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> AbsoluteHeading:
@@ -94,8 +84,6 @@ def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> Absolu
 
 
 Source = Literal["orientation", "dual_antenna_message", "antenna_pair", "gyro_course", "wheels_course", "fused"]
-
-DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING", "Heading2", "HEADING2")
 
 LARGEST_START_STD_RAD = math.radians(5.0)
 """Headings less certain than this are not given to the filter."""
@@ -144,30 +132,26 @@ class DerivedHeading:
         return replace(log, heading=heading, streams=streams, gyro=self.gyro if self.gyro is not None else log.gyro)
 
 
-def stated_source(log: RobotLog) -> Source:
-    """Return what kind of sensor states the heading of a log."""
-    kind = next((stream.message_type for stream in log.streams if stream.role == "heading"), "")
-    return "dual_antenna_message" if any(name in kind for name in DUAL_ANTENNA_TYPES) else "orientation"
-
-
 def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     """Estimate the heading of a log without one, from the best of what it holds.
 
     Raises
     ------
     DataError
-        Too little distance.
+        Too little distance, or none: a robot on a stand.
     """
     if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < 2:
+        refuse_parked(log)
         raise DataError(
             log.name, "no heading in it, and too few wheel or position samples", "record at least two of each"
         )
     track = track_of_log(log)
     found = _with_gyro(log, track, None)
-    if found is not None and (_is_alive(found.estimate) or _follows_wheels(found, track, width_m, log)):
+    alive = found is not None and found.estimate.noises["angle"] < LARGEST_DRIFT
+    if found is not None and (alive or _follows_wheels(found, track, width_m, log)):
         return found
     turn = wheel_rate(track, width_m)
-    pair, length = _pair(log, turn)
+    pair, length = antenna_heading(log, turn)
     estimate = estimate_heading(track, turn, [pair] if pair is not None else [], stands=False)
     if estimate is not None and (found is None or estimate.median_std < found.estimate.median_std):
         why = "no turn rate in the log"
@@ -177,6 +161,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             why = "the turn rate does not cover enough of the drive"
         return _derived(log, estimate, turn, None, length, None, instead=why)
     if found is None:
+        refuse_parked(log)
         raise DataError(
             log.name,
             f"no heading in it, and a drive of {track.travel[-1]:.0f} m is too short to find one from positions of "
@@ -199,14 +184,9 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
     if track.same_clock:
         return None
     found = _with_gyro(log, track, log.heading)
-    if found is None or not _is_alive(found.estimate):
+    if found is None or found.estimate.noises["angle"] >= LARGEST_DRIFT:
         return None
     return found if found.estimate.median_std <= math.hypot(found.estimate.noises[WANDERS], ATTITUDE_STD_RAD) else None
-
-
-def _is_alive(estimate: HeadingEstimate) -> bool:
-    """Return whether the turn rate of an estimate turns with the robot."""
-    return estimate.noises["angle"] < LARGEST_DRIFT
 
 
 def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: RobotLog) -> bool:
@@ -232,8 +212,13 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
         turn, axis = found
         absolute: list[AbsoluteHeading] = []
         if stated is not None:
-            absolute.append(attitude_heading(track, turn)._replace(aligned_std=ATTITUDE_STD_RAD))
-        pair, length = _pair(log, turn)
+            # with the white noise that it shows beside the turn rate
+            one = _averaged(track.heading_t, track.heading, turn, ATTITUDE_CELL_S)
+            step = np.diff(one.heading - np.interp(one.t, turn.t, turn.integrated()))
+            noise = mad_std(np.angle(np.exp(1j * (step - np.median(step))))) / math.sqrt(2.0) if len(step) else 0.0
+            std = np.full(len(one.t), max(noise, LEAST_ATTITUDE_STD_RAD))
+            absolute.append(one._replace(std=std, aligned_std=ATTITUDE_STD_RAD))
+        pair, length = antenna_heading(log, turn)
         absolute += [pair] if pair is not None else []
         estimate = estimate_heading(track, turn, absolute)
         if estimate is None:
@@ -242,12 +227,6 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
         if best is None or estimate.median_std < best.estimate.median_std:
             best = _derived(log, estimate, turn, topic, length, stated)
     return best
-
-
-def _pair(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]:
-    """Return the bearing of the longest baseline between two antennas, and its length [m]."""
-    found = [one for one in (antenna_heading(log, other.fixes, turn) for other in log.other_receivers) if one]
-    return max(found, key=lambda one: one[1]) if found else (None, 0.0)
 
 
 def _derived(
@@ -273,31 +252,21 @@ def _derived(
         attitude_offset = offset, float(estimate.constants_std[OFFSET])
         lag = round(float(estimate.constants[LAG]) * 1e9)
         attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - attitude_offset[0], thin(stated.var_rad2))
-    std = math.degrees(estimate.median_causal_std)
-    causal, smoothed = _samples(estimate, epoch)
-    gyro = GyroSamples(gyro_topic, epoch + np.round(turn.t * 1e9).astype(np.int64), turn.rate) if gyro_topic else None
+    stamps, turn_stamps = (epoch + np.round(t * 1e9).astype(np.int64) for t in (estimate.t, turn.t))
+    causal, smoothed = (np.angle(np.exp(1j * psi)) for psi in (estimate.causal, estimate.smoothed))
+    # the causal one from where it is known
+    std = estimate.causal_std
+    known = slice(int(np.argmax(std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(std))))), None)
     return DerivedHeading(
         source,
         " + ".join(names),
         estimate,
-        causal,
-        smoothed,
-        gyro,
+        HeadingSamples(stamps[known], causal[known], std[known] ** 2),
+        HeadingSamples(stamps, smoothed, estimate.smoothed_std**2),
+        GyroSamples(gyro_topic, turn_stamps, turn.rate) if gyro_topic else None,
         attitude,
         attitude_offset,
-        f"{', '.join(parts)}; σ {std:.2f}°",
-    )
-
-
-def _samples(found: HeadingEstimate, epoch: int) -> tuple[HeadingSamples, HeadingSamples]:
-    """Return causal and smoothed headings as samples, the causal ones from where they are known."""
-    stamps = epoch + np.round(found.t * 1e9).astype(np.int64)
-    known = found.causal_std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(found.causal_std)))
-    first = int(np.argmax(known))
-    causal, smoothed = (np.angle(np.exp(1j * psi)) for psi in (found.causal, found.smoothed))
-    return (
-        HeadingSamples(stamps[first:], causal[first:], found.causal_std[first:] ** 2),
-        HeadingSamples(stamps, smoothed, found.smoothed_std**2),
+        f"{', '.join(parts)}; σ {math.degrees(estimate.median_causal_std):.2f}°",
     )
 
 
@@ -311,15 +280,17 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
     scatter_rad : of the heading about the course over ground
     width_m : the track width b
     """
-    if scatter_rad < NOISY_SCATTER_RAD:
+    stamps, rows = np.unique(log.heading.stamp_ns, return_index=True)
+    if scatter_rad < NOISY_SCATTER_RAD or len(stamps) < 3:
         return None
-    rate = rate_of_heading(log)
-    if rate is None:
-        return None
+    # about a sensor's upward axis
+    rates = np.zeros((len(stamps) - 1, 3))
+    rates[:, 2] = -np.diff(np.unwrap(log.heading.heading_rad)[rows]) / (np.diff(stamps) / 1e9)
+    gyro = GyroAxes(log.topic("heading", "heading"), stamps[:-1] + np.diff(stamps) // 2, rates)
     why = (
         f"the heading drifts ({math.degrees(scatter_rad):.0f}° about the course over ground): only turn rates are used"
     )
-    bare = replace(without_heading(log, why), gyros=(*log.gyros, rate))
+    bare = replace(without_heading(log, why), gyros=(*log.gyros, gyro))
     try:
         found = derive_heading(bare, width_m)
     except DataError:
@@ -332,18 +303,3 @@ def without_heading(log: RobotLog, why: str) -> RobotLog:
     """Return the log without its heading, so that one is estimated; `why` is reported."""
     streams = tuple(one for one in log.streams if one.role != "heading")
     return replace(log, heading=NO_HEADINGS, streams=streams, warnings=(*log.warnings, f"{log.name}: {why}"))
-
-
-def rate_of_heading(log: RobotLog) -> GyroAxes | None:
-    """Return the turn rate of the measured heading about a sensor's upward axis; None with too few samples."""
-    heading = log.heading
-    stamps, rows = np.unique(heading.stamp_ns, return_index=True)
-    if len(stamps) < 3:
-        return None
-    turned = np.diff(np.unwrap(heading.heading_rad)[rows])
-    rate = -turned / (np.diff(stamps) / 1e9)
-    return GyroAxes(
-        log.topic("heading", "heading"),
-        stamps[:-1] + np.diff(stamps) // 2,
-        np.column_stack([0.0 * rate, 0.0 * rate, rate]),
-    )
