@@ -182,17 +182,15 @@ def _show(windows: DriveWindows, hand: int) -> _Shown:
     """Fit displacements and turns for one handedness, with hardly any prior."""
     track = windows.track
     v, u = track.mean_speed, track.half_difference
-    begin, end = windows.begin, windows.end
     nose = track.nose if hand > 0 else track.nose.conj()
-    spans = [(at[end] - at[begin]) / windows.length_m for at in (track.at_places(rate * nose) for rate in (v, u))]
-    seen = (track.place[end] - track.place[begin]) / windows.length_m
+    spans = [windows.over(track.at_places(rate * nose)) / windows.length_m for rate in (v, u)]
+    seen = windows.over(track.place) / windows.length_m
     columns = np.column_stack([spans[0], 1j * spans[0], spans[1], 1j * spans[1]])
     design, target = np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])
     place = _linear(design, target)
     first, last = windows.turn_begin, windows.turn_end
-    turned = hand * (track.heading_at(last) - track.heading_at(first))
     by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in map(track.cumulate, (u, v))]
-    turn = _linear(np.column_stack(by), turned)
+    turn = _linear(np.column_stack(by), hand * windows.turned)
     of_place = sandwich_covariance(place, np.tile(windows.group, 2))
     return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group), place.residuals)
 

@@ -167,8 +167,8 @@ class AlignmentFit(NamedTuple):
     @property
     def turn_slip(self) -> float:
         """Robust scatter of the turns within a second about those of the wheels, in parts of the usual turn."""
-        turned = _turned(self.windows)
-        return float(self.fit.scale[-1]) / max(math.sqrt(float(np.mean(turned**2))), LEAST_TURN_RAD)
+        usual = math.sqrt(float(np.mean(self.windows.turned**2)))
+        return float(self.fit.scale[-1]) / max(usual, LEAST_TURN_RAD)
 
     @property
     def slips(self) -> bool:
@@ -199,12 +199,11 @@ def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     model, w = _Model(found.windows, found.width_m), len(found.windows.begin)
     neutral = PRIOR_MEAN.copy()
     neutral[K] = found.fit.x[K]
-    parts = []
-    for x in (neutral, found.fit.x):
-        residual, _ = model.evaluate(x)
-        parts.append((residual[: 2 * w].reshape(2, w), residual[2 * w :]))
-    (before, turn_before), (after, turn_after) = parts
-    return ResidualsByEstimate(before, after, turn_before, turn_after, model.turned)
+    before, after = (model.evaluate(x)[0] for x in (neutral, found.fit.x))
+    return ResidualsByEstimate(
+        before[: 2 * w].reshape(2, w), after[: 2 * w].reshape(2, w), before[2 * w :], after[2 * w :],
+        found.windows.turned,
+    )  # fmt: skip
 
 
 def _clock_std_s(track: Track, width_m: float) -> float:
@@ -229,14 +228,18 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
         return None
     track, model = windows.track, _Model(windows, width_m)
     start = PRIOR_MEAN.copy()
-    offset = model.first_offset()
-    start[D] = 0.0 if offset is None else offset
+    # the direction of the displacements from wheels laid along the heading
+    laid = windows.over(track.laid)
+    unit = (model.seen * np.conj(laid))[np.abs(laid) > windows.length_m / 3]
+    spins = len(unit) < FEWEST_OVERLAPPING
+    if not spins:
+        start[D] = np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12)))
     w, u = len(windows.begin), len(windows.turn_begin)
     kind = np.concatenate([np.zeros(w, np.int64), np.ones(w, np.int64), np.full(u, 2)])
     group = np.concatenate([windows.group, windows.group, windows.turn_group])
     prior_std = PRIOR_STD.copy()
     # spins show the distance of the ICRs' middle from the antenna, and not its direction
-    prior_std[D] = MOUNTING_STD_RAD if offset is None else prior_std[D]
+    prior_std[D] = MOUNTING_STD_RAD if spins else prior_std[D]
     prior_std[TP] = SAME_CLOCK_STD_S if track.same_clock else prior_std[TP]
     prior_std[M] = MIDDLE_STD_M / (1.5 * width_m)
     prior_std[C] *= width_m
@@ -260,22 +263,6 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     return AlignmentFit(fit, covariance, width_m, windows, speed)
 
 
-def _smooth(t: Floats, angle: Floats) -> Floats:
-    """Return the mean of an angle (h,) over `SMOOTH_S` to either side of its times t (h,): noise is no turn."""
-    area = trapezoids(t, angle)
-    begin, end = np.maximum(t - SMOOTH_S, t[0]), np.minimum(t + SMOOTH_S, t[-1])
-    reach = np.minimum(t - begin, end - t)
-    size = np.maximum(2.0 * reach, 1e-9)
-    mean = (np.interp(t + reach, t, area) - np.interp(t - reach, t, area)) / size
-    return np.where(reach > 0.0, mean, angle)
-
-
-def _turned(windows: DriveWindows) -> Floats:
-    """Return the turn of the heading in each short window (m,) [rad]."""
-    begin, end = (windows.track.heading_at(at) for at in (windows.turn_begin, windows.turn_end))
-    return np.asarray(end - begin)
-
-
 class _Model:
     """Residuals of the windows and their Jacobian."""
 
@@ -283,38 +270,55 @@ class _Model:
         self.track, self.windows, self.b = windows.track, windows, width_m
         track = windows.track
         self.v, self.u = track.mean_speed, track.half_difference
-        self.middle_t = track.t + track.held / 2
         # places are needed where a window begins or ends: at few of the fixes of a long drive
-        edges = np.stack([windows.begin, windows.end])
-        self.edge_t = track.place_t[edges]
-        self.seen = track.place[windows.end] - track.place[windows.begin]
+        self.edge_t = track.place_t[np.stack([windows.begin, windows.end])]
+        self.seen = windows.over(track.place)
         self.level = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
-        self.smooth_heading = _smooth(track.heading_t, track.heading)
         self.turn_v, self.turn_w = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
-        self.turned = _turned(windows)
-
-    def first_offset(self) -> float | None:
-        """Return the direction of the displacements from wheels laid along the heading [rad]; None where it spins."""
-        at = self.track.laid
-        laid = at[self.windows.end] - at[self.windows.begin]
-        unit = (self.seen * np.conj(laid))[np.abs(laid) > self.windows.length_m / 3]
-        if len(unit) < FEWEST_OVERLAPPING:
-            return None
-        return float(np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12))))
+        # the mean of the heading over `SMOOTH_S` to either side: noise is no turn
+        t, area = track.heading_t, trapezoids(track.heading_t, track.heading)
+        reach = np.minimum(np.minimum(t - t[0], t[-1] - t), SMOOTH_S)
+        mean = (np.interp(t + reach, t, area) - np.interp(t - reach, t, area)) / np.maximum(2.0 * reach, 1e-9)
+        self.smooth_heading = np.where(reach > 0.0, mean, track.heading)
 
     def evaluate(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return residuals along, across and of turns, and their Jacobian."""
-        place, place_jacobian = self._displacements(x)
-        turn, turn_jacobian = self._turns(x)
+        """Return residuals (2 w + u,) along, across and of turns, and their Jacobian (2 w + u, k)."""
+        track, v, u, drag = self.track, self.v, self.u, np.abs(self.u)
+        nose, rate, ahead, aside = self._motion(x)
+        t = self.edge_t - x[TP] - x[TH]
+        row = np.clip(np.searchsorted(track.t, t, side="right") - 1, 0, len(track.t) - 2)
+        part = np.clip((t - track.t[row]) / np.maximum(track.t[row + 1] - track.t[row], 1e-12), 0.0, 1.0)
+
+        def laid(speed: Floats) -> Complexes:
+            """Return a speed (n,) laid along the heading in each window (w,); found once where all of them end."""
+            total = track.cumulate(np.asarray(speed * nose))
+            begin, end = total[row] + part * (total[row + 1] - total[row])
+            return np.asarray(end - begin)
+
+        by = np.zeros((len(x), len(self.seen)), np.complex128)
+        by[A], by[M], by[N], by[C], by[L] = laid(v), laid(u), laid(drag), 1j * laid(rate), 1j * laid(v * rate)
+        predicted = x @ by
+        by[D] = 1j * predicted
+        path = track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
+        before, after = (np.interp(t + shift_s, track.t, path) for shift_s in (-STEP_S, STEP_S))
+        by[TP] = np.diff(before - after, axis=0) / (2 * STEP_S)
+        # the derivative of the heading's unit vector, over `TURN_STEP_S`
+        after, before = self._heading_at(t + TURN_STEP_S, x), self._heading_at(t - TURN_STEP_S, x)
+        turning = 0.5j * (after - before) / TURN_STEP_S * np.exp(0.5j * (after + before))
+        begin, end = np.interp(t, track.t + track.held / 2, aside) * turning
+        by[TH] = by[TP] + 1j * laid(rate * ahead) + end - begin
+        level = self.level * np.exp(-1j * x[D])
+        place, by = (predicted - self.seen) * level, by * level
+        turn, turn_by = self._turns(x)
         return (
             np.concatenate([place.real, place.imag, turn]),
-            np.concatenate([place_jacobian.real, place_jacobian.imag, turn_jacobian]),
+            np.concatenate([by.real, by.imag, turn_by], axis=1).T,
         )
 
     def until_fixes(self, x: Floats) -> tuple[Complexes, Floats]:
         """Return place [m] and turn [rad] of the wheels until each fix (m,)."""
-        nose, rate = self._directions(x)
-        path = self.track.cumulate(self._velocity(x, rate) * nose)
+        nose, rate, ahead, aside = self._motion(x)
+        path = self.track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
         t = self.track.place_t
         turn = x[K] * self.turn_w + x[Q] / self.b * self.turn_v + x[G] * self.track.t
         return (
@@ -323,66 +327,29 @@ class _Model:
         )
 
     def _heading_at(self, t: Floats, x: Floats) -> Floats:
-        """Return the heading that a wheel speed of time t (n,) acts along: a response delays both alike."""
-        return np.asarray(np.interp(t + x[TH], self.track.heading_t, self.track.heading) + x[D], np.float64)
+        """Return the heading that a wheel speed of time t acts along: a response delays both alike."""
+        return np.asarray(self.track.heading_at(t + x[TH]) + x[D])
 
-    def _directions(self, x: Floats) -> tuple[Complexes, Floats]:
-        """Return the measured heading as a unit vector, and its rate [rad/s] (n,)."""
-        edges = self._heading_at(np.append(self.track.t, self.track.t[-1] + self.track.held[-1]), x)
-        dt = np.maximum(self.track.held, 1e-9)
-        ends = np.append(self.track.t, self.track.t[-1] + self.track.held[-1]) + x[TH]
-        smooth = np.interp(ends, self.track.heading_t, self.smooth_heading)
-        rate = np.where(self.track.held > 0.0, np.diff(smooth) / dt, 0.0)
-        return np.exp(0.5j * (edges[1:] + edges[:-1])), rate
-
-    def _smooth_turn(self, t: Floats, x: Floats) -> Complexes:
-        """Return the derivative of the heading's unit vector [rad/s] at times t (m,), over `TURN_STEP_S`."""
-        after, before = self._heading_at(t + TURN_STEP_S, x), self._heading_at(t - TURN_STEP_S, x)
-        return np.asarray(0.5j * (after - before) / TURN_STEP_S * np.exp(0.5j * (after + before)), np.complex128)
-
-    def _velocity(self, x: Floats, rate: Floats) -> Complexes:
-        """Return the velocity in the body (n,), forward + j right."""
-        ahead = x[A] * self.v + x[M] * self.u + x[N] * np.abs(self.u)
-        return np.asarray(ahead + 1j * (x[C] + x[L] * self.v) * rate, np.complex128)
-
-    def _displacements(self, x: Floats) -> tuple[Complexes, Complexes]:
-        """Return predicted minus seen displacements in the frame of the heading (w,), and their Jacobian (w, k)."""
+    def _motion(self, x: Floats) -> tuple[Complexes, Floats, Floats, Floats]:
+        """Return the heading as a unit vector, its rate [rad/s], speeds ahead and aside for each of that rate (n,)."""
         track = self.track
-        nose, rate = self._directions(x)
-        v, u, drag = self.v, self.u, np.abs(self.u)
-        t = self.edge_t - x[TP] - x[TH]
-        step = nose * track.held
-        integral = np.zeros(len(nose), np.complex128)
-
-        def laid(speed: Floats) -> Complexes:
-            np.cumsum((speed * step)[:-1], out=integral[1:])
-            return np.asarray(np.interp(t, track.t, integral), np.complex128)
-
-        jacobian = np.zeros((len(self.seen), len(x)), np.complex128)
-        for name, speed in ((A, v), (M, u), (N, drag), (C, rate), (L, v * rate)):
-            jacobian[:, name] = np.diff(laid(speed), axis=0)
-        jacobian[:, [C, L]] *= 1j
-        predicted = sum((x[name] * jacobian[:, name] for name in (A, M, C, L, N)), np.zeros(1))
-        jacobian[:, D] = 1j * predicted
-        np.cumsum((self._velocity(x, rate) * step)[:-1], out=integral[1:])
-        after, before = (np.interp(t + shift, track.t, integral) for shift in (STEP_S, -STEP_S))
-        jacobian[:, TP] = -np.diff(after - before, axis=0) / (2 * STEP_S)
-        sideways = np.interp(t, self.middle_t, x[C] + x[L] * v) * self._smooth_turn(t, x)
-        turning = 1j * laid(rate * (x[A] * v + x[M] * u + x[N] * drag))
-        jacobian[:, TH] = jacobian[:, TP] + np.diff(turning + sideways, axis=0)
-        level = self.level * np.exp(-1j * x[D])
-        return (predicted - self.seen) * level, jacobian * level[:, None]
+        ends = np.append(track.t, track.t[-1] + track.held[-1])
+        heading = self._heading_at(ends, x)
+        smooth = np.interp(ends + x[TH], track.heading_t, self.smooth_heading)
+        rate = np.where(track.held > 0.0, np.diff(smooth) / np.maximum(track.held, 1e-9), 0.0)
+        ahead = x[A] * self.v + x[M] * self.u + x[N] * np.abs(self.u)
+        return np.exp(0.5j * (heading[1:] + heading[:-1])), rate, ahead, x[C] + x[L] * self.v
 
     def _turns(self, x: Floats) -> tuple[Floats, Floats]:
-        """Return predicted minus seen heading changes (u,), and their jacobian (u, k)."""
-        windows, t = self.windows, self.track.t
-        begin, end = windows.turn_begin - x[TH], windows.turn_end - x[TH]
+        """Return predicted minus seen heading changes (u,), and their derivatives (k, u)."""
+        edges = np.stack([self.windows.turn_begin, self.windows.turn_end]) - x[TH]
 
-        def over(values: Floats, shift: float = 0.0) -> Floats:
-            return np.asarray(np.interp(end + shift, t, values) - np.interp(begin + shift, t, values))
+        def over(values: Floats, shift_s: float = 0.0) -> Floats:
+            begin, end = np.interp(edges + shift_s, self.track.t, values)
+            return np.asarray(end - begin)
 
-        jacobian = np.zeros((len(begin), len(x)))
-        jacobian[:, K], jacobian[:, Q], jacobian[:, G] = over(self.turn_w), over(self.turn_v) / self.b, end - begin
-        jacobian[:, TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
-        predicted = x[K] * jacobian[:, K] + x[Q] * jacobian[:, Q] + x[G] * jacobian[:, G]
-        return predicted - self.turned, jacobian
+        by = np.zeros((len(x), edges.shape[1]))
+        by[K], by[Q], by[G] = over(self.turn_w), over(self.turn_v) / self.b, edges[1] - edges[0]
+        predicted = x @ by
+        by[TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
+        return predicted - self.windows.turned, by

@@ -10,7 +10,7 @@ import numpy as np
 from icrtool.alignment.sensor_noise import NOISIER, USUAL_POSITION_STD_M, bend_std_m, unbroken
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.kernels.track import Track, cut
+from icrtool.kernels.track import Rate, Track, cut
 from icrtool.records.measurements import TURNING_MPS, Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
@@ -79,6 +79,16 @@ class DriveWindows(NamedTuple):
     turn_end: Floats
     group: Ints
     turn_group: Ints
+
+    def over(self, at_places: Rate) -> Rate:
+        """Return the change in each window (w,) of what is known at the positions (m,)."""
+        return at_places[self.end] - at_places[self.begin]
+
+    @property
+    def turned(self) -> Floats:
+        """Turn of the heading in each window of time (u,) [rad]."""
+        begin, end = self.track.heading_at(np.stack([self.turn_begin, self.turn_end]))
+        return np.asarray(end - begin)
 
     def rows(self, kept: Bools, turn_kept: Bools) -> DriveWindows:
         """Return the windows of distance (w,) and of time (u,) that are marked."""

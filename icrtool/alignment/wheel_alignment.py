@@ -166,12 +166,12 @@ def _held_note(wheels: WheelSamples, share: float) -> list[str]:
 
 def refuse_standing(log: RobotLog, windows: DriveWindows) -> None:
     """Raise where the wheels turn and the position does not: a robot on a stand, or held."""
-    track, begin, end = windows.track, windows.begin, windows.end
-    if len(begin) < FEWEST_WINDOWS:
+    track = windows.track
+    if len(windows.begin) < FEWEST_WINDOWS:
         return
-    turned = np.abs(track.heading_at(track.place_t[end]) - track.heading_at(track.place_t[begin]))
-    laid, apart = (np.abs(at[end] - at[begin]) for at in (track.laid, track.at_places(track.half_difference)))
-    went = np.abs(track.place[end] - track.place[begin])
+    turned = np.abs(windows.over(track.heading_at(track.place_t)))
+    apart = np.abs(windows.over(track.at_places(track.half_difference)))
+    laid, went = np.abs(windows.over(track.laid)), np.abs(windows.over(track.place))
     moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
     clear = np.maximum(laid, apart) > windows.length_m / 4
     if np.count_nonzero(clear) >= FEWEST_WINDOWS and float((~moved)[clear].mean()) > STANDS_SHARE:
