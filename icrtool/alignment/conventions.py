@@ -33,7 +33,7 @@ from icrtool.alignment.log_track import (
     cut_chords,
 )
 from icrtool.kernels.arrays import Floats, trapezoids
-from icrtool.kernels.robust import RobustFit, mad_std, robust_regression, sandwich_covariance, soft_l1_loss
+from icrtool.kernels.robust import mad_std, robust_regression, sandwich_covariance, soft_l1_loss
 from icrtool.kernels.track import Track
 from icrtool.motion.recording import fit_gyro_line
 from icrtool.records.tables import RobotLog
@@ -88,12 +88,10 @@ class Convention(NamedTuple):
             if self.heading < 0 and not track.same_clock:
                 offset = math.remainder(offset - math.pi / 2, 2 * math.pi)
         count += FAULTS["turned about"] * (abs(offset) > ABOUT_RAD)
-        count += FAULTS["drives backwards"] * self._drives_backwards(track)
-        return count + FAULTS["gyro upside down"] * (gyro_sense * self.heading < 0)
-
-    def _drives_backwards(self, track: Track) -> bool:
         distance = (self.sign_left * track.v_left + self.sign_right * track.v_right) * track.held
-        return float(-np.minimum(distance, 0.0).sum()) > BACKWARDS_SHARE * float(np.abs(distance).sum()) > 0.0
+        backwards = float(-np.minimum(distance, 0.0).sum()) > BACKWARDS_SHARE * float(np.abs(distance).sum()) > 0.0
+        count += FAULTS["drives backwards"] * backwards
+        return count + FAULTS["gyro upside down"] * (gyro_sense * self.heading < 0)
 
 
 class Decision(NamedTuple):
@@ -136,7 +134,10 @@ def decide_conventions(
         return Decision(AS_NAMED, None)
     track = windows.track
     shown = {hand: _show(windows, hand) for hand in (1, -1)}
-    losses = _losses(shown, 0.5 * track.place_std_m / windows.length_m)
+    # twice the negative log-likelihood of either handedness, both in the noise of the better one
+    scale = min(mad_std(one.residuals, 0.0) for one in shown.values())
+    scale = max(scale, 0.5 * track.place_std_m / windows.length_m)
+    losses = {hand: soft_l1_loss(one.residuals / scale) / STARTS_A_WINDOW for hand, one in shown.items()}
     costs: dict[Convention, tuple[float, float]] = {}
     for swapped, left, right, heading, position in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1)):
         if (position < 0 and not metric) or (heading < 0 and not mirror_allowed):
@@ -186,23 +187,17 @@ def _show(windows: DriveWindows, hand: int) -> _Shown:
     spans = [windows.over(track.at_places(rate * nose)) / windows.length_m for rate in (v, u)]
     seen = windows.over(track.place) / windows.length_m
     columns = np.column_stack([spans[0], 1j * spans[0], spans[1], 1j * spans[1]])
-    design, target = np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])
-    place = _linear(design, target)
     first, last = windows.turn_begin, windows.turn_end
     by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in map(track.cumulate, (u, v))]
-    turn = _linear(np.column_stack(by), hand * windows.turned)
+    place, turn = (
+        robust_regression(design, target, np.full(design.shape[1], PRIOR_STD), float(STARTS_A_WINDOW))
+        for design, target in (
+            (np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])),
+            (np.column_stack(by), hand * windows.turned),
+        )
+    )
     of_place = sandwich_covariance(place, np.tile(windows.group, 2))
     return _Shown(place.x, of_place, turn.x, sandwich_covariance(turn, windows.turn_group), place.residuals)
-
-
-def _losses(shown: dict[int, _Shown], least: float) -> dict[int, float]:
-    """Return twice the negative log-likelihood of either handedness, both in the noise of the better one."""
-    scale = max(min(mad_std(one.residuals, 0.0) for one in shown.values()), least)
-    return {hand: soft_l1_loss(one.residuals / scale) / STARTS_A_WINDOW for hand, one in shown.items()}
-
-
-def _linear(columns: Floats, target: Floats) -> RobustFit:
-    return robust_regression(columns, target, np.full(columns.shape[1], PRIOR_STD), float(STARTS_A_WINDOW))
 
 
 def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
@@ -235,7 +230,7 @@ def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
 
 def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
     """Return sentences on which sides or senses are not as named; the heading's own is reported with its offset."""
-    one, done = decision.convention, ": corrected" if corrects else ""
+    one, other, done = decision.convention, decision.as_likely, ": corrected" if corrects else ""
     notes = []
     if one.swapped:
         notes.append(f"left and right wheels are swapped{done}")
@@ -245,16 +240,18 @@ def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
         notes.append(f"{reversed_[signs]} backwards{done}")
     if one.position < 0:
         notes.append(f"positions are mirrored (east for west){done}")
-    if decision.as_likely is not None:
-        notes.append(f"{_in_words(decision.as_likely)} would explain the log as well: check the wheels' names")
+    if other is not None:
+        parts = {
+            "swapped sides": other.swapped,
+            "a reversed left side": other.sign_left < 0,
+            "a reversed right side": other.sign_right < 0,
+            "a mirrored heading": other.heading < 0,
+            "mirrored positions": other.position < 0,
+        }
+        words = " with ".join(part for part, is_so in parts.items() if is_so)
+        words = words or "sides as named and a heading turned by 180°"
+        notes.append(f"{words} would explain the log as well: check the wheels' names")
     return notes
-
-
-def _in_words(one: Convention) -> str:
-    parts = ["swapped sides"] * one.swapped
-    parts += ["a reversed left side"] * (one.sign_left < 0) + ["a reversed right side"] * (one.sign_right < 0)
-    parts += ["a mirrored heading"] * (one.heading < 0) + ["mirrored positions"] * (one.position < 0)
-    return " with ".join(parts) if parts else "sides as named and a heading turned by 180°"
 
 
 def gyro_sense(log: RobotLog, track: Track) -> int:

@@ -7,7 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.sensor_noise import NOISIER, USUAL_POSITION_STD_M, bend_std_m, unbroken
+from icrtool.alignment.sensor_noise import (
+    FEWEST_FIXES,
+    MEDIAN_OF_RAYLEIGH,
+    NOISIER,
+    USUAL_POSITION_STD_M,
+    unbroken,
+)
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.kernels.track import Rate, Track, cut
@@ -43,20 +49,6 @@ STANDS_S = 5.0
 
 MOST_WHEEL_SAMPLES = 25_000
 """The samples of a longer drive are joined to about so many: 1 h at 7 Hz, where windows last seconds."""
-
-
-class Chords(NamedTuple):
-    """Displacements of the fixes over spans of time, and the distance of each side in them.
-
-    Attributes
-    ----------
-    duration : (w,) [s]; step : complex (w,) north + j east [m]; left, right : (w,) with their signs [m]
-    """
-
-    duration: Floats
-    step: Complexes
-    left: Floats
-    right: Floats
 
 
 class DriveWindows(NamedTuple):
@@ -123,28 +115,23 @@ def track_of_streams(
     turns = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
     so_far = np.concatenate([[0], np.cumsum(turns)])
     near = [np.searchsorted(wheel_t, heading_t + shift) for shift in (-STANDS_S, STANDS_S)]
-    heading_t, angle = _averaged(heading_t, np.unwrap(heading.heading_rad), so_far[near[1]] > so_far[near[0]])
+    angle = np.unwrap(heading.heading_rad)
+    if len(heading_t) > MOST_WHEEL_SAMPLES:
+        # neighbours averaged: a delay then moves no single noise
+        first = _thinned(so_far[near[1]] > so_far[near[0]])
+        count = np.diff(first, append=len(heading_t))
+        heading_t, angle = (np.add.reduceat(column, first) / count for column in (heading_t, angle))
     none = np.zeros(len(fix_t), np.bool_)
-    track = _joined(
-        Track(
-            wheel_t, held, left, right, fix_t, gnss.north_m, gnss.east_m, heading_t, angle, np.zeros(len(fix_t)),
-            none, none, none, place_std_m=fix_std_m(gnss), same_clock=same_clock,
-        ), turns,
+    track = Track(
+        wheel_t, held, left, right, fix_t, gnss.north_m, gnss.east_m, heading_t, angle, np.zeros(len(fix_t)),
+        none, none, none, place_std_m=fix_std_m(gnss), same_clock=same_clock,
     )  # fmt: skip
+    if len(wheel_t) > MOST_WHEEL_SAMPLES:
+        # gaps stay samples of their own
+        begins = (held == 0.0) | np.append(True, held[:-1] == 0.0)
+        begins[_thinned(turns)] = begins[-1] = True
+        track = track.joined(np.flatnonzero(begins))
     return track._replace(distance=np.interp(fix_t, track.t, track.travel))
-
-
-def _joined(track: Track, turns: Bools) -> Track:
-    """Return a track, of a long drive with neighbouring wheel samples joined; distances are the same.
-
-    Gaps stay samples of their own; `turns` (n,) marks where the wheels do.
-    """
-    if len(track.t) <= MOST_WHEEL_SAMPLES:
-        return track
-    gap = track.held == 0.0
-    begins = gap | np.append(True, gap[:-1])
-    begins[_thinned(turns)] = begins[-1] = True
-    return track.joined(np.flatnonzero(begins))
 
 
 def _thinned(busy: Bools) -> Ints:
@@ -158,28 +145,34 @@ def _thinned(busy: Bools) -> Ints:
     return np.union1d(moving, even) if len(moving) <= MOST_WHEEL_SAMPLES else even
 
 
-def _averaged(t: Floats, angle: Floats, moves: Bools) -> tuple[Floats, Floats]:
-    """Return times and unwrapped headings of a long drive, neighbours averaged: a delay then moves no single noise."""
-    if len(t) <= MOST_WHEEL_SAMPLES:
-        return t, angle
-    first = _thinned(moves)
-    count = np.diff(first, append=len(t))
-    return np.add.reduceat(t, first) / count, np.add.reduceat(angle, first) / count
-
-
 def fix_std_m(gnss: PositionFixes | Fixes) -> float:
-    """Return the noise of the fixes, an axis [m]: what they state, or what they show where that is clearly more."""
+    """Return the noise of the fixes, an axis [m]: what they state, or what they show where that is clearly more.
+
+    Notes
+    -----
+    They show it without wheels and heading, before it is known what those mean: three white errors make a second
+    difference of six times the variance. What the robot does between two fixes adds little where they are frequent, and
+    much where they are not: `FixSteps.white_std_m` leaves it out.
+    """
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance) & (variance > 0)]
     stated = math.sqrt(float(np.median(known))) if len(known) else USUAL_POSITION_STD_M
-    seen = bend_std_m(gnss)
+    if len(gnss.stamp_ns) < FEWEST_FIXES:
+        return stated
+    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
+    seen = float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
     return seen if seen > NOISIER * stated else stated
 
 
 def window_length(track: Track, least_m: float) -> float:
     """Return how long windows are [m]: at least so, and as the noise of the fixes and held wheel values ask for."""
     noise = WINDOW_IN_POSITION_STD * min(track.place_std_m, 10.0)
-    return max(least_m, noise, min(WINDOW_IN_VALUES * _value_length(track), LONGEST_WINDOW_M))
+    # the distance on which a wheel value lasts while the robot moves, however often it is repeated
+    travel = track.travel
+    moving = np.diff(travel) > 0
+    changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
+    lasts_m = float(travel[-1]) / max(sum(changes) / 2, 1.0)
+    return max(least_m, noise, min(WINDOW_IN_VALUES * lasts_m, LONGEST_WINDOW_M))
 
 
 def windows_of_log(log: RobotLog, width_m: float, heading: HeadingSamples | None = None) -> DriveWindows:
@@ -205,45 +198,37 @@ def cut_windows(track: Track, length_m: float | None = None) -> DriveWindows:
     whole = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_WINDOW_S)
     whole &= at[end] - at[begin] < 2.0 * length
     begin, end = begin[whole], end[whole]
-    turn_begin, turn_end = _turn_windows(track, first, last)
+    # windows of time in which wheels and heading were sampled and the wheels turned
+    turn_begin = turn_end = np.empty(0)
+    travel, sampled = track.travel, track.heading_t
+    if len(sampled):
+        usual = float(np.median(np.diff(sampled))) if len(sampled) > 1 else 0.0
+        turn_begin = sampled[0] + TURN_STEP_S * np.unique(np.floor((sampled - sampled[0]) / TURN_STEP_S))
+        turn_end = turn_begin + max(TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS * usual)
+        whole = (turn_begin >= first) & (turn_end <= last) & track.clear(turn_begin, turn_end)
+        whole &= np.searchsorted(sampled, turn_end) > np.searchsorted(sampled, turn_begin) + 1
+        whole &= np.interp(turn_end, track.t, travel) > np.interp(turn_begin, track.t, travel)
+        turn_begin, turn_end = turn_begin[whole], turn_end[whole]
     # what counts as one independent observation: 10 windows, where there are 40 of them
-    size = min(max(float(track.travel[-1]) / 40.0, 2.0 * length), 10.0 * length)
-    turn_travel = np.interp(turn_begin, track.t, track.travel)
+    size = min(max(float(travel[-1]) / 40.0, 2.0 * length), 10.0 * length)
+    turn_travel = np.interp(turn_begin, track.t, travel)
     return DriveWindows(
         track, begin, end, length, turn_begin, turn_end,
         np.floor(at[begin] / size).astype(np.int64), np.floor(turn_travel / size).astype(np.int64),
     )  # fmt: skip
 
 
-def cut_chords(track: Track) -> Chords:
-    """Cut a drive into spans of `CHORD_S` from fix to fix, without a heading."""
+def cut_chords(track: Track) -> tuple[Floats, Complexes, Floats, Floats]:
+    """Cut a drive into spans of `CHORD_S` from fix to fix, without a heading.
+
+    Returns
+    -------
+    duration (w,) [s]; displacement of the fixes, north + j east; distance of the left and of the right side, with their
+    signs [m]
+    """
     rows = np.unique(np.floor(track.place_t / CHORD_S), return_index=True)[1]
     left, right = (np.diff(track.at_places(speed)[rows]) for speed in (track.v_left, track.v_right))
-    return Chords(np.diff(track.place_t[rows]), np.diff(track.place[rows]), left, right)
-
-
-def _value_length(track: Track) -> float:
-    """Return the distance [m] on which a wheel value lasts while the robot moves, however often it is repeated."""
-    moving = np.diff(track.travel) > 0
-    changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
-    return float(track.travel[-1]) / max(sum(changes) / 2, 1.0)
-
-
-def _turn_windows(track: Track, first: float, last: float) -> tuple[Floats, Floats]:
-    """Return begin and end of windows [s] in which wheels and heading were sampled and the wheels turned."""
-    t = track.heading_t
-    if not len(t):
-        return np.empty(0), np.empty(0)
-    begin = t[0] + TURN_STEP_S * np.unique(np.floor((t - t[0]) / TURN_STEP_S))
-    length = (
-        max(TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS * float(np.median(np.diff(t)))) if len(t) > 1 else TURN_WINDOW_S
-    )
-    begin = begin[(begin >= first) & (begin + length <= last)]
-    end = begin + length
-    sampled = np.searchsorted(t, end) > np.searchsorted(t, begin) + 1
-    moved = np.interp(end, track.t, track.travel) > np.interp(begin, track.t, track.travel)
-    kept = sampled & moved & track.clear(begin, end)
-    return begin[kept], end[kept]
+    return np.diff(track.place_t[rows]), np.diff(track.place[rows]), left, right
 
 
 IMPOSSIBLE_MPS = 1e6
@@ -285,9 +270,7 @@ def check_streams(log: RobotLog) -> None:
         if negative.any():
             text = f"a {what} variance is negative, the first at row {negative.argmax()}"
             raise DataError(log.name, text, "NaN stands for unknown")
-    fastest, farthest = (
-        float(np.abs(pair).max()) for pair in ((wheels.left, wheels.right), (gnss.north_m, gnss.east_m))
-    )
+    fastest, farthest = np.abs([wheels.left, wheels.right]).max(), np.abs([gnss.north_m, gnss.east_m]).max()
     if fastest >= IMPOSSIBLE_MPS:
         raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")
     if farthest >= IMPOSSIBLE_M:

@@ -11,7 +11,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.config import FilterConfig
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.records.measurements import Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog
 
@@ -115,19 +114,6 @@ def measure_steps(t: Floats, place: Complexes, expected: Complexes) -> FixSteps:
     return FixSteps(
         step, product, moves, _jump_rows(step, scale, max(3, round(PERSISTS_S / usual)) if usual > 0 else 3)
     )
-
-
-def bend_std_m(gnss: PositionFixes | Fixes) -> float:
-    """Return the noise from fix to fix, an axis [m], without wheels and heading: before it is known what those mean.
-
-    NaN where there are too few fixes. Three white errors make a second difference of six times the variance; what the
-    robot does between two fixes adds little where they are frequent, and much where they are not:
-    `FixSteps.white_std_m` is the one that leaves it out.
-    """
-    if len(gnss.stamp_ns) < FEWEST_FIXES:
-        return float("nan")
-    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
-    return float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
 
 
 def _jump_rows(step: Complexes, scale: float, span: int) -> Ints:

@@ -142,14 +142,15 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     """
     if min(len(stamps), len(gnss.stamp_ns)) < 2:
         return None
-    chords = cut_chords(track_of_streams(WheelSamples(stamps, left, right), gnss, NO_HEADINGS, same_clock=False))
-    sides, chord = (np.abs(chords.left), np.abs(chords.right)), np.abs(chords.step)
-    distance, turn = (sides[0] + sides[1]) / 2, np.abs(sides[0] - sides[1])
-    usable = (np.abs(chords.duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_CHORD_M) & (distance > 0)
+    track = track_of_streams(WheelSamples(stamps, left, right), gnss, NO_HEADINGS, same_clock=False)
+    duration, step, left, right = cut_chords(track)
+    left, right, chord = np.abs(left), np.abs(right), np.abs(step)
+    distance, turn = (left + right) / 2, np.abs(left - right)
+    usable = (np.abs(duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_CHORD_M) & (distance > 0)
     straight = usable & (turn < STRAIGHT * distance)
     if np.count_nonzero(straight) < FEWEST_WINDOWS:
         bend = np.full(len(chord), np.inf)
-        bend[1:-1] = np.abs(np.angle(chords.step[2:] * np.conj(chords.step[:-2]))) / 2
+        bend[1:-1] = np.abs(np.angle(step[2:] * np.conj(step[:-2]))) / 2
         beside = usable.copy()
         beside[1:-1] &= usable[2:] & usable[:-2]
         straight = beside & (turn < BENT * distance) & (bend < LARGEST_BEND_RAD)
