@@ -64,7 +64,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
 
 def _align_once(log: RobotLog, config: Config) -> Measurements:
     found = align_streams(log, config)
-    heading, derived = found.heading.facts, found.derived
+    heading, derived = found.heading, found.derived
     fix_steps, heading_steps = found.steps()
     position_std_m, heading_std_rad = reference_noise(found.log, config.filter, fix_steps, heading_steps)
     quality = grade_fixes(found.log, config, fix_steps, position_std_m)
@@ -82,7 +82,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
         headings=headings,
         gyro=found.log.gyro,
         heading_from_position=found.log.heading_is_of_position,
-        heading_correlation_s=max(config.filter.heading_correlation_s, found.heading.correlation_s),
+        heading_correlation_s=max(config.filter.heading_correlation_s, found.correlation_s),
         antenna_m=antenna_m,
         losses_ns=quality.losses_ns,
         icr_start=start_icrs(findings, config),
@@ -94,7 +94,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
     return Measurements(
         sensors=sensors,
         findings=findings,
-        wheels=found.wheels.facts,
+        wheels=found.wheels,
         heading=heading,
         streams=found.log.streams,
         fix_statistics=quality.statistics,
@@ -155,7 +155,7 @@ def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) ->
     ----------
     antenna_m : the antenna from the body origin, forward and right; the ICRs refer to the origin
     """
-    wheels, heading, delays = found.wheels.facts, found.heading.facts, found.delays
+    wheels, heading, delays = found.wheels, found.heading, found.delays
     offset = None if heading.offset_deg is None else -heading.offset_deg
     findings = {
         "wheel_scale": _finding(wheels.scale, wheels.scale_std, wheels.applied_scale, nothing=1.0),
@@ -174,8 +174,8 @@ def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) ->
     middle_std = math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)) / 2
     place = "only the position of the antenna relative to the ICRs is determined"
     return findings | {
-        "left_scale": _finding(left_scale, std[4], found.wheels.applied[0], nothing=1.0),
-        "right_scale": _finding(right_scale, std[5], found.wheels.applied[1], nothing=1.0),
+        "left_scale": _finding(left_scale, std[4], found.scales[0], nothing=1.0),
+        "right_scale": _finding(right_scale, std[5], found.scales[1], nothing=1.0),
         "icr_separation_m": Finding(width * multiplier, width * std[3], 0.0, START),
         "antenna_forward_minus_x_icr_m": Finding(-x, std[2], forward_m, place),
         "antenna_right_minus_icr_middle_m": Finding(-(right + left) / 2, middle_std, right_m, place),

@@ -23,8 +23,8 @@ from icrtool.alignment.conventions import (
 )
 from icrtool.alignment.estimator import PRIOR_STD, TP, AlignmentFit, estimate_alignment
 from icrtool.alignment.heading_alignment import (
-    OPPOSITE_SENSE,
-    HeadingAlignment,
+    NO_COURSE,
+    OTHER_CONVENTION,
     align_heading,
     compare_with_course,
     refuse_stuck,
@@ -40,16 +40,15 @@ from icrtool.alignment.heading_choice import (
 from icrtool.alignment.log_track import DriveWindows, check_streams, track_of_log, windows_of_log
 from icrtool.alignment.sensor_noise import FixSteps, measure_steps
 from icrtool.alignment.wheel_alignment import (
-    WheelAlignment,
     align_wheels,
     configured_scales,
     dead_or_copied,
-    refuse_standing,
     scaled,
 )
+from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.config import Config
 from icrtool.kernels.track import Track
-from icrtool.records.measurements import RESPONSE_S
+from icrtool.records.measurements import RESPONSE_S, HeadingFacts, WheelFacts
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
@@ -69,11 +68,6 @@ class Delay(NamedTuple):
     def is_significant(self) -> bool:
         """Whether it is known well, and is not zero."""
         return self.std_s < LARGEST_STD_S and abs(self.value_s) > SIGNIFICANT_SIGMAS * self.std_s
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether it is certain and more than a robot's response to its wheels."""
-        return self.is_significant and _is_large(self.value_s)
 
 
 UNKNOWN = Delay(math.nan, math.nan)
@@ -95,7 +89,6 @@ class StreamDelays(NamedTuple):
     together: bool
     applied_heading_s: float
     applied_gnss_s: float
-    warnings: tuple[str, ...]
 
     @property
     def clock_std_s(self) -> float:
@@ -123,14 +116,14 @@ class StreamDelays(NamedTuple):
         return replace(log, **moved) if moved else log
 
 
-def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> StreamDelays:
-    """Return the delays of heading and positions against the wheels, and which of them are corrected."""
+def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tuple[StreamDelays, list[str]]:
+    """Return the delays of heading and positions against the wheels, those that are corrected, and what to report."""
     heading = position = apart = UNKNOWN
     if fit is not None:
         found = (Delay(*fit.estimate(name)) for name in ("heading_delay", "position_delay"))
         heading, position = (one if one.std_s < 2 * LARGEST_STD_S else UNKNOWN for one in found)
         apart = Delay(*fit.estimate("position_after_heading"))
-    together, notes, applied = log.heading_is_of_position, list[str](), (0.0, 0.0)
+    together, notes, applied, lags = log.heading_is_of_position, list[str](), (0.0, 0.0), [0.0, 0.0]
     if config.filter.preset == "field":
         if fit is not None and not fit.slips:
             applied = _clear_delays(heading, position, apart, together=together)
@@ -138,12 +131,8 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> Stre
         shown = [one if one.is_significant else apart for one in (heading, position)]
         free = [one == "auto" for one in given]
         notes = _delay_notes(applied, [one.std_s for one in shown], free, together=together)
-        of_heading, of_position = (own if lag == "auto" else lag for own, lag in zip(applied, given, strict=True))
-        applied = of_heading, of_position
-    return StreamDelays(
-        heading, position, apart, together, 0.0 if together else applied[0], applied[1],
-        tuple(f"{log.name}: {note}" for note in notes),
-    )  # fmt: skip
+        lags = [own if lag == "auto" else lag for own, lag in zip(applied, given, strict=True)]
+    return StreamDelays(heading, position, apart, together, 0.0 if together else lags[0], lags[1]), notes
 
 
 def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> tuple[float, float]:
@@ -152,7 +141,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
     Twice the negative log-likelihood, with a penalty for each delay that is not zero (`SIGNIFICANT_SIGMAS` squared).
     """
     if together:
-        common = position.value_s if position.is_clear else 0.0
+        common = position.value_s if position.is_significant and _is_large(position.value_s) else 0.0
         return common, common
     if not heading.std_s < LARGEST_STD_S:
         return 0.0, 0.0
@@ -197,22 +186,23 @@ class AlignedStreams(NamedTuple):
     Attributes
     ----------
     log : corrected; the heading's offset stands in `heading`, which the filter applies
+    wheels, heading : what is known of them; scales : what the speeds of the left and of the right side were multiplied
+        with, beside the configured scales; correlation_s : of the noise of a stated heading, where it was raised
     track : what the estimate was made of; fit : the estimate, None where the drive is too short
     derived : the heading where it was estimated, else None
+    warnings : what was found, in sentences
     """
 
     log: RobotLog
-    wheels: WheelAlignment
-    heading: HeadingAlignment
+    wheels: WheelFacts
+    scales: tuple[float, float]
+    heading: HeadingFacts
+    correlation_s: float
     delays: StreamDelays
     track: Track
     fit: AlignmentFit | None
     derived: DerivedHeading | None
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What was found, in sentences."""
-        return (*self.wheels.warnings, *self.heading.warnings, *self.delays.warnings)
+    warnings: tuple[str, ...]
 
     def steps(self) -> tuple[FixSteps, FixSteps]:
         """Return steps of position and of heading [rad] between the fixes, beyond the motion of the wheels.
@@ -224,11 +214,8 @@ class AlignedStreams(NamedTuple):
             none = np.empty(0, np.complex128)
             return measure_steps(track.place_t, track.place, track.laid), measure_steps(np.empty(0), none, none)
         place, turn = self.fit.expected_motion()
-        turned = track.heading_at(track.place_t).astype(np.complex128)
-        return (
-            measure_steps(track.place_t, track.place, place),
-            measure_steps(track.place_t, turned, turn.astype(np.complex128)),
-        )
+        turned = track.heading_at(track.place_t)
+        return measure_steps(track.place_t, track.place, place), measure_steps(track.place_t, turned, turn)
 
 
 def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
@@ -243,25 +230,24 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     as_sent = log
     log, derived, decision, windows, notes, sound = _name_streams(log, config, width)
     refuse_standing(log, windows)
-    course = compare_with_course(windows)
-    free, convention = config.frames.heading_offset_deg == "auto" and corrects, decision.convention
-    fit = estimate_alignment(windows, width)
+    fit, convention = estimate_alignment(windows, width), decision.convention
     if derived is not None:
-        heading = align_heading(log, config, None, derived)
+        heading, correlation_s, of_heading = align_heading(log, config, None, NO_COURSE, convention, derived)
     else:
+        course, free = compare_with_course(windows), config.frames.heading_offset_deg == "auto" and corrects
+        may_derive = free and config.frames.heading == "auto"
         if free:
             refuse_stuck(log)
             if course.turns_about:
-                why = (
-                    "the heading turns about where the robot drives backwards: it is a course over ground, and left out"
-                )
+                why = "the heading turns about where the robot drives backwards"
+                why = f"{why}: it is a course over ground, and left out"
                 return align_streams(without_heading(as_sent, why), config)
-            scatter = fit.heading_scatter if fit is not None and config.frames.heading == "auto" else 0.0
+            scatter = fit.heading_scatter if fit is not None and may_derive else 0.0
             if (bare := as_turn_rate(as_sent, scatter, width)) is not None:
                 return align_streams(bare, config)
             refuse_unexplained(log, fit, course)
-        derived = fuse_heading(log, windows.track) if free and config.frames.heading == "auto" else None
-        heading = align_heading(log, config, (fit, course, convention), derived)
+        derived = fuse_heading(log, windows.track) if may_derive else None
+        heading, correlation_s, of_heading = align_heading(log, config, fit, course, convention, derived)
         if derived is not None:
             log = derived.apply(log)
             windows = windows_of_log(log, width, derived.smoothed)
@@ -269,10 +255,11 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     configured = configured_scales(config)
     if convention.swapped and corrects:
         configured = configured[::-1]
-    wheels = align_wheels(log, config, fit, configured, notes, sound=sound)
-    delays = find_delays(log, config, fit)
-    log = delays.apply(scaled(log, *wheels.applied))
-    return AlignedStreams(log, wheels, heading, delays, windows.track, fit, derived)
+    wheels, scales, of_wheels = align_wheels(log, config, fit, configured, sound=sound)
+    delays, of_delays = find_delays(log, config, fit)
+    log = delays.apply(scaled(log, *scales))
+    warnings = tuple(f"{log.name}: {note}" for note in (*notes, *of_wheels, *of_heading, *of_delays))
+    return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, warnings)
 
 
 def _name_streams(
@@ -315,5 +302,5 @@ def _name_streams(
     if derived is None and config.frames.heading != "auto":
         free_hand = decide_conventions(windows, metric=False)
         if free_hand.convention.heading < 0:
-            notes.append(f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned")
+            notes.append(OTHER_CONVENTION)
     return named if corrects else log, derived, decision, windows, notes, not faults

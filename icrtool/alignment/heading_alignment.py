@@ -15,7 +15,6 @@ from icrtool.alignment.log_track import FEWEST_WINDOWS, STARTS_A_WINDOW, DriveWi
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats
 from icrtool.records.measurements import HeadingFacts
 from icrtool.records.plain_data import known
 from icrtool.records.samples import Datum
@@ -61,12 +60,10 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
         return NO_NAME
     declination = _declination_deg(datum, stamp_ns) if datum is not None else None
     convergence = utm_convergence_deg(datum) if datum is not None else None
-    norths = [("", 0.0)]
-    if declination is not None and abs(declination) > math.degrees(SMALLEST_NAME_RAD):
-        norths.append((f"magnetic declination here is {declination:+.1f}°", math.radians(declination)))
-    if convergence is not None and abs(convergence) > math.degrees(SMALLEST_NAME_RAD):
-        norths.append((f"UTM grid convergence here is {convergence:+.1f}°", math.radians(convergence)))
-    found = []
+    norths, found = [("", 0.0)], []
+    for what, angle_deg in (("magnetic declination", declination), ("UTM grid convergence", convergence)):
+        if angle_deg is not None and abs(angle_deg) > math.degrees(SMALLEST_NAME_RAD):
+            norths.append((f"{what} here is {angle_deg:+.1f}°", math.radians(angle_deg)))
     for turn, turn_text in TURNS.items():
         for north_text, north in norths:
             away = abs(math.remainder(offset_rad - math.radians(turn) + north, 2 * math.pi))
@@ -111,6 +108,7 @@ DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING"
 
 SMALLEST_OFFSET_RAD = math.radians(1.0)
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
+OTHER_CONVENTION = f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned"
 
 EXPLAINED = 0.8
 """Mean resultant length of angles above which they are one direction; share of those that turn about."""
@@ -172,52 +170,40 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
     )
 
 
-class HeadingAlignment(NamedTuple):
-    """What is known of the heading, and what is done with it.
-
-    Attributes
-    ----------
-    facts : as in run.json
-    correlation_s : how long the noise of a stated heading is correlated, where it was raised
-    """
-
-    facts: HeadingFacts
-    correlation_s: float
-    warnings: tuple[str, ...]
-
-
 def align_heading(
-    log: RobotLog, config: Config, stated: tuple[AlignmentFit | None, CourseComparison, Convention] | None,
+    log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseComparison, convention: Convention,
     derived: DerivedHeading | None,
-) -> HeadingAlignment:  # fmt: skip
+) -> tuple[HeadingFacts, float, list[str]]:  # fmt: skip
     """Return offset and noise of the heading, and what is applied.
 
     Parameters
     ----------
-    stated : of the heading that a sensor states: its estimate, None where the drive is too short; its course over
-        ground; the convention that the streams were found to have. None without such a heading
+    fit, course : of the heading that a sensor states: its estimate, None where the drive is too short, and its course
+        over ground; of a log without one None and `NO_COURSE`
+    convention : that the streams were found to have
     derived : the heading where it was estimated, which holds every correction
+
+    Returns
+    -------
+    what run.json states; how long the noise of a stated heading is correlated, where it was raised [s]; what to report
     """
-    corrects, offset, std, scatter, correlation_s = config.filter.preset == "field", math.nan, math.nan, math.nan, 0.0
-    applied, mirrored, course, name, notes = 0.0, False, NO_COURSE, NO_NAME, list[str]()
-    if stated is not None:
-        fit, course, convention = stated
-        mirrored = convention.heading < 0
-        if config.frames.heading_offset_deg != "auto" and corrects:
-            applied = -math.radians(config.frames.heading_offset_deg)
-        if fit is not None:
-            turn, std = fit.estimate("offset")
-            offset, scatter = math.remainder(-turn, 2 * math.pi), fit.scatter[1]
-            applied, name, notes = _correction(log, config, fit, convention, (offset, std), applied)
+    corrects, mirrored = config.filter.preset == "field", convention.heading < 0
+    offset, std, scatter, applied, correlation_s = math.nan, math.nan, math.nan, 0.0, 0.0
+    attitude = None if derived is None else derived.attitude_offset
+    name, notes = NO_NAME, list[str]()
+    if corrects and config.frames.heading_offset_deg != "auto" and (derived is None or attitude is not None):
+        applied = -math.radians(config.frames.heading_offset_deg)
+    if fit is not None:
+        turn, std = fit.estimate("offset")
+        offset, scatter = math.remainder(-turn, 2 * math.pi), fit.scatter[1]
+        applied, name, notes = _correction(log, config, fit, convention, (offset, std), applied)
     noisy = derived is None and corrects and scatter > NOISY_SCATTER_RAD
     if noisy:
         correlation_s = course.duration_s
-        notes.append(
-            f"the heading scatters by {math.degrees(scatter):.0f}° about the course over ground: "
-            "its noise is raised to that"
-        )
-    if derived is not None and derived.attitude_offset is not None:
-        offset, std = derived.attitude_offset
+        spread = f"by {math.degrees(scatter):.0f}° about the course over ground"
+        notes.append(f"the heading scatters {spread}: its noise is raised to that")
+    if attitude is not None:
+        offset, std = attitude
         applied = offset
         text, name = _offset_in_words(log, offset, std, mirrored=mirrored)
         notes = [note for note in notes if OPPOSITE_SENSE in note]
@@ -245,7 +231,7 @@ def align_heading(
         agreement=known(course.agreement),
         mirrored_agreement=known(course.mirrored_agreement),
     )
-    return HeadingAlignment(facts, correlation_s, tuple(f"{log.name}: {note}" for note in notes))
+    return facts, correlation_s, notes
 
 
 def _correction(
@@ -264,22 +250,19 @@ def _correction(
     significant = _significant(offset - fixed, std)
     applies = config.frames.heading_offset_deg == "auto" and corrects
     applied = offset if applies and (mirrored or significant) else fixed
+    notes = []
     if mirrored and not corrects:
-        note = f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned"
+        notes.append(OTHER_CONVENTION)
     elif pose_mirrored:
-        note = "the heading of the same poses is mirrored likewise: corrected; frames.heading sets it"
+        notes.append("the heading of the same poses is mirrored likewise: corrected; frames.heading sets it")
     elif mirrored:
-        note = (
-            f"{OPPOSITE_SENSE}: its yaw is of the other convention (ENU/NED), "
-            f"offset {text}: applied; frames.heading sets it"
-        )
+        yaw = f"its yaw is of the other convention (ENU/NED), offset {text}"
+        notes.append(f"{OPPOSITE_SENSE}: {yaw}: applied; frames.heading sets it")
     elif significant and applies:
-        note = _offset_note(text, applied)
+        notes.append(_offset_note(text, applied))
     elif significant:
-        note = f"heading is {text} off the course over ground; {-math.degrees(fixed):+.1f}° is applied"
-    else:
-        return applied, name, []
-    return applied, name, [note]
+        notes.append(f"heading is {text} off the course over ground; {-math.degrees(fixed):+.1f}° is applied")
+    return applied, name, notes
 
 
 def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool) -> tuple[str, OffsetName]:
@@ -291,10 +274,8 @@ def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool
 
 
 def _offset_note(text: str, applied: float) -> str:
-    return (
-        f"heading is {text} off the course over ground: {-math.degrees(applied):+.1f}° is applied; "
-        "frames.heading_offset_deg sets it"
-    )
+    done = f"{-math.degrees(applied):+.1f}° is applied; frames.heading_offset_deg sets it"
+    return f"heading is {text} off the course over ground: {done}"
 
 
 def _significant(offset: float, std: float) -> bool:
@@ -325,7 +306,11 @@ def refuse_stuck(log: RobotLog) -> None:
     interval = unbroken(np.diff(wheels.stamp_ns) / 1e9)
     left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
     gone = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
-    ahead = _clearly_ahead(np.concatenate([[0.0], np.cumsum(left - right)]), gone)
+    ahead = np.concatenate([[0.0], np.cumsum(left - right)])
+    # without what it gains where it gains too little of the distance to be a turn
+    later = np.minimum(np.searchsorted(gone, gone + TURN_M), len(gone) - 1)
+    turns = np.abs(ahead[later] - ahead) >= TURN_SHARE * (gone[later] - gone)
+    ahead = np.concatenate([[0.0], np.cumsum(np.where(turns[:-1], np.diff(ahead), 0.0))])
     rows = np.searchsorted(wheels.stamp_ns, np.column_stack([begin, end])[long])
     turning = [last > first and float(np.ptp(ahead[first:last])) > STUCK_TURN_M for first, last in rows.tolist()]
     constant = np.diff(gone[np.minimum(rows[turning], len(gone) - 1)]).sum()
@@ -333,13 +318,6 @@ def refuse_stuck(log: RobotLog) -> None:
     if share > STUCK_SHARE:
         seconds = float((end - begin)[long][turning].sum()) / 1e9
         raise _no_heading(log, "stays the same while the wheels turn the robot", f"for {seconds:.0f} s in all")
-
-
-def _clearly_ahead(ahead: Floats, gone: Floats) -> Floats:
-    """Return `ahead` (n,) [m] without what it gains where it gains too little of `gone` (n,) [m] to be a turn."""
-    later = np.minimum(np.searchsorted(gone, gone + TURN_M), len(gone) - 1)
-    turning = np.abs(ahead[later] - ahead) >= TURN_SHARE * (gone[later] - gone)
-    return np.concatenate([[0.0], np.cumsum(np.where(turning[:-1], np.diff(ahead), 0.0))])
 
 
 def _no_heading(log: RobotLog, why: str, found: str) -> DataError:

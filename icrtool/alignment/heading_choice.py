@@ -21,7 +21,7 @@ from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensor_noise import is_hole
 from icrtool.alignment.turn_rates import TurnRate, gyro_rate, wheel_rate
 from icrtool.alignment.wheel_alignment import compare_turns
-from icrtool.alignment.wheel_units import refuse_parked
+from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, trapezoids
 from icrtool.kernels.robust import mad_std
@@ -141,7 +141,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
         Too little distance, or none: a robot on a stand.
     """
     if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < 2:
-        refuse_parked(log)
+        refuse_standing(log)
         raise DataError(
             log.name, "no heading in it, and too few wheel or position samples", "record at least two of each"
         )
@@ -161,7 +161,7 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
             why = "the turn rate does not cover enough of the drive"
         return _derived(log, estimate, turn, None, length, None, instead=why)
     if found is None:
-        refuse_parked(log)
+        refuse_standing(log)
         raise DataError(
             log.name,
             f"no heading in it, and a drive of {track.travel[-1]:.0f} m is too short to find one from positions of "

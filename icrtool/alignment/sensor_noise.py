@@ -91,14 +91,14 @@ class FixSteps(NamedTuple):
         return np.asarray(share > 0.5)
 
 
-def measure_steps(t: Floats, place: Complexes, expected: Complexes) -> FixSteps:
+def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Complexes) -> FixSteps:
     """Compare each step between fixes with the motion of the wheels.
 
     Parameters
     ----------
-    t : (m,) [s]; place : complex (m,) of the fixes; expected : complex (m,) by the wheels, as integrals [m]
+    t : (m,) [s]; place : complex (m,) of the fixes [m], or a heading [rad]; expected : (m,) by the wheels, as integrals
     """
-    step, dt = np.diff(place - expected), np.diff(t)
+    step, dt = np.diff(place - expected).astype(np.complex128), np.diff(t)
     if len(step) < 2:
         unknown = np.full(max(len(step) - 1, 0), np.nan)
         return FixSteps(step, unknown, np.zeros(len(step), np.bool_), np.empty(0, np.int64))

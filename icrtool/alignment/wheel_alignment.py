@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
-from icrtool.alignment.log_track import FEWEST_WINDOWS, DriveWindows
+from icrtool.alignment.log_track import FEWEST_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
-from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats, rows_at_steps
+from icrtool.kernels.arrays import rows_at_steps
 from icrtool.kernels.robust import robust_regression, sandwich_covariance
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import WheelFacts
@@ -46,28 +45,11 @@ FACTOR_TWO_TOLERANCE = 2.0 * USUAL_SCALE_STD
 """A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius) beside what
 wheels usually roll at."""
 
-STANDS_SHARE, STILL = 0.8, 0.2
-"""The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""
-
 LONGEST_BRIDGE_S = 5.0
 """In a longer gap the robot may have stopped and turned: what the counts show at its ends is no path."""
 
 FUSED_CORRELATION = 0.9995
 """A turn rate of the wheels that follows the gyro this closely was made of it."""
-
-
-class WheelAlignment(NamedTuple):
-    """What is known of the wheels, and what is done with them.
-
-    Attributes
-    ----------
-    facts : as in run.json
-    applied : what the speeds of the left and of the right side are multiplied with, beside the configured scales
-    """
-
-    facts: WheelFacts
-    applied: tuple[float, float]
-    warnings: tuple[str, ...]
 
 
 def configured_scales(config: Config) -> tuple[float, float]:
@@ -120,8 +102,13 @@ def dead_or_copied(log: RobotLog) -> list[str]:
     seconds = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
     interval = unbroken(np.diff(seconds, append=seconds[-1:]))
     for side, still, moving in (("left", left, right), ("right", right, left)):
-        gone = np.cumsum(np.abs(moving) * interval)
-        begin, end = _longest_rest(np.cumsum(still * interval), gone)
+        still_m, gone = np.cumsum(still * interval), np.cumsum(np.abs(moving) * interval)
+        # where the one side hardly moves while the other goes furthest, compared every metre of that
+        rows = np.append(rows_at_steps(gone, 1.0), len(gone) - 1)
+        moves = np.flatnonzero(np.abs(np.diff(still_m[rows])) > NEVER_MOVES_SHARE * np.diff(gone[rows]))
+        begins, ends = rows[np.append(0, moves + 1)], rows[np.append(moves, len(rows) - 1)]
+        longest = int(np.argmax(gone[ends] - gone[begins]))
+        begin, end = begins[longest], ends[longest]
         if (distance := gone[end] - gone[begin]) > DEAD_M:
             span = f"from {seconds[begin]:.0f} s to {seconds[end]:.0f} s, while the others go {distance:.0f} m"
             meaning = "if so, do not use the ICRs: topics.wheels chooses others, --from and --to read the rest"
@@ -132,95 +119,45 @@ def dead_or_copied(log: RobotLog) -> list[str]:
     return []
 
 
-def _longest_rest(still_m: Floats, gone: Floats) -> tuple[int, int]:
-    """Return the rows [begin, end) in which one side hardly moves while the other goes furthest.
-
-    Parameters
-    ----------
-    still_m, gone : (n,) position of the one side, distance gone by the other [m]; compared every metre of that
-    """
-    rows = np.append(rows_at_steps(gone, 1.0), len(gone) - 1)
-    moves = np.flatnonzero(np.abs(np.diff(still_m[rows])) > NEVER_MOVES_SHARE * np.diff(gone[rows]))
-    begin, end = rows[np.append(0, moves + 1)], rows[np.append(moves, len(rows) - 1)]
-    longest = int(np.argmax(gone[end] - gone[begin]))
-    return int(begin[longest]), int(end[longest])
-
-
-def _held_share(wheels: WheelSamples) -> float:
-    """Return the share of samples, while moving, that repeat the one before on both sides."""
-    left, right = wheels.v_left_mps, wheels.v_right_mps
-    moving = (np.abs(left) + np.abs(right))[1:] > 0
-    if np.count_nonzero(moving) < FEWEST_WINDOWS:
-        return 0.0
-    same = (np.diff(left) == 0) & (np.diff(right) == 0)
-    return float(np.count_nonzero(same & moving) / np.count_nonzero(moving))
-
-
-def _held_note(wheels: WheelSamples, share: float) -> list[str]:
-    """Return a warning where wheel values are held, with how often they change."""
-    if share <= HELD_SHARE:
-        return []
-    rate = (1.0 - share) * 1e9 / float(np.median(np.diff(wheels.stamp_ns)))
-    return [f"wheel values are held: they change {rate:.1f} times a second while moving"]
-
-
-def refuse_standing(log: RobotLog, windows: DriveWindows) -> None:
-    """Raise where the wheels turn and the position does not: a robot on a stand, or held."""
-    track = windows.track
-    if len(windows.begin) < FEWEST_WINDOWS:
-        return
-    turned = np.abs(windows.over(track.heading_at(track.place_t)))
-    apart = np.abs(windows.over(track.at_places(track.half_difference)))
-    laid, went = np.abs(windows.over(track.laid)), np.abs(windows.over(track.place))
-    moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
-    clear = np.maximum(laid, apart) > windows.length_m / 4
-    if np.count_nonzero(clear) >= FEWEST_WINDOWS and float((~moved)[clear].mean()) > STANDS_SHARE:
-        place = track.place - (np.median(track.place.real) + 1j * np.median(track.place.imag))
-        raise DataError(
-            log.name,
-            f"the wheels turn ({track.travel[-1]:.0f} m) and the robot does not move",
-            f"95 % of the positions lie within {float(np.percentile(np.abs(place), 95)):.2f} m: is it on a stand?",
-        )
-
-
 def align_wheels(
-    log: RobotLog, config: Config, fit: AlignmentFit | None, configured: tuple[float, float], notes: list[str],
-    *, sound: bool,
-) -> WheelAlignment:  # fmt: skip
-    """Return the scales of the sides, and what is applied.
+    log: RobotLog, config: Config, fit: AlignmentFit | None, configured: tuple[float, float], *, sound: bool
+) -> tuple[WheelFacts, tuple[float, float], list[str]]:
+    """Return what is known of the wheels, what the sides are multiplied with, left and right, and what to report.
 
     Parameters
     ----------
-    log : with the configured scales (left, right); fit : of it, None where the drive is too short
-    notes : what else was found
+    log : with the configured scales (left, right), which the factors come on top of
+    fit : of it, None where the drive is too short
     sound : no side is dead or a copy of the other
     """
+    wheels, notes, applied = log.wheels, list[str](), (1.0, 1.0)
     filtered = "" if fit is None or not sound else find_filtering(fit)
-    applied, of_scale = ((1.0, 1.0), []) if filtered else _find_scales(fit, config, sound=sound)
-    share = _held_share(log.wheels)
-    notes = [*notes, *of_scale, *_held_note(log.wheels, share), *_fused_note(log)]
-    scale, std, windows, stretches, residual_m = math.nan, math.nan, 0, 0, math.nan
-    if fit is not None:
-        scale, std = fit.estimate("scale")
-        windows = len(fit.windows.begin)
-        stretches = len(np.union1d(fit.windows.group, fit.windows.turn_group))
-        residual_m = math.hypot(*fit.fit.scale[[0, windows]].tolist())
+    if fit is not None and not filtered:
+        applied, notes = _find_scales(fit, config, sound=sound)
+    moving = (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))[1:] > 0
+    same = (np.diff(wheels.v_left_mps) == 0) & (np.diff(wheels.v_right_mps) == 0)
+    share = float(same[moving].mean()) if np.count_nonzero(moving) >= FEWEST_WINDOWS else 0.0
+    if share > HELD_SHARE:
+        rate = (1.0 - share) * 1e9 / float(np.median(np.diff(wheels.stamp_ns)))
+        notes.append(f"wheel values are held: they change {rate:.1f} times a second while moving")
+    scale, std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
+    windows = 0 if fit is None else len(fit.windows.begin)
     facts = WheelFacts(
         scale=known(scale),
         scale_std=known(std),
         applied_scale=(applied[0] + applied[1]) / 2,
         applied_left_scale=applied[0] * abs(configured[0]),
         applied_right_scale=applied[1] * abs(configured[1]),
-        held_share=known(share),
+        held_share=share,
         filtered=filtered or None,
         windows=windows,
-        stretches=stretches,
-        residual_m=known(residual_m),
+        stretches=0 if fit is None else len(np.union1d(fit.windows.group, fit.windows.turn_group)),
+        residual_m=None if fit is None else known(math.hypot(*fit.fit.scale[[0, windows]].tolist())),
     )
-    return WheelAlignment(facts, applied, tuple(f"{log.name}: {note}" for note in notes))
+    return facts, applied, [*notes, *_fused_note(log)]
 
 
-def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[str]]:
+def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[str]]:
     """Return the factors to apply to the speeds of the left and of the right side, and what to report.
 
     Notes
@@ -228,50 +165,38 @@ def _find_scales(fit: AlignmentFit | None, config: Config, *, sound: bool) -> tu
     The difference of the sides is the asymmetry of the turn rate over its gain: a robot that veers where both sides
     report one speed. Both factors keep the scale as their mean.
     """
-    if fit is None:
-        return (1.0, 1.0), []
-    given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     if fit.slips:
-        slip = (
-            f"over {fit.windows.length_m:.0f} m their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
-        )
-        turns = f"their turns by {100 * fit.turn_slip:.0f} %"
-        return (1.0, 1.0), [f"the wheels slip: {slip}, {turns}; no scale and no delay is corrected"]
+        apart = f"their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
+        slip = f"over {fit.windows.length_m:.0f} m {apart}, their turns by {100 * fit.turn_slip:.0f} %"
+        return (1.0, 1.0), [f"the wheels slip: {slip}; no scale and no delay is corrected"]
+    given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     may = config.filter.preset == "field" and sound and not given
-    scale, notes = _common_scale(fit, may=may)
-    difference, std = _side_difference(fit)
+    factor, notes = 1.0, list[str]()
+    scale, std = fit.estimate("scale")
+    error = abs(scale - 1.0)
+    if std <= LARGEST_SCALE_STD and error > max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std):
+        if small := error <= LARGEST_SCALE_CORRECTION:
+            scale = 1.0 + (scale - 1.0) * USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
+        text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
+        if may and (small or any(abs(scale / value - 1.0) < FACTOR_TWO_TOLERANCE for value in (0.5, 2.0))):
+            factor = scale
+            notes.append(f"{text}: corrected; wheels.left_scale and right_scale set it")
+        else:
+            notes.append(f"{text}: check wheel radius, encoder resolution and units")
+    (asymmetry, asymmetry_std), (turn, turn_std) = fit.estimate("asymmetry"), fit.estimate("turn")
+    if turn <= 0.0:
+        return (factor, factor), notes
+    # left over right scale, minus 1, to first order
+    difference, std = asymmetry / turn, math.hypot(asymmetry_std, asymmetry * turn_std / turn) / turn
     if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, SIGNIFICANT_SIGMAS * std):
-        return (scale, scale), notes
+        return (factor, factor), notes
     side, other = ("left", "right") if difference < 0 else ("right", "left")
     text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other} one"
     text = f"{text} where both report the same distance"
-    if may:
-        notes.append(f"{text}: corrected; wheels.left_scale and right_scale set it")
-        return (scale * (1.0 + difference / 2), scale * (1.0 - difference / 2)), notes
-    return (scale, scale), [*notes, f"{text}: check wheel radii and tyre pressures"]
-
-
-def _side_difference(fit: AlignmentFit) -> tuple[float, float]:
-    """Return left over right scale, minus 1, and its standard deviation, to first order."""
-    (asymmetry, asymmetry_std), (turn, turn_std) = fit.estimate("asymmetry"), fit.estimate("turn")
-    if turn <= 0.0:
-        return 0.0, math.inf
-    return asymmetry / turn, math.hypot(asymmetry_std, asymmetry * turn_std / turn) / turn
-
-
-def _common_scale(fit: AlignmentFit, *, may: bool) -> tuple[float, list[str]]:
-    """Return the factor to apply to both sides, and what to report."""
-    scale, std = fit.estimate("scale")
-    error = abs(scale - 1.0)
-    if std > LARGEST_SCALE_STD or error <= max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std):
-        return 1.0, []
-    if error <= LARGEST_SCALE_CORRECTION:
-        scale = 1.0 + (scale - 1.0) * USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
-    text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
-    twice = any(abs(scale / value - 1.0) < FACTOR_TWO_TOLERANCE for value in (0.5, 2.0))
-    if may and (error <= LARGEST_SCALE_CORRECTION or twice):
-        return scale, [f"{text}: corrected; wheels.left_scale and right_scale set it"]
-    return 1.0, [f"{text}: check wheel radius, encoder resolution and units"]
+    if not may:
+        return (factor, factor), [*notes, f"{text}: check wheel radii and tyre pressures"]
+    notes.append(f"{text}: corrected; wheels.left_scale and right_scale set it")
+    return (factor * (1.0 + difference / 2), factor * (1.0 - difference / 2)), notes
 
 
 def _fused_note(log: RobotLog) -> list[str]:
@@ -362,10 +287,11 @@ def find_filtering(fit: AlignmentFit) -> str:
     long_s = min(LONGEST_S, float(track.t[-1]) / LONG_WINDOWS)
     if long_s < SHORTEST_LONG_S:
         return ""
-    found = [compare_turns(track, fit.width_m, delay, one) for one in (NOISE_S, SHORT_S, MIDDLE_S, long_s)]
-    noise, short, middle, long = found
-    if noise is None or short is None or middle is None or long is None:
+    compared = (compare_turns(track, fit.width_m, delay, one) for one in (NOISE_S, SHORT_S, MIDDLE_S, long_s))
+    found = [one for one in compared if one is not None]
+    if len(found) < 4:
         return ""
+    noise, short, middle, long = found
     change, std = long.ratio - short.ratio, math.hypot(short.ratio_std, long.ratio_std)
     if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(SIGNIFICANT_SIGMAS * std, SMALLEST_CHANGE * long.ratio):
         ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {SHORT_S:g} s and {long.ratio:.2f} ± "

@@ -8,7 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.log_track import CHORD_S, FEWEST_WINDOWS, LEAST_CHORD_M, cut_chords, track_of_streams
+from icrtool.alignment.log_track import (
+    CHORD_S,
+    FEWEST_WINDOWS,
+    LEAST_CHORD_M,
+    DriveWindows,
+    cut_chords,
+    track_of_streams,
+)
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -38,6 +45,10 @@ OTHER_UNIT_TOLERANCE = 0.1
 """A unit other than that of the message type is recognised within this share: slip of 90 % would look like rpm."""
 
 
+STANDS_SHARE, STILL = 0.8, 0.2
+"""The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""
+
+
 class Scale(NamedTuple):
     """Metres by the position reference per unit of the wheels: median, and its standard deviation."""
 
@@ -65,7 +76,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     try:
         factor, how, estimated = _metres_per_unit(wheels, log.gnss, config, topic)
     except ConfigError:
-        refuse_parked(log)
+        refuse_standing(log)
         raise
     warnings = [f"{log.name}: {note}" for note in estimated]
     with np.errstate(over="ignore"):
@@ -93,31 +104,48 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     return replace(log, wheels=samples, streams=streams, warnings=(*log.warnings, *warnings))
 
 
-def refuse_parked(log: RobotLog) -> None:
-    """Raise where the wheels turn and the positions stay within their noise: a robot on a stand.
+def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
+    """Raise where the wheels turn and the robot does not move: it is on a stand, or held.
 
-    For logs that show no heading or no unit, which a robot on a stand shows neither; one that spins on the spot may.
+    Parameters
+    ----------
+    windows : of the log; without them the positions decide, which stay within their noise: for logs that show no
+        heading or no unit, which a robot on a stand shows neither. One that spins on the spot may
 
     Raises
     ------
     DataError
         It stands.
     """
-    turns = (log.wheels.left != 0.0) | (log.wheels.right != 0.0)
-    place = log.gnss.north_m + 1j * log.gnss.east_m
-    if not len(place) or float(np.mean(turns)) < TURNING_SHARE:
+    gone = ""
+    if windows is not None:
+        track = windows.track
+        if len(windows.begin) < FEWEST_WINDOWS:
+            return
+        turned = np.abs(windows.over(track.heading_at(track.place_t)))
+        apart = np.abs(windows.over(track.at_places(track.half_difference)))
+        laid, went = np.abs(windows.over(track.laid)), np.abs(windows.over(track.place))
+        moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
+        clear = np.maximum(laid, apart) > windows.length_m / 4
+        if np.count_nonzero(clear) < FEWEST_WINDOWS or float((~moved)[clear].mean()) <= STANDS_SHARE:
+            return
+        gone = f" ({track.travel[-1]:.0f} m)"
+    elif not len(log.gnss.stamp_ns) or np.mean((log.wheels.left != 0.0) | (log.wheels.right != 0.0)) < TURNING_SHARE:
         return
-    variance = (log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2
-    known = variance[np.isfinite(variance)]
-    noise_m = math.sqrt(float(np.median(known))) if len(known) else 0.0
+    place = log.gnss.north_m + 1j * log.gnss.east_m
     away = np.abs(place - (np.median(place.real) + 1j * np.median(place.imag)))
     reach_m = float(np.percentile(away, 95))
-    if reach_m < max(PARKED_M, PARKED_SIGMAS * noise_m):
-        raise DataError(
-            log.name,
-            "the wheels turn and the robot does not move",
-            f"95 % of the positions lie within {reach_m:.2f} m: is it on a stand?",
-        )
+    if windows is None:
+        variance = (log.gnss.var_north_m2 + log.gnss.var_east_m2) / 2
+        known = variance[np.isfinite(variance)]
+        noise_m = math.sqrt(float(np.median(known))) if len(known) else 0.0
+        if reach_m >= max(PARKED_M, PARKED_SIGMAS * noise_m):
+            return
+    raise DataError(
+        log.name,
+        f"the wheels turn{gone} and the robot does not move",
+        f"95 % of the positions lie within {reach_m:.2f} m: is it on a stand?",
+    )
 
 
 def _spikes(speed: Floats) -> Bools:

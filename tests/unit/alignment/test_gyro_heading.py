@@ -125,11 +125,11 @@ def test_the_stated_deviation_is_that_of_the_heading_that_the_filter_is_given(so
         elif source == "antenna_pair":
             log = with_second_antenna(log, truth, seed)
         found = align_streams(log, CONFIG)
-        assert found.heading.facts.source == source
+        assert found.heading.source == source
         later = found.log.heading.stamp_ns - truth[0][0] >= FIRST_S * 1e9
         square.append((error_deg(found.log.heading, truth)[later] ** 2).mean())
-        assert found.heading.facts.std_deg is not None
-        stated.append(found.heading.facts.std_deg**2)
+        assert found.heading.std_deg is not None
+        stated.append(found.heading.std_deg**2)
     assert 0.8 < math.sqrt(np.mean(square) / np.mean(stated)) < 1.25
 
 
@@ -252,7 +252,7 @@ def test_noise_of_the_fixes_is_no_drift_of_the_heading() -> None:
     north, east = (one + rng.normal(0.0, 1.0, len(one)) for one in (log.gnss.north_m, log.gnss.east_m))
     log = with_attitude(replace(log, gnss=replace(log.gnss, north_m=north, east_m=east)), truth, 1)
     found = align_streams(log, CONFIG)
-    assert found.heading.facts.source in ("orientation", "fused")
+    assert found.heading.source in ("orientation", "fused")
     assert not any("drifts" in warning for warning in found.log.warnings)
 
 
@@ -316,7 +316,7 @@ def test_an_orientation_that_drifts_is_used_as_a_turn_rate() -> None:
     drifting = psi + math.radians(0.5) * (stamps - stamps[0]) / 1e9
     spoilt = replace(log, heading=replace(log.heading, heading_rad=np.angle(np.exp(1j * drifting))))
     found = align_streams(spoilt, CONFIG)
-    assert found.heading.facts.source == "gyro_course"
+    assert found.heading.source == "gyro_course"
     assert found.derived is not None
     assert any("drifts" in warning for warning in found.log.warnings)
     assert math.sqrt((error_deg(found.derived.smoothed, (stamps, psi)) ** 2).mean()) < 1.0

@@ -188,11 +188,11 @@ def test_clocks_that_show_no_difference_are_known_better_than_the_drive_shows() 
     nothing = Delay(0.0, 0.03)
 
     def unknown(after: float, std: float) -> float:
-        return StreamDelays(nothing, nothing, Delay(after, std), False, 0.0, 0.0, ()).clock_std_s
+        return StreamDelays(nothing, nothing, Delay(after, std), False, 0.0, 0.0).clock_std_s
 
     assert unknown(0.0, 0.05) == pytest.approx(0.05 / 2.0)
     assert unknown(0.12, 0.05) > 0.1
     # a drive that shows nothing leaves half of the prior
     assert unknown(0.0, 0.15) == pytest.approx(0.15 / np.sqrt(2.0))
-    corrected = StreamDelays(nothing, nothing, Delay(0.2, 0.05), False, 0.0, 0.2, ())
+    corrected = StreamDelays(nothing, nothing, Delay(0.2, 0.05), False, 0.0, 0.2)
     assert corrected.clock_std_s == 0.05

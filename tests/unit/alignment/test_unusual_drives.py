@@ -28,7 +28,7 @@ def test_wheels_that_spin_show_no_scale_and_no_delay() -> None:
     left, right = spin * log.wheels.v_left_mps, spin * log.wheels.v_right_mps
     spoilt = replace(log, wheels=replace(log.wheels, left=left, right=right))
     found = align_streams(replace(spoilt, heading=moved(spoilt.heading, 0.3)), CONFIG)
-    assert found.wheels.applied == (1.0, 1.0)
+    assert found.scales == (1.0, 1.0)
     assert found.delays.applied_heading_s == found.delays.applied_gnss_s == 0.0
     assert any("the wheels slip" in warning for warning in found.wheels.warnings)
 

@@ -32,7 +32,7 @@ def test_good_wheels_are_left_as_they_are() -> None:
     found = align_streams(log, CONFIG)
     assert found.wheels.warnings == ()
     assert found.log.wheels is log.wheels
-    assert found.wheels.facts.scale == pytest.approx(1.0, abs=0.01)
+    assert found.wheels.scale == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -75,9 +75,9 @@ def test_certain_faults_are_put_right_and_said(spoil, words: str) -> None:  # ty
 )
 def test_faults_that_cannot_be_put_right_are_named(spoil, words: str) -> None:  # type: ignore[no-untyped-def]
     log = make_log(seconds=120.0)
-    check = align_streams(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG).wheels
+    check = align_streams(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG)
     assert any(words in warning for warning in check.warnings)
-    assert check.applied == (1.0, 1.0)
+    assert check.scales == (1.0, 1.0)
 
 
 @pytest.mark.parametrize(("left", "right"), [(1.02, 0.98), (1.08, 1.03), (0.95, 0.95)])
@@ -107,7 +107,9 @@ def test_a_drive_too_straight_to_tell_the_convention_swaps_no_wheels() -> None:
             gnss=PositionFixes(stamps[fix], north, east, known, known, 0 * known),
             heading=HeadingSamples(stamps, told, np.full(len(t), 1e-4)),
         )
-        assert align_streams(straight, CONFIG).wheels.warnings == ()
+        found = align_streams(straight, CONFIG)
+        assert found.scales == (1.0, 1.0)
+        assert not [warning for warning in found.warnings if "wheel" in warning or "side" in warning]
 
 
 def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backwards() -> None:
@@ -131,8 +133,8 @@ def test_preset_paper_corrects_nothing() -> None:
 def test_a_configured_scale_is_not_touched() -> None:
     log = make_log(seconds=120.0)
     spoilt = with_wheels(log, 1.07 * log.wheels.v_left_mps, 1.07 * log.wheels.v_right_mps)
-    check = align_streams(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"])).wheels
-    assert check.applied == (1.0, 1.0)
+    check = align_streams(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"]))
+    assert check.scales == (1.0, 1.0)
     assert any("check wheel radius" in warning for warning in check.warnings)
 
 
@@ -218,7 +220,7 @@ def test_the_diameter_for_the_radius_is_corrected_on_wheels_that_roll_at_less_th
     log = make_log(seconds=120.0)
     left, right = (2.0 / 0.955 * speed for speed in (log.wheels.left, log.wheels.right))
     found = align_streams(with_wheels(log, left, right), CONFIG)
-    assert found.wheels.facts.applied_scale == pytest.approx(0.955 / 2.0, rel=0.01)
+    assert found.scales_scale == pytest.approx(0.955 / 2.0, rel=0.01)
 
 
 def test_a_scale_that_nothing_explains_makes_the_run_unusable() -> None:
