@@ -23,7 +23,7 @@ from icrtool.alignment.conventions import (
 )
 from icrtool.alignment.estimator import PRIOR_STD, TP, AlignmentFit, estimate_alignment
 from icrtool.alignment.heading_alignment import (
-    NO_COURSE,
+    NOT_COMPARED,
     OTHER_CONVENTION,
     align_heading,
     compare_with_course,
@@ -232,7 +232,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     refuse_standing(log, windows)
     fit, convention = estimate_alignment(windows, width), decision.convention
     if derived is not None:
-        heading, correlation_s, of_heading = align_heading(log, config, None, NO_COURSE, convention, derived)
+        heading, correlation_s, of_heading = align_heading(log, config, None, NOT_COMPARED, convention, derived)
     else:
         course, free = compare_with_course(windows), config.frames.heading_offset_deg == "auto" and corrects
         may_derive = free and config.frames.heading == "auto"

@@ -96,13 +96,19 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
     gnss, changes = log.gnss, config.filter.preset != "paper"
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
     kinds, misreported = _classes(log, stated, steps)
-    white = {name: steps.white_std_m(kinds == code) for code, name in CLASSES.items()}
     fixed = kinds == FIXED_FIX
     norm = bool(np.count_nonzero(fixed) >= NORM_SHARE * len(kinds)) and changes
     variance = np.column_stack([gnss.var_north_m2, gnss.var_east_m2])
-    raised: list[str] = []
-    if changes:
-        variance, raised = _at_least_white(variance, kinds, white, unstated_position_std_m(config.filter))
+    white, raised = dict[str, float](), dict[str, float]()
+    for code, name in CLASSES.items():
+        rows = kinds == code
+        std = white[name] = steps.white_std_m(rows)
+        if not (changes and rows.any() and math.isfinite(std)):
+            continue
+        silent_m2 = unstated_position_std_m(config.filter) ** 2
+        shown = np.where(np.isfinite(variance[rows]) & (variance[rows] > 0), variance[rows], silent_m2)
+        if std**2 > NOISIER**2 * float(np.median(shown)):
+            variance[rows], raised[name] = np.maximum(shown, std**2), std
     down = ~fixed & norm
     variance[down] = _of_class(variance, kinds, gnss.stamp_ns)[down]
     if raised or down.any():
@@ -111,18 +117,11 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
         fixes_of(gnss, config.filter, measured_m), fix_class=kinds, misreported=misreported, down_weighted=down
     )
     given = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
-    notes = [
-        *_notes_of_classes(fixes, stated, given, changes=changes),
-        *_notes_of_noise(fixes, stated, {name: white[name] for name in raised}),
-    ]
     known = {name: given[(kinds == code) & np.isfinite(given)] for code, name in CLASSES.items()}
-    std = {name: float(np.median(one)) if len(one) else math.nan for name, one in known.items()}
-    return GnssQuality(
-        fixes,
-        FixStatistics(std, white),
-        _losses(gnss.stamp_ns, fixed) if norm else np.empty((0, 2), np.int64),
-        tuple(f"{log.name}: {note}" for note in notes),
-    )
+    std_m = {name: float(np.median(one)) if len(one) else math.nan for name, one in known.items()}
+    losses = _losses(gnss.stamp_ns, fixed) if norm else np.empty((0, 2), np.int64)
+    notes = _notes(fixes, stated, given, raised, changes=changes)
+    return GnssQuality(fixes, FixStatistics(std_m, white), losses, tuple(f"{log.name}: {note}" for note in notes))
 
 
 def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
@@ -136,25 +135,6 @@ def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Boo
     kinds = np.select([status == RTK_FIX, status == NOT_STATED], [rtk, silent], status)
     misreported = find_misreported(log.gnss.stamp_ns, steps, kinds == FIXED_FIX, status == FIXED_FIX)
     return np.where(misreported, FLOAT_FIX, kinds).astype(np.uint8), misreported
-
-
-def _at_least_white(
-    variance: Floats, kinds: Bytes, white: dict[str, float], silent_std_m: float
-) -> tuple[Floats, list[str]]:
-    """Raise the variances (m, 2) of a class to its white noise where that is clearly more than is stated.
-
-    Returns the variances, and the names of the classes that were raised.
-    """
-    raised, names = variance.copy(), []
-    for code, name in CLASSES.items():
-        rows, std = kinds == code, white.get(name, math.nan)
-        if not rows.any() or not math.isfinite(std):
-            continue
-        stated = np.where(np.isfinite(variance[rows]) & (variance[rows] > 0), variance[rows], silent_std_m**2)
-        if std**2 > NOISIER**2 * float(np.median(stated)):
-            raised[rows] = np.maximum(stated, std**2)
-            names.append(name)
-    return raised, names
 
 
 def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
@@ -182,44 +162,37 @@ def _losses(stamps: Ints, fixed: Bools) -> Ints:
     return np.column_stack([times[:-1][lost], ends[lost]])
 
 
-def _notes_of_classes(fixes: Fixes, stated: Floats, given: Floats, *, changes: bool) -> list[str]:
-    """Return sentences on fixes that are not fixed; `stated`, `given` (m,): deviations before and after [m]."""
+def _notes(fixes: Fixes, stated: Floats, given: Floats, raised: dict[str, float], *, changes: bool) -> list[str]:
+    """Return sentences on fixes that are not fixed, and on classes whose noise was raised to what they scatter by.
+
+    Parameters
+    ----------
+    stated, given : (m,) deviations before and after [m]; raised : [m] by class
+    """
+
+    def accuracy(rows: Bools, silent: str) -> str:
+        known = stated[rows & np.isfinite(stated) & (stated > 0)]
+        return f"±{np.median(known):.2g} m" if len(known) else silent
+
     notes, misreported = [], fixes.misreported
-    if misreported.any():
-        notes.append(
-            f"{_counted(misreported)} state {_accuracy(stated[misreported], 'that they are fixed')} "
-            f"but scatter or jump like RTK float{': taken as float' if changes else ''}"
-        )
     down = fixes.down_weighted & ~misreported
+    count, down_count = (
+        f"{np.count_nonzero(rows):,} fixes ({100 * np.count_nonzero(rows) / len(rows):.0f} %)"
+        for rows in (misreported, down)
+    )
+    if misreported.any():
+        text = f"{count} state {accuracy(misreported, 'that they are fixed')} but scatter or jump like RTK float"
+        notes.append(f"{text}{': taken as float' if changes else ''}")
     if down.any():
-        used = np.median(given[down])
-        notes.append(f"{_counted(down)} are not RTK fixed, as most of this log are: they are used with ±{used:.2g} m")
-    return notes
-
-
-def _notes_of_noise(fixes: Fixes, stated: Floats, raised: dict[str, float]) -> list[str]:
-    """Return sentences on the classes whose noise was raised to what they scatter by [m]."""
-    notes = []
+        used = f"they are used with ±{np.median(given[down]):.2g} m"
+        notes.append(f"{down_count} are not RTK fixed, as most of this log are: {used}")
     for code, name in CLASSES.items():
         rows = fixes.fix_class == code
         if name in raised and not fixes.down_weighted[rows].all():
             kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
-            notes.append(
-                f"the {kind} state {_accuracy(stated[rows], 'no accuracy')} and scatter by {raised[name]:.2g} m: "
-                "the scatter is used"
-            )
+            scatter = f"scatter by {raised[name]:.2g} m: the scatter is used"
+            notes.append(f"the {kind} state {accuracy(rows, 'no accuracy')} and {scatter}")
     return notes
-
-
-def _counted(rows: Bools) -> str:
-    count = int(np.count_nonzero(rows))
-    return f"{count:,} fixes ({100 * count / len(rows):.0f} %)"
-
-
-def _accuracy(stated: Floats, silent: str) -> str:
-    """Return the median accuracy stated (m,) [m] in words, `silent` where none is."""
-    known = stated[np.isfinite(stated) & (stated > 0)]
-    return f"±{np.median(known):.2g} m" if len(known) else silent
 
 
 USUAL_M2 = 2 * 0.005**2
@@ -253,7 +226,7 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
     A jump alone does not show which of its sides is wrong: noise does, or a return. Else the class stays.
     """
     misreported = np.zeros(len(claimed), np.bool_)
-    level, moves = steps.stretch_levels(claimed), steps.stretch_moves()
+    level, moves = steps.stretches(claimed)
     known, moving = level[np.isfinite(level)], level[np.isfinite(level) & moves]
     if len(known) < 2:
         return misreported

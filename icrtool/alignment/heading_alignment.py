@@ -144,7 +144,7 @@ class CourseComparison(NamedTuple):
     duration_s: float
 
 
-NO_COURSE = CourseComparison(0, math.nan, math.nan, False, 0.0)
+NOT_COMPARED = CourseComparison(0, math.nan, math.nan, False, 0.0)
 
 
 def compare_with_course(windows: DriveWindows) -> CourseComparison:
@@ -156,7 +156,7 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
     travel = track.at_places(v)
     moved = (np.abs(seen) > windows.length_m / 3) & (np.abs(laid) > windows.length_m / 3)
     if not moved.any():
-        return NO_COURSE
+        return NOT_COMPARED
     angle, turned_over = (np.exp(1j * np.angle(one * np.conj(seen)))[moved] for one in (laid, other))
     backwards = (travel[end] < travel[begin])[moved]
     ahead, back = angle[~backwards], angle[backwards]
@@ -178,8 +178,8 @@ def align_heading(
 
     Parameters
     ----------
-    fit, course : of the heading that a sensor states: its estimate, None where the drive is too short, and its course
-        over ground; of a log without one None and `NO_COURSE`
+    fit : of the heading that a sensor states, None without one or where the drive is too short; after it the same
+        heading beside the course over ground
     convention : that the streams were found to have
     derived : the heading where it was estimated, which holds every correction
 

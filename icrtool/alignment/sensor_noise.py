@@ -73,22 +73,21 @@ class FixSteps(NamedTuple):
             return float("nan")
         return float(np.sqrt(max(float(self.product[inside].mean()) / 2, 0.0)))
 
-    def stretch_levels(self, claimed: Bools) -> Floats:
-        """Return the white variance, both axes [m^2], of stretches of `FEWEST_STEPS` fixes; NaN where unknown."""
-        stretches = len(self.product) // FEWEST_STEPS
+    def stretches(self, claimed: Bools) -> tuple[Floats, Bools]:
+        """Return the white variance of stretches of `FEWEST_STEPS` fixes, and whether the robot moves for most of each.
+
+        The variance is that of both axes together [m^2], of the fixes that are `claimed` (m,); NaN where unknown.
+        """
+        shape = len(self.product) // FEWEST_STEPS, FEWEST_STEPS
         inside = claimed[:-2] & claimed[1:-1] & claimed[2:] & np.isfinite(self.product)
         inside[np.clip(np.concatenate([self.jump_row - 2, self.jump_row - 1]), 0, None)] = False
-        values = np.where(inside, self.product, 0.0)[: stretches * FEWEST_STEPS].reshape(-1, FEWEST_STEPS)
-        count = inside[: stretches * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).sum(axis=1)
-        level = np.full(stretches, np.nan)
-        np.divide(values.sum(axis=1), count, out=level, where=count > FEWEST_STEPS // 2)
-        return level
-
-    def stretch_moves(self) -> Bools:
-        """Return whether the robot moved for most of each of the same stretches."""
-        stretches = len(self.product) // FEWEST_STEPS
-        share = self.moves[: stretches * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).mean(axis=1)
-        return np.asarray(share > 0.5)
+        products, used, moves = (
+            column[: shape[0] * shape[1]].reshape(shape)
+            for column in (np.where(inside, self.product, 0.0), inside, self.moves)
+        )
+        count, level = used.sum(axis=1), np.full(shape[0], np.nan)
+        np.divide(products.sum(axis=1), count, out=level, where=count > FEWEST_STEPS // 2)
+        return level, np.asarray(moves.mean(axis=1) > 0.5)
 
 
 def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Complexes) -> FixSteps:
@@ -236,20 +235,18 @@ def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn
     for seconds. Preset ``paper`` measures nothing.
     """
     free = settings.preset != "paper" and settings.gnss_std_m == "auto" and log.datum is None
-    if not free or _states_any(log.gnss.var_north_m2):
+    place_stated, turn_stated = (
+        (np.isfinite(one) & (one > 0.0)).any() for one in (log.gnss.var_north_m2, log.heading.var_rad2)
+    )
+    if not free or place_stated:
         return math.nan, math.nan
     values = np.concatenate([log.gnss.north_m, log.gnss.east_m])
     std_m = _measured(place, values, LEAST_POSITION_STD_M, USUAL_POSITION_STD_M)
-    fields = log.heading_is_of_position and not _states_any(log.heading.var_rad2)
-    if math.isnan(std_m) or not fields or settings.heading_std_deg != "auto":
+    if math.isnan(std_m) or not log.heading_is_of_position or turn_stated or settings.heading_std_deg != "auto":
         return std_m, math.nan
     # one axis: `white_std_m` shares the variance among two
     least, usual = (angle / math.sqrt(2.0) for angle in (LEAST_HEADING_STD_RAD, math.radians(USUAL_HEADING_STD_DEG)))
     return std_m, math.sqrt(2.0) * _measured(turn, log.heading.heading_rad, least, usual)
-
-
-def _states_any(variance: Floats) -> bool:
-    return bool((np.isfinite(variance) & (variance > 0.0)).any())
 
 
 def _measured(steps: FixSteps, values: Floats, least: float, usual: float) -> float:

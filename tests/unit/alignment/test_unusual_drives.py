@@ -30,7 +30,7 @@ def test_wheels_that_spin_show_no_scale_and_no_delay() -> None:
     found = align_streams(replace(spoilt, heading=moved(spoilt.heading, 0.3)), CONFIG)
     assert found.scales == (1.0, 1.0)
     assert found.delays.applied_heading_s == found.delays.applied_gnss_s == 0.0
-    assert any("the wheels slip" in warning for warning in found.wheels.warnings)
+    assert any("the wheels slip" in warning for warning in found.warnings)
 
 
 def moved(heading: HeadingSamples, late_s: float) -> HeadingSamples:

@@ -30,7 +30,7 @@ def with_wheels(log: RobotLog, left: np.ndarray, right: np.ndarray) -> RobotLog:
 def test_good_wheels_are_left_as_they_are() -> None:
     log = make_log(seconds=120.0)
     found = align_streams(log, CONFIG)
-    assert found.wheels.warnings == ()
+    assert found.warnings == ()
     assert found.log.wheels is log.wheels
     assert found.wheels.scale == pytest.approx(1.0, abs=0.01)
 
@@ -220,7 +220,7 @@ def test_the_diameter_for_the_radius_is_corrected_on_wheels_that_roll_at_less_th
     log = make_log(seconds=120.0)
     left, right = (2.0 / 0.955 * speed for speed in (log.wheels.left, log.wheels.right))
     found = align_streams(with_wheels(log, left, right), CONFIG)
-    assert found.scales_scale == pytest.approx(0.955 / 2.0, rel=0.01)
+    assert found.wheels.applied_scale == pytest.approx(0.955 / 2.0, rel=0.01)
 
 
 def test_a_scale_that_nothing_explains_makes_the_run_unusable() -> None:
