@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, ge
 import msgspec
 
 from icrtool.errors import ConfigError
-from icrtool.records.regular_file import read_regular
+from icrtool.records.places import read_regular
 from icrtool.records.text import LONGEST_NAME, did_you_mean, shortened
 
 LARGEST_FILE_BYTES = 1 << 20

@@ -10,8 +10,8 @@ import click
 
 from icrtool.cli import when_used
 from icrtool.cli.printing import Printer
+from icrtool.records.places import UrlPath
 from icrtool.records.text import escaped
-from icrtool.records.urls import UrlPath
 
 with when_used():
     from icrtool import errors

@@ -22,8 +22,8 @@ from click.shell_completion import CompletionItem
 from icrtool.cli import when_used
 from icrtool.cli.inputs import ResultPlace
 from icrtool.cli.printing import Printer
+from icrtool.records.places import UrlPath, place_of
 from icrtool.records.text import escaped
-from icrtool.records.urls import UrlPath, place_of
 
 with when_used():
     from icrtool import config, errors

@@ -13,8 +13,8 @@ from icrtool.cli import options, when_used
 from icrtool.cli.inputs import RUNS, runs_of, runs_or_logs
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, flag, option
 from icrtool.cli.printing import Printer
+from icrtool.records.places import UrlPath, place_of
 from icrtool.records.text import LogText
-from icrtool.records.urls import UrlPath, place_of
 
 with when_used():
     from icrtool import errors
@@ -26,7 +26,7 @@ with when_used():
     from icrtool.output.files import atomic, formats
     from icrtool.output.page import group_pages, render, run_page
     from icrtool.output.tables import calibration as tables
-    from icrtool.records import fleet_document, regular_file
+    from icrtool.records import fleet_document, places
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
@@ -77,8 +77,8 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
         with _as_written(file, "run icrtool compare again"):
             comparison = group_pages.read_comparison(file, source if source.is_dir() else None)
             return group_pages.comparison_page(comparison, file.stem)
-    if regular_file.is_special(source):
-        raise errors.RunError(source, regular_file.NOT_REGULAR, regular_file.SAVE_IT)
+    if places.is_special(source):
+        raise errors.RunError(source, places.NOT_REGULAR, places.SAVE_IT)
     what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
     raise errors.RunError(source, what, "icrtool fit, batch and compare make one")
 

@@ -24,8 +24,7 @@ from icrtool.fleet.recordings import about, as_text, find_recordings, is_manifes
 from icrtool.logs.containers.recording_files import files_of_log
 from icrtool.logs.containers.source import RemoteFile
 from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
-from icrtool.records.regular_file import read_regular
-from icrtool.records.urls import UrlPath
+from icrtool.records.places import UrlPath, read_regular
 
 POLL_S = 1.0
 """Time between two looks at a cluster."""

@@ -27,8 +27,8 @@ from icrtool.output.run_directory import PAGE_FILE
 from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records import fleet_document as documents
 from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog
+from icrtool.records.places import is_regular
 from icrtool.records.process_resources import remove
-from icrtool.records.regular_file import is_regular
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.text import LogText, counted, escaped
 

@@ -31,11 +31,11 @@ from icrtool.output.files.remote_place import on_disk, write_below
 from icrtool.output.run_directory import PAGE_FILE, check_target, new_run, open_run, replaced_log
 from icrtool.records.dropout import DEFAULT_SEED
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
+from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, FigureSet
 from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
-from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration

@@ -34,8 +34,7 @@ from icrtool.logs.containers.recording_files import (
 )
 from icrtool.logs.containers.source import find
 from icrtool.logs.containers.sqlite_bag import SqliteBag
-from icrtool.records.regular_file import read_regular
-from icrtool.records.urls import UrlPath, place_of
+from icrtool.records.places import UrlPath, place_of, read_regular
 
 RUN_FILE = "run.json"
 

@@ -29,11 +29,11 @@ from icrtool.logs.streams.assembly import Survey, assemble, longest_part
 from icrtool.logs.streams.headings import GYRO_AXES
 from icrtool.logs.streams.positions import TRANSFORM_FIELDS, TRANSFORM_TYPES, is_static, transform_pose
 from icrtool.logs.streams.select import fields_to_take, find_candidates
+from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import Record
 from icrtool.records.samples import InputFile, Role, rate_and_jitter
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText, escaped
-from icrtool.records.urls import UrlPath, place_of
 
 if TYPE_CHECKING:
     import pandas as pd

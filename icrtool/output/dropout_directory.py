@@ -24,7 +24,7 @@ from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, logs_
 from icrtool.output.run_directory import is_run_directory
 from icrtool.records.dropout_document import DropoutDocument, EarlierReport, SummaryRow
 from icrtool.records.fleet_document import FLEET_FILE
-from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
+from icrtool.records.places import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
 from icrtool.records.run import FigureSet
 from icrtool.records.run_document import known_content
 from icrtool.records.text import escaped

@@ -19,15 +19,14 @@ from icrtool.output.files import formats, run_columns
 from icrtool.output.files.atomic import atomic_directory, check_directory, own_files
 from icrtool.output.files.remote_place import fetched, lies_there
 from icrtool.output.files.run_columns import MEASUREMENTS_FILE, StatesFileError, StatesFormat
+from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of, read_regular
 from icrtool.records.plain_data import Record
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special, read_regular
 from icrtool.records.run import FigureSet, Run
 from icrtool.records.run_document import EVENT_COLUMNS, RUN_SCHEMA, EventDocument, RunDocument
 from icrtool.records.samples import InputFile
 from icrtool.records.tables import States
 from icrtool.records.text import LONGEST_NAME, escaped_texts, shortened
-from icrtool.records.urls import UrlPath, place_of
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"

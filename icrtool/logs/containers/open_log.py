@@ -23,9 +23,8 @@ from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, read_by_ranges
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save, unpack
-from icrtool.records.regular_file import NOT_REGULAR, SAVE_IT, is_special
+from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
 from icrtool.records.samples import InputFile
-from icrtool.records.urls import UrlPath
 
 MOST_CHANNELS = 2048
 """Topics of a log, each publisher of a ROS 1 bag by itself, that are looked at: some 0.5 ms of time each."""

@@ -15,10 +15,9 @@ from threading import Event
 from typing import NamedTuple
 
 from icrtool.errors import LogError
-from icrtool.records.regular_file import open_regular
+from icrtool.records.places import UrlPath, open_regular
 from icrtool.records.samples import InputFile
 from icrtool.records.text import some_of
-from icrtool.records.urls import UrlPath
 
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
 """A file with one of these is a recording even if its content is not: that it cannot be read is a result."""

@@ -24,8 +24,8 @@ from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.container import ahead
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, natural_order, unpacked_name
+from icrtool.records.places import UrlPath, place_of, without_secrets
 from icrtool.records.samples import InputFile
-from icrtool.records.urls import UrlPath, place_of, without_secrets
 
 Result = TypeVar("Result")
 

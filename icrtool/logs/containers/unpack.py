@@ -33,7 +33,7 @@ from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, LARGEST_RATIO, ZS
 from icrtool.logs.containers.container import CUT_OFF
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
 from icrtool.records import process_resources
-from icrtool.records.regular_file import open_regular
+from icrtool.records.places import open_regular
 from icrtool.records.text import some_of
 
 _PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED})?$|\.db3-wal$|^metadata\.yaml$")

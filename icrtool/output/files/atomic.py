@@ -17,9 +17,9 @@ import msgspec
 
 from icrtool.errors import OutputError
 from icrtool.output.files import disk
+from icrtool.records.places import check_links, open_regular, read_regular
 from icrtool.records.plain_data import Record
 from icrtool.records.process_resources import with_parents
-from icrtool.records.regular_file import check_links, open_regular, read_regular
 from icrtool.records.text import escaped, listed
 
 IsOurs = Callable[[Path], bool]

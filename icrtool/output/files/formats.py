@@ -24,8 +24,8 @@ from icrtool.kernels.arrays import Floats
 from icrtool.output.files.atomic import check_place, write_file
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, CalibrationFile
 from icrtool.records.fleet_document import FLEET_FILE, FleetDocument, FleetLog
+from icrtool.records.places import check_links, open_regular, read_regular
 from icrtool.records.plain_data import plain
-from icrtool.records.regular_file import check_links, open_regular, read_regular
 from icrtool.records.text import LogText, escaped_texts, table_cell
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from icrtool.logs.containers.unpack import ScratchFolder
 from icrtool.output.files.atomic import OWN_FILES, make_folders, reported, write_file
 from icrtool.output.files.formats import CHECKSUM_FILE
 from icrtool.records.fleet_document import FLEET_FILE
-from icrtool.records.urls import UrlPath
+from icrtool.records.places import UrlPath
 
 Result = TypeVar("Result")
 

@@ -27,7 +27,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.chunk import LARGEST_RATIO
 from icrtool.output.files.formats import file_b2sum
 from icrtool.records.measurements import Fixes, ReferenceJump, SensorData, SlipEvent
-from icrtool.records.regular_file import open_regular
+from icrtool.records.places import open_regular
 from icrtool.records.run import MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, thin

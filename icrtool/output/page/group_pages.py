@@ -19,7 +19,7 @@ from icrtool.output.text_blocks import Block, Cell, Figure, Section, Table, Titl
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, signed
 from icrtool.records.calibration_document import GroupComparison, TransferCell
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
-from icrtool.records.regular_file import is_regular
+from icrtool.records.places import is_regular
 from icrtool.records.run import ICR_WORDS
 from icrtool.records.text import counted, distance_text
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from icrtool import __version__
 from icrtool.errors import RunError
+from icrtool.records.places import read_regular
 from icrtool.records.plain_data import plain
-from icrtool.records.regular_file import read_regular
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:

@@ -32,7 +32,7 @@ from icrtool.logs.containers.recording_files import log_name
 from icrtool.logs.containers.source import find
 from icrtool.logs.read_log import read_log
 from icrtool.records.fleet_document import FleetFile
-from icrtool.records.urls import UrlPath, place_of, without_secrets
+from icrtool.records.places import UrlPath, place_of, without_secrets
 from support.servers import SECRET, file_server, object_store
 
 SAMPLES = Path(__file__).parents[3] / "sample_logs"

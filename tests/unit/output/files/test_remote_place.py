@@ -18,7 +18,7 @@ import icrtool
 from icrtool.cli import main
 from icrtool.errors import OutputError, RunError
 from icrtool.output.files.remote_place import on_disk
-from icrtool.records.urls import UrlPath
+from icrtool.records.places import UrlPath
 from support.servers import SECRET, object_store
 
 SAMPLES = Path(__file__).parents[4] / "sample_logs"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.records.regular_file import NotRegularFileError, check_links, is_regular, read_regular
+from icrtool.records.places import NotRegularFileError, check_links, is_regular, read_regular
 
 
 @pytest.fixture
