@@ -117,8 +117,7 @@ def call_all_kernels() -> None:
     from icrtool.logs.write_log import WriteOptions, write_log
     from icrtool.records.process_resources import unfinished
     from icrtool.records.run import track_of
-    from icrtool.simulation.drives import DrivePlan, Sensors
-    from icrtool.simulation.record import simulate
+    from icrtool.simulation.drives import DrivePlan, Sensors, simulate
     from icrtool.simulation.studies import default_request, run_study
 
     robot = icrtool.load_config(robot="husky-a200")

@@ -20,15 +20,14 @@ with when_used():
     from icrtool.logs import write_log
     from icrtool.output import simulation_files
     from icrtool.output.tables import study as study_tables
-    from icrtool.simulation import drives, record, studies
+    from icrtool.simulation import drives, studies
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
     from icrtool.logs.write_log import WheelMessages
     from icrtool.records.tables import Icrs
-    from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
-    from icrtool.simulation.record import TruthTable
-    from icrtool.simulation.study_records import Study, StudyName, StudyRequest
+    from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, TruthTable
+    from icrtool.simulation.study_records import Study, StudyRequest
 
 PATHS = ("circle", "curved", "lawnmower", "figure-eight", "spins", "straight")
 GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
@@ -203,7 +202,7 @@ def simulate_command(
         heading_std_deg=math.degrees(sensed.heading_std_rad),
     )
     with simulation_files.log_and_truth(log, force=force) as (fresh_log, fresh_truth):
-        recorded, truth = record.simulate(drive, sensed, seed)
+        recorded, truth = drives.simulate(drive, sensed, seed)
         write_log.write_log(fresh_log, recorded, writing)
         simulation_files.write_truth(truth, fresh_truth)
     beside = simulation_files.truth_path(log)
@@ -275,7 +274,7 @@ STUDY_NAMES = (
 @options.CONFIGURATION
 @options.printing(options.QUIET, options.VERBOSE)
 def study_command(
-    name: StudyName, output: Path | None, request: Change[StudyRequest], preset: Literal["paper", "field"] | None,
+    name: str, output: Path | None, request: Change[StudyRequest], preset: Literal["paper", "field"] | None,
     path: Change[PathPlan], plan: Change[DrivePlan], sensors: Change[Sensors], encoder_counts: float | None,
     rate: float | None, plots: tuple[str, ...], settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,9 +17,8 @@ from icrtool.output.files import disk
 from icrtool.output.files.atomic import atomic_directory, check_directory, reported, restore
 from icrtool.output.files.formats import csv_bytes, json_bytes, read_numbers, schema_of
 from icrtool.records.process_resources import remove
-from icrtool.simulation.drives import TrackSpeeds
-from icrtool.simulation.record import TruthTable
-from icrtool.simulation.study_records import Column, StudyResult
+from icrtool.simulation.drives import TrackSpeeds, TruthTable
+from icrtool.simulation.study_records import StudyResult
 
 SPEED_COLUMNS = ("t_s", "v_left_mps", "v_right_mps")
 
@@ -126,9 +124,20 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
         A file or a foreign directory is there, or the disk does not take it.
     """
     name = result.request.name
+    document = {
+        "schema": STUDY_SCHEMA,
+        "tool_version": __version__,
+        "study": name,
+        "about": result.study.about,
+        "paper_figures": result.study.figures,
+        "settings": result.request.settings(),
+        "findings": [one._asdict() for one in result.findings],
+        "levels": result.records(),
+    }
     with atomic_directory(directory, is_study_directory, kind=KIND) as partial:
-        (partial / STUDY_FILE).write_bytes(json_bytes(study_document(result)))
-        rows = zip(*map(_cells, result.columns.values()), strict=True)
+        (partial / STUDY_FILE).write_bytes(json_bytes(document))
+        columns = (column if isinstance(column, list) else column.tolist() for column in result.columns.values())
+        rows = zip(*columns, strict=True)
         (partial / f"{name}.csv").write_bytes(csv_bytes(result.columns, rows))
         if plots:
             from icrtool.output.figures.study import study_figure
@@ -140,21 +149,3 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
 def is_study_directory(directory: Path) -> bool:
     """Return whether a directory is a study of ours, of whatever version."""
     return schema_of(directory / STUDY_FILE, directory).startswith(SCHEMA_FAMILY)
-
-
-def study_document(result: StudyResult) -> dict[str, Any]:
-    """Return what study.json holds."""
-    return {
-        "schema": STUDY_SCHEMA,
-        "tool_version": __version__,
-        "study": result.request.name,
-        "about": result.study.about,
-        "paper_figures": result.study.figures,
-        "settings": result.request.settings(),
-        "findings": [one._asdict() for one in result.findings],
-        "levels": result.records(),
-    }
-
-
-def _cells(values: Column) -> list[Any]:
-    return values if isinstance(values, list) else values.tolist()

@@ -1,4 +1,4 @@
-"""Simulate a robot of known ICRs on a path, and the sensors of Pentzer 2014, Section 4."""
+"""Simulate a robot of known ICRs on a path, the sensors of Pentzer 2014, Section 4, and what is recorded of them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.kinematics import drive, follow, poses_at
+from icrtool.records.samples import SensorColumns
 from icrtool.records.tables import Icrs
 
 PathKind = Literal["circle", "curved", "lawnmower", "figure-eight", "spins", "straight"]
@@ -33,6 +34,17 @@ MOST_SAMPLES = 20_000_000
 
 LARGEST, SMALLEST = 1e6, 1e-9
 """Magnitudes of the numbers of a drive and its sensors, in their units; 0 is allowed where it has a meaning."""
+
+START_NS = 1_760_000_000_000_000_000
+DATUM = (40.7934, -77.86, 350.0)
+"""Where and when: latitude, longitude [deg], height [m] of the first pose, and the stamp of time 0."""
+
+HEIGHT_STD_RATIO = 2.0
+LARGEST_RTK_STD_M, LARGEST_SBAS_STD_M = 0.05, 0.6
+"""NavSatStatus of a receiver by its noise: GBAS, SBAS, or a plain fix."""
+
+TruthTable = dict[str, Floats | Ints]
+"""The truth at every wheel stamp: the columns of the truth CSV, (n,) each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,46 +203,32 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
     ConfigError
         It names the impossible value.
     """
-    _check_numbers(plan, sensors)
-    for number, (right, left, _) in enumerate([plan.icrs_m, *(icrs for _, icrs in plan.changes)]):
-        if not right > left:
-            raise ConfigError(
-                "change" if number else "icrs",
-                f"y_icr_right {right:g} is not right of y_icr_left {left:g}",
-                "y is positive to the right",
-            )
-    if (
-        isinstance(plan.path, PathPlan)
-        and plan.path.radius_m == 0
-        and plan.path.kind not in ("circle", "spins", "straight")
-    ):
-        raise ConfigError(
-            "radius", f"a {plan.path.kind} path has no bends of radius 0", "only a circle may have radius 0"
-        )
-    times = [time for time, _ in plan.changes]
-    if times != sorted(set(times)):
-        raise ConfigError("change", f"the times {', '.join(f'{time:g}' for time in times)} do not increase")
-    slowest = min(sensors.wheel_rate_hz, sensors.gnss_rate_hz, sensors.heading_rate_hz)
-    if plan.duration_s * slowest < 2:
-        raise ConfigError(
-            "duration", f"{plan.duration_s:g} s holds fewer than two samples at {slowest:g} Hz", "drive longer"
-        )
-
-
-def _check_numbers(plan: DrivePlan, sensors: Sensors) -> None:
-    """Refuse numbers whose samples fill the memory, or that are no size of a robot, a sensor or a drive."""
+    # Numbers whose samples fill the memory, or that are no size of a robot, a sensor or a drive.
     for part in (plan, sensors, plan.path):
         for name in (each.name for each in fields(part) if not isinstance(part, TrackSpeeds)):
             for number in _numbers_in(getattr(part, name)):
                 if number and not SMALLEST <= abs(number) <= LARGEST:
                     why = f"{number:g} is not of a magnitude from {SMALLEST:g} to {LARGEST:g}"
                     raise ConfigError(name, why, "give a number in the unit of its name")
-    rates = (1.0 / plan.step_s, sensors.wheel_rate_hz, sensors.gnss_rate_hz, sensors.heading_rate_hz)
-    if not 0.0 < (samples := plan.duration_s * max(rates)) <= MOST_SAMPLES:
-        raise ConfigError(
-            "duration", f"{plan.duration_s:g} s at {max(rates):g} Hz are {samples:.3g} samples",
-            f"at most {MOST_SAMPLES:,} are simulated",
-        )  # fmt: skip
+    rates = (sensors.wheel_rate_hz, sensors.gnss_rate_hz, sensors.heading_rate_hz)
+    fastest, slowest = max(1.0 / plan.step_s, *rates), min(rates)
+    if not 0.0 < (samples := plan.duration_s * fastest) <= MOST_SAMPLES:
+        why = f"{plan.duration_s:g} s at {fastest:g} Hz are {samples:.3g} samples"
+        raise ConfigError("duration", why, f"at most {MOST_SAMPLES:,} are simulated")
+    for number, (right, left, _) in enumerate([plan.icrs_m, *(icrs for _, icrs in plan.changes)]):
+        if not right > left:
+            why = f"y_icr_right {right:g} is not right of y_icr_left {left:g}"
+            raise ConfigError("change" if number else "icrs", why, "y is positive to the right")
+    path = plan.path
+    if isinstance(path, PathPlan) and path.radius_m == 0 and path.kind not in ("circle", "spins", "straight"):
+        advice = "only a circle may have radius 0"
+        raise ConfigError("radius", f"a {path.kind} path has no bends of radius 0", advice)
+    times = [time for time, _ in plan.changes]
+    if times != sorted(set(times)):
+        raise ConfigError("change", f"the times {', '.join(f'{time:g}' for time in times)} do not increase")
+    if plan.duration_s * slowest < 2:
+        why = f"{plan.duration_s:g} s holds fewer than two samples at {slowest:g} Hz"
+        raise ConfigError("duration", why, "drive longer")
 
 
 def _numbers_in(value: object) -> Iterator[float]:
@@ -334,19 +332,17 @@ def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Gene
     psi += rng.normal(0.0, 1.0, len(heading_t)) * sensors.heading_std_rad
     if sensors.heading_resolution_rad > 0:
         psi = np.rint(psi / sensors.heading_resolution_rad) * sensors.heading_resolution_rad
-    turn = _turn_rate(truth, truth.rows(heading_t)) + rng.normal(0.0, GYRO_STD_RADPS, len(heading_t))
-    return Readings(
-        wheel_t,
-        travels[0][:-1],
-        travels[1][:-1],
-        v_left,
-        v_right,
-        gnss_t[seen],
-        (_antenna(truth.poses(gnss_t), sensors) + noise)[seen],
-        heading_t,
-        psi,
-        turn,
-    )
+    row = truth.rows(heading_t)
+    width = truth.icrs_m[truth.which[row], 0] - truth.icrs_m[truth.which[row], 1]
+    turn = (truth.v_left_mps[row] - truth.v_right_mps[row]) / width
+    turn += rng.normal(0.0, GYRO_STD_RADPS, len(heading_t))
+    pose = truth.poses(gnss_t)
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    forward, right = sensors.antenna_forward_m, sensors.antenna_right_m
+    antenna = pose[:, :2] + np.column_stack([forward * c - right * s, forward * s + right * c])
+    fixes = (antenna + noise)[seen]
+    left_m, right_m = (travel[:-1] for travel in travels)
+    return Readings(wheel_t, left_m, right_m, v_left, v_right, gnss_t[seen], fixes, heading_t, psi, turn)
 
 
 def sample_times(rate_hz: float, duration_s: float) -> Floats:
@@ -370,14 +366,55 @@ def _wheel_speed(
     return speed + sensors.input_bias_mps + noise
 
 
-def _turn_rate(truth: Truth, row: Ints) -> Floats:
-    icrs = truth.icrs_m[truth.which[row]]
-    turn: Floats = (truth.v_left_mps[row] - truth.v_right_mps[row]) / (icrs[:, 0] - icrs[:, 1])
-    return turn
+def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorColumns, TruthTable]:
+    """Return the measurements and the truth of a simulated drive.
+
+    Parameters
+    ----------
+    seed : of the sensors' noise; the same seed gives the same numbers
+
+    Raises
+    ------
+    ConfigError
+        The plan cannot be driven, or a sensor gives too few samples.
+    """
+    check_drive(plan, sensors)
+    truth = drive_plan(plan, 1.0 / sensors.wheel_rate_hz)
+    readings = sense(truth, sensors, plan.duration_s, np.random.default_rng((seed, 0)))
+    times, row = readings.wheel_t, truth.rows(readings.wheel_t)
+    columns: TruthTable = {"stamp_ns": stamps(times), "t_s": times - times[0]}
+    columns |= zip(("north_m", "east_m", "heading_rad"), truth.poses(times).T, strict=True)
+    columns |= zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), truth.icrs_m[truth.which[row]].T, strict=True)
+    columns |= {"v_left_mps": truth.v_left_mps[row], "v_right_mps": truth.v_right_mps[row]}
+    return record(readings, sensors, np.random.default_rng((seed, 1))), columns
 
 
-def _antenna(pose: Floats, sensors: Sensors) -> Floats:
-    """Return north and east (m, 2) of the antenna."""
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    forward, right = sensors.antenna_forward_m, sensors.antenna_right_m
-    return pose[:, :2] + np.column_stack([forward * c - right * s, forward * s + right * c])
+def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> SensorColumns:
+    """Stamp readings from `START_NS` on, delays included, and put the fixes on the globe about `DATUM`."""
+    from pymap3d import ned2geodetic
+
+    fixes = len(readings.gnss_t)
+    down = rng.normal(0.0, HEIGHT_STD_RATIO * sensors.gnss_std_m, fixes)
+    latitude, longitude, height = ned2geodetic(*readings.gnss_m.T, down, *DATUM)
+    status = 2 if sensors.gnss_std_m <= LARGEST_RTK_STD_M else 1 if sensors.gnss_std_m <= LARGEST_SBAS_STD_M else 0
+    return SensorColumns(
+        wheel_stamp_ns=stamps(readings.wheel_t),
+        wheel_position_left_m=readings.travel_left_m,
+        wheel_position_right_m=readings.travel_right_m,
+        wheel_v_left_mps=readings.v_left_mps,
+        wheel_v_right_mps=readings.v_right_mps,
+        gnss_stamp_ns=stamps(readings.gnss_t + sensors.gnss_delay_s),
+        latitude_deg=np.asarray(latitude, np.float64),
+        longitude_deg=np.asarray(longitude, np.float64),
+        height_m=np.asarray(height, np.float64),
+        gnss_std_m=np.full(fixes, sensors.gnss_std_m),
+        gnss_status=np.full(fixes, status, np.int64),
+        heading_stamp_ns=stamps(readings.heading_t + sensors.heading_delay_s),
+        heading_rad=np.angle(np.exp(1j * readings.heading_rad)),
+        yaw_rate_radps=readings.yaw_rate_radps,
+    )
+
+
+def stamps(times: Floats, start_ns: int = START_NS) -> Ints:
+    """Return times [s] as stamps of the log's clock."""
+    return start_ns + np.rint(times * 1e9).astype(np.int64)

@@ -17,7 +17,7 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.filter_records import GUARDED, PRINTED, UNGUARDED
 from icrtool.records.tables import Icrs
 from icrtool.simulation import study_runs as measured
-from icrtool.simulation.drives import DrivePlan, PathKind, PathPlan, check_drive
+from icrtool.simulation.drives import PathKind, PathPlan, check_drive
 from icrtool.simulation.study_records import (
     IDEAL,
     PLAN,
@@ -25,7 +25,6 @@ from icrtool.simulation.study_records import (
     Number,
     Setting,
     Study,
-    StudyName,
     StudyNumber,
     StudyRequest,
     StudyResult,
@@ -173,11 +172,6 @@ def shown_path(paths: Sequence[Any]) -> tuple[Any, ...]:
     return ("curved" if "curved" in paths else paths[0],)
 
 
-def only(*chosen: float | str) -> Callable[[Sequence[Any]], tuple[Any, ...]]:
-    """Return what chooses values by name."""
-    return lambda _: chosen
-
-
 def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
     """Return NEES, NIS and coverage of each case, beside what they should be."""
     numbers = []
@@ -219,13 +213,13 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
 
 PATHS: tuple[PathKind, ...] = ("circle", "curved", "lawnmower", "spins")
 PATH_TIMES = {"circle": "2.9-12.8 s, driven (Figs. 15, 17)", "": "5-15 s, driven"}
-STARTS = only("proper start", "inverted start")
+STARTS = ("proper start", "inverted start")
 START_FATES = {"no guard": "those with y_icr_right > 0 (Fig. 6)", "": "all (Fig. 7)"}
 CHANGE_TIMES = {"inflated": "0.03-0.17 s (Fig. 9)", "": "100-140 s (Fig. 8)"}
 RADIUS_TIMES = {0.0: "0.1 s (Fig. 10)", 2.0: "1.8 s (Fig. 10)"}
 RTK_ERROR = {0.01: "within 3.8 m for 95 % (RTK, tracked, Fig. 29)"}
 
-STUDIES: dict[StudyName, Study] = {
+STUDIES: dict[str, Study] = {
     "convergence": Study(
         about="convergence time of the ICRs, by kind of path",
         figures="4, 5",
@@ -270,7 +264,7 @@ STUDIES: dict[StudyName, Study] = {
             Number("{series}, {value}: ends inverted", "inverted", "percent", "%"),
         ),
         title="Time to follow a change, inflated: {answer}",
-        answer=Number("{series}", "change*_settle_s", "median", "s", at=only("inflated")),
+        answer=Number("{series}", "change*_settle_s", "median", "s", at=("inflated",)),
     ),
     "turn-radius": Study(
         about="convergence after a change, by radius of the turn",
@@ -302,7 +296,7 @@ STUDIES: dict[StudyName, Study] = {
         measures=(measured.measure_errors, trace()),
         numbers=(Number("{series}: error of {icr}, {value} speeds", ERROR, "spread", "m"),),
         title="Commanded speeds move y right by {answer}",
-        answer=Number("{series}", "error_y_icr_right_m", "median", "m", at=only("commanded")),
+        answer=Number("{series}", "error_y_icr_right_m", "median", "m", at=("commanded",)),
     ),
     "gnss": Study(
         about="ICR error and open-loop error by noise of the GNSS",
@@ -352,7 +346,7 @@ STUDIES: dict[StudyName, Study] = {
 }  # fmt: skip
 
 
-def default_request(name: StudyName, config: Config) -> StudyRequest:
+def default_request(name: str, config: Config) -> StudyRequest:
     """Return a study with the paper's parameters, and the configuration's robot for the start of preset ``field``."""
     if config.robot.track_width_m is None:
         config = replace(config, robot=replace(config.robot, track_width_m=PAPER_TRACK_WIDTH_M))
@@ -378,17 +372,15 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
         raise ConfigError("values", f"{request.values} holds a value that is not finite")
     check_drive(request.plan, request.sensors)
     study = STUDIES[request.name]
-    if study.changes_s and not request.plan.changes:
-        request = replace(request, plan=_with_changes(request.plan, study.changes_s))
+    plan, times_s = request.plan, study.changes_s
+    if times_s and not plan.changes:
+        # The ICRs change at the usual times, as far as the drive goes.
+        if plan.duration_s <= times_s[0]:
+            why = f"{plan.duration_s:g} s end before the first change, at {times_s[0]:g} s"
+            raise ConfigError("duration", why, "drive longer, or give earlier times with --change")
+        changes = ((time, changed(plan.icrs_m, number)) for number, time in enumerate(times_s, start=1))
+        plan = replace(plan, changes=tuple(change for change in changes if change[0] < plan.duration_s))
+        request = replace(request, plan=plan)
     settings = list(study.vary(request))
     found = run_scenarios([one.scenario for one in settings], request.runs, request.seed, study.measures, progress)
     return StudyResult(request, study, tuple(map(Level, settings, found)))
-
-
-def _with_changes(plan: DrivePlan, times_s: Sequence[float]) -> DrivePlan:
-    """Return a drive whose ICRs change at the usual times, as far as it goes."""
-    if plan.duration_s <= times_s[0]:
-        why = f"{plan.duration_s:g} s end before the first change, at {times_s[0]:g} s"
-        raise ConfigError("duration", why, "drive longer, or give earlier times with --change")
-    changes = ((time, changed(plan.icrs_m, number)) for number, time in enumerate(times_s, start=1))
-    return replace(plan, changes=tuple(change for change in changes if change[0] < plan.duration_s))

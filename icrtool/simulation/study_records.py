@@ -15,19 +15,6 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.simulation.drives import DrivePlan, PathKind, PathPlan, Sensors
 from icrtool.simulation.study_runs import ICR_NAMES, STATES, Measure, Scenario
 
-StudyName = Literal[
-    "convergence",
-    "initial",
-    "icr-change",
-    "turn-radius",
-    "input-noise",
-    "input-bias",
-    "input-source",
-    "gnss",
-    "rate",
-    "consistency",
-]
-
 PLAN = DrivePlan(step_s=0.005)
 """A study holds track speeds no longer than any wheel interval."""
 
@@ -50,7 +37,7 @@ class StudyRequest:
     paths : the kinds of path to compare, where a study compares them
     """
 
-    name: StudyName
+    name: str
     plan: DrivePlan
     sensors: Sensors
     config: Config
@@ -188,7 +175,7 @@ class Number(NamedTuple):
     how : its computation, a key of `HOW`
     unit : of the number
     paper : the paper's number as text, or that by value or series; by an empty key for all others
-    at : which of the values it is reported of
+    at : the values it is reported of, or which of all
     series : the only series it is reported of; empty: all
     """
 
@@ -197,8 +184,12 @@ class Number(NamedTuple):
     how: How
     unit: str = ""
     paper: str | Mapping[Any, str] = ""
-    at: Callable[[Sequence[Any]], Sequence[Any]] = tuple
+    at: Sequence[Any] | Callable[[Sequence[Any]], Sequence[Any]] = tuple
     series: str = ""
+
+    def values_among(self, levels: Iterable[Level]) -> Sequence[Any]:
+        """Return the values of `at`."""
+        return self.at([level.setting.value for level in levels]) if callable(self.at) else self.at
 
 
 class StudyNumber(NamedTuple):
@@ -293,7 +284,7 @@ class StudyResult:
 def reported(numbers: Sequence[Number], levels: Sequence[Level]) -> list[StudyNumber]:
     """Return numbers of levels, in the order of the levels, the ICRs and `numbers`."""
     pooled: dict[str, tuple[Number, Level, dict[int, Floats]]] = {}
-    at = [number.at([level.setting.value for level in levels]) for number in numbers]
+    at = [number.values_among(levels) for number in numbers]
     for place, level in enumerate(levels):
         series, value, *_ = level.setting
         for icr in ICR_NAMES:
@@ -303,13 +294,11 @@ def reported(numbers: Sequence[Number], levels: Sequence[Level]) -> list[StudyNu
                     names = fnmatch.filter(level.numbers(), number.columns.format(icr=icr))
                     columns = np.concatenate([level.found[name] for name in names])
                     pooled.setdefault(what, (number, level, {}))[2][place] = columns
-    return [
-        StudyNumber(what, HOW[number.how](list(by_level.values())), number.unit, _paper(number.paper, level))
-        for what, (number, level, by_level) in pooled.items()
-    ]
-
-
-def _paper(paper: str | Mapping[Any, str], level: Level) -> str:
-    if isinstance(paper, str):
-        return paper
-    return next((paper[key] for key in (level.setting.value, level.setting.series, "") if key in paper), "")
+    found = []
+    for what, (number, level, by_level) in pooled.items():
+        paper = number.paper
+        if not isinstance(paper, str):
+            keys = (level.setting.value, level.setting.series, "")
+            paper = next((paper[key] for key in keys if key in paper), "")
+        found.append(StudyNumber(what, HOW[number.how](list(by_level.values())), number.unit, paper))
+    return found

@@ -21,9 +21,10 @@ from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GUARDED
 from icrtool.kernels.kinematics import drive, model_states
+from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
+from icrtool.records.tables import RobotLog
 from icrtool.simulation import drives
 from icrtool.simulation.drives import DrivePlan, PathPlan, Readings, Sensors, Truth
-from icrtool.simulation.record import readings_log
 
 Progress = Callable[[float], None]
 
@@ -200,23 +201,36 @@ def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readi
     variance = np.array(process_variance(scenario.config, configured_noise(scenario.config)))
     noise = rng.normal(0.0, 1.0, (len(t), 6))
     states = model_states(x0, t, *speeds, np.sqrt(variance), rate_invariant(scenario.config), noise)
-    return _readings(states, t, speeds, sensors, rng), states, None
-
-
-def _readings(
-    states: Floats, wheel_t: Floats, speeds: tuple[Floats, Floats], sensors: Sensors, rng: np.random.Generator
-) -> Readings:
-    """Measure states (n, 6) at the wheel stamps that fall together with a fix or a heading."""
+    # States are measured at the wheel stamps that fall together with a fix or a heading.
     fix, sample = (
-        np.arange(0, len(wheel_t), max(1, round(sensors.wheel_rate_hz / rate)))
+        np.arange(0, len(t), max(1, round(sensors.wheel_rate_hz / rate)))
         for rate in (sensors.gnss_rate_hz, sensors.heading_rate_hz)
     )
-    return Readings(
-        wheel_t, *speeds, *speeds,
-        wheel_t[fix], states[fix, :2] + rng.normal(0.0, sensors.gnss_std_m, (len(fix), 2)),
-        wheel_t[sample], states[sample, 2] + rng.normal(0.0, sensors.heading_std_rad, len(sample)),
-        np.zeros(len(sample)),
-    )  # fmt: skip
+    gnss_m = states[fix, :2] + rng.normal(0.0, sensors.gnss_std_m, (len(fix), 2))
+    heading_rad = states[sample, 2] + rng.normal(0.0, sensors.heading_std_rad, len(sample))
+    no_rate = np.zeros(len(sample))
+    readings = Readings(t, *speeds, *speeds, t[fix], gnss_m, t[sample], heading_rad, no_rate)
+    return readings, states, None
+
+
+def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
+    """Return readings as a log, whose stamps begin at 0."""
+    fixes, headings = len(readings.gnss_t), len(readings.heading_t)
+    variance = np.full(fixes, sensors.gnss_std_m**2)
+    north, east = readings.gnss_m.T
+    return RobotLog(
+        name="study",
+        wheels=WheelSamples(drives.stamps(readings.wheel_t, 0), readings.v_left_mps, readings.v_right_mps),
+        gnss=PositionFixes(drives.stamps(readings.gnss_t, 0), north, east, variance, variance, np.zeros(fixes)),
+        heading=HeadingSamples(
+            drives.stamps(readings.heading_t, 0), readings.heading_rad, np.full(headings, sensors.heading_std_rad**2)
+        ),
+        datum=None,
+        streams=(),
+        inputs=(),
+        rejected_fixes={},
+        warnings=(),
+    )
 
 
 def measure_errors(run: StudyRun) -> Found:

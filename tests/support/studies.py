@@ -8,9 +8,9 @@ from typing import Any
 
 from icrtool.config import Config
 from icrtool.simulation.studies import default_request, run_study
-from icrtool.simulation.study_records import StudyName, StudyRequest, StudyResult
+from icrtool.simulation.study_records import StudyRequest, StudyResult
 
-SMALL: dict[StudyName, dict[str, Any]] = {
+SMALL: dict[str, dict[str, Any]] = {
     "convergence": {"duration_s": 10.0, "paths": ("circle", "spins")},
     "initial": {"duration_s": 5.0, "values": (1.0, -1.0)},
     "icr-change": {"duration_s": 20.0},
@@ -24,7 +24,7 @@ SMALL: dict[StudyName, dict[str, Any]] = {
 }
 
 
-def small_request(name: StudyName, runs: int, duration_s: float | None = None, **changes: Any) -> StudyRequest:
+def small_request(name: str, runs: int, duration_s: float | None = None, **changes: Any) -> StudyRequest:
     """Return the usual request of a study, made smaller; the ICRs change twice within `duration_s`."""
     base = default_request(name, Config())
     plan = base.plan if duration_s is None else replace(base.plan, duration_s=duration_s)
@@ -34,6 +34,6 @@ def small_request(name: StudyName, runs: int, duration_s: float | None = None, *
 
 
 @cache
-def small_study(name: StudyName) -> StudyResult:
+def small_study(name: str) -> StudyResult:
     """Return the result of a study of two runs."""
     return run_study(small_request(name, 2, **SMALL[name]))

@@ -15,7 +15,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.tables.study import capital, study_subtitle, study_title
 from icrtool.simulation.studies import shown_path
-from icrtool.simulation.study_records import Level, StudyName, StudyResult, chi2_band, consistency_of
+from icrtool.simulation.study_records import Level, StudyResult, chi2_band, consistency_of
 from icrtool.simulation.study_runs import FATES, STATES
 
 if TYPE_CHECKING:
@@ -231,7 +231,7 @@ WITHOUT_GNSS: Draw = partial(
 )
 BEFORE, AFTER = (partial(estimates, value=value) for value in ("not inflated", "inflated"))
 
-PICTURES: dict[StudyName, tuple[tuple[str, Draw], ...]] = {
+PICTURES: dict[str, tuple[tuple[str, Draw], ...]] = {
     "convergence": (("ICR estimate [m]", estimates), ("Runs [%]", shares)),
     "initial": (("Initial y right [m]", fates), ("y right [m]", starts)),
     "icr-change": (
@@ -248,11 +248,11 @@ PICTURES: dict[StudyName, tuple[tuple[str, Draw], ...]] = {
 }  # fmt: skip
 """The rows of panels of each picture: name of the y axis, and what is drawn."""
 
-TOGETHER: frozenset[StudyName] = frozenset({"consistency"})
+TOGETHER: frozenset[str] = frozenset({"consistency"})
 """Pictures whose series share a panel."""
 
 NOTE = "lines: median; bars and bands: 5 to 95 % of the runs"
-NOTES: dict[StudyName, str] = {
+NOTES: dict[str, str] = {
     "initial": "colours: share of the runs; above the dashed line the start is proper",
     "consistency": "model: truth drawn from Q and R; paper and field: exact kinematics, preset's start",
 }

@@ -100,7 +100,7 @@ def study_title(result: StudyResult) -> str:
     """Return the answer of a study with its number, by series."""
     study = result.study
     answer = ", ".join(f"{finding_text(one)} ({one.what})" for one in result.answer)
-    value = study.answer.at([level.setting.value for level in result.levels])[0]
+    value = study.answer.values_among(result.levels)[0]
     return study.title.format(answer=answer, value=value)
 
 

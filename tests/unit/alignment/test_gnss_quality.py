@@ -32,8 +32,7 @@ from icrtool.records.samples import (
     WheelSamples,
 )
 from icrtool.records.tables import RobotLog
-from icrtool.simulation.drives import DrivePlan, Sensors
-from icrtool.simulation.record import simulate
+from icrtool.simulation.drives import DrivePlan, Sensors, simulate
 from support.drives import EPOCH_NS as START_NS
 from support.drives import ICRS, make_log
 

@@ -16,7 +16,7 @@ from icrtool.estimation.fit import fit
 from icrtool.records.samples import GyroSamples, HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense
-from icrtool.simulation.record import readings_log
+from icrtool.simulation.study_runs import readings_log
 from support.drives import ICRS, make_log
 
 CONFIG = load_config(sets=["robot.track_width_m=0.8"])

@@ -18,7 +18,7 @@ from icrtool.records.run import WarmStart
 from icrtool.records.samples import PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense
-from icrtool.simulation.record import readings_log
+from icrtool.simulation.study_runs import readings_log
 from support.contract import RUN_KEYS
 from support.drives import ICRS, make_log
 

@@ -16,7 +16,7 @@ from icrtool.output.tables.run import format_run
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import Icrs, RobotLog
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense
-from icrtool.simulation.record import readings_log
+from icrtool.simulation.study_runs import readings_log
 
 CONFIG = parse_config({"robot": {"track_width_m": 0.6}})
 ICRS: Icrs = (0.5, -0.75, -0.25)

@@ -25,8 +25,7 @@ from icrtool.output.simulation_files import (
 )
 from icrtool.output.tables.study import finding_text, runs_text, study_blocks, study_subtitle, study_title
 from icrtool.output.text_blocks import Table, format_blocks
-from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
-from icrtool.simulation.record import simulate
+from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, simulate
 from icrtool.simulation.studies import STUDIES, run_study
 from icrtool.simulation.study_records import StudyNumber
 from support.studies import small_request, small_study
