@@ -253,8 +253,11 @@ def places() -> list[Path]:
     """Return where machine code may be kept: ``NUMBA_CACHE_DIR``, else beside the package, or in the user's cache."""
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(given)]
-    users = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
-    return [Path(__file__).parent / "__pycache__", Path(users) / "icrtool"]
+    found = [Path(__file__).parent / "__pycache__"]
+    # a container's user may have no home
+    with suppress(RuntimeError):
+        found.append(Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "icrtool")
+    return found
 
 
 def writable_place() -> Path | None:

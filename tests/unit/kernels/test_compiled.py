@@ -123,6 +123,18 @@ def test_a_kernel_compiles_again_where_any_file_of_kernels_has_changed(
     assert found == [1, 1, 0]
 
 
+def test_a_user_without_a_home_has_no_cache_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert len(places()) == 2
+
+    def homeless(path: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "expanduser", homeless)
+    assert places() == [Path(compiled.__file__).parent / "__pycache__"]
+
+
 def test_every_kernel_is_found() -> None:
     names = {one.py_func.__qualname__ for one in all_kernels()}
     assert {"filter_events", "integrate_trials", "fill_errors"} <= names
