@@ -242,7 +242,13 @@ def load_config(path: str | Path | None = None, robot: str | None = None, sets: 
     """
     layers: list[Mapping[str, Any]] = []
     if robot is not None:
-        layers.append({"robot": _builtin_robot(robot)})
+        robots = builtin_robots()
+        if robot not in robots:
+            others = f"{did_you_mean(robot, robots)}the robots are {', '.join(robots)}"
+            advice = "of another one, give --set robot.track_width_m=… and --set robot.wheel_radius_m=…"
+            raise ConfigError(f"robot {robot!r}", "not a built-in robot", f"{others}; {advice}")
+        numbers = {key: value for key, value in robots[robot].items() if key != "source"}
+        layers.append({"robot": {"name": robot, **numbers}})
     if path is not None:
         layers.append(_read_toml(Path(path)))
     layers.extend(_parse_set(text) for text in sets)
@@ -264,18 +270,6 @@ class ConfigSources(NamedTuple):
     def load(self) -> Config:
         """Return the configuration; errors as of `load_config`."""
         return load_config(*self)
-
-
-def _builtin_robot(name: str) -> dict[str, Any]:
-    robots = builtin_robots()
-    if name not in robots:
-        raise ConfigError(
-            f"robot {name!r}",
-            "not a built-in robot",
-            f"{did_you_mean(name, robots)}the robots are {', '.join(robots)}; of another one, give "
-            "--set robot.track_width_m=… and --set robot.wheel_radius_m=…",
-        )
-    return {"name": name, **{key: value for key, value in robots[name].items() if key != "source"}}
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -313,33 +307,30 @@ def _parse_set(text: str) -> dict[str, Any]:
         )
     if not value.strip():
         raise ConfigError(key.strip(), "its value is empty", "leave the option out for the default")
-    return {section: {name: _parse_value(value, key.strip())}}
-
-
-def _parse_value(value: str, key: str) -> Any:  # noqa: ANN401 - whatever TOML holds
-    """Return a value as TOML reads it, with numbers as people type them (``.08``, ``1.``); else it is a text."""
-    for text in (value, _BARE_POINT.sub("0", value)):
+    found: Any = value.strip()
+    # As TOML reads it, with numbers as people type them (.08, 1.); else it is a text.
+    for toml in (value, _BARE_POINT.sub("0", value)):
         try:
-            return parse_toml(f"value = {text}")["value"]
+            found = parse_toml(f"value = {toml}")["value"]
+            break
         except RecursionError as err:
-            raise ConfigError(key, "its value is nested too deeply") from err
+            raise ConfigError(key.strip(), "its value is nested too deeply") from err
         except ValueError:
             continue
-    return value.strip()
+    return {section: {name: found}}
 
 
 def _found(value: object) -> str:
-    """Return a value for a message: as it was written, and not too long."""
-    return f"found {shortened(_as_toml(value), LONGEST_NAME)}"
+    """Return a value for a message: nearly as it was written, with TOML's words for true and false, not too long."""
 
+    def as_toml(value: object) -> str:
+        if isinstance(value, list | tuple) and len(value) > LONGEST_NAME:
+            return f"{len(value)} values"
+        if isinstance(value, list | tuple):
+            return f"[{', '.join(map(as_toml, value))}]"
+        return str(value).lower() if isinstance(value, bool) else repr(value)
 
-def _as_toml(value: object) -> str:
-    """Return a value nearly as it was written: with TOML's words for true and false."""
-    if isinstance(value, list | tuple) and len(value) > LONGEST_NAME:
-        return f"{len(value)} values"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_as_toml, value))}]"
-    return str(value).lower() if isinstance(value, bool) else repr(value)
+    return f"found {shortened(as_toml(value), LONGEST_NAME)}"
 
 
 def _flaw(value: object) -> str | None:

@@ -24,6 +24,7 @@ from icrtool.records.text import LogText, counted, escaped, shortened
 with when_used():
     from icrtool.fleet import batch as batches
     from icrtool.fleet import fleet_files, one_log
+    from icrtool.output.exports import acceptance
     from icrtool.output.files import remote_place
 
 if TYPE_CHECKING:
@@ -111,7 +112,9 @@ def batch_command(
     if compared is not None:
         printer.warn(map(escaped, fleet_files.changes_of(rows, missing)))
     exports.write(
-        "batch", lambda: fleet_files.suites_of(rows), lambda: fleet_files.format_fleet_markdown(rows, missing)
+        "batch",
+        lambda: [acceptance.Suite(row.log, row.verdicts, row.reason if row.status == "failed" else "") for row in rows],
+        lambda: fleet_files.format_fleet_markdown(rows, missing),
     )
     printer.json("batch", replace(document, output=escaped(str(output))))
     printer.text(summary_of(rows, output, written))
@@ -174,7 +177,7 @@ class View(LiveLine):
             self._stages.pop(row.log, None)
             self._counts[row.status] += 1
             self._processed += row.this_time == "processed"
-            self.clear()
+            self.rewrite("")
             if row.status != "failed":
                 self._printer.text(line_of(row))
             elif not self._printer.quiet:

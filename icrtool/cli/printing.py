@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import click
@@ -244,20 +243,14 @@ class LiveLine:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.clear()
+    def __exit__(self, *_: object) -> None:
+        self.rewrite("")
 
     def rewrite(self, text: str) -> None:
         """Show another text in its place."""
         if self.on_terminal:
             sys.stderr.write(f"{CLEAR}{text}")
             sys.stderr.flush()
-
-    def clear(self) -> None:
-        """Remove it."""
-        self.rewrite("")
 
 
 class Stages(LiveLine):

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -31,9 +30,6 @@ from icrtool.records.places import is_regular
 from icrtool.records.process_resources import remove
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.text import LogText, counted, escaped
-
-if TYPE_CHECKING:
-    from icrtool.output.exports.acceptance import Suite
 
 BEFORE_ICRS = ("log", "status", "this_time", "reason", "robot", "group", "start_utc", "duration_s", "distance_m")
 AFTER_ERRORS = ("events", "outages", "warnings", "tool_version", "run")
@@ -234,14 +230,6 @@ def counts_text(rows: Sequence[FleetLog]) -> str:
     text = ", ".join(f"{counts[status]} {status}" for status in ("done", "failed") if counts[status])
     skipped = sum(row.this_time == "skipped" for row in rows)
     return f"{text} ({skipped} of them before, skipped this time)" if skipped else text
-
-
-def suites_of(rows: Sequence[FleetLog]) -> list[Suite]:
-    """Return a suite per log."""
-    # Not at import: it loads the analysis, which a batch that is finished does not need.
-    from icrtool.output.exports.acceptance import Suite
-
-    return [Suite(row.log, row.verdicts, row.reason if row.status == "failed" else "") for row in rows]
 
 
 def format_fleet_markdown(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> str:

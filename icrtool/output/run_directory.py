@@ -17,7 +17,7 @@ from icrtool.errors import ConfigError, OutputError, RunError
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, numbered_file, split_path
 from icrtool.output.files import formats, run_columns
 from icrtool.output.files.atomic import atomic_directory, check_directory, own_files
-from icrtool.output.files.remote_place import fetched, lies_there
+from icrtool.output.files.remote_place import lies_there, on_disk
 from icrtool.output.files.run_columns import MEASUREMENTS_FILE, StatesFileError, StatesFormat
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of, read_regular
 from icrtool.records.plain_data import Record
@@ -208,7 +208,7 @@ def open_run(path: str | Path) -> Run:
         The address cannot be read.
     """
     place = place_of(path) if isinstance(path, str) else path
-    with fetched(place, lambda name: "/" not in name) as directory:
+    with on_disk(place, lambda name: "/" not in name, writes=False) as directory:
         return _run_in(directory, place)
 
 

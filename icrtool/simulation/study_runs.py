@@ -350,29 +350,27 @@ def measure_open_loop(run: StudyRun) -> Found:
     -----
     Section 6.4 with the ICRs the filter ended with, over starts all along the true path.
     """
-    half_width = (run.scenario.config.robot.track_width_m or np.nan) / 2
-    no_slip = np.array([half_width, -half_width, 0.0])
-    models = {"blind_icr_10m_p95_m": run.x[-1, 3:], "blind_no_slip_10m_p95_m": no_slip}
-    return {name: float(np.percentile(_open_loop_errors(run, icrs), 95)) for name, icrs in models.items()}
-
-
-def _open_loop_errors(run: StudyRun, icrs: Floats) -> Floats:
     truth = run.motion
     if truth is None:
         raise ValueError("open-loop errors need the true motion")
+    half_width = (run.scenario.config.robot.track_width_m or np.nan) / 2
+    no_slip = np.array([half_width, -half_width, 0.0])
     north, east = truth.pose[:, 0], truth.pose[:, 1]
     distance = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(north), np.diff(east)))])
     ends = np.searchsorted(distance, distance + TRIAL_M)
-    possible = np.flatnonzero(ends < len(distance))
-    if not len(possible):
-        return np.full(1, np.nan)
-    errors = []
-    for first in possible[np.linspace(0, len(possible) - 1, TRIAL_STARTS).astype(np.int64)]:
-        rows = slice(first, int(ends[first]) + 1)
-        t, v_left, v_right = truth.t_s[rows], truth.v_left_mps[rows], truth.v_right_mps[rows]
-        end = drive(t, v_left, v_right, icrs[None, :], np.zeros(len(t), np.int64), truth.pose[first])[-1]
-        errors.append(float(np.hypot(*(end - truth.pose[int(ends[first])])[:2])))
-    return np.array(errors)
+    starts = np.flatnonzero(ends < len(distance))
+    if len(starts):
+        starts = starts[np.linspace(0, len(starts) - 1, TRIAL_STARTS).astype(np.int64)]
+    found: Found = {}
+    for name, icrs in (("blind_icr_10m_p95_m", run.x[-1, 3:]), ("blind_no_slip_10m_p95_m", no_slip)):
+        errors = []
+        for first, last in zip(starts, ends[starts], strict=True):
+            rows = slice(first, last + 1)
+            t, v_left, v_right = truth.t_s[rows], truth.v_left_mps[rows], truth.v_right_mps[rows]
+            end = drive(t, v_left, v_right, icrs[None, :], np.zeros(len(t), np.int64), truth.pose[first])[-1]
+            errors.append(np.hypot(*(end - truth.pose[last])[:2]))
+        found[name] = float(np.percentile(errors or [np.nan], 95))
+    return found
 
 
 def measure_consistency(run: StudyRun) -> Found:

@@ -46,6 +46,8 @@ def on_disk(
     needed: Needed = is_document,
     parts: Collection[str] | None = None,
     begin: Callable[[str], None] | None = None,
+    *,
+    writes: bool = True,
 ) -> Iterator[Path]:
     """Give the folder on disk that stands for a place of results; of an address, upload what changed in it at the end.
 
@@ -55,6 +57,7 @@ def on_disk(
     needed : whose content is fetched; a file that is there and not needed is empty
     parts : folders that are looked at below an address, beside the files in it; None: all
     begin : called before the upload
+    writes : an address is written; else it is only read
 
     Raises
     ------
@@ -64,29 +67,28 @@ def on_disk(
     if not isinstance(place, UrlPath):
         yield place
         return
-    store = _Store(place)
-    store.probe()
-    with _copied(place, store, needed, parts) as (folder, before):
+    store = _Store(place, "written" if writes else "read")
+    if writes:
+        # A place that cannot be written is refused before any work is done for it.
+        store.put(b"icrtool", _PROBE)
+        store.remove([_PROBE])
+    scratch = ScratchFolder()
+    folder = scratch.path / (place.name or "results")
+    try:
+        before = store.fetch(folder, needed, parts)
         yield folder
-        if begin is not None:
-            begin("uploading")
-        store.upload(folder, before)
-
-
-@contextmanager
-def fetched(place: Path, needed: Needed) -> Iterator[Path]:
-    """Give the folder on disk that stands for a place of results, to read it.
-
-    Raises
-    ------
-    OutputError
-        The address cannot be read.
-    """
-    if not isinstance(place, UrlPath):
-        yield place
-        return
-    with _copied(place, _Store(place, "read"), needed, None) as (folder, _):
-        yield folder
+        if writes:
+            if begin is not None:
+                begin("uploading")
+            store.upload(folder, before)
+    except IcrToolError as err:
+        texts = [str(err.what), err.why, err.advice]
+        if not any(str(folder) in text for text in texts):
+            raise
+        # Errors name the address.
+        raise type(err)(*(text.replace(str(folder), str(place)) for text in texts)) from err
+    finally:
+        scratch.close()
 
 
 def write_below(folder: Path, name: str, content: bytes) -> None:
@@ -129,11 +131,6 @@ class _Store:
         """Write a file."""
         self._done(lambda: self._files.pipe_file(self._of(name), content))
 
-    def probe(self) -> None:
-        """Refuse a place that cannot be written."""
-        self.put(b"icrtool", _PROBE)
-        self._remove([_PROBE])
-
     def fetch(self, folder: Path, needed: Needed, parts: Collection[str] | None) -> dict[str, tuple[int, int]]:
         """Make the folder on disk what the address is.
 
@@ -142,7 +139,13 @@ class _Store:
         dict of str to (int, int)
             What identifies the content of the files, by their names.
         """
-        names = [name for name in self._names(parts) if name != _PROBE and _is_below(name)]
+        names = []
+        for name in self._names(parts):
+            # A stranger may have written it: it must be the name of a file below the folder.
+            path = PurePosixPath(name)
+            below = name and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
+            if below and name != _PROBE:
+                names.append(name)
         with reported(self._place):
             for name in names:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -159,8 +162,8 @@ class _Store:
         if not changed and not gone:
             return
         last = [name for name in COUNTS if name in now]
-        self._remove([name for name in COUNTS if name in before])
-        self._remove([name for name in gone if name not in COUNTS])
+        self.remove([name for name in COUNTS if name in before])
+        self.remove([name for name in gone if name not in COUNTS])
         # What a broken upload leaves is known as icrtool's by the first of these.
         others = [name for name in changed if name not in {OWN_FILES, *last}]
         for names in ([name for name in changed if name == OWN_FILES], others, last):
@@ -172,23 +175,17 @@ class _Store:
         if parts is None:
             found = self._done(lambda: self._files.find(self._name))
         else:
-            found = self._done(self._at_top)
+            found = self._done(lambda: self._files.find(self._name, maxdepth=1))
             found += self._done(lambda: [name for part in parts for name in self._files.find(self._of(part))])
         if found == [self._name]:
             raise OutputError(self._place, "a file is there", "name another place")
         return [name.removeprefix(f"{self._name}/") for name in found]
 
-    def _at_top(self) -> list[str]:
-        try:
-            entries = self._files.ls(self._name, detail=True)
-        except FileNotFoundError:
-            return []
-        return [entry["name"] for entry in entries if entry["type"] == "file"]
-
     def _of(self, name: str) -> str:
         return f"{self._name}/{name}" if name else self._name
 
-    def _remove(self, names: list[str]) -> None:
+    def remove(self, names: list[str]) -> None:
+        """Remove files."""
         self._each(lambda name: self._files.rm_file(self._of(name)), names)
 
     def _each(self, request: Callable[[str], object], names: Iterable[str]) -> None:
@@ -210,30 +207,6 @@ def _as_output(place: UrlPath) -> Iterator[None]:
     except LogError as err:
         why = "cannot be written" if err.why == "no such file" else err.why
         raise OutputError(place, why, err.advice or "is there such a bucket?") from err
-
-
-@contextmanager
-def _copied(
-    place: UrlPath, store: _Store, needed: Needed, parts: Collection[str] | None
-) -> Iterator[tuple[Path, dict[str, tuple[int, int]]]]:
-    """Give a folder on disk with what lies at an address, which errors name, and what identifies its files."""
-    scratch = ScratchFolder()
-    folder = scratch.path / (place.name or "results")
-    try:
-        yield folder, store.fetch(folder, needed, parts)
-    except IcrToolError as err:
-        texts = [str(err.what), err.why, err.advice]
-        if not any(str(folder) in text for text in texts):
-            raise
-        raise type(err)(*(text.replace(str(folder), str(place)) for text in texts)) from err
-    finally:
-        scratch.close()
-
-
-def _is_below(name: str) -> bool:
-    """Return whether a name, which a stranger may have written, is that of a file below a folder."""
-    path = PurePosixPath(name)
-    return bool(name) and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
 
 
 def _identity(file: Path) -> tuple[int, int]:
