@@ -94,16 +94,8 @@ def survey_log(
         container.close()
     check_unchanged(path, before, inputs.result())
     drop_used_columns(tables)
-    return Survey(
-        name=LogText(log_name(path)),
-        path=escaped(str(path)),
-        channels=channels,
-        tables=tuple(tables),
-        candidates=candidates,
-        problems=problems,
-        inputs=inputs.result(),
-        transfer=transfer,
-    )
+    names = LogText(log_name(path)), escaped(str(path))
+    return Survey(*names, channels, tuple(tables), candidates, problems, inputs.result(), transfer)
 
 
 def drop_used_columns(tables: list[TopicTable]) -> None:
@@ -188,9 +180,8 @@ def _collect(
     tables = [
         by_topic[topic].table() for topic in dict.fromkeys(topics[number] for number in wanted) if topic in by_topic
     ]
-    poses = {by_id[number].topic for number in wanted if by_id[number].message_type in TRANSFORM_TYPES} - {
-        by_id[number].topic for number in static
-    }
+    moving = {number for number in wanted if by_id[number].message_type in TRANSFORM_TYPES} - static
+    poses = {by_id[number].topic for number in moving}
     for place, table in enumerate(tables):
         if table.topic in poses and len(table):
             try:

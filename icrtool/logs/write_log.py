@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
@@ -235,11 +235,17 @@ def serialise_topic(plan: TopicPlan, store: Typestore, *, prefix: str = "", ros1
         encoder = store.serialize_ros1 if ros1 else store.serialize_cdr
         return np.frombuffer(encoder(message, plan.message_type), dtype=np.uint8).copy()
 
-    payload = np.tile(encode(), (len(plan.stamp_ns), 1))
+    blank = encode()
+    payload = np.tile(blank, (len(plan.stamp_ns), 1))
     for path, values in plan.columns.items():
-        slot = _find_slot(encode, message, path, values.dtype)
-        little_endian = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-        payload[:, slot] = little_endian.view(np.uint8).reshape(len(values), -1)
+        # The bytes of a number are those that change with it.
+        _put(message, path, np.frombuffer(b"\x11" * values.itemsize, values.dtype)[0])
+        changed = np.flatnonzero(encode() != blank)
+        _put(message, path, values.dtype.type(0))
+        if len(changed) != values.itemsize or changed[-1] - changed[0] != values.itemsize - 1:
+            raise ValueError(f"{path} is not a {values.dtype} field of {plan.message_type}")
+        little_endian = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+        payload[:, changed[0] : changed[-1] + 1] = little_endian.view(np.uint8).reshape(len(values), -1)
     return TopicMessages(prefix + plan.topic, plan.message_type, plan.stamp_ns, payload)
 
 
@@ -271,17 +277,6 @@ def _put(message: object, path: str, value: object) -> None:
         message[int(last)] = value
     else:
         setattr(message, last, value)
-
-
-def _find_slot(encode: Callable[[], NDArray[np.uint8]], message: object, path: str, dtype: np.dtype[Any]) -> slice:
-    """Return the byte range of the scalar at `path`, which is zero before and after: the bytes that change with it."""
-    blank = encode()
-    _put(message, path, np.frombuffer(b"\x11" * dtype.itemsize, dtype=dtype)[0])
-    changed = np.flatnonzero(encode() != blank)
-    _put(message, path, dtype.type(0))
-    if len(changed) != dtype.itemsize or changed[-1] - changed[0] != dtype.itemsize - 1:
-        raise ValueError(f"{path} is not a {dtype} field of {type(message).__name__}")
-    return slice(int(changed[0]), int(changed[-1]) + 1)
 
 
 _TO_SCHEMA_3 = """

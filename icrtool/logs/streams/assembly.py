@@ -95,42 +95,38 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     if source is not None:
         chosen["heading"] = source
     clock = common_clock([one.stamps for one in chosen.values()])
-    warnings = list(survey.problems)
+    notes = []
     if clock == "log":
-        warnings.append(
-            f"{name}: one stream has no header stamps, and the header stamps of another are far from log time; "
-            "log time is used for all streams"
-        )
-    warnings += clock_notes([(role, one.stamps) for role, one in chosen.items()], name)
+        far = "one stream has no header stamps, and the header stamps of another are far from log time"
+        notes.append(f"{far}; log time is used for all streams")
+    notes += clock_notes([(role, one.stamps) for role, one in chosen.items()], name)
     gnss, datum = _fixes(position, config, clock, name)
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock, name)
-    wheels, wheel_warnings = wheel_samples(motion, motion.stamps.on(clock), config, name)
-    warnings += wheel_warnings
-    warnings += [f"{name}: {ignored}" for ignored in ignored_joints(motion, config)]
-    warnings += [f"{name}: {one.topic}: {one.note}" for one in chosen.values() if one.note]
+    wheels, wheel_notes = wheel_samples(motion, motion.stamps.on(clock), config, name)
+    notes += wheel_notes + ignored_joints(motion, config)
+    notes += [f"{one.topic}: {one.note}" for one in chosen.values() if one.note]
     if source is None:
-        warnings += [f"{name}: {one.topic} gives no heading: {one.problem}" for one in found.heading]
+        notes += [f"{one.topic} gives no heading: {one.problem}" for one in found.heading]
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
-    warnings += [
-        f"{name}: {topic}: {unreadable[topic]} messages do not fit their message type; left out"
-        for topic in dict.fromkeys(topic_of_side(side) for one in chosen.values() for side in one.topic.split(" + "))
+    used_topics = [topic_of_side(side) for one in chosen.values() for side in one.topic.split(" + ")]
+    notes += [
+        f"{topic}: {unreadable[topic]} messages do not fit their message type; left out"
+        for topic in dict.fromkeys(used_topics)
         if topic in unreadable
     ]
     antenna = antenna_place(survey.tables, position.topic)
-    samples: dict[Role, Samples] = {"wheels": wheels, "gnss": gnss, "heading": heading}
-    details: dict[Role, str] = {
-        "wheels": "; position" if wheels.from_position else "; speed",
-        "gnss": "",
-        "heading": f"; {convention}",
+    place = "" if antenna is None else f"antenna {antenna[0]:+.2f} m forward, {antenna[1]:+.2f} m right of the base"
+    read: dict[Role, tuple[Samples, str]] = {
+        "wheels": (wheels, "; position" if wheels.from_position else "; speed"),
+        "gnss": (gnss, f"; {place} (/tf_static)" if place else ""),
+        "heading": (heading, f"; {convention}"),
     }
-    if antenna is not None:
-        details["gnss"] = f"; antenna {antenna[0]:+.2f} m forward, {antenna[1]:+.2f} m right of the base (/tf_static)"
     streams = []
     for role, one in chosen.items():
-        stamps, used = samples[role].stamp_ns, clock if one.stamps.header_ns is not None else "log"
-        rate, jitter = rate_and_jitter(stamps)
-        why = one.why + details[role]
-        streams.append(StreamChoice(role, one.topic, one.message_type, len(stamps), rate, used, jitter, why))
+        samples, detail = read[role]
+        used, count = clock if one.stamps.header_ns is not None else "log", len(samples.stamp_ns)
+        rate, jitter = rate_and_jitter(samples.stamp_ns)
+        streams.append(StreamChoice(role, one.topic, one.message_type, count, rate, used, jitter, one.why + detail))
     # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
     others = (
         other
@@ -141,8 +137,9 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     known: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
     units = inertial_units(survey.tables, GYRO_AXES, clock, known)
     log = RobotLog(
-        name, wheels, gnss, heading, datum, tuple(streams), survey.inputs, dict(position.rejected), tuple(warnings),
-        antenna, find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, known),
+        name, wheels, gnss, heading, datum, tuple(streams), survey.inputs, dict(position.rejected),
+        (*survey.problems, *(f"{name}: {note}" for note in notes)), antenna,
+        find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, known),
         tuple(GyroAxes(table.topic, stamps, np.array(rates).T) for table, stamps, rates in units), tuple(receivers),
     )  # fmt: skip
     return longest_part(log)
@@ -156,53 +153,37 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
     DataError
         The clock was set back, and times came again: nothing shows which of two samples came first.
     """
-    yield from _set_back_note(streams, name)
-    if found := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:
-        size_ns, is_back, before_ns = max(found)[0]
-        sense = "back" if is_back else "ahead"
-        yield (
-            f"{name}: header stamps go {sense} by {size_ns / 1e9:.1f} s after {_time_of_day(before_ns)} "
-            f"({', '.join(role for _, role in found)}): their clock was set {'back' if is_back else 'forward'} while "
-            "recording; the later ones are moved by as much, which log time shows"
-        )
-    for role, rows in streams:
-        if rows.note and rows.note != "no header":
-            yield f"{name}: {role}: {rows.note}; log time is used"
-        if rows.replaced > 1:
-            counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
-            yield f"{name}: {role}: {counted}; log time is used for them"
-
-
-def _set_back_note(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
-    """Yield the sentence on the log's clock, with the largest step of the streams that show one."""
     back = [
         (rows.set_back, role)
         for role, rows in streams
         if rows.set_back.pieces > MOST_PIECES or rows.set_back.step_ns > NEAR_NS
     ]
-    if not back:
-        return
-    # Of streams in which times come again, the largest step: they decide what can be done.
-    largest = max(back, key=lambda one: (one[0].pieces > MOST_PIECES, one[0].step_ns))[0]
-    moment = _time_of_day(largest.before_ns)
-    why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment} ({', '.join(role for _, role in back)})"
-    far = largest.step_ns > NEAR_NS
-    if largest.pieces > MOST_PIECES and far:
-        raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
-    if largest.pieces > MOST_PIECES:
-        yield (
-            f"{name}: {why}: the clock was set back while recording, and samples of that time are mixed, which makes "
-            "errors there too large; fit each part alone (--from, --to)"
-        )
-    else:
-        yield (
-            f"{name}: {why}: the clock was set back, or messages are stored out of order; all are used, sorted by "
-            "time; if it was set back, fit each part alone (--from, --to)"
-        )
-
-
-def _time_of_day(stamp_ns: int) -> str:
-    return f"{np.datetime64(stamp_ns // 1_000_000_000, 's')}Z"
+    if back:
+        # Of streams in which times come again, the largest step: they decide what can be done.
+        largest = max(back, key=lambda one: (one[0].pieces > MOST_PIECES, one[0].step_ns))[0]
+        moment, roles = np.datetime64(largest.before_ns // 10**9, "s"), ", ".join(role for _, role in back)
+        why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment}Z ({roles})"
+        if largest.pieces <= MOST_PIECES:
+            cause = "the clock was set back, or messages are stored out of order; all are used, sorted by time"
+            yield f"{why}: {cause}; if it was set back, fit each part alone (--from, --to)"
+        elif largest.step_ns <= NEAR_NS:
+            mixed = "samples of that time are mixed, which makes errors there too large"
+            yield f"{why}: the clock was set back while recording, and {mixed}; fit each part alone (--from, --to)"
+        else:
+            raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
+    if found := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:
+        size_ns, is_back, before_ns = max(found)[0]
+        sense, setting = ("back", "back") if is_back else ("ahead", "forward")
+        moment, roles = np.datetime64(before_ns // 10**9, "s"), ", ".join(role for _, role in found)
+        why = f"header stamps go {sense} by {size_ns / 1e9:.1f} s after {moment}Z ({roles})"
+        moved = "the later ones are moved by as much, which log time shows"
+        yield f"{why}: their clock was set {setting} while recording; {moved}"
+    for role, rows in streams:
+        if rows.note and rows.note != "no header":
+            yield f"{role}: {rows.note}; log time is used"
+        if rows.replaced > 1:
+            counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
+            yield f"{role}: {counted}; log time is used for them"
 
 
 def common_clock(streams: Sequence[StampedRows]) -> Literal["header", "log"]:
@@ -276,26 +257,22 @@ def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: s
     DataError
         Fewer than two usable samples.
     """
+    topic, notes = motion.topic, []
     rows, backwards, dropped = increasing(stamps)
-    warnings = []
     if backwards:
-        warnings.append(f"{log_name}: {motion.topic}: {backwards} wheel stamps go back; sorted")
+        notes.append(f"{topic}: {backwards} wheel stamps go back; sorted")
     if dropped > len(stamps) // 100:
-        warnings.append(
-            f"{log_name}: {motion.topic}: {dropped} of {len(stamps)} wheel samples share a stamp with another; "
-            "the last was kept"
-        )
+        shared = f"{dropped} of {len(stamps)} wheel samples share a stamp with another"
+        notes.append(f"{topic}: {shared}; the last was kept")
     left, right, unit, is_position = _pick(motion, config)
     left, right = left[rows], right[rows]
     finite = np.isfinite(left) & np.isfinite(right)
     lost = len(finite) - int(np.count_nonzero(finite))
     if lost > len(finite) * MOST_NOT_FINITE:
-        warnings.append(
-            f"{log_name}: {motion.topic}: {lost} of {len(finite)} wheel samples are not finite numbers; left out"
-        )
+        notes.append(f"{topic}: {lost} of {len(finite)} wheel samples are not finite numbers; left out")
     stamps, left, right = stamps[rows][finite], left[finite], right[finite]
     if len(stamps) < 2:
-        raise DataError(log_name, f"{motion.topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
+        raise DataError(log_name, f"{topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
     if is_position:
         interval = np.diff(stamps) / 1e9
         with np.errstate(over="ignore"):
@@ -304,11 +281,8 @@ def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: s
     if motion.twist is not None and config.wheels.twist_width_m is None:
         undone = f"converted to wheel speeds with {config.robot.track_width_m:g} m (robot.track_width_m)"
         advice = "if its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
-        warnings.append(
-            f"{log_name}: {motion.topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close "
-            "together"
-        )
-    return WheelSamples(stamps, left, right, unit, is_position), warnings
+        notes.append(f"{topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close together")
+    return WheelSamples(stamps, left, right, unit, is_position), notes
 
 
 def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bool]:
@@ -317,37 +291,30 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
         given = config.wheels.twist_width_m
         width = given if given is not None else config.robot.track_width_m
         if width is None:
-            raise ConfigError(
-                "robot.track_width_m",
-                f"needed to convert the body twist of {motion.topic} to wheel speeds",
-                "give it, or --robot NAME",
-            )
+            why = f"needed to convert the body twist of {motion.topic} to wheel speeds"
+            raise ConfigError("robot.track_width_m", why, "give it, or --robot NAME")
         speed, turn = motion.twist.T
         with np.errstate(over="ignore", invalid="ignore"):
             return speed - turn * width / 2, speed + turn * width / 2, "m", False
-    wanted = config.wheels.quantity
-    positions, speeds = motion.position, motion.speed
-    by_position = positions is not None and wanted != "velocity" and (wanted != "auto" or _alive(positions, speeds))
+    wanted, positions, speeds = config.wheels.quantity, motion.position, motion.speed
     if wanted in ("position", "counts") and positions is None:
         raise ConfigError("wheels.quantity", f"{motion.topic} has no {wanted}", "leave it on auto")
-    if speeds is not None and not by_position:
-        return *speeds, motion.unit, False
-    if positions is None or wanted == "velocity":
+    usable = speeds is None or wanted != "auto" or positions is None or _alive(positions, speeds)
+    if positions is not None and wanted != "velocity" and usable:
+        return *positions, "counts" if wanted == "counts" else motion.unit, True
+    if speeds is None:
         raise ConfigError("wheels.quantity", f"{motion.topic} has no velocity of both sides", "leave it on auto")
-    unit: Unit = "counts" if wanted == "counts" else motion.unit
-    return *positions, unit, True
+    return *speeds, motion.unit, False
 
 
-def _alive(positions: Pair, speeds: Pair | None) -> bool:
+def _alive(positions: Pair, speeds: Pair) -> bool:
     """Return whether the positions change where the speeds do: some drivers leave the position at zero."""
     finite = np.isfinite(positions[0]) & np.isfinite(positions[1])
     if np.count_nonzero(finite) < len(finite) / 2:
         return False
-    if speeds is None:
-        return True
     still = [float(np.ptp(side[finite])) == 0.0 for side in positions]
-    moves = [float(np.nanmax(np.abs(side))) > 0.0 for side in speeds]
-    return not any(s and m for s, m in zip(still, moves, strict=True))
+    moving = [float(np.nanmax(np.abs(side))) > 0.0 for side in speeds]
+    return not any(stuck and moves for stuck, moves in zip(still, moving, strict=True))
 
 
 PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0

@@ -67,7 +67,8 @@ class Bearing:
         if self.variance:
             variance = number(table, self.variance)
         elif self.std:
-            variance = _squared(number(table, self.std))
+            std = number(table, self.std)
+            variance = std * np.abs(std)  # not positive, and so not stated, where the deviation is not
         worth = min(self.worth, FUSED_WORTH) if is_fused(table, self.independent) else self.worth
         return replace(self, worth=worth).of(table, angle, variance, all_valid(table, self.valid))
 
@@ -80,11 +81,6 @@ class Bearing:
             **of_topic(table), yaw_rad=yaw, variance=stated, usable=usable, convention=self.convention,
             convention_why=self.known_by, score=self.worth, why=self.what, problem=problem,
         )  # fmt: skip
-
-
-def _squared(std: Floats) -> Floats:
-    """Return variances (n,) of standard deviations, not positive where these are not."""
-    return std * np.abs(std)
 
 
 _NORTHS = {0.0: "magnetic", 1.0: "geographic", 2.0: "UTM"}
@@ -128,7 +124,7 @@ def read_baselines(table: TopicTable, _: Config) -> HeadingSource:
     accuracy = np.maximum(*(number(table, one) for one in _ACCURACIES))
     std = np.divide(accuracy, length, out=np.full(len(table), np.nan), where=measured)
     valid = all_valid(table, _BASELINE_VALID) & measured
-    return BASELINE.of(table, np.arctan2(east, north), _squared(std), valid)
+    return BASELINE.of(table, np.arctan2(east, north), std * np.abs(std), valid)
 
 
 INS_WORDS = re.compile(r"\bins\b|vectornav|novatel|sbg|microstrain|xsens|gnss|gps|global|map|filtered", re.IGNORECASE)
@@ -292,19 +288,15 @@ def _written_order(
         return np.column_stack([field[chosen] for field in q]) / norm[chosen, None]
 
     as_named, some = (0, 1, 2, 3), unit(rows[:: max(1, len(rows) // MOST_LOOKED_AT)])
-    if len(some) < 2 or (_tilted_share(some, UPRIGHT_COSINE) < TILTED_SHARE).any():
+    # Of each axis of the sensor, the share of the time in which it is not upright.
+    if len(some) < 2 or ((np.abs(_vertical(*some.T)) < UPRIGHT_COSINE).mean(axis=1) < TILTED_SHARE).any():
         return as_named, ""
     rate = None if yaw_rate_radps is None else yaw_rate_radps[rows]
     for order, note in ORDERS:
-        if _tilted_share(some[:, order], LEVEL_COSINE)[2] < TILTED_SHARE and _turns_with(unit(rows)[:, order], rate):
+        tilted = (np.abs(_vertical(*some[:, order].T)[2]) < LEVEL_COSINE).mean()
+        if tilted < TILTED_SHARE and _turns_with(unit(rows)[:, order], rate):
             return order, note
     return as_named, ""
-
-
-def _tilted_share(unit: Floats, cosine: float) -> Floats:
-    """Return, for each axis of the sensor (3,), the share of the time in which it is not upright."""
-    share: Floats = (np.abs(_vertical(*unit.T)) < cosine).mean(axis=1)
-    return share
 
 
 def _vertical(x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:

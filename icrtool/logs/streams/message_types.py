@@ -53,6 +53,10 @@ _SEGWAY_STAMPED = replace(
     speed=tuple(f"segway.{path}" for path in _SEGWAY.speed),
 )  # fmt: skip
 
+# Wheel 0 is the left one in the configuration that comes with MAVROS; the topic states metres or rpm.
+_BOTH = ("data[0]", "data[1]")
+_RPM = FixedWheels("wheel speeds [rpm] of the autopilot: 0 left, 1 right", 80.0, speed=_BOTH, factor=2 * np.pi / 60)
+_TRAVEL = FixedWheels("wheel distances [m] of the autopilot: 0 left, 1 right", 90.0, _BOTH, unit="m")
 _TWIST = Twist("body twist", 50.0, fused=45.0)
 
 # Positions
@@ -190,7 +194,9 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
             ("position[0,1]", "position[2,3]"), ("velocity[0,1]", "velocity[2,3]"),
         ),
         "xbot_msgs/WheelTick": OwnRow(wheels.TICK_FIELDS, wheels.read_ticks),
-        "mavros_msgs/WheelOdomStamped": OwnRow(("data[*]",), wheels.read_autopilot),
+        "mavros_msgs/WheelOdomStamped": OwnRow(
+            ("data[*]",), lambda table, config: (_RPM if "rpm" in table.topic.lower() else _TRAVEL).read(table, config)
+        ),
         "segway_rmp/SegwayStatusStamped": _SEGWAY_STAMPED,
         "segway_rmp_ros2/SegwayStatusStamped": _SEGWAY_STAMPED,
         "segway_interfaces/Stamped": _SEGWAY_STAMPED,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -123,54 +124,50 @@ class Joints:
     def read(self, table: TopicTable, config: Config) -> WheelMotion:
         """Return the motion of those joints that are wheels."""
         codes, texts = table.words(self.names)
-        left, right = _wheels_among(texts, config)
-        lefts, rights, alike = len(left), len(right), np.zeros(0, np.bool_)
-        problem, wheels = "", codes
+        given = config.wheels.left_joints, config.wheels.right_joints
+        left, right = (
+            [i for i, name in enumerate(texts) if name in configured] if configured else named
+            for configured, named in zip(given, wheel_joints(texts), strict=True)
+        )
+        lefts, names, alike = len(left), [texts[i] for i in left + right], np.zeros(0, np.bool_)
+        problem, places = "", codes
         if not (left and right):
-            advice = "name them in wheels.{left,right}_joints"
-            named = f"no left and right wheel among its joints {some_of(texts)}; {advice}"
-            problem = named if texts else "lists no joints"
-        elif max(lefts, rights) > MOST_WHEELS:
-            problem = f"lists {lefts} left and {rights} right wheels; at most {MOST_WHEELS} of a side are read"
+            named = f"no left and right wheel among its joints {some_of(texts)}"
+            problem = f"{named}; name them in wheels.{{left,right}}_joints" if texts else "lists no joints"
+        elif max(lefts, len(right)) > MOST_WHEELS:
+            problem = f"lists {lefts} left and {len(right)} right wheels; at most {MOST_WHEELS} of a side are read"
         else:
-            # Joints by their place among the wheels, left ones first; -1 for all others.
-            wheel = np.full(len(texts) + 1, -1)
-            wheel[left + right] = np.arange(lefts + rights)
             # All messages list the same joints in the same order: one row stands for them.
-            same = codes.strides[0] == 0
-            wheels = np.broadcast_to(wheel[codes[:1]], codes.shape) if same else wheel[codes]
-            alike = _rows_alike(wheels[:1] if same else wheels, lefts, rights)
+            places = _places_of(left + right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
+            alike = _rows_alike(places >= 0, lefts)
             problem = "" if alike.any() else "left and right wheels come in different messages"
         if problem:
             return WheelMotion(**of_topic(table), joints=tuple(texts), problem=problem)
         if not alike.all():
-            table, wheels = table.rows(alike), wheels[alike]
-        why = f"{self.what}: left {some_of([texts[i] for i in left])}, right {some_of([texts[i] for i in right])}"
-        paths, names = {"position": self.position, "speed": self.speed}, [texts[i] for i in left + right]
+            table, places = table.rows(alike), places[alike]
+        why = f"{self.what}: left {some_of(names[:lefts])}, right {some_of(names[lefts:])}"
+        paths = {"position": self.position, "speed": self.speed}
         return of_wheels(
-            lambda quantity: _by_wheel(table.find(paths[quantity]), wheels, lefts + rights), lefts, names, "rad",
+            lambda quantity: _by_wheel(table.find(paths[quantity]), places), lefts, names, "rad",
             **of_topic(table), joints=tuple(texts), score=self.worth, why=why,
         )  # fmt: skip
 
 
-def _wheels_among(texts: Sequence[str], config: Config) -> tuple[list[int], list[int]]:
-    """Return the places of the left and of the right wheels among joints, the configured ones first."""
-    given = config.wheels.left_joints, config.wheels.right_joints
-    left, right = (
-        [i for i, name in enumerate(texts) if name in configured] if configured else named
-        for configured, named in zip(given, wheel_joints(texts), strict=True)
-    )
-    return left, right
+def _places_of(wheels: Sequence[int], codes: Ints, joints: int) -> Ints:
+    """Return the place of each wheel in the list of each message (n, k), -1 where it is not listed."""
+    wheel = np.full(joints + 1, -1)
+    wheel[wheels] = np.arange(len(wheels))
+    rows, listed = np.nonzero(wheel[codes] >= 0)
+    places = np.full((len(wheels), len(codes)), -1).T
+    places[rows, wheel[codes[rows, listed]]] = listed
+    return places
 
 
-def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
-    """Return the rows (n,) that list the set of wheels most rows list, of those sets with both sides.
+def _rows_alike(listed: Bools, lefts: int) -> Bools:
+    """Return the rows (n,) that list the set of wheels (n, k) most rows list, of those sets with both sides.
 
     A mean over wheels that changes its members would jump.
     """
-    listed = np.zeros((lefts + rights, len(wheels)), np.bool_).T
-    for rows, wheel, _ in _listed_wheels(wheels):
-        listed[rows, wheel] = True
     both: Bools = np.logical_and(listed[:, :lefts].any(axis=1), listed[:, lefts:].any(axis=1))
     sets = listed[both]
     if len(sets) and np.any(sets != sets[0]):
@@ -179,25 +176,18 @@ def _rows_alike(wheels: Ints, lefts: int, rights: int) -> Bools:
     return both
 
 
-def _by_wheel(values: NDArray[Any] | None, wheels: Ints, count: int) -> Floats | None:
-    """Return the value of each wheel in each message (n, count), NaN where it is not listed."""
+def _by_wheel(values: NDArray[Any] | None, places: Ints) -> Floats | None:
+    """Return the value of each wheel in each message (n, k), NaN where it is not listed."""
     if values is None:
         return None
-    by_wheel = np.full((count, len(wheels)), np.nan).T
-    for rows, wheel, place in _listed_wheels(wheels[:, : values.shape[1]]):
-        by_wheel[rows, wheel] = values[rows, place]
-    return by_wheel
-
-
-def _listed_wheels(wheels: Ints) -> Iterator[tuple[slice | Ints, int | Ints, int]]:
-    """Yield rows, the wheel that they list (one, or one per row), and its position in the list."""
-    for place, listed in enumerate(wheels.T):
-        if len(listed) and (listed.strides[0] == 0 or (listed == listed[0]).all()):
-            if listed[0] >= 0:
-                yield slice(None), int(listed[0]), place
+    by_wheel = np.full((places.shape[1], len(values)), np.nan).T
+    for wheel, place in enumerate(places.T):
+        rows = (place >= 0) & (place < values.shape[1])
+        if (place == place[0]).all():
+            by_wheel[:, wheel] = values[:, place[0]] if rows[0] else np.nan
         else:
-            rows = np.flatnonzero(listed >= 0)
-            yield rows, listed[rows], place
+            by_wheel[rows, wheel] = values[rows, place[rows]]
+    return by_wheel
 
 
 _ELEMENTS = re.compile(r"\[([\d,]+)\]")
@@ -277,35 +267,21 @@ def read_ticks(table: TopicTable, _: Config) -> WheelMotion:
     bits = int(np.bitwise_or.reduce(valid)) if valid is not None else 0
     axles = [place for place, both in (("f", 3), ("r", 12)) if bits & both == both] or ["r"]
 
-    def travelled(place: str) -> Floats:
-        ticks, direction = table.integers(f"wheel_ticks_{place}"), table.column(f"wheel_direction_{place}")
-        if ticks is None:
-            raise DefinitionError(table.topic, f"its {table.message_type} has no whole numbers wheel_ticks_{place}")
-        steps = np.abs(np.mod(np.diff(ticks) + _HALF_COUNTER, 2 * _HALF_COUNTER) - _HALF_COUNTER)
-        return np.concatenate([[0.0], np.cumsum(np.where(direction[1:] != 0, -steps, steps))])
-
     with np.errstate(invalid="ignore"):  # infinite ones of both signs have no median
         per_metre = float(np.median(table.floats("wheel_tick_factor")))
     known = per_metre > 0
-    sides = [sum(travelled(f"{axle}{side}") for axle in axles) / len(axles) for side in "lr"]
-    left, right = (np.asarray(side) / (per_metre if known else 1.0) for side in sides)
+    sides = [np.zeros(len(table)), np.zeros(len(table))]
+    for side, axle in product((0, 1), axles):
+        name = f"{axle}{'lr'[side]}"
+        ticks, direction = table.integers(f"wheel_ticks_{name}"), table.column(f"wheel_direction_{name}")
+        if ticks is None:
+            raise DefinitionError(table.topic, f"its {table.message_type} has no whole numbers wheel_ticks_{name}")
+        steps = np.abs(np.mod(np.diff(ticks) + _HALF_COUNTER, 2 * _HALF_COUNTER) - _HALF_COUNTER)
+        sides[side][1:] += np.cumsum(np.where(direction[1:] != 0, -steps, steps)) / len(axles)
+    left, right = (side / (per_metre if known else 1.0) for side in sides)
     unit: Unit = "m" if known else "counts"
     why = f"ticks of the {' and '.join({'f': 'front', 'r': 'rear'}[axle] for axle in axles)} wheels"
     return motion_of(**of_topic(table), position=(left, right), unit=unit, score=90.0, why=why)
-
-
-_BOTH = ("data[0]", "data[1]")
-"""Wheel 0 is the left one in the configuration that comes with MAVROS."""
-
-_AUTOPILOT_RPM = FixedWheels(
-    "wheel speeds [rpm] of the autopilot: 0 left, 1 right", 80.0, speed=_BOTH, factor=2 * np.pi / 60
-)
-_AUTOPILOT_M = FixedWheels("wheel distances [m] of the autopilot: 0 left, 1 right", 90.0, _BOTH, unit="m")
-
-
-def read_autopilot(table: TopicTable, config: Config) -> WheelMotion:
-    """Return the motion in mavros_msgs/WheelOdomStamped: metres or rpm of each wheel, as its topic states."""
-    return (_AUTOPILOT_RPM if "rpm" in table.topic.lower() else _AUTOPILOT_M).read(table, config)
 
 
 COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.IGNORECASE)
