@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from icrtool.errors import IcrToolError
     from icrtool.logs.read_log import read_log
     from icrtool.output.files.formats import open_calibration
-    from icrtool.output.page.run_page import write_page
+    from icrtool.output.page.pages import write_page
     from icrtool.output.run_directory import open_run
     from icrtool.records.run import Run, WarmStart
     from icrtool.records.tables import RobotLog
@@ -83,7 +83,7 @@ _HOMES = {
     "open_calibration": "icrtool.output.files.formats",
     "open_run": "icrtool.output.run_directory",
     "read_log": "icrtool.logs.read_log",
-    "write_page": "icrtool.output.page.run_page",
+    "write_page": "icrtool.output.page.pages",
 }
 
 

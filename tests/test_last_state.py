@@ -7,7 +7,7 @@ from pathlib import Path
 
 import icrtool
 from icrtool.output.files.formats import json_bytes, logs_of_fleet
-from icrtool.output.page.run_page import read_report, run_page
+from icrtool.output.page.pages import read_report, run_page
 
 DATA = Path(__file__).parent / "data"
 

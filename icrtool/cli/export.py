@@ -16,7 +16,7 @@ with when_used():
     from icrtool import errors
     from icrtool.calibration import record
     from icrtool.output import run_directory
-    from icrtool.output.exports import controllers, foxglove, maps, paths
+    from icrtool.output.exports import controllers, foxglove, paths
     from icrtool.output.files import atomic, formats
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
         if target in TRAJECTORIES:
             text = paths.format_trajectory(paths.paths_of(run)[0], cast("TrajectoryFormat", target))
         else:
-            text = maps.format_geojson(run) if target == "qgis" else maps.format_kml(run)
+            text = paths.format_geojson(run) if target == "qgis" else paths.format_kml(run)
     write_or_print(text if target in TRAJECTORIES else f"{text}\n", output)
 
 

@@ -24,7 +24,7 @@ with when_used():
     from icrtool.output import run_directory
     from icrtool.output.figures import calibrations as figures
     from icrtool.output.files import atomic, formats
-    from icrtool.output.page import group_pages, render, run_page
+    from icrtool.output.page import pages, render
     from icrtool.output.tables import calibration as tables
     from icrtool.records import fleet_document, places
 
@@ -72,11 +72,11 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
     fleet = source / fleet_document.FLEET_FILE
     if formats.schema_of(fleet, source).startswith(fleet_document.FLEET_FAMILY):
         with _as_written(fleet, "run icrtool batch again"):
-            return group_pages.fleet_page(formats.read_fleet(source), source)
-    if (file := group_pages.comparison_in(source)) is not None:
+            return pages.fleet_page(formats.read_fleet(source), source)
+    if (file := pages.comparison_in(source)) is not None:
         with _as_written(file, "run icrtool compare again"):
-            comparison = group_pages.read_comparison(file, source if source.is_dir() else None)
-            return group_pages.comparison_page(comparison, file.stem)
+            comparison = pages.read_comparison(file, source if source.is_dir() else None)
+            return pages.comparison_page(comparison, file.stem)
     if places.is_special(source):
         raise errors.RunError(source, places.NOT_REGULAR, places.SAVE_IT)
     what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
@@ -85,15 +85,15 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> str:
     """Return the page of a run; what it has no dropout report of, and no pictures, is made for the page."""
-    run, report = run_directory.open_run(directory), run_page.read_report(directory)
-    pictures = run_page.pictures_of_run(directory)
+    run, report = run_directory.open_run(directory), pages.read_report(directory)
+    pictures = pages.pictures_of_run(directory)
     if "trajectory" not in pictures:
-        pictures = run_page.draw_pictures(run) | pictures
+        pictures = pages.draw_pictures(run) | pictures
     if report is None:
         made = dropout_report.dropout_report(run).document
-        return run_page.run_page(run, made, pictures, coordinates=coordinates)
+        return pages.run_page(run, made, pictures, coordinates=coordinates)
     with _as_written(directory / "dropout", "make it again with icrtool dropout-report"):
-        return run_page.run_page(run, report, pictures, coordinates=coordinates)
+        return pages.run_page(run, report, pictures, coordinates=coordinates)
 
 
 @contextmanager

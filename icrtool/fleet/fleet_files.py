@@ -151,7 +151,7 @@ def write_fleet(
     # After the tables: where it is, these are of the same batch.
     write_file(directory / FLEET_FILE, formats.json_bytes(document), directory)
     if page:
-        from icrtool.output.page.group_pages import fleet_page
+        from icrtool.output.page.pages import fleet_page
 
         write_file(directory / PAGE_FILE, fleet_page(document, directory), directory, is_page)
     return document
@@ -183,7 +183,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
     folder : of the batch
     """
     from icrtool.output.figure_catalogue import figures_of
-    from icrtool.output.figures.fleet import FleetNumbers
+    from icrtool.output.figures.calibrations import FleetNumbers
 
     points: list[FleetLog] = []
     errors: dict[str, dict[str, float]] = {}

@@ -215,7 +215,7 @@ def report_and_write(
         inside=directory,
     )  # fmt: skip
     if options.page:
-        from icrtool.output.page.run_page import write_page
+        from icrtool.output.page.pages import write_page
 
         begin("page")
         write_page(run, report, directory / PAGE_FILE, plots=directory, inside=directory)

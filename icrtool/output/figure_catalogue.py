@@ -6,6 +6,7 @@ matplotlib is imported when the first figure is drawn: a page of finished pictur
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -24,26 +25,18 @@ Parts = Mapping[str, tuple[float, ...]]
 HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
 
 
-def _always(_: object) -> Parts:
-    return {"": ()}
-
-
 def _where(content: Callable[[Any], object]) -> Callable[[Any], Parts]:
     """Return the parts of a figure that is drawn once, where there is such content."""
     return lambda subject: {"": ()} if content(subject) else {}
 
 
-def _histogram_horizons_m(report: DropoutReport) -> tuple[float, ...]:
+def _histograms(report: DropoutReport, *, together: bool) -> Parts:
+    """Return the parts of histograms: one figure of all horizons that have trials, or one of each."""
     trials = {row.horizon_m: row.trials for row in report.document.trials}
-    return tuple(metres for metres in HISTOGRAM_HORIZONS_M if trials.get(metres))
-
-
-def _all_histograms(report: DropoutReport) -> Parts:
-    return {"": found} if (found := _histogram_horizons_m(report)) else {}
-
-
-def _histograms(report: DropoutReport) -> Parts:
-    return {f"{metres:02.0f}m": (metres,) for metres in _histogram_horizons_m(report)}
+    found = tuple(metres for metres in HISTOGRAM_HORIZONS_M if trials.get(metres))
+    if together:
+        return {"": found} if found else {}
+    return {f"{metres:02.0f}m": (metres,) for metres in found}
 
 
 class Entry(NamedTuple):
@@ -63,7 +56,7 @@ class Entry(NamedTuple):
     title: str
     caption: str
     place: str
-    parts: Callable[[Any], Parts] = _always
+    parts: Callable[[Any], Parts] = _where(lambda _: True)
     with_place: bool = False
     further: bool = False
 
@@ -115,12 +108,12 @@ FIGURES = {
     "histogram": Entry(
         "report", "How the errors scatter",
         "Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
-        "dropout_errors.dropout_histograms", _all_histograms,
+        "dropout_errors.dropout_histograms", partial(_histograms, together=True),
     ),
     "histogram_": Entry(
         "report", "Errors after {} m, by model",
         "A panel a model. Good: most trials at the left, and a short tail. 5 % of the trials lie beyond the 95 % line.",
-        "dropout_errors.dropout_histogram", _histograms, further=True,
+        "dropout_errors.dropout_histogram", partial(_histograms, together=False), further=True,
     ),
     "summary": Entry(
         "report", "Error over distance",
@@ -130,11 +123,11 @@ FIGURES = {
     "icrs": Entry(
         "fleet", "Final ICRs of every log",
         "One robot on one ground should lie on one level; a step is other ground or wear.",
-        "fleet.fleet_icrs", _where(lambda fleet: fleet.points),
+        "calibrations.fleet_icrs", _where(lambda fleet: fleet.points),
     ),
     "errors": Entry(
         "fleet", "Error of every log", "Which logs are worse than the others of their group?",
-        "fleet.fleet_errors", _where(lambda fleet: fleet.errors_m),
+        "calibrations.fleet_errors", _where(lambda fleet: fleet.errors_m),
     ),
     "transfer": Entry(
         "comparison", "The cost of a foreign calibration",

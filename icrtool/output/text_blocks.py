@@ -182,7 +182,15 @@ Printed = str | Line | Table
 
 def format_blocks(blocks: Iterable[Block], *, verbose: bool = True) -> str:
     """Return a document as plain text, at most `TEXT_WIDTH` wide where it can be wrapped; no line end."""
-    return "\n".join(line.rstrip() for block in printed(blocks, verbose=verbose) for line in _lines(block))
+    lines: list[str] = []
+    for block in printed(blocks, verbose=verbose):
+        if isinstance(block, Table):
+            lines += _table_lines(block)
+        elif isinstance(block, Line):
+            lines += block.text.split("\n")
+        else:
+            lines += _wrap(str(block), "", " " * (len(block) - len(block.lstrip()) + 2)) or [""]
+    return "\n".join(line.rstrip() for line in lines)
 
 
 LOOKS: dict[Grade, Look] = {"good": "good", "care": "as is", "bad": "bad", "fact": "as is"}
@@ -237,11 +245,7 @@ def _sentence(first: str, text: str, most: int, look: Look = "as is", *, verbose
     """Return a sentence behind its label, in so many lines of a brief answer at most; no path is broken."""
     if verbose:
         return Table("l", [(first[:-2], text)])
-    lines = textwrap.wrap(
-        text, BRIEF_WIDTH, initial_indent=first, subsequent_indent=" " * len(first), break_long_words=False,
-        break_on_hyphens=False, max_lines=most, placeholder=" …",
-    )  # fmt: skip
-    return Line("\n".join(lines) or first.rstrip(), look)
+    return Line("\n".join(_wrap(text, first, " " * len(first), BRIEF_WIDTH, most)) or first.rstrip(), look)
 
 
 def _fact_lines(facts: Facts) -> Iterator[tuple[str, str, int]]:
@@ -250,15 +254,6 @@ def _fact_lines(facts: Facts) -> Iterator[tuple[str, str, int]]:
     for number, (name, text) in enumerate(facts.rows):
         of_all = f"{'' if number else facts.label:{LABEL + 2}}{name:{widest}}  "
         yield of_all if facts.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
-
-
-def _lines(block: Printed) -> Iterable[str]:
-    if isinstance(block, Table):
-        return _table_lines(block)
-    if isinstance(block, Line):
-        return block.text.split("\n")
-    indent = " " * (len(block) - len(block.lstrip()) + 2)
-    return _wrap(str(block), "", indent) or [""]
 
 
 def narrowed(table: Table, width: int) -> Table:
@@ -299,7 +294,8 @@ def _table_lines(table: Table) -> Iterator[str]:
             yield lead + last
 
 
-def _wrap(text: str, first: str, later: str) -> list[str]:
+def _wrap(text: str, first: str, later: str, width: int = TEXT_WIDTH, most: int | None = None) -> list[str]:
     return textwrap.wrap(
-        text, TEXT_WIDTH, initial_indent=first, subsequent_indent=later, break_long_words=False, break_on_hyphens=False
-    )
+        text, width, initial_indent=first, subsequent_indent=later, break_long_words=False, break_on_hyphens=False,
+        max_lines=most, placeholder=" …",
+    )  # fmt: skip

@@ -27,9 +27,8 @@ from icrtool.motion.recording import Trials, cut_windows, predicted_path
 from icrtool.motion.window_fit import own_constants
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.page import drive_data
-from icrtool.output.page.group_pages import comparison_page, fleet_page
+from icrtool.output.page.pages import comparison_page, fleet_page, run_page
 from icrtool.output.page.render import pictures_of
-from icrtool.output.page.run_page import run_page
 from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.fleet_document import FleetDocument

@@ -99,16 +99,14 @@ def _suite(one: Suite, command: str) -> ET.Element:
     }
     suite = ET.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
     for verdict in one.verdicts:
-        element, line = (
-            ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate)),
-            verdict.line,
-        )
+        element = ET.SubElement(suite, "testcase", classname=name, name=xml_text(verdict.gate))
+        line = xml_text(verdict.line)
         if verdict.not_checked:
             ET.SubElement(element, "skipped", message=xml_text(verdict.not_checked))
         elif not verdict.passed:
-            ET.SubElement(element, "failure", type="gate", message=xml_text(line)).text = xml_text(line)
+            ET.SubElement(element, "failure", type="gate", message=line).text = line
         else:
-            ET.SubElement(element, "system-out").text = xml_text(line)
+            ET.SubElement(element, "system-out").text = line
     if one.error:
         element = ET.SubElement(suite, "testcase", classname=name, name=command)
         ET.SubElement(element, "error", type="IcrToolError", message=xml_text(one.error))

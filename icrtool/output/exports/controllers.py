@@ -22,7 +22,6 @@ from icrtool.output.text_format import controller_error_text
 from icrtool.records.calibration_document import ControllerErrors
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
-from icrtool.records.run_document import ControllerNumbers
 
 Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]
 TARGETS: tuple[Target, ...] = get_args(Target)
@@ -50,6 +49,24 @@ CONTROLLER_PLACES: dict[Target, tuple[str, ...]] = {
 """Where the parameters of a diff_drive_controller stand in each robot's configuration."""
 
 
+NAV2 = """\
+# robot_localization, odom frame: wheels give vx and vyaw, with the twist covariance of the message:
+# set there twist_covariance_diagonal: {twist}
+ekf_filter_node:
+  ros__parameters:
+    two_d_mode: true
+    world_frame: odom
+    odom0: odom  # your wheel odometry
+    odom0_config: [{used}]
+    odom0_differential: false
+    odom0_relative: false
+# AMCL: shares of variance: turn by turn, turn by distance, distance by distance, distance by turn
+amcl:
+  ros__parameters:
+    robot_model_type: "nav2_amcl::DifferentialMotionModel"
+"""
+
+
 def format_export(calibration: Calibration, target: Target) -> str:
     """Return the text to paste, no line end.
 
@@ -69,96 +86,79 @@ def format_export(calibration: Calibration, target: Target) -> str:
     if errors is None:
         advice = "covariances need a longer drive"
         raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
-    if target == "json":
-        return _json(calibration, errors)
-    if target == "nav2":
-        body = _nav2(errors)
-    else:
-        place = CONTROLLER_PLACES[target]
-        body = [*place, *_controller(calibration, errors, indent=len(place[-1]) - len(place[-1].lstrip()) + 2)]
-    return "\n".join([*_header(calibration, errors), *body])
-
-
-def _json(calibration: Calibration, errors: ControllerErrors) -> str:
+    begin_ns, distance_m = (
+        min(log.begin_ns for log in calibration.logs),
+        sum(log.distance_m for log in calibration.logs),
+    )
+    date = "at an unknown date"
+    if begin_ns:
+        date = datetime.fromtimestamp(begin_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
     numbers, robot = calibration.controller, calibration.robot
-    document = {
-        "schema": EXPORT_SCHEMA,
-        "tool_version": __version__,
-        "date": _date(calibration),
-        "log": calibration.log_names(),
-        "begin_ns": _begin_ns(calibration),
-        "distance_m": _distance_m(calibration),
-        "robot": robot.name,
-        "track_width_m": calibration.width_m,
-        "wheel_radius_m": robot.wheel_radius_m,
-        "model": calibration.recommended,
-        "created": calibration.created or "",
-        "separation_multiplier": numbers.multiplier,
-        "separation_multiplier_std": numbers.multiplier_std,
-        "left_radius_multiplier": numbers.left_radius,
-        "left_radius_multiplier_std": numbers.left_radius_std,
-        "right_radius_multiplier": numbers.right_radius,
-        "right_radius_multiplier_std": numbers.right_radius_std,
-        "icrs_m": [calibration.geometry[name] for name in ICR_COLUMNS],
-        "icr_std_m": [calibration.geometry_std[name] for name in ICR_COLUMNS],
-        **msgspec.structs.asdict(errors),
-        "warnings": export_warnings(calibration),
-        "twist_width_m": robot.twist_width_m or None,
-    }
-    return json_bytes(document).decode().rstrip("\n")
+    if target == "json":
+        document = {
+            "schema": EXPORT_SCHEMA,
+            "tool_version": __version__,
+            "date": date,
+            "log": calibration.log_names(),
+            "begin_ns": begin_ns,
+            "distance_m": distance_m,
+            "robot": robot.name,
+            "track_width_m": calibration.width_m,
+            "wheel_radius_m": robot.wheel_radius_m,
+            "model": calibration.recommended,
+            "created": calibration.created or "",
+            "separation_multiplier": numbers.multiplier,
+            "separation_multiplier_std": numbers.multiplier_std,
+            "left_radius_multiplier": numbers.left_radius,
+            "left_radius_multiplier_std": numbers.left_radius_std,
+            "right_radius_multiplier": numbers.right_radius,
+            "right_radius_multiplier_std": numbers.right_radius_std,
+            "icrs_m": [calibration.geometry[name] for name in ICR_COLUMNS],
+            "icr_std_m": [calibration.geometry_std[name] for name in ICR_COLUMNS],
+            **msgspec.structs.asdict(errors),
+            "warnings": export_warnings(calibration),
+            "twist_width_m": robot.twist_width_m or None,
+        }
+        return json_bytes(document).decode().rstrip("\n")
+    driven = f"driven {date}, {distance_m:.0f} m"
+    return "\n".join([*_header(calibration, errors, driven), *_parameters(calibration, errors, target)])
 
 
-def _nav2(errors: ControllerErrors) -> list[str]:
-    (alpha1, alpha2), (alpha3, alpha4) = errors.turn_noise, errors.way_noise
-    return [
-        "# robot_localization, odom frame: wheels give vx and vyaw, with the twist covariance of the message:",
-        f"# set there twist_covariance_diagonal: {_diagonal(errors.twist_variance)}",
-        "ekf_filter_node:",
-        "  ros__parameters:",
-        "    two_d_mode: true",
-        "    world_frame: odom",
-        "    odom0: odom  # your wheel odometry",
-        f"    odom0_config: [{', '.join('true' if used in ODOMETRY_USED else 'false' for used in range(15))}]",
-        "    odom0_differential: false",
-        "    odom0_relative: false",
-        "# AMCL: shares of variance: turn by turn, turn by distance, distance by distance, distance by turn",
-        "amcl:",
-        "  ros__parameters:",
-        '    robot_model_type: "nav2_amcl::DifferentialMotionModel"',
-        f"    alpha1: {_number(alpha1)}",
-        f"    alpha2: {_number(alpha2)}",
-        f"    alpha3: {_number(alpha3)}",
-        f"    alpha4: {_number(alpha4)}",
-    ]
-
-
-def _controller(calibration: Calibration, errors: ControllerErrors, indent: int) -> list[str]:
-    """Return the parameters of a diff_drive_controller."""
-    radius = calibration.robot.wheel_radius_m
+def _parameters(calibration: Calibration, errors: ControllerErrors, target: Target) -> list[str]:
+    """Return the lines of YAML: of a diff_drive_controller in its place, or for nav2 and robot_localization."""
+    rest = _number(NOT_PLANAR)
+    pose, twist = (
+        f"[{_number(x)}, {_number(y)}, {rest}, {rest}, {rest}, {_number(yaw)}]"
+        for x, y, yaw in (errors.pose_variance, errors.twist_variance)
+    )
+    if target == "nav2":
+        used = ", ".join("true" if one in ODOMETRY_USED else "false" for one in range(15))
+        alphas = enumerate((*errors.turn_noise, *errors.way_noise), start=1)
+        return [
+            *NAV2.format(twist=twist, used=used).splitlines(),
+            *(f"    alpha{i}: {_number(one)}" for i, one in alphas),
+        ]
+    numbers, radius = calibration.controller, calibration.robot.wheel_radius_m
     lines = [f"wheel_separation: {_number(calibration.width_m)}"]
     if radius is not None:
         lines.append(f"wheel_radius: {_number(radius)}")
-    for key, value, std in controller_rows(calibration.controller):
-        lines.append(f"{key}: {value:.4f}  # {f'± {std:.4f}' if std > 0.0 else 'not estimated'}")
-    lines += [
-        f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
-        f"pose_covariance_diagonal: {_diagonal(errors.pose_variance)}",
-        f"# of velocities over {TWIST_OVER_M:g} m",
-        f"twist_covariance_diagonal: {_diagonal(errors.twist_variance)}",
-    ]
-    return [" " * indent + line for line in lines]
-
-
-def controller_rows(numbers: ControllerNumbers) -> list[tuple[str, float, float]]:
-    """Return what a diff_drive_controller calls each number, its value and its standard deviation."""
-    return [
+    for key, value, std in (
         ("wheel_separation_multiplier", numbers.multiplier, numbers.multiplier_std),
         ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std),
         ("right_wheel_radius_multiplier", numbers.right_radius, numbers.right_radius_std),
+    ):
+        lines.append(f"{key}: {value:.4f}  # {f'± {std:.4f}' if std > 0.0 else 'not estimated'}")
+    lines += [
+        f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
+        f"pose_covariance_diagonal: {pose}",
+        f"# of velocities over {TWIST_OVER_M:g} m",
+        f"twist_covariance_diagonal: {twist}",
     ]
+    *_, last = place = CONTROLLER_PLACES[target]
+    return [*place, *textwrap.indent("\n".join(lines), " " * (len(last) - len(last.lstrip()) + 2)).splitlines()]
 
 
-def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
+def _header(calibration: Calibration, errors: ControllerErrors, driven: str) -> list[str]:
     """Return the comments above: where the numbers come from, and what they cannot express."""
     (right, left, x), (std_right, std_left, std_x) = (
         [one[name] for name in ICR_COLUMNS] for one in (calibration.geometry, calibration.geometry_std)
@@ -166,10 +166,7 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     robot = f", {_one_line(name)}" if (name := calibration.robot.name) else ""
     # That of a report has no date: the same run, the same file.
     fitted = f", fitted {calibration.created[:10]}" if calibration.created else ""
-    origin = (
-        f"icrtool {__version__}: {_one_line(calibration.log_names())}, driven {_date(calibration)}, "
-        f"{_distance_m(calibration):.0f} m{robot}{fitted}"
-    )
+    origin = f"icrtool {__version__}: {_one_line(calibration.log_names())}, {driven}{robot}{fitted}"
     icrs = (
         f"y_icr_right {right:+.3f} ± {std_right:.3f} m, y_icr_left {left:+.3f} ± {std_left:.3f} m, "
         f"x_icr {x:+.3f} ± {std_x:.3f} m (body: x forward, y right)"
@@ -192,35 +189,12 @@ def _header(calibration: Calibration, errors: ControllerErrors) -> list[str]:
     ]
 
 
-def _diagonal(planar: tuple[float, float, float]) -> str:
-    x, y, yaw = (_number(value) for value in planar)
-    rest = _number(NOT_PLANAR)
-    return f"[{x}, {y}, {rest}, {rest}, {rest}, {yaw}]"
-
-
 def _number(value: float) -> str:
     """Return a YAML float of four digits: always with a point, or ROS takes it for an integer."""
     if not math.isfinite(value):
         raise ValueError(f"{value} cannot be exported")
-    text = f"{value:.4g}"
-    if "e" in text:
-        mantissa, _, exponent = text.partition("e")
-        return f"{mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"
-    return text if "." in text else f"{text}.0"
-
-
-def _begin_ns(calibration: Calibration) -> int:
-    return min(log.begin_ns for log in calibration.logs)
-
-
-def _distance_m(calibration: Calibration) -> float:
-    return sum(log.distance_m for log in calibration.logs)
-
-
-def _date(calibration: Calibration) -> str:
-    if not (begin_ns := _begin_ns(calibration)):
-        return "at an unknown date"
-    return datetime.fromtimestamp(begin_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    mantissa, e, exponent = f"{value:.4g}".partition("e")
+    return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}{e}{exponent}"
 
 
 def _one_line(text: str) -> str:
@@ -283,6 +257,5 @@ def format_twist(calibration: Calibration) -> str:
 def sign_in_rep103(term: Term) -> float:
     """Return the factor of a parameter when y points left, turns count counter-clockwise and w = -w."""
     left, right = np.array([0.3]), np.array([0.1])
-    here, swapped = (term.column(wheel_motion(*sides, 1.0))[0] for sides in ((left, right), (right, left)))
-    axis = 1.0 if term.axis == VX else -1.0
-    return axis if here == swapped else -axis
+    same = term.column(wheel_motion(left, right, 1.0))[0] == term.column(wheel_motion(right, left, 1.0))[0]
+    return 1.0 if same == (term.axis == VX) else -1.0

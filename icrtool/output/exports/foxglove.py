@@ -7,17 +7,18 @@ filter's, ``icr_odometry`` and ``no_slip_odometry`` are where wheel speeds alone
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.dropout_analysis.trials import errors_from_states
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Ints
 from icrtool.kernels.kinematics import body_velocity
 from icrtool.logs.write_log import (
     TopicMessages,
@@ -111,12 +112,17 @@ def write_foxglove(run: Run, path: Path) -> None:
         *(_odometry(run, path, rows) for path in paths),
         *(_fixes(run, rows, globe) if globe is not None else ()),
         _icrs(run, rows),
-        _errors(run),
+        _errors(run, rows),
     ]
     topics = [serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
     topics += [_whole_path(path, store) for path in paths]
     slip = ({**plain(event), "x_m": event.east_m, "y_m": event.north_m} for event in run.document.events)
-    topics += [_event_topic("/events", slip, store), _event_topic("/outages", _outages(run), store)]
+    outages: list[dict[str, Any]] = []
+    for (begin_ns, end_ns), span in outage_rows(run):
+        x_m, y_m, distance = run.table.east_m[span], run.table.north_m[span], run.table.distance_m[span]
+        place = {"x_m": float(x_m[0]), "y_m": float(y_m[0]), "distance_m": float(distance[-1] - distance[0])}
+        outages.append({"kind": "outage", "begin_ns": begin_ns, "end_ns": end_ns, **place})
+    topics += [_event_topic("/events", slip, store), _event_topic("/outages", outages, store)]
     about = {name: "" if value is None else str(value) for name, value in about_run(run).items()}
     about["datum"] = "" if globe is None else " ".join(f"{value!r}" for value in globe)
     write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about, library=LIBRARY)
@@ -156,7 +162,7 @@ def _odometry(run: Run, path: ExportPath, rows: Ints) -> TopicPlan:
     table, stamps, (z, w) = run.table, path.stamp_ns[rows], path.quaternion
     icrs = (column[rows] if len(column) > 1 else column for column in path.icrs)
     v_x, v_y, omega = body_velocity(table.v_left_mps[rows], table.v_right_mps[rows], *icrs)
-    columns = header_stamps(stamps) | {
+    columns = {
         "pose.pose.position.x": path.x_m[rows],
         "pose.pose.position.y": path.y_m[rows],
         "pose.pose.orientation.z": z[rows],
@@ -172,8 +178,8 @@ def _odometry(run: Run, path: ExportPath, rows: Ints) -> TopicPlan:
             "pose.covariance.7": states.std_north_m[rows] ** 2,
             "pose.covariance.35": states.std_heading_rad[rows] ** 2,
         }
-    fixed: dict[str, object] = {"header.frame_id": WORLD, "child_frame_id": BODIES[path.name]}
-    return TopicPlan(f"/{path.name}/odometry", "nav_msgs/msg/Odometry", stamps, fixed, columns)
+    topic, fixed = f"/{path.name}/odometry", {"child_frame_id": BODIES[path.name]}
+    return _plan(topic, "nav_msgs/msg/Odometry", stamps, WORLD, columns, fixed)
 
 
 def _whole_path(path: ExportPath, store: Typestore) -> TopicMessages:
@@ -194,73 +200,57 @@ def _whole_path(path: ExportPath, store: Typestore) -> TopicMessages:
     return TopicMessages(f"/{path.name}/path", name, path.stamp_ns[:1], [bytes(store.serialize_cdr(message, name))])
 
 
-def _fixes(run: Run, rows: Ints, globe: Globe) -> tuple[TopicPlan, ...]:
-    """Return the filter's position, the fixes that it used and those that it rejected, as NavSatFix."""
+def _fixes(run: Run, rows: Ints, globe: Globe) -> Iterator[TopicPlan]:
+    """Yield the filter's position, the fixes that it used and those that it rejected, as NavSatFix."""
     table, fixes = run.table, run.sensors.fixes
+    variances = table.std_east_m**2, table.std_north_m**2
+    of_filter = table.stamp_ns, table.east_m, table.north_m, *variances, np.full(len(table), PLAIN_FIX, np.int8)
     status = np.where(fixes.fix_class == FIXED_FIX, GBAS_FIX, PLAIN_FIX).astype(np.int8)
-    body = np.full(len(rows), PLAIN_FIX, np.int8)
-    used, rejected = np.flatnonzero(run.gnss.used), np.flatnonzero(run.gnss.rejected)
-    place, variance = (
-        (table.east_m[rows], table.north_m[rows]),
-        (table.std_east_m[rows] ** 2, table.std_north_m[rows] ** 2),
-    )
-    plans = [_fix_plan("/filter/fix", BODIES["filter"], table.stamp_ns[rows], place, variance, body, globe)]
-    for topic, chosen in (("/gnss/fix", used), ("/gnss/fix_rejected", rejected)):
-        place = fixes.east_m[chosen], fixes.north_m[chosen]
-        variance = fixes.var_east_m2[chosen], fixes.var_north_m2[chosen]
-        plans.append(_fix_plan(topic, "antenna", fixes.stamp_ns[chosen], place, variance, status[chosen], globe))
-    return tuple(plans)
+    measured = fixes.stamp_ns, fixes.east_m, fixes.north_m, fixes.var_east_m2, fixes.var_north_m2, status
+    topics: list[tuple[str, str, tuple[NDArray[Any], ...], Ints]] = [
+        ("/filter/fix", BODIES["filter"], of_filter, rows),
+        ("/gnss/fix", "antenna", measured, np.flatnonzero(run.gnss.used)),
+        ("/gnss/fix_rejected", "antenna", measured, np.flatnonzero(run.gnss.rejected)),
+    ]
+    for topic, frame, values, chosen in topics:
+        stamp_ns, east, north, var_east, var_north, status = (column[chosen] for column in values)
+        latitude, longitude = globe.places(east, north)
+        columns: dict[str, NDArray[Any]] = {
+            "status.status": status,
+            "latitude": latitude,
+            "longitude": longitude,
+            "position_covariance.0": var_east,
+            "position_covariance.4": var_north,
+        }
+        fixed = {"status.service": 1, "altitude": globe.height_m, "position_covariance_type": DIAGONAL_KNOWN}
+        yield _plan(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, frame, columns, fixed)
 
 
-def _fix_plan(
-    topic: str, frame: str, stamp_ns: Ints, place_m: tuple[Floats, Floats], variance_m2: tuple[Floats, Floats],
-    status: NDArray[np.int8], globe: Globe,
+def _plan(
+    topic: str, kind: str, stamp_ns: Ints, frame: str, columns: dict[str, NDArray[Any]],
+    fixed: Mapping[str, object] = MappingProxyType({}),
 ) -> TopicPlan:  # fmt: skip
-    latitude, longitude = globe.places(*place_m)
-    columns = header_stamps(stamp_ns) | {
-        "status.status": status,
-        "latitude": latitude,
-        "longitude": longitude,
-        "position_covariance.0": variance_m2[0],
-        "position_covariance.4": variance_m2[1],
-    }
-    fixed: dict[str, object] = {
-        "header.frame_id": frame, "status.service": 1, "altitude": globe.height_m,
-        "position_covariance_type": DIAGONAL_KNOWN,
-    }  # fmt: skip
-    return TopicPlan(topic, "sensor_msgs/msg/NavSatFix", stamp_ns, fixed, columns)
+    """Return a topic whose messages begin with a header."""
+    return TopicPlan(topic, kind, stamp_ns, {"header.frame_id": frame, **fixed}, header_stamps(stamp_ns) | columns)
 
 
 def _icrs(run: Run, rows: Ints) -> TopicPlan:
     table = run.table
-    stamps, columns = table.stamp_ns[rows], header_stamps(table.stamp_ns[rows])
+    columns: dict[str, NDArray[Any]] = {}
     for name in ICR_COLUMNS:
         value, std = getattr(table, name)[rows], getattr(table, f"std_{name}")[rows]
         columns |= {name: value, f"std_{name}": std}
         columns |= {f"{name[:-2]}_minus_std_m": value - std, f"{name[:-2]}_plus_std_m": value + std}
-    return TopicPlan("/icrs", ICRS, stamps, {"header.frame_id": BODIES["filter"]}, columns)
+    return _plan("/icrs", ICRS, table.stamp_ns[rows], BODIES["filter"], columns)
 
 
-def _errors(run: Run) -> TopicPlan:
+def _errors(run: Run, rows: Ints) -> TopicPlan:
     """Return the open-loop errors from the states that have a trial."""
-    errors = errors_from_states(run, ERROR_HORIZON_M)
-    rows = rows_apart(run.table.stamp_ns, INTERVAL_S)
+    errors, unknown = errors_from_states(run, ERROR_HORIZON_M), np.full(len(run.table), np.nan)
     rows = rows[np.isfinite(errors["icr"][rows])]
-    unknown = np.full(len(run.table), np.nan)
-    columns = header_stamps(run.table.stamp_ns[rows])
-    columns |= {f"{name}_m": errors.get(name, unknown)[rows] for name in ("icr", "icr_final", "no_slip")}
-    fixed: dict[str, object] = {"header.frame_id": BODIES["filter"], "horizon_m": ERROR_HORIZON_M}
-    return TopicPlan("/open_loop_error", ERROR, run.table.stamp_ns[rows], fixed, columns)
-
-
-def _outages(run: Run) -> Iterator[dict[str, Any]]:
-    table = run.table
-    for (begin_ns, end_ns), rows in outage_rows(run):
-        distance = table.distance_m[rows]
-        yield {
-            "kind": "outage", "begin_ns": begin_ns, "end_ns": end_ns, "x_m": float(table.east_m[rows.start]),
-            "y_m": float(table.north_m[rows.start]), "distance_m": float(distance[-1] - distance[0]),
-        }  # fmt: skip
+    columns = {f"{name}_m": errors.get(name, unknown)[rows] for name in ("icr", "icr_final", "no_slip")}
+    stamps = run.table.stamp_ns[rows]
+    return _plan("/open_loop_error", ERROR, stamps, BODIES["filter"], columns, {"horizon_m": ERROR_HORIZON_M})
 
 
 def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore) -> TopicMessages:

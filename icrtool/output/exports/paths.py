@@ -1,4 +1,6 @@
-"""The paths of a run for other programs: poses in ENU (REP-103), places on the globe, and text for evo and KITTI tools.
+"""The paths of a run for other programs: poses in ENU (REP-103) as text, and on the globe as GeoJSON and KML.
+
+Text is for evo and KITTI tools, GeoJSON for QGIS and web maps, KML 2.2 for Google Earth.
 
 x is east, y is north, z is up; yaw is counter-clockwise from east; the body's x is forward and its y left. The origin
 is the datum of the run, or that of its position reference where it was metric already.
@@ -8,20 +10,28 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
+from xml.etree import ElementTree as ET
 
 import numpy as np
+import orjson
 
 from icrtool import __version__
+from icrtool.alignment.gnss_quality import CLASSES
+from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import drive_wheels, odometry_icrs
+from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icrs
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.track import FrozenIcrs
 from icrtool.output.series import places
-from icrtool.records.run import Run
-from icrtool.records.tables import Icrs, States
+from icrtool.output.text_format import driven_text, duration_text, run_title, xml_text
+from icrtool.records.plain_data import plain
+from icrtool.records.run import ICR_COLUMNS, Run
+from icrtool.records.tables import States
+from icrtool.records.text import distance_text
 
 PathName = Literal["filter", "smoothed", "icr", "no_slip"]
 
@@ -88,10 +98,16 @@ def paths_of(run: Run) -> tuple[ExportPath, ...]:
     """Return the paths of a run: filter, smoother where it has one, ICR odometry, no slip where b is known."""
     table = run.table
     momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    paths = [_of_states("filter", table, momentary)]
+    found: list[tuple[PathName, States | OdometryPath, FrozenIcrs, float]] = [("filter", table, momentary, 0.0)]
     if run.smoothed is not None:
-        paths.append(_of_states("smoothed", run.smoothed, momentary))
-    return *paths, *(_of_odometry(name, run, icrs) for name, icrs in odometry_icrs(run).items())
+        found.append(("smoothed", run.smoothed, momentary, 0.0))
+    for name, icrs in odometry_icrs(run).items():
+        driven = drive_wheels(table, run.in_gap, icrs)
+        found.append((name, driven, FrozenIcrs.constant(*icrs), driven.end_error_m))
+    return tuple(
+        ExportPath(name, table.stamp_ns, path.east_m, path.north_m, math.pi / 2 - path.heading_rad, icrs, end_error_m)
+        for name, path, icrs, end_error_m in found
+    )
 
 
 def about_run(run: Run) -> dict[str, str | bool | None]:
@@ -151,17 +167,6 @@ def outage_rows(run: Run) -> Iterator[tuple[tuple[int, int], slice]]:
         yield (begin_ns, end_ns), slice(min(int(first), len(stamps) - 1), int(last) + 1)
 
 
-def _of_states(name: PathName, table: States, icrs: FrozenIcrs) -> ExportPath:
-    yaw = math.pi / 2 - table.heading_rad
-    return ExportPath(name, table.stamp_ns, table.east_m, table.north_m, yaw, icrs, 0.0)
-
-
-def _of_odometry(name: PathName, run: Run, icrs: Icrs) -> ExportPath:
-    path = drive_wheels(run.table, run.in_gap, icrs)
-    yaw, constant = math.pi / 2 - path.heading_rad, FrozenIcrs.constant(*icrs)
-    return ExportPath(name, run.table.stamp_ns, path.east_m, path.north_m, yaw, constant, path.end_error_m)
-
-
 TrajectoryFormat = Literal["evo", "kitti"]
 
 SUFFIXES: dict[TrajectoryFormat, str] = {"evo": ".tum", "kitti": ".kitti"}
@@ -178,16 +183,15 @@ def format_trajectory(path: ExportPath, target: TrajectoryFormat) -> str:
     TUM (``evo``): stamp [s], x, y, z, and the quaternion x, y, z, w. KITTI: the upper three rows of the pose matrix,
     row by row, without a stamp. World ENU, body x forward and y left (REP-103); KITTI's own camera frame is not used.
     """
+    cos, sin = np.cos(path.yaw_rad), np.sin(path.yaw_rad)
+    columns = (cos, -sin, path.x_m, sin, path.y_m) if target == "kitti" else (path.x_m, path.y_m, *path.quaternion)
+    # Adding zero takes the sign off a rounded -0.0.
+    rows = zip(*((np.round(column, DIGITS) + 0.0).tolist() for column in columns), strict=True)
     if target == "kitti":
-        cos, sin, minus_sin = np.cos(path.yaw_rad), np.sin(path.yaw_rad), -np.sin(path.yaw_rad)
-        matrix = zip(*(_numbers(column) for column in (cos, minus_sin, path.x_m, sin, path.y_m)), strict=True)
-        return "".join(f"{c} {n} 0 {x} {s} {c} 0 {y} 0 0 1 0\n" for c, n, x, s, y in matrix)
-    z, w = path.quaternion
-    columns = (_numbers(column) for column in (path.x_m, path.y_m, z, w))
-    seconds, rest = np.divmod(path.stamp_ns, 1_000_000_000)
-    stamps = zip(seconds.tolist(), rest.tolist(), strict=True)
-    rows = zip(stamps, *columns, strict=True)
-    return "".join(f"{whole}.{part:09d} {x} {y} 0 0 0 {qz} {qw}\n" for (whole, part), x, y, qz, qw in rows)
+        return "".join(f"{c} {n} 0 {x} {s} {c} 0 {y} 0 0 1 0\n" for c, n, x, s, y in rows)
+    stamps = (divmod(stamp, 1_000_000_000) for stamp in path.stamp_ns.tolist())
+    lines = zip(stamps, rows, strict=True)
+    return "".join(f"{whole}.{part:09d} {x} {y} 0 0 0 {z} {w}\n" for (whole, part), (x, y, z, w) in lines)
 
 
 def is_trajectory(first: bytes) -> bool:
@@ -195,7 +199,222 @@ def is_trajectory(first: bytes) -> bool:
     return re.fullmatch(rb"[-+.0-9e \n]*", first) is not None
 
 
-def _numbers(column: Floats) -> list[float]:
-    """Return rounded numbers; adding zero takes the sign off a rounded -0.0."""
-    rounded: list[float] = (np.round(column, DIGITS) + 0.0).tolist()
-    return rounded
+STATE_CELL_M = 0.2
+"""A state becomes a point where the path enters another cell of a grid of this side."""
+
+DEGREE_DIGITS = 9
+"""Decimals of latitude and longitude: 0.1 mm."""
+
+Feature = dict[str, Any]
+"""A feature of GeoJSON."""
+
+
+def format_geojson(run: Run) -> str:
+    """Return a feature collection, no line end; each feature's attribute ``layer`` is what it is.
+
+    Layers: ``path`` (a line for each of filter, smoother, ICR and no-slip odometry), ``state`` (points along the
+    filter's path, at most one in 0.2 m), ``fix``, ``event`` and ``outage`` (a line).
+
+    Raises
+    ------
+    DataError
+        The run has no place on the globe.
+    """
+    globe = find_globe(run)
+    features = [
+        *_path_features(run, paths_of(run), globe),
+        *_outage_features(run, globe),
+        *_state_features(run, globe),
+        *_fix_features(run, globe),
+        *_event_features(run, globe),
+    ]
+    document = {"type": "FeatureCollection", "name": run.name, "icrtool": about_run(run), "features": features}
+    return orjson.dumps(plain(document)).decode()
+
+
+def coordinates(x_m: Floats, y_m: Floats, globe: Globe) -> list[list[float]]:
+    """Return longitude and latitude [deg] of points (n,) east and north of the datum."""
+    latitude, longitude = globe.places(x_m, y_m)
+    pairs: list[list[float]] = np.round(np.column_stack([longitude, latitude]), DEGREE_DIGITS).tolist()
+    return pairs
+
+
+def _line(layer: str, x_m: Floats, y_m: Floats, globe: Globe, properties: dict[str, Any]) -> Feature:
+    """Return a line, thinned."""
+    rows = line_rows(x_m, y_m)
+    geometry = {"type": "LineString", "coordinates": coordinates(x_m[rows], y_m[rows], globe)}
+    return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer} | properties}
+
+
+def _points(layer: str, x_m: Floats, y_m: Floats, globe: Globe, columns: dict[str, list[Any]]) -> Iterator[Feature]:
+    """Yield a point for each row; `columns` are its attributes."""
+    for pair, values in zip(coordinates(x_m, y_m, globe), zip(*columns.values(), strict=True), strict=True):
+        properties = {"layer": layer, **dict(zip(columns, values, strict=True))}
+        yield {"type": "Feature", "geometry": {"type": "Point", "coordinates": pair}, "properties": properties}
+
+
+def _path_features(run: Run, paths: Sequence[ExportPath], globe: Globe) -> Iterator[Feature]:
+    """Yield a line for each path."""
+    for path in paths:
+        length_m = float(np.hypot(np.diff(path.x_m), np.diff(path.y_m)).sum())
+        begin, end = utc_text(path.stamp_ns[[0, -1]])
+        properties = {
+            "path": path.name, "label": LABELS[path.name], "log": run.name, "begin_utc": begin, "end_utc": end,
+            "length_m": length_m, "end_error_m": path.end_error_m, "usable": run.usable,
+        }  # fmt: skip
+        yield _line("path", path.x_m, path.y_m, globe, properties)
+
+
+def _outage_features(run: Run, globe: Globe) -> Iterator[Feature]:
+    """Yield the filter's path in each outage as a line."""
+    for span_ns, rows in outage_rows(run):
+        begin, end = utc_text(np.array(span_ns, np.int64))
+        properties = {"begin_utc": begin, "end_utc": end, "duration_s": (span_ns[1] - span_ns[0]) / 1e9}
+        yield _line("outage", run.table.east_m[rows], run.table.north_m[rows], globe, properties)
+
+
+def _state_features(run: Run, globe: Globe) -> Iterator[Feature]:
+    table = run.table
+    rows = places(table.north_m, table.east_m, STATE_CELL_M)
+    stamps = table.stamp_ns[rows]
+    columns: dict[str, list[Any]] = {"time_utc": utc_text(stamps), "stamp_ns": stamps.tolist()}
+    names = ["t_s", "distance_m", "heading_deg", "v_left_mps", "v_right_mps", "std_north_m", "std_east_m"]
+    names += [name for icr in ICR_COLUMNS for name in (icr, f"std_{icr}")]
+    for name in names:
+        turned = name == "heading_deg"
+        column = np.mod(np.degrees(table.heading_rad[rows]), 360.0) if turned else getattr(table, name)[rows]
+        columns[name] = column.tolist()
+    for model, errors in errors_from_states(run, ERROR_HORIZON_M).items():
+        columns[f"{model}_error_{ERROR_HORIZON_M:g}m_m"] = errors[rows].tolist()
+    yield from _points("state", table.east_m[rows], table.north_m[rows], globe, columns)
+
+
+def _fix_features(run: Run, globe: Globe) -> Iterator[Feature]:
+    fixes, outcome, uses = run.sensors.fixes, run.gnss, {UNSEEN: "not in the run", GATED: "rejected"}
+    columns = {
+        "time_utc": utc_text(fixes.stamp_ns),
+        "stamp_ns": fixes.stamp_ns.tolist(),
+        "class": [CLASSES[code] for code in fixes.fix_class.tolist()],
+        "use": [uses.get(code, "used") for code in outcome.code.tolist()],
+        "nis": outcome.nis.tolist(),
+        "difference_m": outcome.difference.tolist(),
+        "std_north_m": np.sqrt(fixes.var_north_m2).tolist(),
+        "std_east_m": np.sqrt(fixes.var_east_m2).tolist(),
+    }
+    yield from _points("fix", fixes.east_m, fixes.north_m, globe, columns)
+
+
+def _event_features(run: Run, globe: Globe) -> Iterator[Feature]:
+    """Yield a point for each slip event."""
+    for event in plain(run.document.events):
+        east, north = np.array([event.pop("east_m")]), np.array([event.pop("north_m")])
+        begin = utc_text(np.array([event["begin_ns"]], np.int64))
+        yield from _points(
+            "event", east, north, globe, {"begin_utc": begin} | {key: [one] for key, one in event.items()}
+        )
+
+
+KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
+
+TRACK_INTERVAL_S = 1.0
+"""The drive over time has a place each second."""
+
+COLORS: dict[PathName | str, str] = {
+    "filter": "ff000000", "smoothed": "ff606060", "icr": "ffb27200", "no_slip": "ff005ed5", "outage": "ff00ffff",
+}  # fmt: skip
+"""Alpha, blue, green, red: the colours of the figures."""
+
+
+def format_kml(run: Run) -> str:
+    """Return a KML document, no line end: lines on the ground, a track with times, outages, events.
+
+    Raises
+    ------
+    DataError
+        The run has no place on the globe.
+    """
+    globe, paths = find_globe(run), paths_of(run)
+    ET.register_namespace("", KML)
+    ET.register_namespace("gx", GX)
+    root = ET.Element(f"{{{KML}}}kml")
+    document = _child(root, "Document")
+    _child(document, "name", run_title(run.document))
+    about = f"{utc_text(run.table.stamp_ns[:1])[0]}: {driven_text(run.document.drive)}"
+    _child(document, "description", about if run.usable else f"{about}. Not usable: {run.document.unusable_because}")
+    for name, color in COLORS.items():
+        style = _child(document, "Style")
+        style.set("id", name)
+        line = _child(style, "LineStyle")
+        _child(line, "color", color)
+        _child(line, "width", "6" if name == "outage" else "3")
+    folder = _folder(document, "paths")
+    for one in _path_features(run, paths, globe):
+        facts = one["properties"]
+        drifts = facts["path"] not in ("filter", "smoothed")
+        note = f"ends {distance_text(facts['end_error_m'])} off the filter" if drifts else ""
+        _placemark(folder, facts["label"], note, facts["path"], geometry=one["geometry"])
+    _track(_folder(document, "drive over time"), paths[0], globe)
+    folder = _folder(document, "outages")
+    for number, one in enumerate(_outage_features(run, globe), start=1):
+        facts = one["properties"]
+        note = f"{duration_text(facts['duration_s'])} without usable GNSS"
+        span = facts["begin_utc"], facts["end_utc"]
+        _placemark(folder, f"outage {number}", note, "outage", span, one["geometry"])
+    folder = _folder(document, "slip events")
+    for one in _event_features(run, globe):
+        facts = one["properties"]
+        lasted = duration_text(facts["end_s"] - facts["begin_s"])
+        note = f"{lasted}, {100 * facts['severity']:.0f} % of the wheels' motion missed"
+        times = utc_text(np.array([facts["begin_ns"], facts["end_ns"]], np.int64))
+        _placemark(folder, facts["kind"], note, span=times, geometry=one["geometry"])
+    ET.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode")
+
+
+def _child(parent: ET.Element, tag: str, text: str | None = None) -> ET.Element:
+    child = ET.SubElement(parent, f"{{{KML}}}{tag}")
+    child.text = xml_text(text) if text is not None else None
+    return child
+
+
+def _folder(document: ET.Element, name: str) -> ET.Element:
+    folder = _child(document, "Folder")
+    _child(folder, "name", name)
+    return folder
+
+
+def _placemark(
+    folder: ET.Element, name: str, note: str = "", style: str = "", span: Sequence[str] = (),
+    geometry: Mapping[str, Any] | None = None,
+) -> ET.Element:  # fmt: skip
+    """Add a place mark with a geometry of GeoJSON on the ground; its elements have a fixed order."""
+    placemark = _child(folder, "Placemark")
+    _child(placemark, "name", name)
+    if note:
+        _child(placemark, "description", note)
+    if span:
+        times = _child(placemark, "TimeSpan")
+        for tag, time in zip(("begin", "end"), span, strict=True):
+            _child(times, tag, time)
+    if style:
+        _child(placemark, "styleUrl", f"#{style}")
+    if geometry is not None:
+        shape, places = _child(placemark, geometry["type"]), geometry["coordinates"]
+        if geometry["type"] == "LineString":
+            _child(shape, "tessellate", "1")
+        else:
+            places = [places]
+        _child(shape, "coordinates", " ".join(f"{east:.9f},{north:.9f},0" for east, north in places))
+    return placemark
+
+
+def _track(folder: ET.Element, path: ExportPath, globe: Globe) -> None:
+    rows = rows_apart(path.stamp_ns, TRACK_INTERVAL_S)
+    track = ET.SubElement(_placemark(folder, "robot", style="filter"), f"{{{GX}}}Track")
+    _child(track, "altitudeMode", "clampToGround")
+    for time in utc_text(path.stamp_ns[rows]):
+        _child(track, "when", time)
+    for east, north in coordinates(path.x_m[rows], path.y_m[rows], globe):
+        ET.SubElement(track, f"{{{GX}}}coord").text = f"{east:.9f} {north:.9f} 0"
+    for heading_deg in np.mod(90.0 - np.degrees(path.yaw_rad[rows]), 360.0).tolist():
+        ET.SubElement(track, f"{{{GX}}}angles").text = f"{heading_deg:.1f} 0 0"

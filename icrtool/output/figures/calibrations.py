@@ -1,24 +1,27 @@
-"""Figures of calibrations: residuals of an alignment, a forecast, and what one costs in the runs of another."""
+"""Figures of calibrations (residuals, a forecast, the cost of a foreign one) and of the logs of a batch."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from itertools import compress, cycle
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.patches import Circle
 
-from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.output.figures import style
+from icrtool.output.text_format import error_text
 from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.text import counted
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from icrtool.alignment.estimator import ResidualsByEstimate
     from icrtool.calibration.error_growth import Forecast
+    from icrtool.records.fleet_document import FleetLog
 
 CIRCLES = 20
 
@@ -84,39 +87,27 @@ AFTER: style.Look = BEFORE | {
 @style.styled
 def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     """Return residuals of displacements and of heading changes over windows, before and after."""
-    first, last = (float(np.median(np.hypot(*part))) for part in (residuals.before, residuals.after))
+    places, turns = (residuals.before, residuals.after), (residuals.turn_before, residuals.turn_after)
+    off_m = [np.hypot(*part) for part in places]
+    off_deg = [np.degrees(np.abs(part)) for part in turns]
+    first, last = map(np.median, off_m)
     answer = f"Windows of the drive are off by {last:.3f} m calibrated, {first:.3f} m before"
     windows = f"{residuals.before.shape[1]} windows of driven distance, predicted by wheels and heading: residuals"
-    figure = style.new_figure(
-        answer, f"{name}: {windows}", height_in=4.2, margins_in=(0.75, 0.2, 0.7, 1.0), wspace=0.32
-    )
+    margins_in = (0.75, 0.2, 0.7, 1.0)
+    figure = style.new_figure(answer, f"{name}: {windows}", height_in=4.2, margins_in=margins_in, wspace=0.32)
     place, turn = figure.subplots(1, 2)
-    turns = (residuals.turn_before, residuals.turn_after)
-    for part, turned, look in zip((residuals.before, residuals.after), turns, (BEFORE, AFTER), strict=True):
+    for part, turned, look in zip(places, turns, (BEFORE, AFTER), strict=True):
         place.plot(part[1], part[0], **look)
         turn.plot(np.degrees(residuals.turn_rad), np.degrees(turned), **look)
-    reach = _reach(np.hypot(*np.concatenate([residuals.before, residuals.after], axis=1)))
-    place.set(xlim=(-reach, reach), ylim=(-reach, reach))
-    place.set(xlabel="Residual to the right [m]", ylabel="Residual ahead [m]")
-    turned = np.degrees(np.concatenate(turns))
+    for axes, sizes, unit in ((place, off_m, "m"), (turn, off_deg, "°")):
+        first, last = map(np.median, sizes)
+        axes.set_title(f"median {first:.3f} {unit} before, {last:.3f} {unit} after", loc="left", pad=5.0)
+        reach = 1.2 * max(float(np.percentile(np.concatenate(sizes), SHOWN_PERCENT)), 1e-3)
+        axes.set_ylim(-reach, reach)
+    place.set(xlim=place.get_ylim(), xlabel="Residual to the right [m]", ylabel="Residual ahead [m]")
     turn.set(xlabel="Heading change measured, clockwise [°]", ylabel="Residual of the heading change [°]")
-    turn.set_ylim(-_reach(turned), _reach(turned))
-    _label(place, residuals.before, residuals.after, 1.0, "m")
-    _label(turn, residuals.turn_before[None], residuals.turn_after[None], float(np.degrees(1.0)), "°")
     style.add_legend(figure, markerscale=2.0)
     return figure
-
-
-def _reach(residuals: Floats) -> float:
-    return 1.2 * max(float(np.percentile(np.abs(residuals), SHOWN_PERCENT)), 1e-3)
-
-
-def _label(axes: Axes, before: Floats, after: Floats, factor: float, unit: str) -> None:
-    """Write the median size of the residuals above a panel."""
-    first, last = (
-        factor * float(np.median(np.hypot(*part) if len(part) > 1 else np.abs(part))) for part in (before, after)
-    )
-    axes.set_title(f"median {first:.3f} {unit} before, {last:.3f} {unit} after", loc="left", pad=5.0)
 
 
 LONGEST_NAME = 14
@@ -126,16 +117,35 @@ LONGEST_NAME = 14
 def transfer(found: GroupComparison) -> Figure:
     """Return the figure: p95 after 10 m, calibrated on row and tested on column; costs with 95 % intervals."""
     names, rows = list(found.groups), [one for one in found.costs if one.p95_m is not None]
+    errors = np.full((len(names), len(names)), np.nan)
+    for cell in found.transfer:
+        if cell.horizon_m == CHOICE_HORIZON_M and cell.p95_m is not None:
+            errors[names.index(cell.calibrated_on), names.index(cell.tested_on)] = cell.p95_m
+    with_own = np.eye(len(names), dtype=bool)
+    # The errors with a calibration of another group, and with its own.
+    parts = [part[np.isfinite(part)] for part in (errors[~with_own], errors[with_own])]
+    answer = f"No group has a trial of {CHOICE_HORIZON_M:g} m"
+    if all(map(len, parts)):
+        other, own = (" to ".join(dict.fromkeys((f"{min(part):.2f}", f"{max(part):.2f}"))) for part in parts)
+        answer = f"{other} m off after {CHOICE_HORIZON_M:g} m (95 %) with another's calibration, {own} m with its own"
     subtitle = f"{' · '.join(names)}: on the diagonal each trial is predicted by a fit that does not contain it"
     height_in, margins_in = 2.95 + 0.45 * len(names) + 0.12 * len(rows), (1.3, 0.2, 1.35, 0.75)
-    figure = style.new_figure(
-        _answer(found), subtitle, width_in=9.6, height_in=height_in, margins_in=margins_in, wspace=1.15
-    )
+    figure = style.new_figure(answer, subtitle, width_in=9.6, height_in=height_in, margins_in=margins_in, wspace=1.15)
     matrix, costs = figure.subplots(1, 2, width_ratios=(1.0, 1.2))
-    _draw_matrix(matrix, found, names)
+    most = float(np.nanmax(errors)) if np.isfinite(errors).any() else 1.0
+    matrix.imshow(errors, cmap="Blues", vmin=0.0, vmax=1.6 * most)
+    for (row, column), error in np.ndenumerate(errors):
+        text = f"{error:.2f} m" if np.isfinite(error) else "–"
+        matrix.text(column, row, text, ha="center", va="center", fontsize=8.5)
+    short = [style.drawable(name, LONGEST_NAME) for name in names]
+    matrix.xaxis.tick_top()
+    matrix.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="left")
+    matrix.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
+    matrix.set_xlabel(f"95 % error after {CHOICE_HORIZON_M:g} m:\ncalibrated on the row, tested on the column")
+    matrix.grid(visible=False)
     labels = []
     for y, one in enumerate(rows):
-        calibrated, tested = (style.drawable(name, LONGEST_NAME) for name in (one.calibrated_on, one.tested_on))
+        calibrated, tested = short[names.index(one.calibrated_on)], short[names.index(one.tested_on)]
         labels.append(f"{calibrated} on {tested}, {one.horizon_m:g} m")
         if one.p95_low_m is not None and one.p95_high_m is not None:
             costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **style.ICR | {"linestyle": "-"})
@@ -147,30 +157,98 @@ def transfer(found: GroupComparison) -> Figure:
     return figure
 
 
-def _answer(found: GroupComparison) -> str:
-    """Return the errors with a calibration of another group, and with its own."""
-    cells = [one for one in found.transfer if one.horizon_m == CHOICE_HORIZON_M]
-    own = [one.p95_m for one in cells if one.p95_m is not None and one.calibrated_on == one.tested_on]
-    other = [one.p95_m for one in cells if one.p95_m is not None and one.calibrated_on != one.tested_on]
-    if not (own and other):
-        return f"No group has a trial of {CHOICE_HORIZON_M:g} m"
-    spans = [" to ".join(dict.fromkeys((f"{min(errors):.2f}", f"{max(errors):.2f}"))) for errors in (other, own)]
-    return f"{spans[0]} m off after {CHOICE_HORIZON_M:g} m (95 %) with another's calibration, {spans[1]} m with its own"
+ROW_IN = 0.22
+MOST_ROWS = 40
+LEAST_DAYS = 1.0
+"""Shown of the calendar: matplotlib gives a single date four years."""
+LONGEST_ROBOT, LONGEST_GROUP, LONGEST_LOG = 24, 24, 34
+"""Characters of a label that there is space for."""
+
+GROUP_LOOKS: tuple[style.Look, ...] = tuple(
+    {"linestyle": "none", "marker": marker, "color": color}
+    for marker, color in zip("os^DvP", ("#1b6ca8", "#d95f02", "#1b9e77", "#7570b3", "#a6761d", "#666666"), strict=True)
+)
+"""Of robots or groups, in turn."""
 
 
-def _draw_matrix(axes: Axes, found: GroupComparison, names: list[str]) -> None:
-    values = np.full((len(names), len(names)), np.nan)
-    for cell in found.transfer:
-        if cell.horizon_m == CHOICE_HORIZON_M and cell.p95_m is not None:
-            values[names.index(cell.calibrated_on), names.index(cell.tested_on)] = cell.p95_m
-    most = float(np.nanmax(values)) if np.isfinite(values).any() else 1.0
-    axes.imshow(values, cmap="Blues", vmin=0.0, vmax=1.6 * most)
-    for row, column in np.ndindex(values.shape):
-        text = f"{values[row, column]:.2f} m" if np.isfinite(values[row, column]) else "–"
-        axes.text(column, row, text, ha="center", va="center", fontsize=8.5)
-    short = [style.drawable(name, LONGEST_NAME) for name in names]
-    axes.xaxis.tick_top()
-    axes.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="left")
-    axes.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
-    axes.set_xlabel(f"95 % error after {CHOICE_HORIZON_M:g} m:\ncalibrated on the row, tested on the column")
-    axes.grid(visible=False)
+class FleetNumbers(NamedTuple):
+    """What the figures of a batch show.
+
+    Attributes
+    ----------
+    points : the logs with a date and both lateral ICRs
+    errors_m : 95 % error after 10 m of each log, by group and name
+    model : whose errors they are
+    """
+
+    title: str
+    points: Sequence[FleetLog]
+    errors_m: Mapping[str, Mapping[str, float]]
+    model: str
+
+
+@style.styled
+def fleet_icrs(fleet: FleetNumbers) -> Figure:
+    """Return both lateral ICRs of every log over its date, ±σ, a colour and marker per robot."""
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+
+    points, robots = fleet.points, dict.fromkeys(point.robot for point in fleet.points)
+    icrs = {side: [point.icr[f"y_icr_{side}_m"] or 0.0 for point in points] for side in ("right", "left")}
+    spans = (f"y {side} {min(found):+.2f} to {max(found):+.2f} m" for side, found in icrs.items())
+    answer = ", ".join(spans).replace("-", "−")
+    title, subtitle = f"ICRs: {answer}", f"{fleet.title}: of each log, ±σ"
+    figure = style.new_figure(title, subtitle, height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12)
+    panels = figure.subplots(2, 1, sharex=True)
+    days = date2num([np.datetime64(point.start_utc.rstrip("Z")) for point in points])  # type: ignore[no-untyped-call]
+    for axes, (side, found) in zip(panels, icrs.items(), strict=True):
+        stds = [point.icr.get(f"std_y_icr_{side}_m") or 0.0 for point in points]
+        for robot, look in zip(robots, cycle(GROUP_LOOKS), strict=False):
+            key = f" {style.drawable(robot or 'robot not named', LONGEST_ROBOT)}"  # matplotlib leaves out "_label"
+            mine = [point.robot == robot for point in points]
+            columns = (list(compress(column, mine)) for column in (days, found, stds))
+            axes.errorbar(*columns, markersize=4.5, capsize=2.0, linewidth=1.0, label=key, **look)
+        axes.set_ylabel(f"ICR y {side} [m]")
+    first, last = panels[-1].get_xlim()
+    if last - first < LEAST_DAYS or len(set(days)) == 1:
+        middle = (first + last) / 2
+        panels[-1].set_xlim(middle - LEAST_DAYS / 2, middle + LEAST_DAYS / 2)
+    locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
+    panels[-1].xaxis.set_major_locator(locator)
+    panels[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator, show_offset=False))  # type: ignore[no-untyped-call]
+    years = sorted({point.start_utc[:4] for point in points})
+    panels[-1].set_xlabel(f"Date, UTC, {' to '.join(dict.fromkeys((years[0], years[-1])))}")
+    style.add_legend(figure, ncols=4)
+    return figure
+
+
+@style.styled
+def fleet_errors(fleet: FleetNumbers) -> Figure:
+    """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs those of the largest."""
+    errors = [
+        (group, log, error)
+        for group, logs in fleet.errors_m.items()
+        for log, error in sorted(logs.items(), key=lambda one: -one[1])
+    ]
+    largest = sorted(errors, key=lambda one: -one[2])[:MOST_ROWS]
+    shown = [one for one in errors if one in largest]
+    cut = f", the {MOST_ROWS} largest" if len(errors) > MOST_ROWS else ""
+    median = error_text(float(np.median([error for *_, error in errors])))
+    labels = [style.drawable(log, LONGEST_LOG) for _, log, _ in shown]
+    title = f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}"
+    subtitle = f"{fleet.title}: 95 % error after 10 m without GNSS, {fleet.model}{cut}"
+    height_in = 1.9 + ROW_IN * len(shown)
+    figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=(2.9, 0.7, 0.65, 1.05))
+    axes = figure.subplots()
+    axes.set_yticks(range(len(labels)), labels, parse_math=False)
+    axes.set_ylim(len(labels) - 0.4, -0.6)
+    for (group, logs), look in zip(fleet.errors_m.items(), cycle(GROUP_LOOKS), strict=False):
+        rows = [row for row, one in enumerate(shown) if one[0] == group]
+        middle = error_text(float(np.median(list(logs.values()))))
+        label = f" {style.drawable(group, LONGEST_GROUP)}: {counted(len(logs), 'log')}, median {middle}"
+        axes.plot([shown[row][2] for row in rows], rows, markersize=5.5, label=label, **look)
+    beside: style.Look = {"va": "center", "fontsize": 8.0, "annotation_clip": False, "bbox": None}
+    for row, (*_, error) in enumerate(shown):
+        style.write_beside(axes, error_text(error), (error, row), (6.0, 0.0), **beside)
+    style.logarithmic_errors(axes)
+    style.add_legend(figure, ncols=2)
+    return figure

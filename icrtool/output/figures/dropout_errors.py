@@ -57,7 +57,13 @@ def dropout_summary(report: DropoutReport) -> Figure:
     reached = [one for one in report.document.budgets if one.model in {model.name for model in models}]
     best = next((one for one in reached if one.model == models[0].name), None)
     pens = _pens(report)
-    title = _largest(report, models[0]) if best is None else f"Within {best.budget_m:g} m (95 %) for {best.reach_text}"
+    title = "Error over distance: no trial was long enough"
+    if best is not None:
+        title = f"Within {best.budget_m:g} m (95 %) for {best.reach_text}"
+    elif known := [row for row in models[0].document.by_horizon if row.p95_m is not None]:
+        # Of a run that is not usable no distance is stated.
+        refused = "" if report.usable else "Do not use: "
+        title = f"{refused}{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
     # Beside the models: the mean of the first, budget, outages.
     most = max(row.trials for row in report.document.trials)
     keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
@@ -73,7 +79,14 @@ def dropout_summary(report: DropoutReport) -> Figure:
     if outages:
         look = style.spot("black", 7.0, "X") | {"zorder": 5, "label": "real outage"}
         axes.plot(column_of(outages, "distance_m"), column_of(outages, "end_error_m"), **look)
-    low, high = _shown_errors(models, [*budgets_m, *column_of(outages, "end_error_m")])
+    # The scale holds all that is drawn from the first horizon on, over at most `MOST_DECADES`.
+    drawn = [*(one.column("p95_m") for one in models), models[0].column("expected_error_m")]
+    errors = np.concatenate([*drawn, budgets_m, column_of(outages, "end_error_m")])
+    errors = errors[np.isfinite(errors) & (errors > 0)]
+    low, high = 0.01, 1.0
+    if len(errors):
+        high = float(errors.max()) / LEAST_SHOWN
+        low = max(LEAST_SHOWN * float(errors.min()), high / 10**MOST_DECADES)
     axes.set(xlim=(0, report.horizons_m[-1] * 1.02), ylim=(low, high), xlabel="Distance without GNSS [m]")
     axes.locator_params(axis="x", nbins=10, steps=[1, 2, 5, 10])
     style.logarithmic_errors(axes, "y")
@@ -84,15 +97,6 @@ def dropout_summary(report: DropoutReport) -> Figure:
         _mark_reaches(axes, marked, pens, low)
     style.add_legend(figure, ncols=KEY_COLUMNS)
     return figure
-
-
-def _largest(report: DropoutReport, model: ModelResult) -> str:
-    """Return the error at the last horizon that has trials; of a run that is not usable no distance is stated."""
-    known = [row for row in model.document.by_horizon if row.p95_m is not None]
-    if not known:
-        return "Error over distance: no trial was long enough"
-    error = f"{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
-    return error if report.usable else f"Do not use: {error}"
 
 
 @style.styled
@@ -112,7 +116,7 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
     figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.38)
     panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
     p95 = model.column("p95_m")[places]
-    end = _histogram_end([np.nanmax(p95), *(budget for budget in budgets_m if budget < 2 * np.nanmax(p95))])
+    end = LEAST_HISTOGRAM_IN_P95 * max([np.nanmax(p95), *(one for one in budgets_m if one < 2 * np.nanmax(p95))])
     for axes, h in zip(panels, places, strict=True):
         heading = f"after {report.horizons_m[h]:g} m, {model.document.by_horizon[h].trials:,} trials"
         _draw_bins(axes, model, h, _pens(report)[model.name]["color"], end, heading)
@@ -143,7 +147,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     height_in, margins_in = 1.5 + PANEL_HEIGHT_IN * len(results), (0.75, 0.2, 0.85, 0.9)
     figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.45)
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
-    end = _histogram_end([min(max(p95), MOST_HISTOGRAM_IN_P95 / LEAST_HISTOGRAM_IN_P95 * p95[0])])
+    end = min(LEAST_HISTOGRAM_IN_P95 * max(p95), MOST_HISTOGRAM_IN_P95 * p95[0])
     for axes, result in zip(panels, results, strict=True):
         color, word = _pens(report)[result.name]["color"], MODEL_WORDS.get(result.name, result.label)
         _draw_bins(axes, result, h, color, end, word)
@@ -182,29 +186,17 @@ def _draw_model(
     x = np.linspace(first_m, horizons_m[-1], CURVE_POINTS)
     known = np.isfinite(result.column("p95_m"))
     at = np.append(0.0, horizons_m[known])
-
-    def between(errors: Floats) -> Floats:
-        drawn: Floats = np.where(x <= at[-1], np.interp(x, at, np.append(0.0, errors[known])), np.nan)
-        return drawn
-
+    p95, low, high, mean = (
+        np.where(x <= at[-1], np.interp(x, at, np.append(0.0, result.column(name)[known])), np.nan)
+        for name in ("p95_m", "p95_low_m", "p95_high_m", "expected_error_m")
+    )
     thin = result.name == "no_slip"
     look = pen | ({"linewidth": THIN} if thin else {}) | {"zorder": 2.6 if first else 2.4}
-    axes.plot(x, between(result.column("p95_m")), label=f"{label}, 95 %", **look)
+    axes.plot(x, p95, label=f"{label}, 95 %", **look)
     if not thin:
-        low, high = (between(values) for values in (result.column("p95_low_m"), result.column("p95_high_m")))
         axes.fill_between(x, low, high, color=pen["color"], alpha=BAND_ALPHA, linewidth=0)
     if first:
-        axes.plot(x, between(result.column("expected_error_m")), label=f"{label}, mean", **look | {"linewidth": THIN})
-
-
-def _shown_errors(models: list[ModelResult], others_m: list[float]) -> tuple[float, float]:
-    """Return the ends [m] of the scale: all that is drawn from the first horizon on, over at most `MOST_DECADES`."""
-    errors = np.concatenate([*(one.column("p95_m") for one in models), models[0].column("expected_error_m"), others_m])
-    errors = errors[np.isfinite(errors) & (errors > 0)]
-    if not len(errors):
-        return 0.01, 1.0
-    high = float(errors.max()) / LEAST_SHOWN
-    return max(LEAST_SHOWN * float(errors.min()), high / 10**MOST_DECADES), high
+        axes.plot(x, mean, label=f"{label}, mean", **look | {"linewidth": THIN})
 
 
 def _mark_reaches(
@@ -223,24 +215,15 @@ def _mark_reaches(
         below_pt += 0.0 if left else LABEL_LINE_PT
 
 
-def _histogram_end(marks_m: list[Any]) -> float:
-    """Return the right end [m] of the scale that panels share, by what is marked on it."""
-    end = LEAST_HISTOGRAM_IN_P95 * float(max(marks_m))
-    return end if end > 0 else 1.0
-
-
 def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float, heading: str) -> None:
     """Draw the bins of one model at horizon number `h` up to `end_m`, and its expected value and 95 %."""
-    row, bins = result.document.by_horizon[h], result.histograms[h]
-    width = float(bins.right[0] - bins.left[0])
-    edges = np.append(bins.left, bins.right[-1])
-    style.fill_bins(axes, edges, bins.percent, color=color, alpha=0.75)
+    row, bins, end_m = result.document.by_horizon[h], result.histograms[h], end_m or 1.0
+    style.fill_bins(axes, np.append(bins.left, bins.right[-1]), bins.percent, color=color, alpha=0.75)
     axes.axvline(result.column("p95_m")[h], label="95 % of the trials", **P95)
     axes.axvline(result.column("expected_error_m")[h], label="expected value", **style.MEAN)
     axes.set_title(heading, loc="left", pad=4.0, fontweight="bold")
     expected, p95, largest = map(error_text, (row.expected_error_m, row.p95_m, row.max_m))
-    facts = f"expected {expected},  95 % within {p95},  max {largest}"
-    axes.set_title(facts, loc="right", pad=4.0)
+    axes.set_title(f"expected {expected},  95 % within {p95},  max {largest}", loc="right", pad=4.0)
     axes.set_xlim(0, end_m)
     axes.locator_params(axis="y", nbins=4)
     beyond = float(bins.percent[bins.left >= end_m].sum())
@@ -252,9 +235,6 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     elif beyond > 0:
         text = f"{beyond:.{0 if beyond >= 1 else 2}f} % beyond →"
         axes.text(1.0, 0.9, text, ha="right", va="top", fontsize=8.0, **where)
-    axes.set_ylabel(f"Trials [% per {_width_text(width)}]")
+    width_m = float(bins.right[0] - bins.left[0])
+    axes.set_ylabel(f"Trials [% per {f'{width_m:g} m' if width_m >= 0.1 else f'{100 * width_m:g} cm'}]")
     axes.grid(visible=False, axis="x")
-
-
-def _width_text(metres: float) -> str:
-    return f"{metres:g} m" if metres >= 0.1 else f"{100 * metres:g} cm"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from matplotlib.transforms import Bbox, BboxBase
+from matplotlib.transforms import Bbox
 
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
@@ -23,7 +23,7 @@ from icrtool.output.figures.trajectory import (
 )
 from icrtool.output.series import places
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title, turn_text
-from icrtool.records.dropout_document import ExampleTrial, Outage, OutageDocument, TrialDocument
+from icrtool.records.dropout_document import ExampleTrial, Outage, TrialDocument
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +36,7 @@ CELL_TITLE: style.Look = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
 
 PICTURED = ("no_slip",)
 """Drawn beside the model that trials were chosen by."""
-OUTAGES = {"forced": style.FORCED, "real": style.REAL}
+OUTAGES = {"forced": style.line(style.BAD_FIX_COLOR, width=1.8), "real": style.line("black", (0, (2.0, 1.2)), 1.8)}
 PATH = style.line(style.FIX_COLOR, width=1.4)
 
 MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 5.3
@@ -183,9 +183,16 @@ def dropout_outages(report: DropoutReport) -> Figure:
     easts = np.concatenate([report.reference_east_m, *(one.east_m for one in outages)])
     width_in = style.WIDTH_IN - 0.95
     box_in = fitted_box_in(norths, easts, width_in)
-    figure = style.new_figure(
-        _outages_text(report.document.outages), run_title(report.run_document), height_in=box_in + 1.65
-    )
+    parts = []
+    for kind in OUTAGES:
+        # How many there are of each kind, and the largest end error of each.
+        if ours := [one.document for one in outages if one.document.kind == kind]:
+            worst = max(one.end_error_m or 0.0 for one in ours)
+            lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
+            span = " to ".join(duration_text(length) for length in dict.fromkeys((lengths[0], lengths[-1])))
+            parts.append(f"{len(ours)} {kind} of {span}, end error up to {error_text(worst)}")
+    title = f"Outages: {'; '.join(parts)}"
+    figure = style.new_figure(title, run_title(report.run_document), height_in=box_in + 1.65)
     axes = figure.subplots()
     cell = look_down(axes, norths, easts, width_in / box_in, ticks=9)
     draw_path(axes, report.reference_north_m, report.reference_east_m, cell, PATH, zorder=2, label="filter")
@@ -236,63 +243,35 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
         axes.plot(*place, label="step of the reference", **JUMP_LOOK)
 
 
-def _outages_text(outages: Sequence[OutageDocument]) -> str:
-    """Return how many outages of each kind there are, and the largest end error of each."""
-    parts = []
-    for kind in ("forced", "real"):
-        ours = [one for one in outages if one.kind == kind]
-        if ours:
-            worst = max(one.end_error_m or 0.0 for one in ours)
-            lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
-            span = duration_text(lengths[0])
-            span += f" to {duration_text(lengths[-1])}" if len(lengths) > 1 else ""
-            parts.append(f"{len(ours)} {kind} of {span}, end error up to {error_text(worst)}")
-    return "Outages: " + "; ".join(parts)
-
-
 def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
     """Write each outage's number and end error beside its end where it fits; the tables have them all."""
     axes.apply_aspect()
-    point_px = axes.figure.dpi / 72.0
+    point_px, frame = axes.figure.dpi / 72.0, axes.bbox
+
+    def spots(path: Floats) -> list[Bbox]:
+        return [Bbox([place, place]).padded(MARK_PT * point_px) for place in path]
+
     paths = [axes.transData.transform(np.column_stack([one.east_m, one.north_m])) for one in outages]
-    taken = [_spot_box(place, point_px) for path in paths for place in path[[0, -1]]]
-    crossed = [
-        _spot_box(path[row], point_px) for path in paths for row in places(path[:, 1], path[:, 0], LINE_PT * point_px)
-    ]
+    taken, crossed = [], []
+    for path in paths:
+        taken += spots(path[[0, -1]])
+        crossed += spots(path[places(path[:, 1], path[:, 0], LINE_PT * point_px)])
+    height = point_px * LINE_PT
     for number, (one, path) in enumerate(zip(outages, paths, strict=True), start=1):
         text = f"{number}: {error_text(one.document.end_error_m)}"
-        boxes = _label_boxes(path[-1], CHARACTER_PT * len(text), point_px)
-        found = _free_box(boxes, [*taken, *crossed], axes.bbox) or _free_box(boxes, taken, axes.bbox)
-        if found is None:
+        width = point_px * CHARACTER_PT * len(text)
+        # Where the label can stand within the frame, nearest first: better across a path than across another label.
+        boxes = {}
+        for dx, dy in LABEL_OFFSETS_PT:
+            x, y = path[-1] + point_px * np.array([dx, dy]) - (width if dx <= 0 else 0.0, height / 2)
+            if frame.x0 < x and frame.y0 < y and x + width < frame.x1 and y + height < frame.y1:
+                boxes[dx, dy] = Bbox.from_bounds(x, y, width, height)
+        free = [offset for offset, box in boxes.items() if not box.count_overlaps(taken)]
+        if not free:
             continue
+        found = next((offset for offset in free if not boxes[offset].count_overlaps(crossed)), free[0])
         taken.append(boxes[found])
         line = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6} if math.hypot(*found) > LINE_FROM_PT else None
         side = "left" if found[0] > 0 else "right"
         look: style.Look = {"ha": side, "va": "center", "fontsize": 8.0, "zorder": 6, "arrowprops": line}
         style.write_beside(axes, text, (float(one.east_m[-1]), float(one.north_m[-1])), found, **look)
-
-
-def _spot_box(place: Floats, point_px: float) -> Bbox:
-    return Bbox([place, place]).padded(MARK_PT * point_px)
-
-
-def _label_boxes(place: Floats, width_pt: float, point_px: float) -> dict[tuple[float, float], Bbox]:
-    """Return where a label of this width can stand beside a place [px], by its offset [points], nearest first."""
-    x, y, width, height = *place, point_px * width_pt, point_px * LINE_PT
-    return {
-        (dx, dy): Bbox.from_bounds(
-            x + point_px * dx - (width if dx <= 0 else 0.0), y + point_px * dy - height / 2, width, height
-        )
-        for dx, dy in LABEL_OFFSETS_PT
-    }
-
-
-def _free_box(
-    boxes: dict[tuple[float, float], Bbox], obstacles: list[Bbox], frame: BboxBase
-) -> tuple[float, float] | None:
-    """Return the offset of the first box within the frame that covers no obstacle."""
-    for offset, box in boxes.items():
-        inside = frame.x0 < box.x0 and frame.y0 < box.y0 and box.x1 < frame.x1 and box.y1 < frame.y1
-        if inside and not box.count_overlaps(obstacles):
-            return offset
-    return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,14 +44,10 @@ LEAST_MARGIN_S = 10.0
 BINS = 30
 
 
-def _answer(run: Run) -> str:
-    """Return where the estimates ended, and which of them the drive does not show."""
-    finals = {ICR_WORDS[column]: run.document.icr.final[column] for column in ICR_COLUMNS}
-    ends = ", ".join(f"{word} {signed(value)} m" for word, value in finals.items() if value is not None)
-    unknown = ", ".join(word for word, value in finals.items() if value is None)
-    if not ends:
-        return f"This drive does not show its ICRs: {unknown}"
-    return f"The ICRs end at {ends}{f'; not shown: {unknown}' if unknown else ''}"
+def _time_axis(span_s: float) -> tuple[str, float]:
+    """Return the name of a time axis in the unit that suits a span [s], and its seconds."""
+    unit, seconds = ("s", 1.0) if span_s <= 600 else ("min", 60.0) if span_s <= 4 * 3600 else ("h", 3600.0)
+    return f"Time [{unit}]", seconds
 
 
 @style.styled
@@ -61,22 +56,36 @@ def icr_estimates(run: Run) -> Figure:
 
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
-    spans = _spans_s(run)
+    finals, stds = run.document.icr.final, run.document.icr.final_std
+    ends = ", ".join(f"{ICR_WORDS[one]} {signed(at)} m" for one in ICR_COLUMNS if (at := finals[one]) is not None)
+    unknown = ", ".join(ICR_WORDS[column] for column in ICR_COLUMNS if finals[column] is None)
+    title = f"The ICRs end at {ends}{f'; not shown: {unknown}' if unknown else ''}"
+    spans = [(0.0, float(run.table.t_s[-1]))]
+    if begins := [converging[0] for converging in run.convergence_s.values() if converging is not None]:
+        first, last = min(begins), run.settled_s
+        margin = max(LEARNING_MARGIN * (last - first), LEAST_MARGIN_S)
+        begin, end = max(first - margin, 0.0), last + margin
+        if spans[0][1] - begin > LONG_RUN * (end - begin):
+            spans = [(begin, end), (end, spans[0][1])]
     learning = "; left: learning, right: after it" if len(spans) > 1 else ""
-    title, subtitle = _answer(run), f"{run_title(run.document)}: estimates of the filter{learning}"
-    margins_in = (0.75, 0.2, 0.8, 0.9)
-    figure = style.new_figure(title, subtitle, height_in=5.8, margins_in=margins_in, wspace=0.22, hspace=0.3)
-    panels = figure.subplots(
-        3, len(spans), squeeze=False, sharex="col", gridspec_kw={"width_ratios": (2, 3)[: len(spans)]}
-    )
+    figure = style.new_figure(
+        title if ends else f"This drive does not show its ICRs: {unknown}",
+        f"{run_title(run.document)}: estimates of the filter{learning}",
+        height_in=5.8, margins_in=(0.75, 0.2, 0.8, 0.9), wspace=0.22, hspace=0.3,
+    )  # fmt: skip
+    widths = {"width_ratios": (2, 3)[: len(spans)]}
+    panels = figure.subplots(3, len(spans), squeeze=False, sharex="col", gridspec_kw=widths)
     for row, column in zip(panels, ICR_COLUMNS, strict=True):
         for axes, span in zip(row, spans, strict=True):
             _draw_estimate(axes, run, column, span, first=axes is row[0])
         row[0].set_ylabel(NAMES[column])
-        row[0].set_title(_convergence_text(run, column), loc="left", pad=4.0)
-        row[-1].set_title(_final_text(run, column), loc="right", pad=4.0)
+        settling, final = run.convergence_s[column], finals[column]
+        found = f"10–90 % in {settling[1] - settling[0]:.1f} s" if settling else "starts near its final value"
+        row[0].set_title(found, loc="left", pad=4.0)
+        found = f"final {signed(final)} ± {stds[column]:.3f} m" if final is not None else "not shown by this drive"
+        row[-1].set_title(found, loc="right", pad=4.0)
     for axes, (begin, end) in zip(panels[-1], spans, strict=True):
-        axes.set_xlabel(f"Time [{style.time_unit(end - begin)[0]}]")
+        axes.set_xlabel(_time_axis(end - begin)[0])
     style.add_legend(figure, columnspacing=1.4, handlelength=2.0)
     return figure
 
@@ -105,21 +114,9 @@ def icr_clusters(run: Run) -> Figure:
     return figure
 
 
-def _spans_s(run: Run) -> list[tuple[float, float]]:
-    """Return begin and end [s] of the panels: all three estimates converging and what follows, or all in one."""
-    duration = float(run.table.t_s[-1])
-    begins = [span[0] for span in run.convergence_s.values() if span is not None]
-    if not begins:
-        return [(0.0, duration)]
-    first, last = min(begins), run.settled_s
-    margin = max(LEARNING_MARGIN * (last - first), LEAST_MARGIN_S)
-    begin, end = max(first - margin, 0.0), last + margin
-    return [(begin, end), (end, duration)] if duration - begin > LONG_RUN * (end - begin) else [(0.0, duration)]
-
-
 def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float, float], *, first: bool) -> None:
-    """Draw one estimate over a span; the `first` panel also has b/2 and the convergence."""
-    table, unit = run.table, style.time_unit(span_s[1] - span_s[0])[1]
+    """Draw one estimate over a span; the `first` panel also has b/2 and the begin and end of the convergence."""
+    table, unit = run.table, _time_axis(span_s[1] - span_s[0])[1]
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
     t, value = table.t_s[rows] / unit, getattr(table, column)[rows]
     band = 2 * getattr(table, f"std_{column}")[rows]
@@ -131,7 +128,13 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
         # Here the band is as wide as the prior: it is shown as far as the estimates go.
-        spread += _draw_convergence(axes, run, column, unit)
+        marks = ("white", "10 %"), ("black", "90 % of the change")
+        for second, (fill, label) in zip(run.convergence_s[column] or (), marks, strict=False):
+            spread.append(float(getattr(table, column)[np.searchsorted(table.t_s, second)]))
+            axes.plot([second / unit], spread[-1:], zorder=4, clip_on=False, label=label, **style.spot(fill))
+        if run.track_width_m is not None:
+            spread.append(SIDES[column] * run.track_width_m / 2)
+            axes.axhline(spread[-1], **NO_SLIP_PLACE)
     else:
         spread += [*percentiles(low, BAND_RANGE_PERCENT[:1]), *percentiles(high, BAND_RANGE_PERCENT[1:])]
     middle, half = (min(spread) + max(spread)) / 2, max(np.ptp(spread) / 2, LEAST_HALF_RANGE_M)
@@ -144,56 +147,36 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
         if (mean := segment.mean[column]) is not None:
             stretch = segment.begin_s / unit, segment.end_s / unit
             axes.plot(stretch, (mean, mean), zorder=2.5, label="mean between", **SEGMENT)
-    style.shade_spans(axes, (run.outages_ns - table.stamp_ns[0]) / 1e9 / unit, label="no usable GNSS")
-    _mark_clipped(axes, t, value)
-
-
-def _mark_clipped(axes: Axes, t: Floats, value: Floats) -> None:
-    """Write the extreme of an estimate at the edge of the panel that cuts it off."""
-    low, high = axes.get_ylim()
-    for row, edge, arrow in ((int(value.argmin()), low, "↓"), (int(value.argmax()), high, "↑")):
-        if not low <= value[row] <= high:
-            text, va = f"{arrow} {signed(value[row])}", "top" if edge == high else "bottom"
+    _shade_outages(axes, run, unit, "no usable GNSS")
+    # The extreme of an estimate stands at the edge of the panel that cuts it off.
+    low_end, high_end = axes.get_ylim()
+    for row, edge, arrow in ((int(value.argmin()), low_end, "↓"), (int(value.argmax()), high_end, "↑")):
+        if not low_end <= value[row] <= high_end:
+            text, va = f"{arrow} {signed(value[row])}", "top" if edge == high_end else "bottom"
             style.write_beside(axes, text, (t[row], edge), va=va, fontsize=7.5, color=style.BAD_FIX_COLOR)
 
 
-def _draw_convergence(axes: Axes, run: Run, column: IcrColumn, unit_s: float) -> list[float]:
-    """Draw b/2 and the begin and end of the convergence; return where they are [m]."""
-    heights: list[float] = []
-    marks = ("white", "10 %"), ("black", "90 % of the change")
-    for second, (fill, label) in zip(run.convergence_s[column] or (), marks, strict=False):
-        heights.append(float(getattr(run.table, column)[np.searchsorted(run.table.t_s, second)]))
-        axes.plot([second / unit_s], heights[-1:], zorder=4, clip_on=False, label=label, **style.spot(fill))
-    if (width := run.track_width_m) is not None:
-        heights.append(SIDES[column] * width / 2)
-        axes.axhline(heights[-1], **NO_SLIP_PLACE)
-    return heights
-
-
-def _convergence_text(run: Run, column: IcrColumn) -> str:
-    span = run.convergence_s[column]
-    return f"10–90 % in {span[1] - span[0]:.1f} s" if span is not None else "starts near its final value"
-
-
-def _final_text(run: Run, column: IcrColumn) -> str:
-    final, std = run.document.icr.final[column], run.document.icr.final_std[column]
-    return f"final {signed(final)} ± {std:.3f} m" if final is not None else "not shown by this drive"
+def _shade_outages(axes: Axes, run: Run, unit_s: float, label: str) -> None:
+    """Shade the outages over the whole height; one artist however many there are."""
+    spans = (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / unit_s
+    if len(spans):
+        bars = [(float(begin), float(end - begin)) for begin, end in spans]
+        where = axes.get_xaxis_transform()
+        axes.broken_barh(bars, (0, 1), transform=where, facecolor=style.OUTAGE_COLOR, zorder=0.5, label=label)
 
 
 def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weight: Floats, span_m: float) -> None:
     """Draw percent of time over value, and show `span_m` of it."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
-    width = _bin_width(span_m)
+    # The round width of about `BINS` bins.
+    target = span_m / BINS
+    decade = 10.0 ** np.floor(np.log10(target))
+    width = float(min((step * decade for step in (1.0, 2.0, 5.0, 10.0)), key=lambda step: abs(step - target)))
     first, last = int(np.floor(low / width)), int(np.ceil(high / width))
     share, edges = np.histogram(value, bins=last - first, range=(first * width, last * width), weights=weight)
-    style.fill_bins(
-        axes,
-        edges,
-        100 * share / max(weight.sum(), 1e-9),
-        color=style.BAR_COLOR,
-        label=f"estimates, bins of {width:g} m",
-    )
+    percent, label = 100 * share / max(weight.sum(), 1e-9), f"estimates, bins of {width:g} m"
+    style.fill_bins(axes, edges, percent, color=style.BAR_COLOR, label=label)
     axes.set_xlim(low, high)
     mean, std = run.document.icr.mean[column], run.document.icr.std[column]
     title = "not shown"
@@ -211,13 +194,6 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
     axes.grid(visible=False, axis="x")
 
 
-def _bin_width(span_m: float) -> float:
-    """Return the round width of about `BINS` bins over a span [m]."""
-    target = span_m / BINS
-    decade = 10.0 ** np.floor(np.log10(target))
-    return float(min((step * decade for step in (1.0, 2.0, 5.0, 10.0)), key=lambda step: abs(step - target)))
-
-
 MOST_SINGLE = 1500
 TIME_BINS = 300
 """More used fixes than `MOST_SINGLE` are drawn by their range and median in so many equal times."""
@@ -231,7 +207,7 @@ def gnss_difference(run: Run) -> Figure:
 
     Of many fixes, the range and the median in each of `TIME_BINS` equal times are drawn.
     """
-    facts = run.document.gnss
+    facts, duration_s, fixes = run.document.gnss, float(run.table.t_s[-1]), run.sensors.fixes
     mean, most = facts.mean_difference_m, facts.max_difference_m
     of, word = facts.used + facts.rejected, position_word(run.document)
     apart = f"{error_text(mean)} from the {word} on average, " if mean is not None else ""
@@ -239,28 +215,23 @@ def gnss_difference(run: Run) -> Figure:
     subtitle = f"{run_title(run.document)}: distance between filter and {word}, {of:,} of them"
     figure = style.new_figure(title, subtitle, height_in=3.9)
     axes = figure.subplots()
-    unit, seconds = style.time_unit(float(run.table.t_s[-1]))
-    t, difference = run.gnss.t_s / seconds, run.gnss.difference
-    used, gated = run.gnss.used, run.gnss.rejected
+    name, unit = _time_axis(duration_s)
+    t, difference = run.gnss.t_s / unit, run.gnss.difference
+    used, weak = run.gnss.used, run.gnss.used & fixes.down_weighted
     top = scale_end_m(difference[used])
     if mean is not None and most is not None:
-        trusted = used & ~run.sensors.fixes.down_weighted
-        _draw_used(axes, t[trusted], difference[trusted], f"used, max {error_text(most)}")
+        label = f"used, max {error_text(most)}"
+        _draw_used(axes, t[used & ~weak], difference[used & ~weak], label)
         axes.axhline(mean, label=f"mean {error_text(mean)}", **style.MEAN)
-    _mark(axes, t, difference, gated, top, "rejected", "x", color=style.BAD_FIX_COLOR, markersize=4.5)
-    weak = run.sensors.fixes.down_weighted & used
+    _mark(axes, t, difference, run.gnss.rejected, top, "rejected", "x", color=style.BAD_FIX_COLOR, markersize=4.5)
     _mark(axes, t, difference, weak, top, "down-weighted", ".", color=style.FLOAT_COLOR, markersize=4.0)
     lost = len(run.sensors.losses_ns) > 0
-    style.shade_spans(
-        axes,
-        (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / seconds,
-        label="no usable GNSS, or RTK lost" if lost else "no usable GNSS",
-    )
-    axes.set(xlim=(0, max(float(run.table.t_s[-1]) / seconds, 1e-3)), ylim=(0, top))
-    axes.set(xlabel=f"Time [{unit}]", ylabel="Difference [m]")
+    _shade_outages(axes, run, unit, "no usable GNSS, or RTK lost" if lost else "no usable GNSS")
+    axes.set(xlim=(0, max(duration_s / unit, 1e-3)), ylim=(0, top), xlabel=name, ylabel="Difference [m]")
     # Five short entries stand side by side; with more, or longer ones, there are two rows.
-    ncols = 3 if lost or run.sensors.fixes.down_weighted.any() else 5
-    style.add_legend(figure, ncols=ncols, columnspacing=1.6, handlelength=2.0)
+    style.add_legend(
+        figure, ncols=3 if lost or fixes.down_weighted.any() else 5, columnspacing=1.6, handlelength=2.0
+    )  # fmt: skip
     return figure
 
 
@@ -271,10 +242,8 @@ def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:
         axes.plot(*broken, color=style.BAR_COLOR, linewidth=0.7, label=label)
         return
     edges = np.linspace(t[0], t[-1], TIME_BINS + 1)
-    bounds = np.searchsorted(t, edges)
-    bounds[-1] = len(t)
+    parts = np.split(difference, np.searchsorted(t, edges[1:-1]))
     empty = np.full(3, np.nan)
-    parts = [difference[a:b] for a, b in pairwise(bounds)]
     low, middle, high = np.array([np.percentile(part, (0, 50, 100)) if len(part) else empty for part in parts]).T
     centre = (edges[1:] + edges[:-1]) / 2
     axes.fill_between(centre, low, high, color=style.BAND_COLOR, linewidth=0, label=label)

@@ -115,8 +115,6 @@ OTHER_PENS = (
     line("#c51b7d", "-", 1.2),
 )
 """Of calibrations, in the order of the report."""
-FORCED = line(BAD_FIX_COLOR, width=1.8)
-REAL = line("black", (0, (2.0, 1.2)), 1.8)
 
 ICR_LOOKS: dict[str, Look] = {
     "y_icr_right": {"label": "y right", "color": "#2166ac", "linestyle": "-", "marker": "o", "markersize": 3.5},
@@ -245,11 +243,6 @@ def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
         stem.with_name(f"{stem.name}.{form}").write_bytes(picture_bytes(figure, form))
 
 
-def time_unit(span_s: float) -> tuple[str, float]:
-    """Return the unit of time that suits a span [s], and its seconds."""
-    return ("s", 1.0) if span_s <= 600 else ("min", 60.0) if span_s <= 4 * 3600 else ("h", 3600.0)
-
-
 def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
     """Fill the bins of a histogram from zero up; `Axes.stairs` measures every step of its outline and takes longer."""
     filled = axes.fill_between(edges, np.append(heights, heights[-1:]), step="post", linewidth=0, **look)
@@ -269,12 +262,3 @@ def logarithmic_errors(axes: Axes, of: Literal["x", "y"] = "x") -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(NullLocator())
-
-
-def shade_spans(axes: Axes, spans: Floats, label: str = "") -> None:
-    """Shade spans (k, 2) of the x axis over the whole height; one artist however many there are."""
-    if len(spans):
-        bars = [(float(begin), float(end - begin)) for begin, end in spans]
-        axes.broken_barh(
-            bars, (0, 1), transform=axes.get_xaxis_transform(), facecolor=OUTAGE_COLOR, zorder=0.5, label=label
-        )  # fmt: skip

@@ -13,14 +13,12 @@ from icrtool.output.figures import style
 from icrtool.output.series import places
 from icrtool.output.text_format import driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run
-from icrtool.records.run_document import OdometryDocument
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
 from icrtool.records.text import distance_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 MARGINS_IN = (0.75, 0.2, 0.6, 1.3)
@@ -66,11 +64,17 @@ def trajectory(run: Run) -> Figure:
     table = run.table
     every = -(-len(table) // MOST_STATES)
     paths = {name: drive_wheels(table, run.in_gap, icrs, every) for name, icrs in odometry_icrs(run).items()}
-    lowest, highest = _extent(_corners(table), *map(_corners, paths.values()))
+    lowest, highest = _corners(table)
+    detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
+    lows, highs = zip((lowest, highest), *map(_corners, paths.values()), strict=True)
+    lowest = np.maximum(np.min(lows, axis=0), lowest - detour)
+    highest = np.minimum(np.max(highs, axis=0), highest + detour)
     norths, easts = np.column_stack([lowest, highest])
     width_in = style.WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
-    title = _end_errors_text(run.document.odometry)
+    ends = {"the final ICRs": run.document.odometry.icr, "no slip": run.document.odometry.no_slip}
+    off = [f"{distance_text(one.end_error_m)} off with {name}" for name, one in ends.items() if one is not None]
+    title = f"Wheels alone end {', '.join(off)}"
     subtitle = f"{run_title(run.document)}: {driven_text(run.document.drive)}"
     height_in = box_in + MARGINS_IN[2] + MARGINS_IN[3]
     figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=MARGINS_IN)
@@ -83,27 +87,18 @@ def trajectory(run: Run) -> Figure:
         _draw_odometry(axes, path, cell, *ODOMETRIES[name])
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
-    _draw_events(axes, run)
+    # Where the slip events were: the filter's path through each, and a ring at its begin.
+    for event in run.sensors.events:
+        rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
+        if rows.any():
+            east, north = table.east_m[rows], table.north_m[rows]
+            axes.plot(east, north, color=style.FLOAT_COLOR, linewidth=3.0, zorder=4.5)
+            axes.plot(east[:1], north[:1], label="slip event", **SLIP_LOOK)
     axes.plot(table.east_m[:1], table.north_m[:1], zorder=5, label="start", **style.spot("white", 8.0))
     axes.plot(table.east_m[-1:], table.north_m[-1:], zorder=5, label="end", **style.spot("black", 6.0))
     name_directions(axes)
     style.add_legend(figure, ncols=2, columnspacing=3.0)
     return figure
-
-
-def _end_errors_text(odometry: OdometryDocument) -> str:
-    ends = {"the final ICRs": odometry.icr, "no slip": odometry.no_slip}
-    return "Wheels alone end " + ", ".join(
-        f"{distance_text(end.end_error_m)} off with {name}" for name, end in ends.items() if end is not None
-    )
-
-
-def _extent(drive: Corners, *paths: Corners) -> Corners:
-    """Return the least and the greatest (north, east) to show [m], of those of the drive and of other paths."""
-    lowest, highest = drive
-    detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
-    lows, highs = zip(drive, *paths, strict=True)
-    return np.maximum(np.min(lows, axis=0), lowest - detour), np.minimum(np.max(highs, axis=0), highest + detour)
 
 
 def _corners(path: States | OdometryPath) -> Corners:
@@ -142,17 +137,6 @@ def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Fl
             if look is REJECTED_LOOK:
                 shown = shown[:: 1 + len(shown) // MOST_REJECTED]
             axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, label=label, **look)
-
-
-def _draw_events(axes: Axes, run: Run) -> None:
-    """Mark where the slip events were: the filter's path through each, and a ring at its begin."""
-    table = run.table
-    for event in run.sensors.events:
-        rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
-        if rows.any():
-            east, north = table.east_m[rows], table.north_m[rows]
-            axes.plot(east, north, color=style.FLOAT_COLOR, linewidth=3.0, zorder=4.5)
-            axes.plot(east[:1], north[:1], label="slip event", **SLIP_LOOK)
 
 
 def _draw_jumps(axes: Axes, run: Run) -> None:
@@ -222,24 +206,20 @@ def look_down(axes: Axes, norths: Floats, easts: Floats, shape: float, margin: f
 
 def name_directions(axes: Axes) -> None:
     """Name the axes; of coordinates far from zero (UTM) whole kilometres stand in the name, not at each tick."""
-    axes.set_xlabel("East [m]" + _short_ticks(axes.xaxis, axes.get_xlim()[0]))
-    axes.set_ylabel("North [m]" + _short_ticks(axes.yaxis, axes.get_ylim()[0]))
+    from matplotlib.ticker import ScalarFormatter
+
+    for name, axis, (lowest_m, _) in (("East", axes.xaxis, axes.get_xlim()), ("North", axes.yaxis, axes.get_ylim())):
+        offset, counted_from = float(np.floor(lowest_m / 1000) * 1000), ""
+        if abs(lowest_m) >= FAR_M:
+            formatter = ScalarFormatter()
+            formatter.set_useOffset(offset)
+            axis.set_major_formatter(formatter)
+            axis.get_offset_text().set_visible(False)
+            counted_from = f"  {'+' if offset > 0 else '−'} {abs(offset):,.0f} m"
+        axis.set_label_text(f"{name} [m]{counted_from}")
 
 
 def draw_path(axes: Axes, north_m: Floats, east_m: Floats, cell_m: float, pen: style.Look, **look: Any) -> None:
     """Draw a path (n,), a point for each cell it enters."""
     shown = places(north_m, east_m, cell_m)
     axes.plot(east_m[shown], north_m[shown], **pen, **look)
-
-
-def _short_ticks(axis: Axis, lowest_m: float) -> str:
-    from matplotlib.ticker import ScalarFormatter
-
-    if abs(lowest_m) < FAR_M:
-        return ""
-    formatter = ScalarFormatter()
-    offset = float(np.floor(lowest_m / 1000) * 1000)
-    formatter.set_useOffset(offset)
-    axis.set_major_formatter(formatter)
-    axis.get_offset_text().set_visible(False)
-    return f"  {'+' if offset > 0 else '−'} {abs(offset):,.0f} m"

@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
-from itertools import chain
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from msgspec import UNSET, UnsetType
@@ -48,19 +47,6 @@ ERROR_KEYS = {"p95": "p95_m", "p95_low": "p95_low_m", "p95_high": "p95_high_m", 
               "expected_low": "expected_low_m", "expected_high": "expected_high_m"}  # fmt: skip
 
 
-class PageSteps(NamedTuple):
-    """Which states a page has, all of them or every `joined`-th.
-
-    Attributes
-    ----------
-    rows : (n,) states; the last one is always there
-    joined : wheel samples between two of them
-    """
-
-    rows: Ints
-    joined: int
-
-
 def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[str, object]:
     """Return plain data for the page of a run.
 
@@ -71,18 +57,19 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
     coordinates : whether the axes of the map count from the datum; else from the first state
     """
     table = run.table
+    # Of many states every so many-th, and the last one.
     joined = -(-len(table) // MOST_STEPS)
-    steps = PageSteps(np.unique(np.append(np.arange(0, len(table), joined), len(table) - 1)), joined)
+    rows = np.unique(np.append(np.arange(0, len(table), joined), len(table) - 1))
     origin = float(np.round(table.north_m[0])), float(np.round(table.east_m[0]))
     return {
         "origin": origin if coordinates else None,
         "duration_s": float(table.t_s[-1]),
-        "steps": _steps_data(run, steps, origin),
-        "series": _series_data(run, steps),
+        "steps": {"joined": joined} | _steps_data(run, rows, origin),
+        "series": _series_data(run, rows),
         "fixes": _fixes_data(run, origin),
-        "headings": _headings_data(run),
+        "headings": _differences(run.heading, run.heading.used, np.degrees(run.heading.difference))[1],
         "half_width_m": None if run.track_width_m is None else run.track_width_m / 2,
-        **_models_data(run, report, steps, origin),
+        **_models_data(run, report, rows, origin),
         "events": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in run.document.events],
         "outages": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
         "changes_s": list(run.changes_s),
@@ -106,9 +93,9 @@ def errors_data(report: DropoutDocument) -> dict[str, object]:
     }
 
 
-def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict[str, object]:
+def _steps_data(run: Run, rows: Ints, origin: tuple[float, float]) -> dict[str, object]:
     """Return what the wheels did and where the reference was, at every step."""
-    track, rows = track_of(run), steps.rows
+    track = track_of(run)
     columns = {
         "left": track.cumulate(track.v_left)[rows],
         "right": track.cumulate(track.v_right)[rows],
@@ -117,21 +104,22 @@ def _steps_data(run: Run, steps: PageSteps, origin: tuple[float, float]) -> dict
         "east": track.east[rows] - origin[1],
     }
     gaps = np.searchsorted(rows, np.flatnonzero(track.held[:-1] == 0.0), side="right") - 1
+    # First and last step of each stretch without a reference.
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], track.in_outage[rows], [False]]).astype(np.int8)))
     return {
-        "joined": steps.joined,
         "gaps": np.unique(gaps).tolist(),
-        "without_reference": _spans(track.in_outage[rows]),
+        "without_reference": (edges.reshape(-1, 2) - [0, 1]).tolist(),
     } | {name: packed_sums(column) for name, column in columns.items()}
 
 
-def _series_data(run: Run, steps: PageSteps) -> dict[str, Column]:
+def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
     """Return the states that the time series show; each is a step too."""
     table, icrs = run.table, {"y_right": "y_icr_right_m", "y_left": "y_icr_left_m", "x": "x_icr_m"}
-    values = {name: getattr(table, column)[steps.rows] for name, column in icrs.items()}
+    values = {name: getattr(table, column)[steps] for name, column in icrs.items()}
     spreads = {f"std_{name}": getattr(table, f"std_{column}") for name, column in icrs.items()}
     speeds = {"v_left": table.v_left_mps, "v_right": table.v_right_mps}
-    rows = extremes(*(one[steps.rows] for one in speeds.values()), *values.values(), points=SERIES_POINTS)
-    state = steps.rows[rows]
+    rows = extremes(*(one[steps] for one in speeds.values()), *values.values(), points=SERIES_POINTS)
+    state = steps[rows]
     return {
         "step": packed_sums(rows, unit=1),
         "t": packed_sums(table.t_s[state]),
@@ -146,50 +134,38 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
     fixes, difference = run.sensors.fixes, run.gnss.difference
     found: dict[str, object] = {"top_m": scale_end_m(difference[run.gnss.used])}
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
-        rows = _extreme_rows(difference, chosen)
+        rows, differences = _differences(run.gnss, chosen, difference)
         north, east = packed(fixes.north_m[rows] - origin[0]), packed(fixes.east_m[rows] - origin[1])
-        found[name] = _differences(run.gnss, chosen, rows, difference) | {"north": north, "east": east}
+        found[name] = differences | {"north": north, "east": east}
     return found
 
 
-def _headings_data(run: Run) -> dict[str, object]:
-    """Return how far the headings that the filter used were from its own [deg]."""
-    rows = _extreme_rows(run.heading.difference, run.heading.used)
-    return _differences(run.heading, run.heading.used, rows, np.degrees(run.heading.difference))
-
-
-def _differences(outcome: MeasurementOutcome, chosen: Bools, rows: Ints, difference: Floats) -> dict[str, object]:
-    """Return differences at rows of the chosen measurements, and moments at which a line through them breaks."""
-    t = outcome.t_s[chosen]
+def _differences(outcome: MeasurementOutcome, chosen: Bools, difference: Floats) -> tuple[Ints, dict[str, object]]:
+    """Return the rows of the chosen measurements, the extremes of many; their differences, and where a line breaks."""
+    rows = np.flatnonzero(chosen)
+    t = outcome.t_s[rows]
     after = breaks_after(t)
     breaks = (t[after] + t[after + 1]) / 2
-    return {"t": packed(outcome.t_s[rows]), "difference": packed(difference[rows]), "breaks_s": breaks.tolist()}
-
-
-def _extreme_rows(difference: Floats, chosen: Bools) -> Ints:
-    """Return the chosen rows, the extremes of many."""
-    rows = np.flatnonzero(chosen)
-    return rows[extremes(difference[rows], points=FIX_POINTS)]
+    rows = rows[extremes(difference[rows], points=FIX_POINTS)]
+    columns = {"t": packed(outcome.t_s[rows]), "difference": packed(difference[rows])}
+    return rows, {**columns, "breaks_s": breaks.tolist()}
 
 
 Paths = Iterator[tuple[str, tuple[Floats, Complexes]]]
 """Name of a model; heading [rad] and place [m] of the robot along its path, at the steps of the page alone."""
 
 
-def _models_data(run: Run, report: DropoutDocument, steps: PageSteps, origin: tuple[float, float]) -> dict[str, object]:
+def _models_data(run: Run, report: DropoutDocument, steps: Ints, origin: tuple[float, float]) -> dict[str, object]:
     """Return the models of the report, and where each of constant parameters leads from the begin of the drive."""
     labels = {one.name: one.label for one in report.models}
     recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(run.track_width_m)))
-    paths = dict(
-        chain(
-            _odometry(run, steps.rows, origin),
-            _held_out(recording, report, steps.rows),
-            _calibrated(recording, report, steps.rows),
-        )
-    )
-    count = len(steps.rows)
-    every = max(-(-len(paths) * count // PATH_POINTS), 1)
-    rows = np.unique(np.append(np.arange(0, count, every), count - 1))
+    paths = {
+        **dict(_odometry(run, steps, origin)),
+        **dict(_held_out(recording, report, steps)),
+        **dict(_calibrated(recording, report, steps)),
+    }
+    every = max(-(-len(paths) * len(steps) // PATH_POINTS), 1)
+    rows = np.unique(np.append(np.arange(0, len(steps), every), len(steps) - 1))
     packed_paths = {
         name: {
             "every": every,
@@ -249,12 +225,6 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
             with suppress(DataError):
                 model = calibrated(stored_calibration(document), recording, with_gyro=turned)
                 yield one.name, predicted_path(recording, *model)(recording.track.t[rows])
-
-
-def _spans(flags: Bools) -> list[list[int]]:
-    """Return first and last row of each stretch of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [[int(first), int(end) - 1] for first, end in edges.reshape(-1, 2)]
 
 
 LARGEST_STEP = 32_000

@@ -65,9 +65,13 @@ def render(
 
     style = "\n".join(_static(name) for name in STYLES)
     code = [BEGIN, *(_static(name) for name in scripts)]
+    # As a content security policy names a style or a script.
+    of_style, *of_scripts = (
+        f"'sha256-{b64encode(sha256(one.encode()).digest()).decode('ascii')}'" for one in (style, *code)
+    )
     policy = (
-        f"default-src 'none'; img-src data:; style-src {_source(style)}; "
-        f"script-src {' '.join(map(_source, code))}; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; img-src data:; style-src {of_style}; "
+        f"script-src {' '.join(of_scripts)}; base-uri 'none'; form-action 'none'"
     )
     return _environment().get_template("base.html").render(
         # Ours, not of a log: they stand in the page as they are.
@@ -82,35 +86,30 @@ def render(
 def _environment() -> Environment:
     """Return the templates, compiled once a process."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
+    from markupsafe import Markup, escape
 
     def shown(value: object) -> object:
         """Return what is printed for a value: text without characters that hide or reorder others."""
         return escaped(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+    def with_units(text: str) -> Markup:
+        """Return a text whose values stay on one line with their units and standard deviations."""
+        printed = MINUS.sub("−", str(escape(escaped(text))))
+        return Markup(RANGE.sub("\u2011", UNIT.sub("\xa0", printed)))  # noqa: S704 - escaped
 
     environment = Environment(
         loader=PackageLoader("icrtool.output.page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, finalize=shown,
     )  # fmt: skip
     environment.filters |= {
-        "units": _with_units,
-        "breakable": _breakable,
+        "units": with_units,
+        # A name may be broken behind its underscores, on a narrow screen.
+        "breakable": lambda name: Markup("_<wbr>").join(map(escape, escaped(name).split("_"))),
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}",
         "kind": lambda block: type(block).__name__,
-        "grouped": _grouped,
         "named": lambda pictures, names: [one for name, one in pictures.items() if name.startswith(names)],
     }
     return environment
-
-
-def _grouped(rows: Sequence[tuple[str, str]]) -> list[tuple[str, list[str]]]:
-    """Return labelled sentences by label; one without a label belongs to that before it."""
-    found: list[tuple[str, list[str]]] = []
-    for name, text in rows:
-        if name or not found:
-            found.append((name, []))
-        found[-1][1].append(text)
-    return found
 
 
 def script_json(data: Mapping[str, object]) -> str:
@@ -118,28 +117,8 @@ def script_json(data: Mapping[str, object]) -> str:
     return json.dumps(plain(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
 
 
-def _with_units(text: str) -> Markup:
-    """Return a text whose values stay on one line with their units and standard deviations."""
-    from markupsafe import Markup, escape
-
-    printed = MINUS.sub("−", str(escape(escaped(text))))
-    return Markup(RANGE.sub("\u2011", UNIT.sub("\xa0", printed)))  # noqa: S704 - escaped
-
-
-def _breakable(name: str) -> Markup:
-    """Return a name that may be broken behind its underscores, on a narrow screen."""
-    from markupsafe import Markup, escape
-
-    return Markup("_<wbr>").join(escape(part) for part in escaped(name).split("_"))
-
-
 def _static(name: str) -> str:
     return files("icrtool.output.page").joinpath("static", *name.split("/")).read_text(encoding="utf-8")
-
-
-def _source(text: str) -> str:
-    """Return a style or script as the content security policy names it."""
-    return f"'sha256-{b64encode(sha256(text.encode()).digest()).decode('ascii')}'"
 
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import textwrap
+from itertools import product
 
 from msgspec import UNSET
 
 from icrtool import __version__
 from icrtool.calibration.error_growth import Forecast
-from icrtool.calibration.held_out import HeldOut, HeldOutRow
+from icrtool.calibration.held_out import HeldOut
 from icrtool.calibration.pooled import CalibrationResult
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.sensor_findings import LABELS
@@ -41,8 +42,6 @@ from icrtool.records.calibration_document import (
     ForecastSource,
     GroupComparison,
     SensorDocument,
-    SensorParameter,
-    TransferCell,
 )
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
@@ -56,7 +55,7 @@ BUDGET_M = 0.5
 def calibration_blocks(result: CalibrationResult | None, sensors: SensorDocument | None) -> list[Block]:
     """Return what `icrtool calibrate` prints: numbers, how far on what they were not fitted to, settings of one log."""
     blocks = _result_blocks(result) if result is not None else []
-    return [*blocks, *sensor_blocks(sensors)] if sensors is not None else blocks
+    return [*blocks, *_sensor_blocks(sensors)] if sensors is not None else blocks
 
 
 def _result_blocks(result: CalibrationResult) -> list[Block]:
@@ -70,41 +69,36 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
         if row.name in REACH_ROWS and (reached := row.within(table.horizons_m, BUDGET_M)) is not None
     ]
     unknown = "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown)
-    parameters = parameter_table(calibration.fitted, calibration.fitted_with_gyro)
+    model = [
+        parameter_table(calibration.fitted, calibration.fitted_with_gyro),
+        *held_out_blocks(table),
+        *result.notes,
+    ]
     return [
         Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
         *numbers_of(calibration.controller, calibration.width_m, icrs),
         Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?"),
         Facts([("not found", f"too small, or not driven; taken as usual: {unknown}")] if unknown else []),
-        Section(
-            f"Motion model: {model_text(calibration.fitted)}",
-            [parameters, *held_out_blocks(table), *result.notes], VERBOSE,
-        ),
-    ]  # fmt: skip
+        Section(f"Motion model: {model_text(calibration.fitted)}", model, VERBOSE),
+    ]
 
 
 def held_out_blocks(table: HeldOut) -> list[Block]:
     """Return the leave-one-out table: p95 / expected error by horizon, of all trials together and of the worst fold."""
-    what = "log" if table.folds[0].whole else "block"
-    rows = [(row.label, *(_cell(row, h) for h in range(len(table.horizons_m)))) for row in table.scores]
-    tested = (
-        f"each {what} left out in turn"
-        if table.folds[0].whole
-        else "each trial predicted by a fit to the rest of the drive"
-    )
+    what, tested = "block", "each trial predicted by a fit to the rest of the drive"
+    if table.folds[0].whole:
+        what, tested = "log", "each log left out in turn"
+    rows = []
+    for row in table.scores:
+        cells, of_all = [], row.together
+        for h, trials in enumerate(of_all.trials):
+            worst = f"{row.worst('p95', h):.2f}/{row.worst('expected', h):.2f}" if trials else ""
+            cells.append(f"{of_all.p95[h]:.2f}/{of_all.expected[h]:.2f} ({worst})" if trials else "–")
+        rows.append((row.label, *cells))
     return [
         f"{tested} ({len(table.folds)} {what}s): 95 % / expected error [m] of all trials (of the worst {what})",
         Table("lr", rows, ("model", *(f"{horizon:g} m" for horizon in table.horizons_m))),
     ]
-
-
-def _cell(row: HeldOutRow, h: int) -> str:
-    if not row.together.trials[h]:
-        return "–"
-    all_trials = row.together.p95[h], row.together.expected[h]
-    worst = (row.worst(column, h) for column in ("p95", "expected"))
-    (p95, expected), (worst_p95, worst_expected) = all_trials, worst
-    return f"{p95:.2f}/{expected:.2f} ({worst_p95:.2f}/{worst_expected:.2f})"
 
 
 MEANINGS = "shown: found well enough to set; weak: found roughly; not shown, not separable: this drive cannot find it"
@@ -112,50 +106,39 @@ MEANINGS = "shown: found well enough to set; weak: found roughly; not shown, not
 OPTIONS_WIDTH = 76
 """Characters of options in a line of a terminal of 80 columns, beside indent and backslash."""
 
-DIGITS = {"_deg": (2, "°"), "_m": (3, "m"), "_s": (3, "s"), "scale": (4, "")}
+FORMS = {"_deg": ("+.2f", "°"), "_m": ("+.3f", "m"), "_s": ("+.3f", "s"), "scale": (".4f", "")}
+"""Of value and standard deviation, and their unit, by the end of the key."""
 
 
-def sensor_blocks(calibration: SensorDocument) -> list[Block]:
+def _sensor_blocks(calibration: SensorDocument) -> list[Block]:
     """Return the settings that one log proposes, and the estimates that they come from."""
     facts = calibration.drive
     right, left = facts.turned_right_deg, facts.turned_left_deg
     speed = f"{facts.speed_mean_mps:.2f} ± {facts.speed_std_mps:.2f} m/s"
     stretches = f"{calibration.independent_stretches} independent stretches"
-    compared = f"{calibration.windows} windows of driven distance, {stretches}"
     head = [
         ("drive", f"{facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left"),
-        ("compared", compared),
+        ("compared", f"{calibration.windows} windows of driven distance, {stretches}"),
     ]
-    rows = [
-        (LABELS[key], value_text(key, one), one.verdict + (f": {one.note}" if one.note else ""))
-        for key, one in calibration.parameters.items()
-    ]
+    rows = []
+    for key, one in calibration.parameters.items():
+        (form, unit), value = next(form for ending, form in FORMS.items() if key.endswith(ending)), "–"
+        if one.value is not None:
+            std = f" ± {one.std:{form.lstrip('+')}}" if one.verdict != "given" else ""
+            value = f"{one.value:{form}}{std} {unit}".rstrip()
+        rows.append((LABELS[key], value, one.verdict + (f": {one.note}" if one.note else "")))
     table = Table("l", rows, ("parameter", "value ± std", "verdict"))
-    return [Section(calibration.log, [Facts(head), table, MEANINGS, ""], VERBOSE), *setting_blocks(calibration)]
-
-
-def value_text(key: str, one: SensorParameter) -> str:
-    """Return value and standard deviation of a parameter with their unit; a dash where there is none."""
-    if one.value is None:
-        return "–"
-    digits, unit = next(form for ending, form in DIGITS.items() if key.endswith(ending))
-    number = f"{one.value:+.{digits}f}" if not key.endswith("scale") else f"{one.value:.{digits}f}"
-    spread = f" ± {one.std:.{digits}f}" if one.verdict != "given" else ""
-    return f"{number}{spread} {unit}".rstrip()
-
-
-def setting_blocks(calibration: SensorDocument) -> list[Block]:
-    """Return the settings that one log proposes."""
+    estimates = Section(calibration.log, [Facts(head), table, MEANINGS, ""], VERBOSE)
     if not calibration.settings:
         shown = any(one.verdict == "shown" for one in calibration.parameters.values())
         why = "the drive confirms the configuration" if shown else "the drive showed nothing well enough"
-        return [f"nothing to configure: {why}"]
+        return [estimates, f"nothing to configure: {why}"]
     # an option and its value stay together
     options = " ".join(f"--set\u00a0{key}={value:g}" for key, value in calibration.settings.items())
     lines = textwrap.wrap(options, OPTIONS_WIDTH, break_long_words=False, break_on_hyphens=False)
     # a shell joins the lines again
     joined = " \\\n  ".join(lines).replace("\u00a0", " ")
-    return [Line(f"to configure:\n  {joined}", "as is")]
+    return [estimates, Line(f"to configure:\n  {joined}", "as is")]
 
 
 SHOWN_M = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
@@ -216,8 +199,7 @@ def forecast_blocks(
 ) -> list[Block]:
     """Return the table of a forecast, and how far within each budget."""
     total = float(forecast.distance_m[-1])
-    fitted, logs = calibration.fitted, counted(len(calibration.logs), "log")
-    model = f"{model_text(fitted)} from {logs}"
+    model = f"{model_text(calibration.fitted)} from {counted(len(calibration.logs), 'log')}"
     kinds = [("", forecast)] if gyro is None else [("", forecast), (", with gyro", gyro)]
     rows = []
     for metres in sorted({*(metres for metres in SHOWN_M if metres < total), math.floor(total)}):
@@ -251,8 +233,11 @@ def transfer_csv(found: GroupComparison) -> bytes:
 def transfer_blocks(found: GroupComparison) -> list[Block]:
     """Return what `icrtool compare` prints: verdicts, the transfer matrix, differences of each pair, the logs."""
     names = list(found.groups)
-    cells = {(one.calibrated_on, one.tested_on): one for one in found.transfer if one.horizon_m == CHOICE_HORIZON_M}
-    matrix = [(row, *(_errors(cells.get((row, column))) for column in names)) for row in names]
+    cells = dict.fromkeys(product(names, names), "-")
+    for one in found.transfer:
+        if one.horizon_m == CHOICE_HORIZON_M and one.p95_m is not None and one.expected_m is not None:
+            cells[one.calibrated_on, one.tested_on] = f"{one.p95_m:.2f} / {one.expected_m:.2f}"
+    matrix = [(row, *(cells[row, column] for column in names)) for row in names]
     caption = f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column"
     cost: list[Block] = [
         Figure((), "comparison"),
@@ -264,32 +249,25 @@ def transfer_blocks(found: GroupComparison) -> list[Block]:
     return [
         Section("Do they differ?", [Items([pair.verdict for pair in found.pairs])]),
         Section("What a calibration costs elsewhere", cost),
-        *(Section(f"{pair.second} compared with {pair.first}", _pair_tables(pair), VERBOSE) for pair in found.pairs),
+        *map(_pair_section, found.pairs),
         Section("Logs", [Items(logs)], PAGE),
     ]
 
 
-def _pair_tables(pair: ComparedPair) -> list[Table]:
+def _pair_section(pair: ComparedPair) -> Section:
     """Return how parameters and held-out errors of two groups differ."""
-    rows = [
-        (one.quantity, *(f"{round(value, 3) + 0.0:+.3f}" for value in (one.first, one.second)),
-         with_std(one.difference, one.std, 3), "yes" if one.significant else "no, may be chance")
-        for one in pair.parameters
-    ]  # fmt: skip
-    head = ("quantity", pair.first, pair.second, "difference ± std", "significant")
-    errors = [
-        (
-            f"{one.horizon_m:g} m", with_interval(one.p95_m, one.p95_low_m, one.p95_high_m),
-            with_interval(one.expected_m, one.expected_low_m, one.expected_high_m),
-        )
-        for one in pair.errors if one.p95_m is not None and one.expected_m is not None
-    ]  # fmt: skip
+    rows, errors = [], []
+    for one in pair.parameters:
+        values = (f"{round(value, 3) + 0.0:+.3f}" for value in (one.first, one.second))
+        significant = "yes" if one.significant else "no, may be chance"
+        rows.append((one.quantity, *values, with_std(one.difference, one.std, 3), significant))
+    for row in pair.errors:
+        if row.p95_m is not None and row.expected_m is not None:
+            p95 = with_interval(row.p95_m, row.p95_low_m, row.p95_high_m)
+            expected = with_interval(row.expected_m, row.expected_low_m, row.expected_high_m)
+            errors.append((f"{row.horizon_m:g} m", p95, expected))
     route = ", the same route" if any(one.paired for one in pair.errors) else ""
     caption = f"Error of a fit to other trials, {pair.second} minus {pair.first}{route}, with its 95 % interval"
-    return [Table("lrrrl", rows, head), Table("lr", errors, ("after", "95 %", "expected"), caption)]
-
-
-def _errors(cell: TransferCell | None) -> str:
-    if cell is None or cell.p95_m is None or cell.expected_m is None:
-        return "-"
-    return f"{cell.p95_m:.2f} / {cell.expected_m:.2f}"
+    head = ("quantity", pair.first, pair.second, "difference ± std", "significant")
+    tables = [Table("lrrrl", rows, head), Table("lr", errors, ("after", "95 %", "expected"), caption)]
+    return Section(f"{pair.second} compared with {pair.first}", tables, VERBOSE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import product
 
 import numpy as np
 
@@ -229,19 +230,19 @@ def baseline_sections(report: DropoutReport) -> Iterator[Section]:
     baseline = report.baseline
     if baseline is None:
         return
-    shown, same, rows = shown_horizons(report.horizons_m), baseline.is_of(report.run_document), []
-    for result in report.results:
-        for label, metric in (("95 %", "p95"), ("expected", "expected")):
-            cells, name = [], METRICS[metric]
-            column = result.column(name)
-            for h in shown:
-                row, theirs = baseline.at(result.name, float(report.horizons_m[h]))
-                difference = float(column[h]) - (math.nan if row is None else column_of([row], name)[0])
-                sums = result.block_sums[h] if result.block_sums else None
-                half = difference_half_width(sums, theirs, metric, 1.0, paired=same)
-                interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
-                cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
-            rows.append([f"{result.label}, {label}", *cells])
-    table = Table("lr", rows, ("difference to the baseline", *(f"{report.horizons_m[h]:g} m" for h in shown)))
+    same, rows = baseline.is_of(report.run_document), []
+    shown = [(h, float(report.horizons_m[h])) for h in shown_horizons(report.horizons_m)]
+    for result, (label, metric) in product(report.results, (("95 %", "p95"), ("expected", "expected"))):
+        cells, name = [], METRICS[metric]
+        for h, horizon_m in shown:
+            row, theirs = baseline.at(result.name, horizon_m)
+            before = math.nan if row is None else column_of([row], name)[0]
+            difference = float(result.column(name)[h]) - before
+            sums = result.block_sums[h] if result.block_sums else None
+            half = difference_half_width(sums, theirs, metric, 1.0, paired=same)
+            interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
+            cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
+        rows.append([f"{result.label}, {label}", *cells])
+    table = Table("lr", rows, ("difference to the baseline", *(f"{horizon_m:g} m" for _, horizon_m in shown)))
     title = f"Against the baseline ({baseline.log}, icrtool {baseline.tool_version})"
     yield Section(title, [table, Items(baseline.changes(report.run_document))], VERBOSE)

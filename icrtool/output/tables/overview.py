@@ -10,13 +10,13 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import IcrToolError
-from icrtool.logs.read_log import SurveyDocument, SurveyedSource, SurveyedTopic
+from icrtool.logs.read_log import SurveyDocument, SurveyedTopic
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.output.tables.run import Row, excitation_check, gravest, next_line
 from icrtool.output.text_blocks import VERBOSE, Block, Facts, Section, Table
 from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
-from icrtool.records.samples import ROLE_WORDS, StreamChoice
+from icrtool.records.samples import ROLE_WORDS
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
 
@@ -30,15 +30,24 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
     if not stamps:
         return []
     begin, end = min(int(column[0]) for column in stamps), max(int(column[-1]) for column in stamps)
+    date = "at an unknown date (its stamps do not count from 1970)"
     if begin >= OLDEST_DATE_NS:
         date = datetime.fromtimestamp(begin / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    else:
-        date = "at an unknown date (its stamps do not count from 1970)"
     rows = [("recorded", f"{date}, {duration_text((end - begin) / 1e9)}")]
     if run is not None:
         drive = run.document.drive
         rows.append(("driven", f"{driven_text(drive)}, {drive.speed_mean_mps:.2f} m/s on average"))
-    return rows + _extent_rows(log)
+    fixes, datum = log.gnss, log.datum
+    sound = np.isfinite(fixes.north_m) & np.isfinite(fixes.east_m)
+    if sound.any():
+        # Outliers are left out.
+        ends = (np.percentile(column[sound], (0.1, 99.9)) for column in (fixes.east_m, fixes.north_m))
+        east_m, north_m = (highest - lowest for lowest, highest in ends)
+        where = " (metric positions)"
+        if datum is not None:
+            where = f" about {datum.latitude_deg:.5f}°, {datum.longitude_deg:.5f}°"
+        rows.append(("area", f"{east_m:.1f} m east-west x {north_m:.1f} m north-south{where}"))
+    return rows
 
 
 def info_blocks(
@@ -55,7 +64,15 @@ def info_blocks(
     command : to run next
     """
     decision, good = verdict(run, problem, names), run is not None and run.usable
-    rows = [*_holds_rows(names[0], survey, log), *(overview_rows(log, run) if log is not None else [])]
+    rows: list[Row] = []
+    if survey is not None:
+        size = sum(file.bytes for file in survey.inputs)
+        topics, files = counted(len(survey.topics), "topic"), counted(len(survey.inputs), "file")
+        rows.append(("log", f"{names[0]}: {topics}, {size / 1e6:.3g} MB in {files}"))
+        rows += [("read", survey.transfer)] if survey.transfer else []
+    elif log is not None:
+        rows.append(("log", f"{log.name}: table"))
+    rows += overview_rows(log, run) if log is not None else []
     if run is not None:
         # Its advice is among the warnings.
         _, what, text, more = excitation_check(run.document)
@@ -72,17 +89,6 @@ def info_blocks(
     answer = Section("", [], lead=decision, label="verdict", grade="good" if good else "bad")
     last: list[Block] = [next_line(command)] if command is not None else []
     return [answer, Facts(rows), *last, *_survey_sections(names[1], survey, log)]
-
-
-def _holds_rows(name: str, survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Row]:
-    if survey is not None:
-        size = sum(file.bytes for file in survey.inputs)
-        topics, files = counted(len(survey.topics), "topic"), counted(len(survey.inputs), "file")
-        yield "log", f"{name}: {topics}, {size / 1e6:.3g} MB in {files}"
-        if survey.transfer:
-            yield "read", survey.transfer
-    elif log is not None:
-        yield "log", f"{log.name}: table"
 
 
 def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Row]:
@@ -121,7 +127,12 @@ def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | N
         yield Section(f"Topics of {path}", [Table("l", rows)], VERBOSE)
     for role, word in ROLE_WORDS.items():
         stream, sources = chosen.get(role), survey.candidates[role] if survey is not None else ()
-        blocks = [_source_text(one, stream) for one in sources] or ["  no candidate"] * (survey is not None)
+        blocks = ["  no candidate"] if survey is not None and not sources else []
+        for one in sources:
+            is_used = stream is not None and one.topic == stream.topic
+            refused = "used although unsuitable, because it is configured" if is_used else "cannot be used"
+            found = f"{refused}: {one.problem}" if one.problem else one.why
+            blocks.append(f"  {'*' if is_used else '-'} {one.topic} ({one.message_type}; {one.stamps}): {found}")
         if stream is not None:
             jitter = f", jitter {stream.jitter_ms:.3g} ms" if stream.jitter_ms is not None else ""
             blocks += [f"  -> {stream.topic}: {stream.why}"]
@@ -150,14 +161,6 @@ def _topic_text(one: SurveyedTopic) -> str:
     return ", ".join([*parts, f"{one.unreadable} unreadable"] if one.unreadable else parts)
 
 
-def _source_text(one: SurveyedSource, used: StreamChoice | None) -> str:
-    """Return a candidate, whether it is the one that is used, and why or why not."""
-    is_used = used is not None and one.topic == used.topic
-    refused = "used although unsuitable, because it is configured" if is_used else "cannot be used"
-    verdict = f"{refused}: {one.problem}" if one.problem else one.why
-    return f"  {'*' if is_used else '-'} {one.topic} ({one.message_type}; {one.stamps}): {verdict}"
-
-
 def verdict(run: Run | None, problem: IcrToolError | None, names: Sequence[str]) -> str:
     """Return in a sentence whether a log, of these names, can be fitted and used, and whether it shows the ICRs."""
     if run is None:
@@ -175,16 +178,3 @@ def next_command(log: str, options: Sequence[str], run: Run | None) -> str | Non
     cut = "--from" in options or "--to" in options
     command = "fit" if cut else "dropout-report"
     return shlex.join(["icrtool", command, log, *options])
-
-
-def _extent_rows(log: RobotLog) -> list[Row]:
-    """Return the size of the area of the positions, outliers left out, and where it is."""
-    fixes, datum = log.gnss, log.datum
-    sound = np.isfinite(fixes.north_m) & np.isfinite(fixes.east_m)
-    if not sound.any():
-        return []
-    sizes = [np.subtract(*np.percentile(column[sound], (99.9, 0.1))) for column in (fixes.east_m, fixes.north_m)]
-    where = (
-        f" about {datum.latitude_deg:.5f}°, {datum.longitude_deg:.5f}°" if datum is not None else " (metric positions)"
-    )
-    return [("area", f"{sizes[0]:.1f} m east-west x {sizes[1]:.1f} m north-south{where}")]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from icrtool.output.figures.fleet import FleetNumbers, fleet_errors, fleet_icrs
+from icrtool.output.figures.calibrations import FleetNumbers, fleet_errors, fleet_icrs
 from icrtool.output.figures.style import drawable, new_figure, picture_bytes, save, style
 from icrtool.records.fleet_document import FleetLog
 

@@ -22,8 +22,7 @@ from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import trial_ends
 from icrtool.output.exports.foxglove import BODIES, ERROR_HORIZON_M, WORLD, foxglove_layout, write_foxglove
-from icrtool.output.exports.maps import GX, KML, format_geojson, format_kml
-from icrtool.output.exports.paths import format_trajectory, paths_of
+from icrtool.output.exports.paths import GX, KML, format_geojson, format_kml, format_trajectory, paths_of
 from icrtool.records.run import Run, track_of
 from support.barn import BAD_FIXES, OUTAGE_S
 from support.documents import with_summary

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from icrtool.cli.printing import show
-from icrtool.output.tables.calibration import setting_blocks
+from icrtool.output.tables.calibration import calibration_blocks
 from icrtool.output.text_blocks import TEXT_WIDTH, Facts, Line, Table, format_blocks
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, SensorDocument, SensorDrive
 
@@ -36,7 +36,7 @@ def test_settings_to_copy_are_words_that_a_shell_joins_and_a_terminal_holds() ->
         schema=CALIBRATION_SCHEMA, log="log", inputs=(), windows=1, independent_stretches=1, window_miss_m=0.1,
         drive=SensorDrive(*[0.0] * len(SensorDrive.__struct_fields__)), settings=settings, alignment={}, parameters={},
     )  # fmt: skip
-    text = format_blocks(setting_blocks(log), verbose=False)
+    text = format_blocks(calibration_blocks(None, log), verbose=False)
     assert max(map(len, text.splitlines())) <= 80
     script = f"printf '%s\\n' {text.partition(':')[2].strip()}"
     options = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True).stdout.splitlines()

@@ -21,8 +21,8 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.page.drive_data import packed, packed_levels, packed_sums
+from icrtool.output.page.pages import draw_pictures, run_page, write_page
 from icrtool.output.page.render import pictures_of
-from icrtool.output.page.run_page import draw_pictures, run_page, write_page
 from icrtool.output.tables.dropout import reach_rows, report_blocks
 from icrtool.output.text_blocks import format_blocks
 from icrtool.records.measurements import ReferenceJump

@@ -1,0 +1,383 @@
+"""The pages: ``report.html`` of a run, of a batch, whose table leads to those of its logs, and of a comparison."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+import msgspec
+
+from icrtool.dropout_analysis.report import DropoutReport
+from icrtool.dropout_analysis.starts import with_smoothed_reference
+from icrtool.errors import RunError
+from icrtool.motion.models import FAMILY
+from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
+from icrtool.output.files.atomic import is_page, write_file
+from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
+from icrtool.output.page.drive_data import ERROR_KEYS, drive_data
+from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
+from icrtool.output.run_directory import PAGE_FILE, check_sum
+from icrtool.output.tables.calibration import transfer_blocks
+from icrtool.output.tables.dropout import answer_sections, model_sections, outage_blocks, verdict_lines, worst_section
+from icrtool.output.tables.errors import errors_section, main_rows
+from icrtool.output.tables.run import advice_blocks, log_sections, unusable_lines
+from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Section, Table, Title
+from icrtool.output.text_format import (
+    MODEL_WORDS,
+    driven_text,
+    duration_text,
+    error_text,
+    position_word,
+    run_title,
+    signed,
+)
+from icrtool.records.calibration_document import GroupComparison
+from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument, TrialDocument
+from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
+from icrtool.records.places import is_regular
+from icrtool.records.run import ICR_WORDS, Run, check_type
+from icrtool.records.run_document import EventDocument, RunDocument
+from icrtool.records.text import counted, distance_text
+
+VENDOR = ("vendor/uPlot.iife.min.js", "vendor/d3.min.js")
+SCRIPTS = (*VENDOR, "columns.js", "open_loop.js", "charts.js", "map.js", "run.js")
+
+
+def write_page(
+    run: Run, report: DropoutReport, path: str | Path, *, plots: Path | None = None, coordinates: bool = True,
+    inside: Path | None = None,
+) -> None:  # fmt: skip
+    """Write a run and its dropout report as one HTML file.
+
+    Parameters
+    ----------
+    run : of `icrtool.fit` or `icrtool.open_run`
+    report : of `icrtool.dropout_report`
+    path : the file
+    plots : directory of the run, whose PNG pictures the page shows where no script draws; default: that of `run`
+    coordinates : False leaves out where on the globe the robot was
+    inside : as in `icrtool.output.files.atomic.atomic_file`
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    check_type(run, Run, "icrtool.open_run(directory) reads one")
+    pictures = pictures_of_run(plots if plots is not None else run.directory)
+    page = run_page(run, report.document, pictures, coordinates=coordinates)
+    write_file(Path(path), page, inside, ours=is_page if inside is not None else None)
+
+
+def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture], *, coordinates: bool = True) -> str:
+    """Return the page of a run as HTML.
+
+    Parameters
+    ----------
+    run, coordinates : as in `write_page`
+    report : what report.json holds
+    pictures : by name; those that the page is to show where no script draws
+    """
+    if not coordinates:
+        # Coordinates relative to a datum that is left out show no place.
+        metric = run.document.gnss.datum is None
+        pictures = {name: one for name, one in pictures.items() if not (metric and one.with_place)}
+        run, report = without_place(run, report)
+    summary = run.document
+    compared = with_smoothed_reference(run) if report.smoothed else run
+    begun = f"{datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    place, datum = "left out", summary.gnss.datum
+    if coordinates:
+        place = "metric reference, no datum"
+        if datum is not None:
+            place = f"datum {datum[0]:.6f}° {datum[1]:.6f}°, {datum[2]:.1f} m"
+    made = (
+        f"icrtool {summary.tool_version}, {summary.schema}, {report.schema}; {report.starts:,} states; "
+        f"intervals by {report.bootstrap.method}"
+    )
+    provenance = [("log", f"{one.path}: {one.bytes:,} bytes, sha256 {one.sha256}") for one in summary.inputs]
+    made_from = Section("Provenance", [Facts([*provenance, ("place", place), ("made with", made)])], PAGE)
+    about = (
+        "From this drive icrtool learned how the robot slips when it turns, and then tested how far wheel speeds alone "
+        "keep its position."
+    )
+    blocks = [
+        Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {about}"),
+        *page_blocks(summary, report),
+        Section("Log and settings", [*log_sections(summary), made_from], name="log"),
+        Section("Words on this page", [Figure((), "words")], name="words"),
+    ]
+    return render(
+        SCRIPTS, drive_data(compared, report, coordinates=coordinates), title=summary.log,
+        kind="Drive without GNSS: report of one log", blocks=blocks, pictures=pictures,
+        position_word=position_word(summary), duration_s=summary.drive.duration_s,
+        folded_models=len(report.models) - len(main_rows(report)),
+    )  # fmt: skip
+
+
+def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
+    """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
+    drive: list[Block] = [Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive")]
+    if events := summary.events:
+        rows = []
+        for one in events:
+            times = duration_text(one.begin_s), duration_text(one.end_s - one.begin_s)
+            rows.append((one.kind, *times, distance_text(one.distance_m), f"{100 * one.severity:.0f} %"))
+        head = ("kind", "from", "lasts", "distance", "missing motion")
+        caption = "Slip events: the robot did not move as its wheels did"
+        table = Table("lr", rows, head, caption, [one.begin_s for one in events])
+        drive.append(Section("", [table], PAGE))
+    drive += [*outage_blocks(report), Figure(("icr_clusters", "outages"))]
+    warnings = [one.removeprefix(f"{summary.log}: ") for one in summary.warnings]
+    return [
+        *unusable_lines(summary), *advice_blocks(summary),
+        Section("Answer", answer_sections(summary, report), name="answer"),
+        Section("The drive", drive, name="drive"),
+        errors_section(report, summary), worst_section(summary, report), *model_sections(report),
+        *([Section("Acceptance limits", verdict_lines(report), name="limits")] if report.gates else []),
+        Section("Warnings", [Items(warnings) if warnings else "None."], PAGE, name="warnings"),
+    ]  # fmt: skip
+
+
+def read_report(directory: Path) -> DropoutDocument | None:
+    """Return what the report.json of a run directory holds; None where it has none.
+
+    Raises
+    ------
+    RunError
+        It is not a report of this version, or was edited.
+    """
+    name = f"{DROPOUT_DIRECTORY}/{REPORT_FILE}"
+    file = directory / name
+    if not os.path.lexists(file):
+        return None
+    if name in (sums := _listed(directory)):
+        check_sum(directory, name, sums)
+    if schema_of(file, directory) != DROPOUT_SCHEMA:
+        raise RunError(file, f"is no report of schema {DROPOUT_SCHEMA}", "make it again with icrtool dropout-report")
+    try:
+        return read_document(file, DropoutDocument, directory)
+    except (ValueError, RecursionError) as err:
+        why = f"is not as this version of icrtool writes it ({err})"
+        raise RunError(file, why, "make it again with icrtool dropout-report") from err
+
+
+def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
+    """Return the pictures in a run's directory and in that of its dropout report."""
+    if directory is None:
+        return {}
+    sums = _listed(directory)
+    places = (directory / "plots", directory / DROPOUT_DIRECTORY / "plots")
+    return {name: one for place in places for name, one in pictures_in(place, directory, sums).items()}
+
+
+def _listed(directory: Path) -> dict[str, str]:
+    """Return the sums of the files of a run; none where it has no list of them."""
+    return read_sums(directory) if os.path.lexists(directory / CHECKSUM_FILE) else {}
+
+
+def draw_pictures(run: Run) -> dict[str, Picture]:
+    """Draw the pictures of a run anew, into memory."""
+    from icrtool.output.figure_catalogue import figures_of
+
+    return drawn_pictures(figures_of("run", run))
+
+
+Placed = TypeVar("Placed", EventDocument, TrialDocument)
+
+
+def without_place(run: Run, report: DropoutDocument) -> tuple[Run, DropoutDocument]:
+    """Return a run and what report.json holds of it, with the first state as origin and without the datum.
+
+    Notes
+    -----
+    Where a position reference is metric its coordinates may be those of a map grid, so the origin moves there too.
+    Magnetic declination and grid convergence narrow the place down, and are left out with their name.
+    """
+    table, sensors, document, changed = run.table, run.sensors, run.document, msgspec.structs.replace
+    north, east = float(table.north_m[0]), float(table.east_m[0])
+
+    def moved(one: Placed) -> Placed:
+        return changed(one, north_m=one.north_m - north, east_m=one.east_m - east)
+
+    cause, datum = document.heading.offset_name, document.gnss.datum
+    shown = changed(
+        document,
+        config=replace(document.config, frames=replace(document.config.frames, datum=None)),
+        warnings=tuple(one.replace(cause, "its cause is left out") if cause else one for one in document.warnings),
+        gnss=changed(document.gnss, datum=None if datum is None else (math.nan, math.nan, math.nan)),
+        heading=changed(document.heading, offset_name=None, magnetic_declination_deg=None, utm_convergence_deg=None),
+        events=tuple(map(moved, document.events)),
+    )
+    fixes = replace(sensors.fixes, north_m=sensors.fixes.north_m - north, east_m=sensors.fixes.east_m - east)
+    events = (one._replace(north_m=one.north_m - north, east_m=one.east_m - east) for one in sensors.events)
+    at_origin = replace(
+        run,
+        table=replace(table, north_m=table.north_m - north, east_m=table.east_m - east),
+        sensors=replace(sensors, fixes=fixes, events=tuple(events)),
+        document=shown,
+    )
+    worst, examples = tuple(map(moved, report.worst)), tuple(map(moved, report.examples))
+    return at_origin, changed(report, worst=worst, examples=examples)
+
+
+def fleet_page(document: FleetDocument, folder: Path) -> str:
+    """Return the page of a fleet as HTML.
+
+    Parameters
+    ----------
+    folder : of the batch; pages of logs that are there are linked
+    """
+    logs, title, counts = document.logs, folder.absolute().name, document.counts
+    unusable = sum(log.status == "done" and not log.usable for log in logs)
+    skipped = f" ({counts.skipped} of them before, skipped this time)" if counts.skipped else ""
+    found = [f"{counts.done - unusable} can be used", f"{unusable} cannot", f"{counts.failed} failed{skipped}"]
+    found += [f"acceptance limits not met: {document.gates_failed}"] if document.gates_failed else []
+    about = f"{len(logs)} logs: {', '.join(found)}. Made with icrtool {document.tool_version}."
+    blocks: list[Block] = [Title(title, about)]
+    if document.calibrations:
+        table = _robots_table(document.calibrations)
+        blocks.append(Section("The robot, from all logs together", [table], name="robots"))
+    blocks.append(Section("Logs", [_logs_table(logs, folder)], name="logs"))
+    # Reasons without what is particular to a log: the first part of ``why; advice``.
+    reasons = Counter(log.reason.split(";")[0].split(" (tried")[0] for log in logs if log.status == "failed")
+    if reasons:
+        table = Table("lr", [(reason, f"{count}") for reason, count in reasons.most_common()], ("reason", "logs"))
+        blocks.append(Section("Why logs failed", [table], name="failed"))
+    if pictures := pictures_in(folder / "plots", folder):
+        blocks.append(Section("All logs together", [Figure(tuple(pictures), folded=False)], name="pictures"))
+    kind = "Drive without GNSS: report of many logs"
+    return render(("fleet.js",), None, title=title, kind=kind, blocks=blocks, pictures=pictures)
+
+
+def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
+    """Return what each robot's logs teach together."""
+    grouped = any(one.group for one in calibrations)
+    rows: list[list[str | Cell]] = []
+    for one in calibrations:
+        numbers = [Cell(one.reason), Cell("")]
+        if one.multiplier is not None:
+            within = "–" if one.within_m is None else f"{'more than ' if one.within_beyond else ''}{one.within_m:.1f} m"
+            numbers = [Cell(f"{one.multiplier:.3f}", f"± {one.multiplier_std:.3f}"), Cell(within)]
+        icrs = ", ".join(map(signed, one.icrs_m))
+        more = [one.group] if grouped else []
+        rows.append([one.robot or "all logs", *numbers, *more, f"{len(one.logs)}", icrs, ", ".join(one.left_out)])
+    group = ("group",) if grouped else ()
+    head = ("robot", "multiplier", "within 0.5 m (95 %) for", *group, "logs", "ICRs right, left, x [m]", "left out")
+    return Table(f"lrr{'l' * grouped}rrl", rows, head, "Each log was predicted without itself")
+
+
+def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
+    """Return a line a log, which leads to its page; of one that failed the reason stands in place of its numbers."""
+    named = [key for key in ("robot", "group") if len({getattr(log, key) for log in logs} - {""}) > 1]
+    # Distances within a budget are those of the best model that some log has.
+    distances = dict.fromkeys(name for log in logs for name in log.errors if "_within_" in name)
+    by_model = ([name for name in distances if name.startswith(f"{model}_within_")] for model in MODEL_WORDS)
+    budgets = next(filter(None, by_model), [])
+    columns: dict[str, Cell] = {}
+    rows, search = [], []
+    for log in logs:
+        columns = _columns(log, budgets)
+        status = Cell("not usable", note=log.reason) if log.status == "done" and not log.usable else log.status
+        names = [getattr(log, key) for key in named]
+        page = PurePosixPath(log.run) / PAGE_FILE
+        # No link where it is not there, or would lead out of the folder.
+        link = "" if page.is_absolute() or not is_regular(folder / page, folder) else f"./{quote(str(page))}"
+        numbers = [log.reason] if log.status == "failed" else columns.values()
+        rows.append([Cell(log.log, link=link), status, *names, *numbers])
+        words = (log.log, log.status, log.robot, log.group, log.reason, *log.tags)
+        chosen = {key: getattr(log, key) for key in ("status", "robot", "group")}
+        search.append({"words": " ".join(words).casefold()} | chosen)
+    caption = (
+        f"One line a log; its name opens its page. Errors: 95 % of the trials of {CHOICE_HORIZON_M:g} m stay below."
+    )
+    head = ("log", "status", *named, *columns)
+    return Table(f"ll{'l' * len(named)}r", rows, head, caption, search=search)
+
+
+def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
+    """Return what the table shows of a log, by the name of its column; `budgets`: error names of distances."""
+    columns = {}
+    for name in budgets:
+        bound, budget = "> " if name in log.bounds else "", name.rpartition("_within_")[2].removesuffix("m_m")
+        columns[f"within {budget} m for"] = _cell(log.errors.get(name), f"{bound}{{:.1f}} m".format)
+    for model, label in MODEL_WORDS.items():
+        columns[f"error, {label}"] = _cell(log.errors.get(f"{model}_p95_{CHOICE_HORIZON_M:g}m_m"), error_text)
+    columns["multiplier"] = _with_std(log.multiplier, log.multiplier_std, "")
+    for name, word in ICR_WORDS.items():
+        columns[f"ICR {word}"] = _with_std(log.icr.get(name), log.icr.get(f"std_{name}"), "+")
+    return columns | {
+        "distance": _cell(log.distance_m, distance_text),
+        "duration": _cell(log.duration_s, duration_text),
+        "start": Cell(log.start_utc.replace("T", " ").removesuffix("Z"), order=log.start_utc),
+        "events": _cell(log.events, str),
+        "warnings": _cell(log.warnings, str),
+        "limits not met": _cell(log.gates_failed, str),
+    }
+
+
+def _cell(value: float | None, text: Callable[[Any], str]) -> Cell:
+    """Return a number of a log; what is not known stands last, whatever the order."""
+    return Cell("", order="") if value is None else Cell(text(value), order=value)
+
+
+def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
+    spread = f" ± {std:.3f}" if std is not None else ""
+    return _cell(value, lambda number: f"{number:{sign}.3f}{spread}".replace("-", "−"))
+
+
+COMPARISON_FAMILY = "icrtool/compare/"
+
+
+def comparison_page(found: GroupComparison, title: str) -> str:
+    """Return the page of a comparison as HTML."""
+    from icrtool.output.figures.calibrations import transfer
+
+    names, labels = list(found.groups), {name: model.label for name, model in FAMILY.items()}
+    groups = "; ".join(
+        f"{name}: {counted(len(one.logs), 'log')}, model {labels.get(one.model, one.model)}"
+        for name, one in found.groups.items()
+    )
+    # The errors in the runs of each group over distance, by the group of the calibration.
+    by_group: list[dict[str, object]] = []
+    for tested_on in names:
+        rows = {(one.calibrated_on, one.horizon_m): one for one in found.transfer if one.tested_on == tested_on}
+        horizons = sorted({horizon_m for _, horizon_m in rows})
+        models = [
+            {"name": f"of {name}", "label": f"calibration of {name}{' (held out)' if name == tested_on else ''}"}
+            | {key: [getattr(rows.get((name, h)), f"{key}_m", None) for h in horizons] for key in ERROR_KEYS}
+            for name in names
+        ]
+        by_group.append({"horizons_m": horizons, "models": models, "reference": {"p95": [], "expected": []}})
+    return render(
+        (*VENDOR, "columns.js", "charts.js", "comparison.js"), {"by_group": by_group}, title=title,
+        kind="Drive without GNSS: groups of runs compared",
+        blocks=[Title(f"{', '.join(names)} ({title})", groups), *transfer_blocks(found)],
+        names=names, pictures=drawn_pictures([("transfer", transfer(found))]),
+    )  # fmt: skip
+
+
+def read_comparison(file: Path, inside: Path | None = None) -> GroupComparison:
+    """Return what ``icrtool compare -o`` wrote.
+
+    Raises
+    ------
+    OSError, ValueError, RecursionError
+        It cannot be read, or is not of this version.
+    """
+    return read_document(file, GroupComparison, inside)
+
+
+def comparison_in(place: Path) -> Path | None:
+    """Return the file of a comparison: `place` itself, or the one in that folder; None where there is none."""
+    inside = place if place.is_dir() else None
+    files = [place] if inside is None else sorted(place.glob("*.json"))
+    return next((file for file in files if schema_of(file, inside).startswith(COMPARISON_FAMILY)), None)
