@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 
 from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventions, senses_by_distance
+from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.log_track import cut_windows, track_of_log
 from icrtool.kernels.track import Track
-from support.exact_drives import simulate
+from icrtool.records.samples import GyroSamples
+from support.exact_drives import CONFIG, simulate
 
 
 def spoilt(track: Track, one: Convention) -> Track:
@@ -83,6 +86,24 @@ def test_a_mirrored_pose_is_likelier_than_swapped_sides(track: Track) -> None:
     found = decide_conventions(cut_windows(spoilt(track, one)._replace(same_clock=True)), metric=True)
     assert found.convention == one
     assert found.as_likely == AS_NAMED._replace(swapped=True)
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_a_gyro_tells_swapped_sides_from_a_mirrored_pose(sense: int) -> None:
+    """One explains the log as well as the other; a gyro turns as the pose does, or in the opposite sense."""
+    log = simulate(3, lever=(0.0, 0.0), offset_deg=0.0, scales=(1.0, 1.0), seconds=120.0)
+    t, heading = log.heading.stamp_ns / 1e9, np.unwrap(log.heading.heading_rad)
+    every = slice(None, None, 20)
+    gyro = GyroSamples("/imu", log.heading.stamp_ns[every], sense * np.gradient(heading[every], t[every]))
+    spoilt_log = replace(
+        log,
+        wheels=replace(log.wheels, left=log.wheels.right, right=log.wheels.left),
+        streams=tuple(replace(one, topic="/pose") for one in log.streams),
+        gyro=gyro,
+    )
+    found = align_streams(spoilt_log, CONFIG)
+    assert found.heading.applied_mirror == (sense < 0)
+    assert any("wheels are swapped" in warning for warning in found.warnings) == (sense > 0)
 
 
 def test_geodetic_positions_are_never_mirrored(track: Track) -> None:
