@@ -259,17 +259,16 @@ def check_streams(log: RobotLog) -> None:
         if len(stamps) < 2:
             raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
         back = stamps < np.append(stamps[:1], stamps[:-1])
-        if back.any():
-            raise DataError(log.name, f"the {what} stamps go back at row {back.argmax()}", "sort the rows by stamp")
         bad = ~np.logical_and.reduce(np.isfinite(values))
-        if bad.any():
-            count = np.count_nonzero(bad)
-            text = f"{count} {what} samples are not finite numbers, the first at row {bad.argmax()}"
-            raise DataError(log.name, text, "leave those rows out")
         negative = np.logical_or.reduce([np.zeros(len(stamps), np.bool_), *(one < 0 for one in variances)])
-        if negative.any():
-            text = f"a {what} variance is negative, the first at row {negative.argmax()}"
-            raise DataError(log.name, text, "NaN stands for unknown")
+        count = np.count_nonzero(bad)
+        for rows, fault, advice in (
+            (back, f"the {what} stamps go back at row", "sort the rows by stamp"),
+            (bad, f"{count} {what} samples are not finite numbers, the first at row", "leave those rows out"),
+            (negative, f"a {what} variance is negative, the first at row", "NaN stands for unknown"),
+        ):
+            if rows.any():
+                raise DataError(log.name, f"{fault} {rows.argmax()}", advice)
     fastest, farthest = np.abs([wheels.left, wheels.right]).max(), np.abs([gnss.north_m, gnss.east_m]).max()
     if fastest >= IMPOSSIBLE_MPS:
         raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")

@@ -279,39 +279,34 @@ def gyro_rate(track: Track, gyro: GyroAxes, epoch_ns: int) -> tuple[TurnRate, st
         return None
     angles = [trapezoids(t, rate) for rate in gyro.rates_radps.T]
     turned = np.column_stack([np.interp(end, t, angle) - np.interp(begin, t, angle) for angle in angles])
-    axis, name = _vertical_axis(turned, end - begin, change)
+    small = np.abs(turned).max(axis=1) < LARGEST_CHANGE_RAD
+    # the downward vertical in the sensor
+    axis, name = np.array([0.0, 0.0, -1.0]), "z up"
+    if np.count_nonzero(small) >= 6:
+        axis, name = _vertical_axis(turned[small], (end - begin)[small], change[small], axis)
     return _bridged(t, gyro.rates_radps @ axis, track), name
 
 
-def _vertical_axis(turned: Floats, seconds: Floats, change: Floats) -> tuple[Floats, str]:
+def _vertical_axis(turned: Floats, seconds: Floats, change: Floats, up: Floats) -> tuple[Floats, str]:
     """Return the direction of the downward vertical in the sensor (3,), and its name.
 
     Parameters
     ----------
     turned : (m, 3) turn about each axis; seconds : (m,) over which; change : (m,) of the course over ground [rad]
+    up : (3,) that of a sensor whose z axis points up
     """
-    up = np.array([0.0, 0.0, -1.0])
-    small = np.abs(turned).max(axis=1) < LARGEST_CHANGE_RAD
-    columns, y = np.column_stack([turned, seconds])[small], change[small]
-    if len(y) < 6:
-        return up, "z up"
-    found = robust_regression(columns, y, AXIS_PRIOR_STD).x
-    bias = found[3] * columns[:, 3]
+    found = robust_regression(np.column_stack([turned, seconds]), change, AXIS_PRIOR_STD).x
     size = float(np.linalg.norm(found[:3]))
     if size <= LEAST_AXIS:
         return up, "z up"
-    axis = found[:3] / size
+    axis, name = found[:3] / size, "tilted"
     main = int(np.argmax(np.abs(axis)))
-    name = "tilted"
     if abs(axis[main]) > ALONG_AN_AXIS:
         axis = np.sign(axis[main]) * np.eye(3)[main]
         name = f"{'xyz'[main]} {'down' if axis[main] > 0 else 'up'}"
-    scatter = [float(np.abs(_wrapped(y - bias - columns[:, :3] @ one)).mean()) for one in (axis, up)]
+    left = change[:, None] - found[3] * seconds[:, None] - turned @ np.column_stack([axis, up])
+    scatter = np.abs(np.angle(np.exp(1j * left))).mean(axis=0)
     return (axis, name) if scatter[0] < BETTER * scatter[1] else (up, "z up")
-
-
-def _wrapped(angle: Floats) -> Floats:
-    return np.asarray(np.angle(np.exp(1j * angle)), np.float64)
 
 
 def _bridged(t: Floats, rate: Floats, track: Track) -> TurnRate:

@@ -201,9 +201,14 @@ def _metres_per_unit(
         if counts is not None:
             known["counts"] = 2 * math.pi * radius / counts
     unit, per = wheels.unit, "" if wheels.from_position else "/s"
-    if unit == "rad" and unit in known and (other := _other_unit(wheels, gnss, known[unit])):
-        why = f"{topic} is read in {other}, not rad/s: the position reference goes as far as that"
-        return _factors(known[unit])[other], f" in {other} (by the position reference)", [why]
+    if unit == "rad" and radius is not None and not wheels.from_position:
+        scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
+        far = scale is not None and scale.value > 0.0 and abs(math.log(scale.value / radius)) >= 2 * UNIT_TOLERANCE
+        # the units in which drivers fill speeds of joints
+        for other, value in (("m/s", 1.0), ("rpm", 2 * math.pi * radius / 60), ("deg/s", math.radians(radius))):
+            if scale is not None and far and abs(math.log(scale.value / value)) < OTHER_UNIT_TOLERANCE:
+                why = f"{topic} is read in {other}, not rad/s: the position reference goes as far as that"
+                return value, f" in {other} (by the position reference)", [why]
     if unit in known:
         return known[unit], "" if unit == "m" else f" in {unit}{per}", []
     scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
@@ -224,27 +229,10 @@ def _metres_per_unit(
             f"needed to read {topic}, which is in {unit}",
             f"give it with --set {lacking}=…; the log has too little driving to estimate it",
         )
-    how = f"{_SCALE_WORDS.get(unit, 'travel of a unit of the wheels')} {_with_std(scale)} m"
-    how += " (estimated from the position reference)"
+    what = {"rad": "wheel radius", "counts": "travel of a count"}.get(unit, "travel of a unit of the wheels")
+    how = f"{what} {_with_std(scale)} m (estimated from the position reference)"
     why = f"{topic} names no unit, and none that is known fits" if unit == "unknown" else f"{lacking} is not given"
     return scale.value, f", {how}", [f"{why}: {how}"]
-
-
-def _other_unit(wheels: WheelSamples, gnss: PositionFixes, radius_m: float) -> str:
-    """Return the unit of speeds whose message type has rad/s, where another is right and rad/s far off; else empty."""
-    scale = None if wheels.from_position else reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
-    if scale is None or scale.value <= 0.0 or abs(math.log(scale.value / radius_m)) < 2 * UNIT_TOLERANCE:
-        return ""
-    factors = _factors(radius_m)
-    return next((name for name in factors if abs(math.log(scale.value / factors[name])) < OTHER_UNIT_TOLERANCE), "")
-
-
-def _factors(radius_m: float) -> dict[str, float]:
-    """Return metres per second of the units in which drivers fill speeds of joints."""
-    return {"m/s": 1.0, "rpm": 2 * math.pi * radius_m / 60, "deg/s": math.radians(radius_m)}
-
-
-_SCALE_WORDS: dict[WheelUnit, str] = {"rad": "wheel radius", "counts": "travel of a count"}
 
 
 def _with_std(scale: Scale) -> str:
