@@ -138,19 +138,17 @@ def decide_conventions(
     scale = min(mad_std(one.residuals, 0.0) for one in shown.values())
     scale = max(scale, 0.5 * track.place_std_m / windows.length_m)
     losses = {hand: soft_l1_loss(one.residuals / scale) / STARTS_A_WINDOW for hand, one in shown.items()}
-    costs: dict[Convention, tuple[float, float]] = {}
-    for swapped, left, right, heading, position in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1)):
-        if (position < 0 and not metric) or (heading < 0 and not mirror_allowed):
-            continue
-        one = Convention(swapped, left, right, heading, position)
-        cost, offset = _cost(one, shown[heading * position])
-        costs[one] = cost + losses[heading * position], offset
-    named = costs[AS_NAMED][0]
-    best = min(cost for cost, _ in costs.values())
-    if named - best < DECISIVE:
+    costs, offsets = dict[Convention, float](), dict[Convention, float]()
+    headings, positions = (1, -1) if mirror_allowed else (1,), (1, -1) if metric else (1,)
+    for one in map(Convention._make, product((False, True), (1, -1), (1, -1), headings, positions)):
+        hand = one.heading * one.position
+        cost, offsets[one] = _cost(one, shown[hand])
+        costs[one] = cost + losses[hand]
+    best = min(costs.values())
+    if costs[AS_NAMED] - best < DECISIVE:
         return Decision(AS_NAMED, None)
-    likely = {one: one.faults(offset, track, gyro_sense) for one, (cost, offset) in costs.items() if cost < best + TIE}
-    ranked = sorted(likely, key=lambda one: (likely[one], costs[one][0]))
+    likely = {one: one.faults(offsets[one], track, gyro_sense) for one in costs if costs[one] < best + TIE}
+    ranked = sorted(likely, key=lambda one: (likely[one], costs[one]))
     chosen = ranked[0]
     close = len(ranked) > 1 and likely[ranked[1]] <= likely[chosen] + 0.5
     return Decision(chosen, ranked[1] if close else None)
@@ -202,29 +200,26 @@ def _show(windows: DriveWindows, hand: int) -> _Shown:
 
 def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
     """Return the squared Mahalanobis distance of what was shown from what a convention expects, and its offset."""
-    # named sides -> true sides -> (v, u) of the true sides, as a matrix on (v, u) of the named ones
     sides = np.diag([float(one.sign_left), float(one.sign_right)])
     if one.swapped:
         sides = sides[::-1]
+    # (v, u) of the named sides by those of the true ones: p = Z (v, u)_named = Z back (v, u)_true
     halves = np.array([[0.5, 0.5], [0.5, -0.5]])
-    true_by_named = halves @ sides @ np.linalg.inv(halves)
-    back = np.linalg.inv(true_by_named)
-    # p = Z (v, u)_named = Z back (v, u)_true
+    back = 2.0 * halves @ sides.T @ halves
     lift = np.kron(back.T, np.eye(2))
-    z, covariance = lift @ shown.z, lift @ shown.z_covariance @ lift.T
-    size = max(math.hypot(z[0], z[1]), math.hypot(z[2], z[3]), 1e-9)
+    z = lift @ shown.z
     offset = math.atan2(z[1], z[0])
     c, s = math.cos(offset), math.sin(offset)
-    unturn = np.kron(np.eye(2), np.array([[c, s], [-s, c]])) / size
-    z, covariance = unturn @ z, unturn @ covariance @ unturn.T
-    away = z - np.array([1.0, 0.0, 0.0, 0.0])
-    cost = float(away @ np.linalg.solve(covariance + np.diag(EXPECTED_STD[:4] ** 2), away))
-    exchange = np.array([[back[1, 1], back[0, 1]], [back[1, 0], back[0, 0]]])
-    turn = exchange @ shown.turn * one.position
-    spread = exchange @ shown.turn_covariance @ exchange.T
-    size = max(float(np.abs(turn).max()), 1e-9)
-    away = turn / size - np.array([1.0, 0.0])
-    cost += float(away @ np.linalg.solve(spread / size**2 + np.diag(EXPECTED_STD[4:] ** 2), away))
+    place = np.kron(np.eye(2), [[c, s], [-s, c]]) @ lift / max(math.hypot(z[0], z[1]), math.hypot(z[2], z[3]), 1e-9)
+    turn = one.position * back.T[::-1, ::-1]
+    turn /= max(float(np.abs(turn @ shown.turn).max()), 1e-9)
+    cost = 0.0
+    for scaled, value, covariance, expected, std in (
+        (place, shown.z, shown.z_covariance, [1.0, 0.0, 0.0, 0.0], EXPECTED_STD[:4]),
+        (turn, shown.turn, shown.turn_covariance, [1.0, 0.0], EXPECTED_STD[4:]),
+    ):
+        away = scaled @ value - expected
+        cost += float(away @ np.linalg.solve(scaled @ covariance @ scaled.T + np.diag(std**2), away))
     return cost, math.remainder(offset * one.position, 2 * math.pi)
 
 
@@ -235,9 +230,9 @@ def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
     if one.swapped:
         notes.append(f"left and right wheels are swapped{done}")
     signs = (one.sign_left, one.sign_right)
-    reversed_ = {(-1, 1): "the left wheels count", (1, -1): "the right wheels count", (-1, -1): "both wheels count"}
+    reversed_ = {(-1, 1): "the left wheels", (1, -1): "the right wheels", (-1, -1): "both wheels"}
     if signs in reversed_:
-        notes.append(f"{reversed_[signs]} backwards{done}")
+        notes.append(f"{reversed_[signs]} count backwards{done}")
     if one.position < 0:
         notes.append(f"positions are mirrored (east for west){done}")
     if other is not None:
