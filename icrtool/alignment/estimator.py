@@ -124,7 +124,7 @@ class AlignmentFit(NamedTuple):
     ----------
     fit : the robust fit; covariance : of its parameters
     width_m : b that w was formed with
-    windows : that it was made of
+    windows : that it was made of; model : what it expects of them
     turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is that at this speed
     """
 
@@ -132,6 +132,7 @@ class AlignmentFit(NamedTuple):
     covariance: Floats
     width_m: float
     windows: DriveWindows
+    model: MotionOfWindows
     turning_speed_mps: float
 
     def estimate(self, name: str) -> tuple[float, float]:
@@ -177,7 +178,7 @@ class AlignmentFit(NamedTuple):
 
     def expected_motion(self) -> tuple[Complexes, Floats]:
         """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,), by this estimate."""
-        return _Model(self.windows, self.width_m).until_fixes(self.fit.x)
+        return self.model.until_fixes(self.fit.x)
 
     def geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs about the antenna, multiplier and side scales, and their covariance (6, 6)."""
@@ -196,10 +197,10 @@ class AlignmentFit(NamedTuple):
 
 def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
-    model, w = _Model(found.windows, found.width_m), len(found.windows.begin)
+    w = len(found.windows.begin)
     neutral = PRIOR_MEAN.copy()
     neutral[K] = found.fit.x[K]
-    before, after = (model.evaluate(x)[0] for x in (neutral, found.fit.x))
+    before, after = (found.model.evaluate(x)[0] for x in (neutral, found.fit.x))
     return ResidualsByEstimate(
         before[: 2 * w].reshape(2, w), after[: 2 * w].reshape(2, w), before[2 * w :], after[2 * w :],
         found.windows.turned,
@@ -226,7 +227,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     """
     if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return None
-    track, model = windows.track, _Model(windows, width_m)
+    track, model = windows.track, MotionOfWindows(windows, width_m)
     start = PRIOR_MEAN.copy()
     # the direction of the displacements from wheels laid along the heading
     laid = windows.over(track.laid)
@@ -260,10 +261,10 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
         covariance[D, D] += ATTITUDE_STD_RAD**2 * min(1.0, 2.0 * ATTITUDE_TIME_S / max(float(track.t[-1]), 1e-9))
     weight = track.held * model.u**2
     speed = float((weight * model.v).sum() / max(float(weight.sum()), 1e-12))
-    return AlignmentFit(fit, covariance, width_m, windows, speed)
+    return AlignmentFit(fit, covariance, width_m, windows, model, speed)
 
 
-class _Model:
+class MotionOfWindows:
     """Residuals of the windows and their Jacobian."""
 
     def __init__(self, windows: DriveWindows, width_m: float) -> None:

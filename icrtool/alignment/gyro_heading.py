@@ -20,7 +20,7 @@ import numpy as np
 
 from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS
 from icrtool.alignment.log_track import FEWEST_WINDOWS
-from icrtool.alignment.turn_rates import Guess, TurnRate, fit_middle, measure_courses
+from icrtool.alignment.turn_rates import Courses, Guess, TurnRate, fit_middle, measure_courses
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.heading_filter import (
     HeadingEvents,
@@ -145,24 +145,28 @@ def estimate_heading(
     absolute : further headings
     stands : whether the rate is zero while the wheels stand
     """
+    still = _standing(track, turn) if stands else (np.empty(0), np.empty(0))
     noises, guess = USUAL_NOISES, Guess(np.zeros(len(turn.t)), turn.bias_std, turn.scale_std)
-    problem = _Problem(track, turn, guess, (), stands=stands)
-    if problem.courses < FEWEST_WINDOWS:
-        return None
-    guess = problem.guess(noises)
-    for _ in range(ROUNDS):
-        problem = _Problem(track, turn, guess, (), stands=stands)
-        if problem.courses < FEWEST_WINDOWS:
+    attempt = 0
+    while True:
+        courses = measure_courses(track, turn, guess)
+        if len(courses.end) < FEWEST_WINDOWS:
             return None
-        # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
-        noises = problem.choose(NOISES, noises)
-        better = problem.guess(noises)
-        turned = float(np.abs(better.bias - guess.bias).max()) * problem.window_s
-        if turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S:
+        problem = _Problem(courses, still, turn, ())
+        if attempt:
+            # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
+            noises = problem.choose(NOISES, noises)
+        better = problem.guess(noises)._replace(middle=fit_middle(courses, guess))
+        turned = float(np.abs(better.bias - guess.bias).max() * np.median(courses.end - courses.begin))
+        settled = turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S and attempt > 0
+        guess = guess if settled else better
+        if settled or attempt == ROUNDS:
             break
-        guess = better
+        attempt += 1
     if absolute:
-        problem = _Problem(track, turn, guess, absolute, stands=stands)
+        if not settled:
+            courses = measure_courses(track, turn, guess)
+        problem = _Problem(courses, still, turn, absolute)
         grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
         noises = problem.choose(grids, noises)
     found = problem.solve(noises)
@@ -191,17 +195,10 @@ class _Problem:
     """The events of a log, in order, and what is not known of their noise."""
 
     def __init__(
-        self, track: Track, turn: TurnRate, guess: Guess, absolute: Sequence[AbsoluteHeading], *, stands: bool
+        self, courses: Courses, still: tuple[Floats, Floats], turn: TurnRate, absolute: Sequence[AbsoluteHeading]
     ) -> None:
-        """Measure the courses about a guess."""
         self.turn, self.absolute, self.G = turn, absolute, turn.integrated()
-        courses = measure_courses(track, turn, guess)
-        self.courses = len(courses.end)
-        if self.courses < FEWEST_WINDOWS:
-            return
-        self.middle = fit_middle(courses, guess)
-        self.window_s = float(np.median(courses.end - courses.begin))
-        still_t, still_rate = _standing(track, turn) if stands else (np.empty(0), np.empty(0))
+        still_t, still_rate = still
         t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
         # steps that measure nothing, between events far apart
         at = np.sort(t)
@@ -272,8 +269,7 @@ class _Problem:
         states, covariances = smooth_headings(events, model, filter_headings(events, model))
         bias = np.interp(self.turn.t, self.t, states[:, BIAS])
         bias_std, scale_std = np.sqrt(np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0))[[BIAS, SCALE]]
-        x, delay_s = float(states[-1, X]), float(states[-1, DELAY])
-        return Guess(bias, float(bias_std), float(scale_std), x, delay_s, self.middle)
+        return Guess(bias, float(bias_std), float(scale_std), float(states[-1, X]), float(states[-1, DELAY]))
 
     def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
         """Return the noises with those of the grids that have the largest likelihood, one after the other."""

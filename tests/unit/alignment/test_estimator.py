@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icrtool.alignment.estimator import AlignmentFit, _Model, estimate_alignment
+from icrtool.alignment.estimator import AlignmentFit, estimate_alignment
 from icrtool.alignment.log_track import cut_windows, track_of_log
 from support.exact_drives import ICRS, simulate
 
@@ -97,15 +97,14 @@ def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
 
 def test_the_jacobian_equals_differences() -> None:
     found = estimate(2, heading_std_deg=0.0)
-    model = _Model(found.windows, WIDTH_M)
     x = np.array([1.01, 0.02, -0.1, 0.02, 0.5, 0.01, 1e-3, 0.1, 0.03, -0.02, 0.04])
-    residuals, jacobian = model.evaluate(x)
+    residuals, jacobian = found.model.evaluate(x)
     for column, step in enumerate([1e-6] * 8 + [0.02, 0.02, 1e-6]):
         sides = []
         for sign in (1, -1):
             moved = x.copy()
             moved[column] += sign * step
-            sides.append(model.evaluate(moved)[0])
+            sides.append(found.model.evaluate(moved)[0])
         # the frame of a residual turns with the offset; delays are differentiated over a step, the same one here
         tolerance = {7: 1.1 * np.abs(residuals).max(), 8: 0.02, 9: 0.02}.get(column, 1e-6)
         assert np.allclose((sides[0] - sides[1]) / (2 * step), jacobian[:, column], atol=tolerance), column
