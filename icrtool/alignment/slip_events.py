@@ -15,9 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.reference_jumps import decide_jumps, without_jumps
-from icrtool.alignment.sensor_noise import MOVES_MPS
-from icrtool.alignment.slip_windows import (
+from icrtool.alignment.reference_motion import (
     FIRST_QUANTILE,
     LATER_QUANTILE,
     LEAST_DISTANCE2,
@@ -27,12 +25,15 @@ from icrtool.alignment.slip_windows import (
     Knots,
     Motion,
     compare,
+    decide_jumps,
     fit_motion,
     lay_knots,
     model_error,
     spans_of,
     window_durations,
+    without_jumps,
 )
+from icrtool.alignment.sensor_noise import MOVES_MPS
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.records.measurements import RESPONSE_S, ReferenceJump, SensorData, SlipEvent, SlipKind
 
@@ -110,7 +111,7 @@ def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
     does more than its wheels, which no slip can cause, are counted: where there are many, the others are not used
     (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
 
-    Steps from fix to fix that may be jumps (`icrtool.alignment.reference_jumps`) are in no window.
+    Steps from fix to fix that may be jumps (`icrtool.alignment.reference_motion`) are in no window.
     """
     # exact data, or intervals of very different lengths, may not separate the parameters of the motion
     with suppress(np.linalg.LinAlgError):
