@@ -148,12 +148,14 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
     lag, after = heading.value_s, apart.value_s
     # as stamped; both alike; the heading alone; the position alone; each by itself
     free = {(0.0, 0.0): 0, (lag, lag): 1, (lag, 0.0): 1, (0.0, after): 1, (lag, lag + after): 2}
-
-    def cost(delays: tuple[float, float]) -> float:
-        misfits = (lag - delays[0]) / heading.std_s, (after - delays[1] + delays[0]) / apart.std_s
-        return misfits[0] ** 2 + misfits[1] ** 2 + SIGNIFICANT_SIGMAS**2 * free[delays]
-
-    return min((one for one in free if all(value == 0.0 or _is_large(value) for value in one)), key=cost)
+    costs = {
+        (first, second): ((lag - first) / heading.std_s) ** 2
+        + ((after - second + first) / apart.std_s) ** 2
+        + SIGNIFICANT_SIGMAS**2 * free[first, second]
+        for first, second in free
+        if all(value == 0.0 or _is_large(value) for value in (first, second))
+    }
+    return min(costs, key=lambda one: costs[one])
 
 
 def _is_large(delay_s: float) -> bool:
@@ -163,20 +165,17 @@ def _is_large(delay_s: float) -> bool:
 
 def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bool], *, together: bool) -> list[str]:
     """Return a line for each stream, heading and position, that was moved and is free to be."""
-    if together:
-        subjects = [("", "", ""), ("the position and its heading", "lag", "frames.reference_delay_s")]
-    else:
-        subjects = [
-            ("the heading", "lags", "frames.heading_delay_s"),
-            ("the position", "lags", "frames.reference_delay_s"),
-        ]
+    subjects = [("the heading", "lags", "frames.heading_delay_s"), ("the position", "lags", "frames.reference_delay_s")]
     alike = not together and applied[0] == applied[1] and free[0]
     also = "; the position is corrected alike, as nothing shows that its delay differs" if alike else ""
+    if together:
+        subjects[1] = ("the position and its heading", "lag", "frames.reference_delay_s")
     notes = list[str]()
-    for (subject, lags, key), value, std, is_free in zip(subjects, applied, std_s, free, strict=True):
-        if subject and value != 0.0 and is_free and not (alike and notes):
+    for row in [1] if together else [0] if alike else [0, 1]:
+        (subject, lags, key), value = subjects[row], applied[row]
+        if value != 0.0 and free[row]:
             fact = f"{subject} {lags} the wheels" if value > 0 else f"the wheels lag {subject}"
-            notes.append(f"{fact} by {abs(value):.2f} ± {std:.2f} s: corrected; {key} sets it{also}")
+            notes.append(f"{fact} by {abs(value):.2f} ± {std_s[row]:.2f} s: corrected; {key} sets it{also}")
     return notes
 
 

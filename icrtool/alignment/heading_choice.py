@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -83,8 +82,6 @@ def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> Absolu
     return AbsoluteHeading(t[last], np.angle(mean * np.exp(1j * turned[last])), 1.0 / np.sqrt(count), rate)
 
 
-Source = Literal["orientation", "dual_antenna_message", "antenna_pair", "gyro_course", "wheels_course", "fused"]
-
 LARGEST_START_STD_RAD = math.radians(5.0)
 """Headings less certain than this are not given to the filter."""
 
@@ -105,7 +102,7 @@ class DerivedHeading:
 
     Attributes
     ----------
-    source : what it was made of; topic : of its parts
+    source : what it was made of, as in `HeadingFacts`; topic : of its parts
     estimate : causal and smoothed; causal, smoothed : the same as samples, the causal ones for the filter
     gyro : the turn rate that was used, None where it is the wheels'
     attitude : the attitude sensor's own heading, corrected, None where none was used; attitude_offset : what was
@@ -113,7 +110,7 @@ class DerivedHeading:
     why : its parts and standard deviation, for the user
     """
 
-    source: Source
+    source: str
     topic: str
     estimate: HeadingEstimate
     causal: HeadingSamples
@@ -191,14 +188,13 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
 
 def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: RobotLog) -> bool:
     """Return whether a gyro turns as the wheels of a robot that may slip do, in windows of time."""
-    gyro = derived.gyro
-    if gyro is None:
+    if derived.gyro is None:
         return False
-    t = (gyro.stamp_ns - int(log.wheels.stamp_ns[0])) / 1e9
-    found = compare_turns(track._replace(heading_t=t, heading=trapezoids(t, gyro.rate_radps)), width_m, 0.0, COMPARED_S)
-    if found is None:
-        return False
-    return found.left_rad < LEFT_SHARE * found.turn_rad and LEAST_GAIN < found.ratio < LARGEST_GAIN
+    t = (derived.gyro.stamp_ns - int(log.wheels.stamp_ns[0])) / 1e9
+    by_gyro = track._replace(heading_t=t, heading=trapezoids(t, derived.gyro.rate_radps))
+    found = compare_turns(by_gyro, width_m, 0.0, COMPARED_S)
+    alike = found is not None and found.left_rad < LEFT_SHARE * found.turn_rad
+    return found is not None and alike and LEAST_GAIN < found.ratio < LARGEST_GAIN
 
 
 def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> DerivedHeading | None:
@@ -238,7 +234,7 @@ def _derived(
     bias = f"turn rate (bias {math.degrees(estimate.constants[1]):+.2f} deg/s at the end)"
     parts = [bias if gyro_topic else f"wheels ({instead})", "course over ground"]
     names = [gyro_topic or "wheels", log.topic("gnss", "positions")]
-    source: Source = "gyro_course" if gyro_topic else "wheels_course"
+    source = "gyro_course" if gyro_topic else "wheels_course"
     if baseline_m > 0.0:
         source = "antenna_pair"
         parts.insert(0, f"two antennas {baseline_m:.2f} m apart")
