@@ -254,6 +254,6 @@ def record_starts(
     return np.array(starts, np.int64), stop
 
 
-def unaligned(data: Bytes, kind: str) -> NDArray[Any]:
+def unaligned(data: Bytes, kind: str | np.dtype[Any]) -> NDArray[Any]:
     """Return the value that begins at each byte."""
     return np.ndarray(max(len(data) - np.dtype(kind).itemsize + 1, 0), kind, data, strides=(1,))

@@ -22,7 +22,7 @@ from icrtool.logs.containers.chunk import (
     Space,
     decompress,
 )
-from icrtool.logs.containers.container import Block, Container, Cut, ahead, made_ahead
+from icrtool.logs.containers.container import Block, Channel, Container, Cut, ahead, made_ahead
 from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile, Source
 
 THREADS, BLOCKS_AHEAD = 2, 3
@@ -94,6 +94,11 @@ class ChunkedFile(Container):
     Parameters
     ----------
     source : where its bytes come from; None: from the file on disk
+
+    Raises
+    ------
+    NotByRangesError
+        It is distant and has no index: it is better read from disk.
     """
 
     _chunks: Sequence[Chunk] | None = None
@@ -116,6 +121,32 @@ class ChunkedFile(Container):
         self._remote = source if isinstance(source, RemoteFile) else None
         self._at = 0
         self._size = self._source.size
+        try:
+            self._chunks = self._read_index()
+            if self._chunks is None and self._remote is not None:
+                raise NotByRangesError
+            if self._chunks is None:
+                # Its records state what its channels are.
+                for _ in self._read_in_order():
+                    pass
+            self.channels = self._described_channels()
+        except BaseException:
+            self.close()
+            raise
+
+    @abstractmethod
+    def _read_index(self) -> Sequence[Chunk] | None:
+        """Return the chunks that the file's index lists, None without an index, or where it does not fit the file.
+
+        Raises
+        ------
+        LogError
+            The file is of another kind.
+        """
+
+    @abstractmethod
+    def _described_channels(self) -> Sequence[Channel]:
+        """Return the channels, as the index or the records describe them."""
 
     @abstractmethod
     def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:
@@ -283,19 +314,6 @@ class ChunkedFile(Container):
             target[at : at + end - begin] = data[begin:end]
             at += end - begin
         return at
-
-    def _learn_all(self) -> None:
-        """Read a file without an index for what its records state about channels.
-
-        Raises
-        ------
-        NotByRangesError
-            It is a distant one, which is better read from disk.
-        """
-        if self._remote is not None:
-            raise NotByRangesError
-        for _ in self._read_in_order():
-            pass
 
     def share_read(self) -> float:
         """Return the share of the file that has been read, 0 to 1."""

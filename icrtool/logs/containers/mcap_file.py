@@ -143,45 +143,41 @@ class McapFile(ChunkedFile):
     _message_index = staticmethod(_message_index)
 
     def __init__(self, path: Path, message_compression: str = "", source: Source | None = None) -> None:
-        super().__init__(path, message_compression, source)
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
         self._counts: dict[int, int] = {}
         self._listed: list[int] = []
-        try:
-            if self._source.read_at(0, len(MAGIC)) != MAGIC:
-                raise LogError(path, "not an MCAP file", "its first bytes are not those of MCAP")
-            self._chunks: list[Chunk] | None = self._read_index()
-            if self._chunks is None:
-                self._learn_all()
-        except BaseException:
-            self.close()
-            raise
-        self.channels = [self._channel(number) for number in sorted(self._channels)]
+        super().__init__(path, message_compression, source)
 
-    def _channel(self, number: int) -> Channel:
-        channel = self._channels[number]
-        schema = self._schemas.get(channel.schema_id)
-        encoding, written = channel.message_encoding, schema.encoding if schema else ""
-        text = ("latin-1",) if written == "protobuf" else ("utf-8", "replace")
-        return Channel(
-            id=number,
-            topic=LogText(channel.topic),
-            message_type=ros_type_name(schema.name) if schema else LogText(""),
-            encoding=LogText(encoding),
-            definition=schema.data.decode(*text) if schema is not None and (encoding, written) in _ENCODINGS else "",
-            definition_format="idl" if written == "ros2idl" else "msg",
-            count=self._counts.get(number) if self._chunks is not None else None,
-        )
+    def _described_channels(self) -> list[Channel]:
+        described = []
+        for number, channel in sorted(self._channels.items()):
+            schema = self._schemas.get(channel.schema_id)
+            encoding, written = channel.message_encoding, schema.encoding if schema else ""
+            text = ("latin-1",) if written == "protobuf" else ("utf-8", "replace")
+            is_known = schema is not None and (encoding, written) in _ENCODINGS
+            described.append(
+                Channel(
+                    id=number,
+                    topic=LogText(channel.topic),
+                    message_type=ros_type_name(schema.name) if schema else LogText(""),
+                    encoding=LogText(encoding),
+                    definition=schema.data.decode(*text) if schema is not None and is_known else "",
+                    definition_format="idl" if written == "ros2idl" else "msg",
+                    count=self._counts.get(number) if self._chunks is not None else None,
+                )
+            )
+        return described
 
     def _read_index(self) -> list[Chunk] | None:
-        """Return the chunks listed in the file's index; None without an index, or where it does not fit the file."""
+        if self._source.read_at(0, len(MAGIC)) != MAGIC:
+            raise LogError(self.path, "not an MCAP file", "its first bytes are not those of MCAP")
         chunks: list[Chunk] = []
         schemas: dict[int, Schema] = {}
         channels: dict[int, McapChannel] = {}
         statistics: Statistics | None = None
         for opcode, content in self._summary_records():
-            record: Any = _chunk_of_index(content) if opcode == _CHUNK_INDEX else _parse(opcode, content)
+            record = _parse(opcode, content)
             if record is None:
                 return None
             if opcode == _CHUNK_INDEX:
@@ -325,29 +321,23 @@ class McapFile(ChunkedFile):
             self.report(f"{what} is described twice, differently; the first description was used")
 
 
-def _chunk_of_index(content: bytes) -> Chunk | None:
-    """Return the chunk that a chunk index record describes, None where the record is damaged."""
-    try:
-        begin_ns, end_ns, start, length, map_bytes = struct.unpack_from("<QQQQI", content)
-        channels = frozenset(channel for channel, _ in struct.iter_unpack("<HQ", content[36 : 36 + map_bytes]))
-        index_length, name_bytes = struct.unpack_from("<QI", content, 36 + map_bytes)
-        name_end = 48 + map_bytes + name_bytes
-        _, size = struct.unpack_from("<QQ", content, name_end)
-    except struct.error:
-        return None
-    at, length = start + _HEAD_BYTES, length - _HEAD_BYTES
-    compression = content[48 + map_bytes : name_end].decode("ascii", "replace")
-    return Chunk(at, length, channels or None, begin_ns, end_ns, index_length, size, compression)
-
-
-def _parse(opcode: int, content: bytes) -> Any:  # noqa: ANN401 - a record of the library, by the operation code
-    """Return a schema, channel or statistics record, None where it is damaged."""
+def _parse(opcode: int, content: bytes) -> Any:  # noqa: ANN401 - a chunk, or a record of the library
+    """Return what a chunk index, schema, channel or statistics record holds, None where it is damaged."""
     from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
     from mcap.records import Channel, Schema, Statistics
 
     kinds = {_SCHEMA: Schema.read, _CHANNEL: Channel.read, _STATISTICS: Statistics.read}
     try:
-        return kinds[opcode](ReadDataStream(BytesIO(content)))
+        if opcode != _CHUNK_INDEX:
+            return kinds[opcode](ReadDataStream(BytesIO(content)))
+        begin_ns, end_ns, start, length, map_bytes = struct.unpack_from("<QQQQI", content)
+        channels = frozenset(channel for channel, _ in struct.iter_unpack("<HQ", content[36 : 36 + map_bytes]))
+        index_length, name_bytes = struct.unpack_from("<QI", content, 36 + map_bytes)
+        name_end = 48 + map_bytes + name_bytes
+        compression = content[48 + map_bytes : name_end].decode("ascii", "replace")
+        _, size = struct.unpack_from("<QQ", content, name_end)
+        at, length = start + _HEAD_BYTES, length - _HEAD_BYTES
+        return Chunk(at, length, channels or None, begin_ns, end_ns, index_length, size, compression)
     except (McapError, struct.error, ValueError, OverflowError, MemoryError):
         return None

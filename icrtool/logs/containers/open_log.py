@@ -1,24 +1,37 @@
-"""Open a log: the container is recognised by its content, not by its file name."""
+"""Open a log: the container is recognised by its content, not by its file name; several files are read as one log."""
 
 from __future__ import annotations
 
 import stat
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from threading import Event
 from types import MappingProxyType
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
+
+import numpy as np
 
 from icrtool.errors import LogChangedError, LogError
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers import mcap_file, ros1_bag, sqlite_bag
-from icrtool.logs.containers.bag_directory import BagDirectory
 from icrtool.logs.containers.chunked_file import NotByRangesError
-from icrtool.logs.containers.container import Container, Origin
+from icrtool.logs.containers.container import Block, Channel, Container, Cut, Origin
 from icrtool.logs.containers.mcap_file import McapFile
-from icrtool.logs.containers.recording_files import STANDARD_INPUT, files_of_log, inputs_of, split_files
+from icrtool.logs.containers.recording_files import (
+    STANDARD_INPUT,
+    BagFiles,
+    Span,
+    bag_files,
+    check_spans,
+    files_of_log,
+    inputs_of,
+    split_files,
+    unpacked_name,
+)
 from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, read_by_ranges
 from icrtool.logs.containers.sqlite_bag import SqliteBag
@@ -29,35 +42,20 @@ from icrtool.records.samples import InputFile
 MOST_CHANNELS = 2048
 """Topics of a log, each publisher of a ROS 1 bag by itself, that are looked at: some 0.5 ms of time each."""
 
+MOST_FILES = 5000
+"""Of a recording: one of three days that begins a file every minute has 4,320. Each takes about 1 ms."""
+
 # A bag of any version: one of another than 2.0 is refused by name.
 _CONTAINERS: dict[bytes, type[McapFile | Ros1Bag | SqliteBag]] = {
     mcap_file.MAGIC: McapFile,
     ros1_bag.MAGIC[:9]: Ros1Bag,
     sqlite_bag.MAGIC: SqliteBag,
 }
-_LONGEST_MAGIC = 16
 
-KINDS = "an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file, also compressed"
-
-
-class Brought(NamedTuple):
-    """A log that lies on disk now, perhaps packed.
-
-    Attributes
-    ----------
-    inputs : what was read for it; none of one that was there before
-    transfer : how it came over a connection
-    distant : as in `BagDirectory`
-    """
-
-    log: Path
-    inputs: tuple[InputFile, ...] = ()
-    transfer: str = ""
-    distant: Mapping[str, RemoteFile] = MappingProxyType({})
-
-    def words(self) -> str:
-        """Return how it came over a connection, and how much of what is distant was read since."""
-        return "; ".join(filter(None, [self.transfer, read_by_ranges(self.distant.values()) if self.distant else ""]))
+_NOT_A_LOG = (
+    "not a log",
+    "a log is an .mcap file, a ROS 1 .bag, a ROS 2 bag directory or a .db3 file, also compressed",
+)
 
 
 def open_log(path: Path, share: Callable[[float], None] | None = None) -> Container:
@@ -73,24 +71,36 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
         The path does not exist, the file is empty, is not a known container, or nothing in it can be read.
     """
     try:
-        remote, why = RemoteFile(path) if isinstance(path, UrlPath) else None, ""
-        if remote is not None:
-            opened = _by_ranges(path, remote)
+        why_fetched = ""
+        if isinstance(path, UrlPath):
+            opened = _by_ranges(path)
             if not isinstance(opened, str):
                 return opened
-            why = opened
+            why_fetched = opened
         elif path != STANDARD_INPUT and not _is_packed_file(path):
             return _plain_log(path)
-        scratch = ScratchFolder()
-        try:
-            return _unpacked_log(path, _brought(path, scratch.path, remote, why, share), scratch, share)
-        except BaseException:
-            scratch.close()
-            raise
+        with ExitStack() as undo:
+            scratch = ScratchFolder()
+            undo.callback(scratch.close)
+            log, origin, distant = _brought(path, scratch.path, why_fetched, share)
+            problem = ""
+            try:
+                if _is_packed_file(log):
+                    log, problem = unpack(log, scratch.path / "unpacked", share)
+                container = _plain_log(log, distant)
+            except LogError as err:
+                # Its own path is gone when the user reads this.
+                raise LogError(path, err.why, "; ".join(filter(None, [problem, err.advice]))) from err
+            undo.pop_all()
     except FileNotFoundError as err:
         raise LogError(path, "no such file or directory") from err
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
+    if problem:
+        container.report(problem)
+    container.path, container.files = path, [path]
+    container.origin = origin._replace(remove=scratch.close)
+    return container
 
 
 FileState = tuple[int, int, int] | None
@@ -141,49 +151,28 @@ def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
     OSError
         It cannot be read.
     """
-    scratch = ScratchFolder()
-    try:
-        file, inputs, *_ = _brought(path, scratch.path, RemoteFile(path) if isinstance(path, UrlPath) else None)
+    with closing(ScratchFolder()) as scratch:
+        file, origin, _ = _brought(path, scratch.path)
         if _is_packed_file(file):
             file, problem = unpack(file, scratch.path / "unpacked")
             if problem:
                 raise LogError(path, "does not decompress", problem)
-        yield file, (inputs or inputs_of([path], Event()))[0]
-    finally:
-        scratch.close()
+        yield file, (origin.inputs or inputs_of([path], Event()))[0]
 
 
-def _unpacked_log(
-    path: Path, brought: Brought, scratch: ScratchFolder, share: Callable[[float], None] | None
-) -> Container:
-    """Return the container of a log that lies in a temporary folder, or is unpacked there, which is removed with it."""
-    log, problem = brought.log, ""
-    try:
-        if _is_packed_file(log):
-            log, problem = unpack(log, scratch.path / "unpacked", share)
-        container = _plain_log(log, brought.distant)
-    except LogError as err:
-        # Its own path is gone when the user reads this.
-        raise LogError(path, err.why, "; ".join(filter(None, [problem, err.advice]))) from err
-    if problem:
-        container.report(problem)
-    container.path, container.files = path, [path]
-    container.origin = Origin(brought.inputs, brought.words, scratch.close)
-    return container
-
-
-def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:
+def _by_ranges(path: UrlPath) -> Container | str:
     """Return the container of a file at an address, where it has an index; else why it has to be fetched."""
+    remote = RemoteFile(path)
     if remote.is_folder:
         return "SQLite files, or packed"
     if not remote.has_ranges:
         return "its server gives no parts of a file"
     start = remote.read_at(0, 512)
     kind = container_of(BytesIO(start))
+    if kind is None and is_packed(start):
+        return "it is packed"
     if kind is None:
-        if is_packed(start):
-            return "it is packed"
-        raise LogError(path, "not a log", f"a log is {KINDS}")
+        raise LogError(path, *_NOT_A_LOG)
     if kind is SqliteBag:
         return "an SQLite file"
     try:
@@ -195,26 +184,36 @@ def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:
 
 
 def _brought(
-    path: Path, folder: Path, remote: RemoteFile | None, why: str = "", share: Callable[[float], None] | None = None
-) -> Brought:
-    """Return a log that was fetched or saved to a folder where it is not on disk; `why` it is fetched."""
-    if remote is None and path != STANDARD_INPUT:
-        return Brought(path)
-    if remote is None:
-        if sys.stdin.isatty():
-            raise LogError(path, "standard input is a terminal", "pipe a log into it, or name one")
-        log = folder / "stdin"
-        digest = save(sys.stdin.buffer, log)
-        return Brought(log, (InputFile(str(path), log.stat().st_size, digest),))
-    log = folder / (path.name or "log")
-    if remote.is_folder:
-        log.mkdir()
-        inputs, distant = fetch_folder(remote.path, log, share)
-    else:
-        inputs, distant = (remote.fetch(log, share),), {}
-    size = sum(one.bytes for one in inputs if one.sha256 is not None) / 1e6
-    transfer = f"{size:.3g} MB fetched to a temporary folder: {why}" if size else ""
-    return Brought(log, inputs, transfer, distant)
+    path: Path, folder: Path, why_fetched: str = "", share: Callable[[float], None] | None = None
+) -> tuple[Path, Origin, Mapping[str, RemoteFile]]:
+    """Return where a log lies on disk, perhaps packed: in a folder to which it was fetched or saved, if it did not.
+
+    Returns
+    -------
+    log, where it came from, and those of its files that are read by ranges, as in `BagDirectory`
+    """
+    distant: dict[str, RemoteFile] = {}
+    if isinstance(path, UrlPath):
+        log, remote = folder / (path.name or "log"), RemoteFile(path)
+        if remote.is_folder:
+            log.mkdir()
+            inputs, distant = fetch_folder(path, log, share)
+        else:
+            inputs = (remote.fetch(log, share),)
+        size = sum(one.bytes for one in inputs if one.sha256 is not None) / 1e6
+        fetched = f"{size:.3g} MB fetched to a temporary folder: {why_fetched}" if size else ""
+
+        def transfer() -> str:
+            return "; ".join(filter(None, [fetched, read_by_ranges(distant.values()) if distant else ""]))
+
+        return log, Origin(inputs, transfer), distant
+    if path != STANDARD_INPUT:
+        return path, Origin(), distant
+    if sys.stdin.isatty():
+        raise LogError(path, "standard input is a terminal", "pipe a log into it, or name one")
+    log = folder / "stdin"
+    digest = save(sys.stdin.buffer, log)
+    return log, Origin((InputFile(str(path), log.stat().st_size, digest),)), distant
 
 
 def _is_packed_file(path: Path) -> bool:
@@ -239,10 +238,8 @@ def _usable(container: Container, path: Path) -> Container:
 
 def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType({})) -> Container:
     """Return the container of a log that is not packed; `distant` as in `BagDirectory`."""
-    if files := split_files(path):
-        return _usable(BagDirectory(path, files), path)
-    if stat.S_ISDIR(path.stat().st_mode):
-        return _usable(BagDirectory(path, distant=distant), path)
+    if (files := split_files(path)) or stat.S_ISDIR(path.stat().st_mode):
+        return _usable(BagDirectory(path, files, distant), path)
     if is_special(path):
         # Opening a pipe would block, and every container needs random access.
         raise LogError(path, NOT_REGULAR, SAVE_IT)
@@ -251,11 +248,144 @@ def _plain_log(path: Path, distant: Mapping[str, RemoteFile] = MappingProxyType(
             raise LogError(path, "an empty file", "the recording never began, or the copy failed")
         if (container := container_of(stream)) is not None:
             return _usable(container(path), path)
-    raise LogError(path, "not a log", f"a log is {KINDS}")
+    raise LogError(path, *_NOT_A_LOG)
 
 
 def container_of(stream: BinaryIO) -> type[McapFile | Ros1Bag | SqliteBag] | None:
     """Return which container the first bytes of a file are of; None where it is no log."""
     stream.seek(0)
-    start = stream.read(_LONGEST_MAGIC)
+    start = stream.read(max(map(len, _CONTAINERS)))
     return next((container for magic, container in _CONTAINERS.items() if start.startswith(magic)), None)
+
+
+class BagDirectory(Container):
+    """A directory of storage files, or several files of one split recording, read as one log.
+
+    Parameters
+    ----------
+    files : of a recording that is not a directory
+    distant : MCAP files that are empty there, and are read by ranges where they have an index, by their names
+
+    Raises
+    ------
+    LogError
+        No storage file in it, none that can be read, or, without metadata.yaml, more than one recording.
+    """
+
+    def __init__(
+        self, path: Path, files: Sequence[Path] = (), distant: Mapping[str, RemoteFile] = MappingProxyType({})
+    ) -> None:
+        super().__init__(path)
+        self._distant = distant
+        self._scratch: ScratchFolder | None = None
+        self._parts: dict[Path, Container] = {}
+        self._reading = 0
+        try:
+            bag = BagFiles([*files]) if files else bag_files(path, self.report)
+            self._by_name = bag.by_name
+            if (count := len(bag.files)) > MOST_FILES:
+                raise LogError(path, f"{count} storage files; at most {MOST_FILES} are read", "join some of them")
+            for file in bag.files:
+                try:
+                    self._parts[file] = self._open(file, bag.message_compression)
+                except LogError as err:
+                    self.report(f"{file.name}: {err.why}; {err.advice}")
+                except OSError as err:
+                    self.report(f"{file.name}: cannot be read; {err.strerror}")
+            if not self._parts:
+                raise LogError(path, "no storage file in it can be read", "; ".join(self.problems))
+        except BaseException:
+            self.close()
+            raise
+        self.files = [*self._parts]
+        self._numbers: list[tuple[Ints, Ints]] = []
+        self.channels = self._merge_channels()
+
+    @property
+    def problems(self) -> list[str]:
+        """What could not be read, of the directory and of each file."""
+        return super().problems + [problem for part in self._parts.values() for problem in part.problems]
+
+    def share_read(self) -> float:
+        """Return the mean over the files, which are read one after the other."""
+        return (self._reading + [*self._parts.values()][self._reading].share_read()) / len(self._parts)
+
+    def close(self) -> None:
+        """Release all files."""
+        for part in self._parts.values():
+            part.close()
+        if self._scratch is not None:
+            self._scratch.close()
+        super().close()
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return first and last log time of all files, None where one of them has no index."""
+        known = [span for part in self._parts.values() if (span := part.span_ns()) is not None]
+        if not known or len(known) < len(self._parts):
+            return None
+        begins, ends = zip(*known, strict=True)
+        return min(begins), max(ends)
+
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+        """Yield the messages of the wanted channels, file by file.
+
+        Raises
+        ------
+        LogError
+            At the end: the files, found by name, are recordings of different times.
+        """
+        spans = []
+        parts = zip(self._parts.items(), self._numbers, strict=True)
+        for self._reading, ((file, part), (own, merged)) in enumerate(parts):
+            if not len(own):
+                continue
+            begins, ends = [], []
+            mine, whole = (frozenset(own[np.isin(merged, list(numbers))].tolist()) for numbers in (wanted, cut.whole))
+            for block in part.blocks(mine, cut._replace(whole=whole)):
+                if len(block.log_time_ns):
+                    begins.append(int(block.log_time_ns.min()))
+                    ends.append(int(block.log_time_ns.max()))
+                place = np.searchsorted(own, block.channel).clip(max=len(own) - 1)
+                yield block._replace(channel=np.where(own[place] == block.channel, merged[place], -1))
+            self.mixed |= part.mixed
+            if begins:
+                spans.append(Span(min(begins), max(ends), file.name))
+        if self._by_name:
+            for odd in check_spans(self.path, spans):
+                self.report(odd)
+
+    def _open(self, file: Path, message_compression: str) -> Container:
+        """Return the container of a storage file, decompressed to a temporary folder where it is packed."""
+        storage = file
+        if unpacked_name(file.name) != file.name:
+            self._scratch = self._scratch or ScratchFolder()
+            storage, problem = unpack(file, self._scratch.path / str(len(self._parts)))
+            if problem:
+                self.report(f"{file.name}: {problem}")
+        if storage.suffix == ".bag":
+            return Ros1Bag(storage)
+        if (source := self._distant.get(storage.name)) is not None:
+            try:
+                return McapFile(storage, message_compression, source)
+            except NotByRangesError:
+                source.fetch(storage, None)
+        return (McapFile if storage.suffix == ".mcap" else SqliteBag)(storage, message_compression)
+
+    def _merge_channels(self) -> list[Channel]:
+        """Give a topic that stands in several files one number."""
+        merged: dict[tuple[str, str, str], Channel] = {}
+        for part in self._parts.values():
+            numbers: dict[int, int] = {}
+            for channel in part.channels:
+                key = (channel.topic, channel.message_type, channel.encoding)
+                known = merged.get(key)
+                if known is None:
+                    merged[key] = replace(channel, id=len(merged))
+                else:
+                    both = known.count is not None and channel.count is not None
+                    count = (known.count or 0) + (channel.count or 0) if both else None
+                    merged[key] = replace(known, count=count, definition=known.definition or channel.definition)
+                numbers[channel.id] = merged[key].id
+            own = np.array(sorted(numbers), np.int64)
+            self._numbers.append((own, np.array([numbers[number] for number in own.tolist()], np.int64)))
+        return list(merged.values())

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from threading import Event
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from icrtool.errors import LogError
 from icrtool.records.places import UrlPath, open_regular
@@ -29,6 +29,9 @@ _PACKED_END = re.compile(rf"{PACKED}$", re.IGNORECASE)
 _ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
 
 STORAGE = re.compile(rf"\.(mcap|db3)(?:{PACKED})?$")
+
+LARGEST_METADATA_BYTES, _DEEPEST = 1 << 18, 20
+"""Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""
 
 LONGEST_PAUSE_S = 3600.0
 """The files of a split recording follow one another without a gap. A longer gap: they are separate recordings."""
@@ -53,25 +56,136 @@ def storage_files(directory: Path) -> list[Path]:
     LogError
         There is none, or there are recordings of several kinds: the user must name one.
     """
-    found = sorted((file for file in directory.iterdir() if _is_storage(file)), key=natural_order)
-    others = sorted((entry for entry in directory.iterdir() if _is_other_log(entry)), key=natural_order)
+    entries = sorted(directory.iterdir(), key=natural_order)
+    found = [entry for entry in entries if STORAGE.search(entry.name) and entry.is_file()]
+    others = [
+        entry
+        for entry in entries
+        if (entry / "metadata.yaml").is_file() or (entry.suffix == ".bag" and entry.is_file())
+    ]
     kinds = {match[1] for file in found if (match := STORAGE.search(file.name))}
+    if len(kinds) == 1 and not others:
+        return found
     if not found and len(others) == 1:
         raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} is in it", "name that file")
-    if len(kinds) > 1 or others:
+    if found or others:
         why = f"holds more than one recording: {some_of([entry.name for entry in (*found, *others)])}"
         raise LogError(directory, why, "name one of them")
-    if not found and (directory / "run.json").is_file():
+    if (directory / "run.json").is_file():
         raise LogError(directory, "is a run, not a log", "icrtool dropout-report reads it; or name the log itself")
-    if not found and (directory / "fleet.json").is_file():
+    if (directory / "fleet.json").is_file():
         advice = f"icrtool dropout-report {directory}/runs/NAME reads one of its runs; icrtool report makes its page"
         raise LogError(directory, "is the folder of a batch, not a log", advice)
-    runs = sorted(entry.parent.name for entry in directory.glob("*/run.json")) if not found else []
-    if runs:
+    if runs := sorted(entry.parent.name for entry in directory.glob("*/run.json")):
         raise LogError(directory, f"holds runs, not a log: {some_of(runs)}", "icrtool dropout-report reads one of them")
-    if not found:
-        raise LogError(directory, "not a ROS 2 bag directory", "it holds no .mcap or .db3 file")
-    return found
+    raise LogError(directory, "not a ROS 2 bag directory", "it holds no .mcap or .db3 file")
+
+
+class BagFiles(NamedTuple):
+    """The storage files of a bag directory, and how their messages are compressed each; empty for not at all.
+
+    Attributes
+    ----------
+    by_name : no metadata.yaml names them
+    """
+
+    files: list[Path]
+    message_compression: str = ""
+    by_name: bool = False
+
+
+def bag_files(directory: Path, report: Callable[[str], None]) -> BagFiles:
+    """Return the files that metadata.yaml names and that are there; all storage files where it names none.
+
+    Parameters
+    ----------
+    report : called with what is missing; a recorder that was killed leaves no such file, or half of it
+
+    Raises
+    ------
+    LogError
+        As `storage_files`.
+    """
+    file = directory / "metadata.yaml"
+    names, message_compression, trouble = list[str](), "", ""
+    if not file.is_file():
+        trouble = "no metadata.yaml"
+    else:
+        try:
+            if file.stat().st_size > LARGEST_METADATA_BYTES:
+                raise ValueError("too long")
+            names, message_compression = _metadata(file.read_text(encoding="utf-8"))
+        except (ValueError, OSError, RecursionError):
+            trouble = "its metadata.yaml cannot be read"
+    if trouble:
+        report(f"{trouble}; its storage files were found by their names")
+    there, missing = dict[Path, None](), dict[str, None]()
+    for name in (Path(one).name for one in names):
+        # a file may have been unpacked since
+        stored = [directory / name, directory / unpacked_name(name)]
+        found = next((one for one in stored if os.path.isfile(one)), None)  # noqa: PTH113 - also of a name that is too long
+        if found is not None:
+            there[found] = None
+        else:
+            missing[stored[0].name] = None
+    if missing:
+        report(f"metadata.yaml names files that are not there: {some_of([*missing])}")
+    if there:
+        return BagFiles([*there], message_compression)
+    return BagFiles(storage_files(directory), message_compression, by_name=True)
+
+
+def _metadata(text: str) -> tuple[list[str], str]:
+    """Return what the text of a metadata.yaml states: the names of storage files, and how each message is compressed.
+
+    Raises
+    ------
+    ValueError
+        The text is not YAML, or not the metadata of a bag; or it has an alias.
+    """
+    document = _plain_yaml(text)
+    information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
+    files = information.get("relative_file_paths") if isinstance(information, dict) else None
+    if not isinstance(information, dict) or not isinstance(files, list):
+        raise ValueError("not the metadata of a bag")  # noqa: TRY004 - as for all that a text can be
+    by_message = str(information.get("compression_mode")).upper() == "MESSAGE"
+    compression = str(information.get("compression_format")) if by_message else ""
+    return [name for name in files if isinstance(name, str)], compression
+
+
+def _plain_yaml(text: str) -> object:
+    """Return a YAML text as dicts, lists and strings; merge keys are ordinary keys.
+
+    Raises
+    ------
+    ValueError
+        The text is not YAML, is nested too deeply, has a key that is no text, or an alias: by aliases a short text
+        stands for gigabytes.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+    from ruamel.yaml.events import CollectionEndEvent, MappingStartEvent, NodeEvent, ScalarEvent, SequenceStartEvent
+
+    def value(event: Any, depth: int) -> object:  # noqa: ANN401 - an event of the library
+        if isinstance(event, ScalarEvent):
+            return str(event.value)
+        if not isinstance(event, MappingStartEvent | SequenceStartEvent) or depth == _DEEPEST:
+            raise ValueError("has an alias, or is nested too deeply")
+        parts: list[Any] = []
+        while not isinstance(inner := next(events), CollectionEndEvent):
+            parts.append(value(inner, depth + 1))
+        if isinstance(event, SequenceStartEvent):
+            return parts
+        if not all(isinstance(key, str) for key in parts[::2]):
+            raise ValueError("a key is no text")
+        return dict(zip(parts[::2], parts[1::2], strict=True))
+
+    try:
+        events = iter(YAML(typ="safe").parse(text))
+        first = next((event for event in events if isinstance(event, NodeEvent)), None)
+        return None if first is None else value(first, 0)
+    except YAMLError as err:
+        raise ValueError("no YAML") from err
 
 
 def is_bag_directory(folder: Path) -> bool:
@@ -115,17 +229,6 @@ def check_spans(directory: Path, spans: Sequence[Span]) -> list[str]:
                 "if they are two, name one of them"
             )
     return odd
-
-
-def _is_storage(entry: Path) -> bool:
-    return STORAGE.search(entry.name) is not None and entry.is_file()
-
-
-def _is_other_log(entry: Path) -> bool:
-    """Return whether an entry is a ROS 1 bag, or a bag directory of its own."""
-    if entry.is_dir():
-        return (entry / "metadata.yaml").is_file()
-    return entry.suffix == ".bag" and entry.is_file()
 
 
 def unpacked_name(name: str) -> str:

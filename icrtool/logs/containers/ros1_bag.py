@@ -50,22 +50,19 @@ _VALUES = {b"op": 1, b"conn": 4, b"time": 8}
 
 
 class _Record(NamedTuple):
-    """A top-level record: header fields, file offset of its data, length of its data."""
+    """A top-level record: operation code, header fields, file offset of its data, length of its data."""
 
+    op: int
     fields: dict[bytes, bytes]
     at: int
     length: int
-
-    @property
-    def op(self) -> int:
-        return self.number(b"op", 1)
 
     def number(self, name: bytes, size: int = 4) -> int:
         return int.from_bytes(self.fields.get(name, b"")[:size], "little")
 
     def time(self, name: bytes) -> int:
         """Return a time [ns], 0 where there is none."""
-        seconds, nanoseconds = (int.from_bytes(self.fields.get(name, b"")[at : at + 4], "little") for at in (0, 4))
+        nanoseconds, seconds = divmod(self.number(name, 8), 1 << 32)
         return seconds * 1_000_000_000 + nanoseconds
 
     def text(self, name: bytes) -> str:
@@ -188,23 +185,23 @@ class Ros1Bag(ChunkedFile):
     _message_index = staticmethod(_message_index)
 
     def __init__(self, path: Path, source: Source | None = None) -> None:
-        super().__init__(path, source=source)
         self._connections: dict[int, Channel] = {}
-        try:
-            start = self._source.read_at(0, len(MAGIC))
-            if start != MAGIC and start.startswith(MAGIC[:9]):
-                advice = "only 2.0 can be read; `rosbag fix` converts older ones"
-                raise LogError(path, "a bag of another version", advice)
-            if start != MAGIC:
-                raise LogError(path, "not a ROS 1 bag", "its first bytes are not a bag's")
-            self._chunks: list[Chunk] | None = self._read_index()
-            if self._chunks is None:
-                self.report(f"has no index (not closed, or {CUT_OFF}); read from start to end")
-                self._learn_all()
-        except BaseException:
-            self.close()
-            raise
-        self.channels = list(self._connections.values())
+        super().__init__(path, source=source)
+
+    def _described_channels(self) -> list[Channel]:
+        return list(self._connections.values())
+
+    def _read_index(self) -> list[Chunk] | None:
+        start = self._source.read_at(0, len(MAGIC))
+        if start != MAGIC and start.startswith(MAGIC[:9]):
+            advice = "only 2.0 can be read; `rosbag fix` converts older ones"
+            raise LogError(self.path, "a bag of another version", advice)
+        if start != MAGIC:
+            raise LogError(self.path, "not a ROS 1 bag", "its first bytes are not a bag's")
+        chunks = self._listed_chunks()
+        if chunks is None:
+            self.report(f"has no index (not closed, or {CUT_OFF}); read from start to end")
+        return chunks
 
     def _described(self, chunk: Chunk) -> Chunk:
         if self._remote is not None and chunk.is_stored:
@@ -225,9 +222,10 @@ class Ros1Bag(ChunkedFile):
             return None
         header = self._source.read_at(at + 4, header_length + 4)
         length = int.from_bytes(header[header_length:], "little")
-        return _Record(_header_fields(header[:header_length]), at + header_length + 8, length)
+        fields = _header_fields(header[:header_length])
+        return _Record(int.from_bytes(fields.get(b"op", b"")[:1], "little"), fields, at + header_length + 8, length)
 
-    def _read_index(self) -> list[Chunk] | None:
+    def _listed_chunks(self) -> list[Chunk] | None:
         """Return the chunks listed in the bag's index; None where there is none, or it is damaged."""
         first = self._record(len(MAGIC))
         if first is None or first.op != _BAG_HEADER:
@@ -245,7 +243,7 @@ class Ros1Bag(ChunkedFile):
                 return None
             content = self._source.read_at(record.at, record.length)
             if record.op == _CONNECTION:
-                self._connect(record.number(b"conn"), record.text(b"topic"), content)
+                self._connect(record.fields, content)
             elif record.op == _CHUNK_INFO:
                 held = np.frombuffer(content[: len(content) // 8 * 8], "<u4").reshape(-1, 2).tolist()
                 for connection, count in held:
@@ -282,7 +280,7 @@ class Ros1Bag(ChunkedFile):
                 break
             if record.op == _CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
                 content = self._source.read_at(record.at, record.length)
-                self._connect(record.number(b"conn"), record.text(b"topic"), content)
+                self._connect(record.fields, content)
             at = record.at + record.length
         if at < self._size:
             self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
@@ -296,17 +294,17 @@ class Ros1Bag(ChunkedFile):
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         _, at, start, end = record
-        described = _Record(_header_fields(bytes(data[at + 4 : start - 4])), start, end - start)
-        self._connect(described.number(b"conn"), described.text(b"topic"), bytes(data[start:end]))
+        self._connect(_header_fields(bytes(data[at + 4 : start - 4])), bytes(data[start:end]))
 
-    def _connect(self, number: int, topic: str, content: bytes) -> None:
+    def _connect(self, header: dict[bytes, bytes], content: bytes) -> None:
         """Remember a connection record; `content` is the header that the publisher sent."""
+        number = int.from_bytes(header.get(b"conn", b"")[:4], "little")
         fields = {name: value.decode("utf-8", "replace") for name, value in _header_fields(content).items()}
         if number in self._connections or b"type" not in fields:
             return
         self._connections[number] = Channel(
             id=number,
-            topic=LogText(topic or fields.get(b"topic", "")),
+            topic=LogText(header.get(b"topic", b"").decode("utf-8", "replace") or fields.get(b"topic", "")),
             message_type=ros_type_name(fields[b"type"]),
             encoding=LogText("ros1"),
             definition=fields.get(b"message_definition", ""),

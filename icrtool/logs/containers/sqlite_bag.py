@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -65,8 +66,14 @@ class SqliteBag(Container):
             try:
                 self._restrict()
                 self.channels = self._read_topics()
-                self.message_compression = message_compression or self._found_compression()
-                self._rows = self._count_rows()
+                first = self._first_row("SELECT data FROM messages LIMIT 1")
+                # Serialised data never begins like compressed data.
+                if not message_compression and first and isinstance(first[0], bytes) and first[0][:4] == ZSTD_MAGIC:
+                    self.message_compression = "zstd"
+                last = self._first_row("SELECT max(rowid) FROM messages")
+                self._rows = _UNKNOWN_ROWS if last is None else last[0] or 0
+                if not isinstance(self._rows, int):
+                    raise sqlite3.DatabaseError("its rows are not numbered")
             except BaseException:
                 self.close()
                 raise
@@ -90,20 +97,19 @@ class SqliteBag(Container):
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return the times of the first and the last message, None where they cannot be read."""
-        try:
-            # one query each: SQLite takes both from its index of times then
-            first, last = (
-                self._query(f"SELECT {which}(timestamp) FROM messages WHERE timestamp > 0").fetchone()[0]  # noqa: S608
-                for which in ("min", "max")
-            )
-        except _DAMAGE:
-            return None
-        return (first, last) if isinstance(first, int) and isinstance(last, int) else None
+        # one query each: SQLite takes both from its index of times then
+        query = "SELECT {}(timestamp) FROM messages WHERE timestamp > 0"
+        first, last = (self._first_row(query.format(which)) or (None,) for which in ("min", "max"))
+        return (first[0], last[0]) if isinstance(first[0], int) and isinstance(last[0], int) else None
 
     def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages of the wanted topics in the order they were stored."""
         self._interruption = None
-        blocks: Iterator[Block] = made_ahead(self._in_order(wanted, cut), self._end_query)
+
+        def end_query() -> None:
+            self._interruption = GeneratorExit()
+
+        blocks: Iterator[Block] = made_ahead(self._in_order(wanted, cut), end_query)
         if lost := self._cut_inside_page():
             blocks = _without_last(blocks, lost)
         yield from blocks
@@ -165,14 +171,18 @@ class SqliteBag(Container):
             self._interruption = err
         return self._interruption is not None or self._steps_left < 0
 
-    def _end_query(self) -> None:
-        """End the query that is running in another thread."""
-        self._interruption = GeneratorExit()
-
     def _query(self, query: str, parameters: tuple[int, ...] = ()) -> sqlite3.Cursor:
         """Run a query, with its own limit of steps."""
         self._steps_left = _LEAST_STEPS + _STEPS_PER_BYTE * self._file.stat().st_size
         return self._database.execute(query, parameters)
+
+    def _first_row(self, query: str) -> tuple[Any, ...] | None:
+        """Return the first row that a query finds, None where there is none, or it cannot be read."""
+        try:
+            row: tuple[Any, ...] | None = self._query(query).fetchone()
+        except _DAMAGE:
+            return None
+        return row
 
     def _read_topics(self) -> list[Channel]:
         tables = self._tables
@@ -207,36 +217,6 @@ class SqliteBag(Container):
             self.report(f"its message definitions cannot be read ({err})")
             return {}
 
-    def _found_compression(self) -> str:
-        """Return the message compression that the first message shows: serialised data never begins like compressed."""
-        try:
-            first = self._query("SELECT data FROM messages LIMIT 1").fetchone()
-        except _DAMAGE:
-            return ""
-        return "zstd" if first and isinstance(first[0], bytes) and first[0].startswith(ZSTD_MAGIC) else ""
-
-    def _count_rows(self) -> int:
-        try:
-            last = self._query("SELECT max(rowid) FROM messages").fetchone()[0] or 0
-        except _DAMAGE:
-            return _UNKNOWN_ROWS
-        if not isinstance(last, int):
-            raise sqlite3.DatabaseError("its rows are not numbered")
-        return last
-
-    def _rows_within(self, cut: Cut) -> tuple[int, int]:
-        """Return the row before the first message in a cut, and the last row in it; by the index of times, if any."""
-        if cut == WHOLE:
-            return 0, self._rows
-        within = f"timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns}"
-        if cut.whole:
-            within = f"({within}) OR topic_id IN ({_numbers(cut.whole)})"
-        try:
-            first, last = self._query(f"SELECT min(rowid), max(rowid) FROM messages WHERE {within}").fetchone()  # noqa: S608
-        except _DAMAGE:
-            return 0, self._rows
-        return (first - 1, last) if first is not None else (0, 0)
-
     def _in_order(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages in the order they were stored, up to the first row that SQLite cannot read.
 
@@ -246,10 +226,17 @@ class SqliteBag(Container):
         lock. Rows that hold no message, which the first query finds, are left out by the second.
         """
         # The ids are integers from the database itself; as parameters they could exceed SQLite's limit of variables.
-        within = f"topic_id IN ({_numbers(wanted)})"
+        within, whole = (f"topic_id IN ({','.join(map(str, sorted(some)))})" for some in (wanted, cut.whole))
+        after, stop = 0, self._rows
         if cut != WHOLE:
-            times = f"timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns}"
-            within += f" AND ({times} OR topic_id IN ({_numbers(cut.whole)}))"
+            inside = f"timestamp >= {cut.begin_ns} AND timestamp < {cut.end_ns}"
+            if cut.whole:
+                inside = f"({inside}) OR {whole}"
+            # by the index of times, if any
+            ends = self._first_row(f"SELECT min(rowid), max(rowid) FROM messages WHERE {inside}")  # noqa: S608
+            if ends is not None:
+                after, stop = (ends[0] - 1, ends[1]) if ends[0] is not None else (0, 0)
+            within += f" AND ({inside})"
         # A column may hold any type. Type and length of a message are known without reading it.
         sound = "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
         sound += f" AND length(data) <= {_LARGEST_MESSAGE_BYTES}"
@@ -260,7 +247,6 @@ class SqliteBag(Container):
             f"WHERE {rows} AND rowid > ? ORDER BY rowid LIMIT ?)"
             for rows in (within, f"{within} AND {sound} AND rowid <= ?")
         )
-        after, stop = self._rows_within(cut)
         count = _FIRST_ROWS
         while after < stop:
             try:
@@ -284,7 +270,10 @@ class SqliteBag(Container):
                 )
             if content is None:
                 continue
-            block = _unpacked(texts, content)
+            # ids, times and sizes, with commas between
+            topics, times, sizes = (np.fromstring(text, np.int64, sep=",") for text in texts)
+            end = np.cumsum(sizes)
+            block = Block(np.frombuffer(content, np.uint8), topics, times, end - sizes, end)
             yield self._with_possible_times(block)
             by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
             count = max(1, min(4 * count, _MOST_ROWS, by_size))
@@ -302,22 +291,11 @@ class SqliteBag(Container):
         return page_bytes if size % page_bytes else 0
 
 
-def _numbers(numbers: Iterable[int]) -> str:
-    return ",".join(str(number) for number in sorted(numbers))
-
-
 def _allow(action: int, first: str | None, second: str | None, _: str | None, view: str | None) -> int:
     """Return whether SQLite may do an action: reading a recorder's tables and calling a few functions is allowed."""
     reads = action == sqlite3.SQLITE_READ and (first in _TABLES or not first) and view is None
     calls = action == sqlite3.SQLITE_FUNCTION and second in _FUNCTIONS
     return sqlite3.SQLITE_OK if reads or calls or action == sqlite3.SQLITE_SELECT else sqlite3.SQLITE_DENY
-
-
-def _unpacked(texts: Sequence[str], content: bytes) -> Block:
-    """Return joined messages as a block; `texts` are topic ids, times and sizes with commas between."""
-    topics, times, sizes = (np.fromstring(text, np.int64, sep=",") for text in texts)
-    end = np.cumsum(sizes)
-    return Block(np.frombuffer(content, np.uint8), topics, times, end - sizes, end)
 
 
 def _without_last(blocks: Iterable[Block], lost: int) -> Iterator[Block]:

@@ -23,7 +23,7 @@ from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from tarfile import AREGTYPE, CONTTYPE, REGTYPE, SUPPORTED_TYPES, TarError, TarInfo
 from types import SimpleNamespace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import lz4.frame
 import zstandard
@@ -138,13 +138,6 @@ class ScratchFolder:
         process_resources.end(self.path)
 
 
-class Unpacked(NamedTuple):
-    """A log that was unpacked, a file or a bag directory, and what went wrong (empty: nothing)."""
-
-    path: Path
-    problem: str
-
-
 def is_packed(start: bytes) -> bool:
     """Return whether a file is compressed or an archive, by its first 512 bytes."""
     return start.startswith((_ZIP, *DECODERS)) or _is_tar(start)
@@ -166,8 +159,8 @@ def save(source: Readable, place: Path) -> str:
     return digest.hexdigest()
 
 
-def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = None) -> Unpacked:
-    """Unpack a file that is compressed, or an archive.
+def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = None) -> tuple[Path, str]:
+    """Unpack a file that is compressed, or an archive: return the log, and what went wrong (empty: nothing).
 
     Parameters
     ----------
@@ -192,7 +185,7 @@ def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = Non
     written = [file for file in folder.rglob("*") if file.is_file() and file.stat().st_size]
     if budget.trouble and not written:
         raise LogError(path, "does not decompress", budget.trouble)
-    return Unpacked(found, f"{budget.trouble}; what could be unpacked was read" if budget.trouble else "")
+    return found, f"{budget.trouble}; what could be unpacked was read" if budget.trouble else ""
 
 
 class _Budget:

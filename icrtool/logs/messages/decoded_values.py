@@ -7,18 +7,36 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import lru_cache, reduce
+from itertools import islice
 from operator import xor
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Ints
-from icrtool.logs.containers.container import Block
+from icrtool.logs.containers.container import Block, Channel
 from icrtool.logs.messages.decoder import MESSAGES_AT_ONCE, Decoder, text_numbers
-from icrtool.logs.messages.schema import MOST_ELEMENTS, Slot, Step, steps_of
+from icrtool.logs.messages.definitions import (
+    BASE,
+    DEEPEST,
+    MOST_ELEMENTS,
+    MOST_FIELDS,
+    NAME,
+    SEQUENCE,
+    SIZES,
+    Definitions,
+    Slot,
+    Step,
+    full_name,
+    kind_at,
+    ros_definitions,
+    steps_of,
+)
+from icrtool.logs.messages.protobuf import definitions_in, descriptors_of, parser_of
 from icrtool.records.text import LONGEST_TEXT
 
 LONGEST_MESSAGE_BYTES = 1 << 20
@@ -26,36 +44,6 @@ LONGEST_MESSAGE_BYTES = 1 << 20
 
 _LARGEST_INTEGER = 1 << 62
 _FLOATS = ("float32", "float64")
-
-
-class MessageColumns(Protocol):
-    """Some decoded messages of one topic."""
-
-    @property
-    def readable(self) -> Bools:
-        """Which of the messages given (m,) are readable; what follows holds those alone."""
-        ...
-
-    def numbers(self, path: str) -> NDArray[Any]:
-        """Return a field of numbers as float64 or int64: (n,) or, of a sequence, (n, longest)."""
-        ...
-
-    def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
-        """Return the numbers of a text field's texts (n,) or (n, longest), -1 for none; new texts become known."""
-        ...
-
-
-class MessageDecoder(Protocol):
-    """Decodes the messages of one topic."""
-
-    @property
-    def slots(self) -> Mapping[str, Slot]:
-        """The wanted fields that the messages have, by path."""
-        ...
-
-    def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, MessageColumns]]:
-        """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,11 +114,13 @@ def _taker(path: str, kind: str) -> Callable[[object], Any]:
     steps = steps_of(path)
     convert = _text if kind == "string" else _float if kind in _FLOATS else _integer
 
-    def take_all(message: object) -> list[Any]:
-        values = value_at(message, steps)
-        return [convert(one) for one in values] if isinstance(values, list) else []
+    def take(message: object) -> Any:  # noqa: ANN401 - a number, a text, or a list of either
+        value = value_at(message, steps)
+        if "[*]" in path:
+            return [convert(one) for one in value] if isinstance(value, list) else []
+        return convert(value)
 
-    return take_all if "[*]" in path else lambda message: convert(value_at(message, steps))
+    return take
 
 
 def parse_json(data: bytes) -> dict[str, Any] | None:
@@ -249,44 +239,31 @@ def parse_sentence(text: bytes) -> dict[str, Any] | None:
     if found is None or reduce(xor, found[1]) != int(found[2], 16):
         return None
     name, *fields = found[1].decode("ascii").split(",")
-    read = _READERS.get(name[2:])
-    return {} if read is None else read([*fields, *[""] * 16])
-
-
-def _gga(fields: Sequence[str]) -> dict[str, Any]:
-    _, north, hemisphere, east, side, quality, _, _, height, _, undulation, *_ = fields
-    return {
-        "sentence_kind": GGA,
-        "latitude": _degrees(north, hemisphere, "NS"),
-        "longitude": _degrees(east, side, "EW"),
-        "altitude": _number(height) + _number(undulation or "0"),
-        "quality": int(quality) if quality.isdecimal() and len(quality) == 1 else 0,
-    }
-
-
-def _rmc(fields: Sequence[str]) -> dict[str, Any]:
-    _, status, north, hemisphere, east, side, _, _, _, _, _, mode, *_ = fields
-    return {
-        "sentence_kind": RMC,
-        "latitude": _degrees(north, hemisphere, "NS"),
-        "longitude": _degrees(east, side, "EW"),
-        "quality": QUALITY_OF_MODE.get(mode, 1) if status == "A" else 0,
-    }
-
-
-def _gst(fields: Sequence[str]) -> dict[str, Any]:
-    return {
-        "sentence_kind": GST,
-        "north_std": _number(fields[5]),
-        "east_std": _number(fields[6]),
-    }
-
-
-def _hdt(fields: Sequence[str]) -> dict[str, Any]:
-    return {"sentence_kind": HDT, "heading": _number(fields[0])}
-
-
-_READERS: dict[str, Callable[[Sequence[str]], dict[str, Any]]] = {"GGA": _gga, "RMC": _rmc, "GST": _gst, "HDT": _hdt}
+    fields += [""] * 16
+    match name[2:]:
+        case "GGA":
+            _, north, hemisphere, east, side, quality, _, _, height, _, undulation, *_ = fields
+            return {
+                "sentence_kind": GGA,
+                "latitude": _degrees(north, hemisphere, "NS"),
+                "longitude": _degrees(east, side, "EW"),
+                "altitude": _number(height) + _number(undulation or "0"),
+                "quality": int(quality) if quality.isdecimal() and len(quality) == 1 else 0,
+            }
+        case "RMC":
+            _, status, north, hemisphere, east, side, _, _, _, _, _, mode, *_ = fields
+            return {
+                "sentence_kind": RMC,
+                "latitude": _degrees(north, hemisphere, "NS"),
+                "longitude": _degrees(east, side, "EW"),
+                "quality": QUALITY_OF_MODE.get(mode, 1) if status == "A" else 0,
+            }
+        case "GST":
+            return {"sentence_kind": GST, "north_std": _number(fields[5]), "east_std": _number(fields[6])}
+        case "HDT":
+            return {"sentence_kind": HDT, "heading": _number(fields[0])}
+        case _:
+            return {}
 
 
 def _number(text: str) -> float:
@@ -297,3 +274,118 @@ def _degrees(text: str, side: str, sides: str) -> float:
     """Return degrees of ``ddmm.mmmm``, negative on the second of two sides; NaN without one of them."""
     whole, minutes = divmod(_number(text), 100.0)
     return (whole + minutes / 60.0) * {sides[0]: 1.0, sides[1]: -1.0}.get(side, float("nan"))
+
+
+LONGEST_SCHEMA = 1 << 20
+"""Characters of a JSON schema."""
+
+_KINDS = {"integer": "int64", "number": "float64", "boolean": "bool", "string": "string"}
+_OTHER_NAMES = {
+    "header.stamp.sec": ("timestamp.sec", "timestamp.seconds"),
+    "header.stamp.nanosec": ("timestamp.nsec", "timestamp.nanos", "header.stamp.nsec"),
+    "header.frame_id": ("frame_id",),
+}
+"""Fields that stand for those of a ROS header in JSON and in Protobuf."""
+
+_FOXGLOVE_KINDS = {"frame_id": "string", "name": "string", "sec": "int64", "nsec": "int64"}
+"""Types of fields in Foxglove's schemas, of which JSON may name none; others are float64."""
+
+_MOST_PATHS, _MOST_NESTED = 512, 3
+"""Fields of an unknown type that are listed, and messages within one another in which they are looked for."""
+
+
+def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
+    """Return the decoder of Protobuf or JSON; a JSON schema without fields leaves it to the messages what they hold."""
+    definitions = _definitions_of(channel)
+    paths: dict[str, str] = {}
+    slots: dict[str, Slot] = {}
+    for column in wanted:
+        others = _OTHER_NAMES.get(column, ())
+        for path in (column, *others) if definitions else others[:1] or (column,):
+            if definitions:
+                kind = kind_at(definitions, full_name(channel.message_type), steps_of(path))
+            else:
+                kind = _FOXGLOVE_KINDS.get(path.rpartition(".")[2], "float64")
+            if kind is not None:
+                paths[column], slots[column] = path, Slot(kind, len(slots))
+                break
+    if channel.encoding == "json":
+        return ValueDecoder(slots, paths, parse_json)
+    descriptors = descriptors_of(channel.definition, channel.message_type)
+    parser = parser_of(descriptors, channel.message_type, [steps_of(path) for path in paths.values()])
+    return ValueDecoder(slots, paths, parser.parse)
+
+
+@lru_cache(maxsize=64)
+def definitions_in_schema(text: str, message_type: str) -> Definitions:
+    """Return the message types of a channel's JSON schema, as those of ROS are given; none where it lists no fields.
+
+    Raises
+    ------
+    DefinitionError
+        The schema cannot be read, or is too large.
+    """
+    if len(text) > LONGEST_SCHEMA:
+        raise DefinitionError(message_type, f"the schema in the log has more than {LONGEST_SCHEMA} characters")
+    try:
+        schema = orjson.loads(text) if text.strip() else {}
+    except ValueError as err:
+        raise DefinitionError(message_type, "the schema in the log is no JSON") from err
+    definitions: dict[str, tuple[Any, Any]] = {}
+    _add(definitions, message_type, schema, 0)
+    if sum(len(fields) for _, fields in definitions.values()) > MOST_FIELDS:
+        raise DefinitionError(message_type, f"its schema has more than {MOST_FIELDS} fields", "it is not read")
+    return definitions
+
+
+def _add(definitions: dict[str, tuple[Any, Any]], name: str, schema: object, depth: int) -> None:
+    """Add the fields of an object, and the types of those that are objects."""
+    properties = schema.get("properties") if isinstance(schema, dict) else None
+    if not isinstance(properties, dict) or depth > DEEPEST:
+        return
+    fields: list[tuple[str, tuple[int, Any]]] = []
+    definitions[name] = ([], fields)
+    for part, described in properties.items():
+        inner = f"{name}.{part}"
+        is_list = _kind(described) == "array"
+        if is_list:
+            described = described.get("items")  # noqa: PLW2901 - the elements are described as a field is
+        kind = _kind(described)
+        one = (NAME, inner) if kind == "object" else (BASE, (_KINDS.get(kind, "float64"), 0))
+        fields.append((part, (SEQUENCE, (one, 0)) if is_list else one))
+        if kind == "object":
+            _add(definitions, inner, described, depth + 1)
+
+
+def _kind(described: object) -> str:
+    """Return the type that a schema states; empty where it states none, as of an enumeration, which is a number."""
+    if not isinstance(described, dict):
+        return ""
+    kind = described.get("type", "object" if "properties" in described else None)
+    kinds = [one for one in (kind if isinstance(kind, list) else [kind]) if one != "null"]
+    return kinds[0] if kinds and isinstance(kinds[0], str) else ""
+
+
+def _definitions_of(channel: Channel) -> Definitions:
+    if channel.encoding == "protobuf":
+        return definitions_in(descriptors_of(channel.definition, channel.message_type))
+    if channel.encoding == "json":
+        return definitions_in_schema(channel.definition, channel.message_type)
+    return ros_definitions(channel)
+
+
+def number_fields(channel: Channel) -> list[str]:
+    """Return the paths of the plain numbers in a channel's messages; empty where its type is not known."""
+    try:
+        definitions = _definitions_of(channel)
+    except DefinitionError:
+        return []
+    return list(islice(_numbers_in(definitions, full_name(channel.message_type), "", 0), _MOST_PATHS))
+
+
+def _numbers_in(definitions: Definitions, name: str, prefix: str, depth: int) -> Iterator[str]:
+    for named, (node, detail) in definitions[name][1] if name in definitions else ():
+        if int(node) == BASE and detail[0] in SIZES:
+            yield f"{prefix}{named}"
+        elif int(node) == NAME and depth < _MOST_NESTED:
+            yield from _numbers_in(definitions, detail, f"{prefix}{named}.", depth + 1)

@@ -7,7 +7,7 @@ gathered at once. Messages without a like are decoded one by one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from struct import Struct
@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
+from icrtool.logs.containers.chunk import unaligned
 from icrtool.logs.containers.container import Block, Channel
-from icrtool.logs.messages.definitions import definitions_of
-from icrtool.logs.messages.schema import (
+from icrtool.logs.messages.definitions import (
     COUNTED,
     MOST_ELEMENTS,
     MOST_TAKEN,
@@ -30,6 +30,7 @@ from icrtool.logs.messages.schema import (
     Operation,
     Slot,
     compile_layout,
+    ros_definitions,
 )
 from icrtool.records.text import LONGEST_TEXT
 
@@ -99,7 +100,8 @@ class _Run:
         self._message, self._stop, self._cdr = message, len(message), layout.cdr
         self._base = self._at = 4 if layout.cdr else 0
         self._steps_left = min(_STEPS_PER_BYTE * len(message) + _LEAST_STEPS + 2 * len(layout.program), _MOST_STEPS)
-        self._lengths: list[int] = []
+        # the ranges that decide the shape: encapsulation and lengths; those beside one another are one
+        self._same, self._lengths = [[0, self._base]], 0
         self._taken: list[list[Any]] = [[] for _ in range(layout.taken)]
         self._big, readable = False, True
         try:
@@ -111,8 +113,14 @@ class _Run:
             self._program(layout.program, taking=True)
         except _UnreadableError:
             readable = False
-        same = None if len(self._lengths) > _MOST_LENGTHS else self._same()
-        self.shape = Shape(readable, self._at if readable else len(message), same, self._big, self._taken)
+        same = tuple((begin, message[begin:end]) for begin, end in self._same if message[begin:end])
+        self.shape = Shape(
+            readable=readable,
+            size=self._at if readable else len(message),
+            same=same if self._lengths <= _MOST_LENGTHS else None,
+            big=self._big,
+            taken=self._taken,
+        )
 
     def _program(self, program: Sequence[Operation], *, taking: bool) -> None:
         for kind, size, count, slot, counter, body, is_constant in program:
@@ -162,36 +170,35 @@ class _Run:
             self._at += (self._base - self._at) & 3
         if self._at + 4 > self._stop:
             raise _UnreadableError
-        if len(self._lengths) <= _MOST_LENGTHS:
-            self._lengths.append(self._at)
+        self._lengths += 1
+        if self._same[-1][1] == self._at:
+            self._same[-1][1] += 4
+        elif self._lengths <= _MOST_LENGTHS:
+            self._same.append([self._at, self._at + 4])
         number: int = self._unpack(self._message, self._at)[0]
         self._at += 4
         if number > self._stop - self._at:
             raise _UnreadableError
         return number
 
-    def _same(self) -> tuple[tuple[int, bytes], ...]:
-        """Return the ranges that decide the shape: encapsulation and lengths; those beside one another as one."""
-        ranges = [[0, min(4, self._stop)]] if self._cdr and self._stop else []
-        for at in self._lengths:
-            if ranges and ranges[-1][1] == at:
-                ranges[-1][1] = at + 4
-            else:
-                ranges.append([at, at + 4])
-        return tuple((begin, self._message[begin:end]) for begin, end in ranges)
-
 
 @dataclass(slots=True)
 class Decoder:
-    """Decodes messages of one topic; it knows the shapes of those before."""
+    """Decodes messages of one topic; it knows the shapes of those before.
+
+    Attributes
+    ----------
+    slots : the wanted fields that the messages have, by path; by default those of the layout
+    columns : what holds the messages
+    """
 
     layout: Layout
+    slots: Mapping[str, Slot] = field(default_factory=dict)
+    columns: type[Decoded] = field(default_factory=lambda: Decoded)
     _known: list[Shape] = field(default_factory=list)
 
-    @property
-    def slots(self) -> dict[str, Slot]:
-        """The wanted fields that the messages have, by path."""
-        return self.layout.slots
+    def __post_init__(self) -> None:
+        self.slots = self.slots or self.layout.slots
 
     def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, Decoded]]:
         """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
@@ -222,10 +229,10 @@ class Decoder:
             fits[0] = True
             if compare and shape.same is not None:
                 fits = size[left] >= shape.size if shape.readable else size[left] == shape.size
-                together = _unaligned(data, np.dtype((np.void, shape.size)))[start[left[fits]]]
+                together = unaligned(data, np.dtype((np.void, shape.size)))[start[left[fits]]]
                 fits[fits] = shape.of(together)
                 if not shapes and shape.readable and shape.size and fits.all():
-                    return Decoded(
+                    return self.columns(
                         self.layout,
                         together.view(np.uint8),
                         np.arange(0, len(start) * shape.size, shape.size),
@@ -238,7 +245,7 @@ class Decoder:
             left = left[~fits]
         done = int(left[0]) if len(left) else len(start)
         readable = np.array([shape.readable for shape in shapes], np.bool_)[shape_of[:done]]
-        return Decoded(self.layout, data, start[:done][readable], shapes, shape_of[:done][readable], readable)
+        return self.columns(self.layout, data, start[:done][readable], shapes, shape_of[:done][readable], readable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +307,7 @@ class Decoded:
             row[: len(one)] = one
         # a message that lacks the number may be too near to the end of the data to be read there
         last = len(self.data) - kind.itemsize
-        values: NDArray[Any] = _unaligned(self.data, kind)[np.minimum(self.start[:, None] + table[self.shape_of], last)]
+        values: NDArray[Any] = unaligned(self.data, kind)[np.minimum(self.start[:, None] + table[self.shape_of], last)]
         return values
 
     def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
@@ -325,7 +332,7 @@ class Decoded:
         for shape, rows in self.by_shape():
             at, length = shape.taken[number][0]
             if length:
-                found[rows] = _unaligned(self.data, np.dtype((np.void, length)))[self.start[rows] + at].tolist()
+                found[rows] = unaligned(self.data, np.dtype((np.void, length)))[self.start[rows] + at].tolist()
         return list(found)
 
     def _codes(self, at: int, length: int, rows: Ints | slice, known: dict[bytes, int]) -> list[int]:
@@ -334,7 +341,7 @@ class Decoded:
         if len(self.shapes) == 1:
             texts = self._fields(at, kind)[:, 0]
         else:
-            texts = _unaligned(self.data, kind)[self.start[rows] + at]
+            texts = unaligned(self.data, kind)[self.start[rows] + at]
         is_one = length == 0 or bool((texts == texts[0]).all())
         return text_numbers(texts[: 1 if is_one else None].tolist(), known)
 
@@ -361,11 +368,6 @@ def text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
     return numbers
 
 
-def _unaligned(data: Bytes, kind: np.dtype[Any]) -> NDArray[Any]:
-    """Return the value that begins at each byte."""
-    return np.ndarray(max(len(data) - kind.itemsize + 1, 0), kind, data, strides=(1,))
-
-
 @cache
 def _types(kind: str) -> tuple[np.dtype[Any], np.dtype[Any]]:
     """Return the type of a slot's numbers in little-endian messages, and in columns."""
@@ -382,4 +384,4 @@ def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:
         The layout of the channel's type is not known.
     """
     encoding: Literal["cdr", "ros1"] = "cdr" if channel.encoding == "cdr" else "ros1"
-    return Decoder(compile_layout(definitions_of(channel), channel.message_type, wanted, encoding))
+    return Decoder(compile_layout(ros_definitions(channel), channel.message_type, wanted, encoding))

@@ -1,99 +1,63 @@
-"""Message definitions: the log's own (text, IDL, schema), else the bundled vendor ones, else those of ROS 2 Humble."""
+"""Message definitions, and where the wanted fields of a type are: its definition compiled to a small program.
+
+Definitions are the log's own (text, IDL, schema), else the bundled vendor ones, else those of ROS 2 Humble. A message
+has no index: the offset of a field depends on the strings and sequences before it. The program lists what to pass over
+and what to take; `icrtool.logs.messages.decoder` runs it over one message of each shape.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
-from itertools import islice
-from typing import Any, Literal
-
-import orjson
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.protobuf import definitions_in, descriptors_of
-from icrtool.logs.messages.schema import (
-    ARRAY,
-    BASE,
-    DEEPEST,
-    MOST_FIELDS,
-    NAME,
-    SEQUENCE,
-    SIZES,
-    Definitions,
-    FieldDetail,
-    Step,
-)
 from icrtool.records.text import LONGEST_NAME, shortened
 
-LONGEST_SCHEMA = 1 << 20
-"""Characters of a JSON schema."""
+NUMBERS, TEXT, LOOP = range(3)
+"""Kinds of operations."""
 
-_KINDS = {"integer": "int64", "number": "float64", "boolean": "bool", "string": "string"}
+Definitions = Mapping[str, tuple[Any, Any]]
+"""``package/msg/Name`` to (constants, fields), as rosbags parses it."""
 
+FieldDetail: TypeAlias = Any
+"""Name and length of a field's type; rosbags nests them by the kind of type."""
 
-@lru_cache(maxsize=64)
-def definitions_in_schema(text: str, message_type: str) -> Definitions:
-    """Return the message types of a channel's JSON schema, as those of ROS are given; none where it lists no fields.
+BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
+"""Kinds of field types, the numbers of rosbags' Nodetype."""
+SIZES = {
+    "bool": 1, "byte": 1, "char": 1, "octet": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
+    "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
+}  # fmt: skip
+LONGEST_UNROLLED = 4096
+"""Longest fixed array of which elements are taken: a covariance has 36."""
 
-    Raises
-    ------
-    DefinitionError
-        The schema cannot be read, or is too large.
-    """
-    if len(text) > LONGEST_SCHEMA:
-        raise DefinitionError(message_type, f"the schema in the log has more than {LONGEST_SCHEMA} characters")
-    try:
-        schema = orjson.loads(text) if text.strip() else {}
-    except ValueError as err:
-        raise DefinitionError(message_type, "the schema in the log is no JSON") from err
-    definitions: dict[str, tuple[Any, Any]] = {}
-    _add(definitions, message_type, schema, 0)
-    if sum(len(fields) for _, fields in definitions.values()) > MOST_FIELDS:
-        raise DefinitionError(message_type, f"its schema has more than {MOST_FIELDS} fields", "it is not read")
-    return definitions
+DEEPEST, MOST_FIELDS, LONGEST_FIXED, MOST_NUMBERS = 32, 20_000, 1 << 31, 1 << 16
+"""Bounds of a definition: messages within one another, fields in all, elements of a fixed array, numbers taken.
 
+Real definitions reach a depth of 6 and some hundred fields; a definition that refers to itself has no end.
+"""
+MOST_ELEMENTS, MOST_TAKEN = 256, 1024
+"""Taken of a sequence, and of sequences in the elements of a sequence together."""
 
-def _add(definitions: dict[str, tuple[Any, Any]], name: str, schema: object, depth: int) -> None:
-    """Add the fields of an object, and the types of those that are objects."""
-    properties = schema.get("properties") if isinstance(schema, dict) else None
-    if not isinstance(properties, dict) or depth > DEEPEST:
-        return
-    fields: list[tuple[str, tuple[int, Any]]] = []
-    definitions[name] = ([], fields)
-    for field, described in properties.items():
-        inner = f"{name}.{field}"
-        kind = _kind(described)
-        if kind == "array":
-            described = described.get("items")  # noqa: PLW2901 - the elements are described as a field is
-            kind = _kind(described)
-            element = (NAME, inner) if kind == "object" else (BASE, (_KINDS.get(kind, "float64"), 0))
-            fields.append((field, (SEQUENCE, (element, 0))))
-        else:
-            fields.append((field, (NAME, inner) if kind == "object" else (BASE, (_KINDS.get(kind, "float64"), 0))))
-        if kind == "object":
-            _add(definitions, inner, described, depth + 1)
+Step = str | int | None
+"""A field's name, an element's place, or None for all elements of a sequence."""
 
+_STEP = re.compile(r"([^.\[\]]+)|\[(\d+|\*)\]")
 
-def _kind(described: object) -> str:
-    """Return the type that a schema states; empty where it states none, as of an enumeration, which is a number."""
-    if not isinstance(described, dict):
-        return ""
-    kind = described.get("type", "object" if "properties" in described else None)
-    kinds = [one for one in (kind if isinstance(kind, list) else [kind]) if one != "null"]
-    return kinds[0] if kinds and isinstance(kinds[0], str) else ""
+COUNTED = -1
+"""In place of a number of elements: the message states it before them."""
 
 
 _SEPARATOR = "=" * 80 + "\n"
 LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
 """Limits for a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
-LONGEST_IDL, MOST_NUMBERS = 1 << 16, 512
+LONGEST_IDL, MOST_IDL_NUMBERS = 1 << 16, 512
 """Characters and lengths, bounds and constants of a definition in IDL; the parser takes 5 ms for each number."""
-
-MOST_NESTED = 3
-"""Messages within one another in which a field of an unknown type is looked for."""
 
 _COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
 _ANNOTATION = re.compile(r"@\s*[\w:]+(?:\s*\([^()]*\))?")
@@ -107,18 +71,14 @@ _TIME: Definitions = {
 """Time and duration: ROS 1 has no definitions of them; in ROS 2 a definition text may leave them out."""
 
 
-def definitions_of(channel: Channel) -> Definitions:
-    """Return the definitions that a channel's type needs.
+def ros_definitions(channel: Channel) -> Definitions:
+    """Return the definitions that the type of a channel of ROS messages needs.
 
     Raises
     ------
     DefinitionError
         Neither the log nor the bundle knows the type, or the log's text cannot be parsed.
     """
-    if channel.encoding == "protobuf":
-        return definitions_in(descriptors_of(channel.definition, channel.message_type))
-    if channel.encoding == "json":
-        return definitions_in_schema(channel.definition, channel.message_type)
     if channel.definition:
         types = {**_TIME, **_parse(channel.definition, channel.definition_format, channel.message_type)}
         return types if _is_complete(types) else {**standard_definitions(), **types}
@@ -131,23 +91,6 @@ def definitions_of(channel: Channel) -> Definitions:
     if name in standard_definitions():
         return standard_definitions()
     raise DefinitionError(channel.message_type, "its definition is not in the log and not bundled")
-
-
-def number_fields(channel: Channel) -> list[str]:
-    """Return the paths of the plain numbers in a channel's messages; empty where its type is not known."""
-    try:
-        definitions = definitions_of(channel)
-    except DefinitionError:
-        return []
-    return list(islice(_numbers_in(definitions, full_name(channel.message_type), "", 0), MOST_NUMBERS))
-
-
-def _numbers_in(definitions: Definitions, name: str, prefix: str, depth: int) -> Iterator[str]:
-    for field, (node, detail) in definitions[name][1] if name in definitions else ():
-        if int(node) == BASE and detail[0] in SIZES:
-            yield f"{prefix}{field}"
-        elif int(node) == NAME and depth < MOST_NESTED:
-            yield from _numbers_in(definitions, detail, f"{prefix}{field}.", depth + 1)
 
 
 def kind_at(definitions: Definitions, name: str, steps: Sequence[Step]) -> str | None:
@@ -197,11 +140,9 @@ def _parse(text: str, written: Literal["msg", "idl"], message_type: str) -> Defi
         parts = text.split(_SEPARATOR)[1:] if text.startswith(f"{_SEPARATOR}IDL: ") else [f"\n{text}"]
         plain = [_plain_idl(part.split("\n", 1)[1]) for part in parts]
         numbers = sum(part.count(sign) for part in plain for sign in "[<=")
-        if numbers > MOST_NUMBERS or sum(map(len, plain)) > LONGEST_IDL or any(map(_EXPRESSION.search, plain)):
-            why = (
-                f"its definition has expressions, {MOST_NUMBERS} numbers, or {LONGEST_IDL} characters without comments"
-            )
-            raise DefinitionError(message_type, why, "this type is not read")
+        if numbers > MOST_IDL_NUMBERS or sum(map(len, plain)) > LONGEST_IDL or any(map(_EXPRESSION.search, plain)):
+            why = f"expressions, {MOST_IDL_NUMBERS} numbers, or {LONGEST_IDL} characters without comments"
+            raise DefinitionError(message_type, f"its definition has {why}", "this type is not read")
         types: dict[str, Any] = {}
         for part in plain:
             types.update(get_types_from_idl(part))
@@ -241,3 +182,194 @@ def standard_definitions() -> Definitions:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE).fielddefs
+
+
+class Operation(NamedTuple):
+    """A step of a program.
+
+    Attributes
+    ----------
+    kind : `NUMBERS`, `TEXT` or `LOOP`
+    size, number : bytes of a number; how many numbers or elements, or `COUNTED`
+    slot : number of the slot that takes it, -1 where it is passed over
+    counter : number of the slot that takes a counted number of elements, -1 where it is passed over
+    body : what each element of a loop is made of
+    is_constant : nothing in the loop is counted or taken: from the second element on, all have the same size
+    """
+
+    kind: int
+    size: int
+    number: int
+    slot: int
+    counter: int = -1
+    body: tuple[Operation, ...] = ()
+    is_constant: bool = False
+
+    @property
+    def takes(self) -> bool:
+        """Whether anything in it is taken."""
+        return self.slot >= 0 or self.counter >= 0 or any(operation.takes for operation in self.body)
+
+
+class Slot(NamedTuple):
+    """A wanted field: its primitive type (or ``string``), and its number."""
+
+    kind: str
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A compiled message layout.
+
+    Attributes
+    ----------
+    slots : by path
+    taken : how many slots the program knows; of a field that a definition has twice, the last one counts
+    """
+
+    program: tuple[Operation, ...]
+    slots: dict[str, Slot]
+    taken: int
+    cdr: bool
+
+
+def steps_of(path: str) -> tuple[Step, ...]:
+    """Return the steps of a path such as ``joints[*].name`` or ``position_covariance[4]``."""
+    found = (match.groups() for match in _STEP.finditer(path))
+    return tuple(name or (None if place == "*" else int(place)) for name, place in found)
+
+
+class _Compiler:
+    """Reads a definition once and writes the program."""
+
+    def __init__(self, definitions: Definitions, wanted: Sequence[str], *, cdr: bool) -> None:
+        self._definitions = definitions
+        self._wanted = frozenset(wanted)
+        self.cdr = cdr
+        self.program: list[Operation] = []
+        self.slots: dict[str, Slot] = {}
+        self._fields = self._depth = self._loops = self.taken = self._numbers_taken = 0
+
+    def message(self, name: str, prefix: str) -> None:
+        """Write the fields of message type `name`."""
+        if name not in self._definitions:
+            raise DefinitionError(name, "its definition is not in the log and not bundled")
+        if self._depth >= DEEPEST:
+            raise DefinitionError(name, f"its definition nests more than {DEEPEST} messages", "this type is not read")
+        self._depth += 1
+        for field, (node, detail) in self._definitions[name][1]:
+            self._fields += 1
+            if self._fields > MOST_FIELDS:
+                raise DefinitionError(name, f"its definition has more than {MOST_FIELDS} fields", "it is not read")
+            path = f"{prefix}{field}"
+            if node == NAME:
+                self.message(detail, f"{path}.")
+            elif node == BASE:
+                self._base(path, detail[0])
+            else:
+                (element, inner), length = detail
+                count = length if node == ARRAY else COUNTED
+                if count > LONGEST_FIXED:
+                    raise DefinitionError(path, "its definition has an array longer than a message can be")
+                if element == BASE and inner[0] in SIZES:
+                    self._array(path, inner[0], count)
+                else:
+                    self._loop(f"{path}[*]", element, inner, count)
+        self._depth -= 1
+
+    def _base(self, path: str, kind: str) -> None:
+        if kind == "string":
+            self.program.append(Operation(TEXT, 0, COUNTED, self._slot(path, kind) if path in self._wanted else -1))
+        elif kind not in SIZES:
+            raise DefinitionError(path, f"field type {kind} is not read", "only its message type is affected")
+        elif path in self._wanted:
+            self.program.append(Operation(NUMBERS, SIZES[kind], 1, self._slot(path, kind)))
+        else:
+            self._skip(SIZES[kind], 1)
+
+    def _slot(self, path: str, kind: str, count: int = 1) -> int:
+        """Return the number of a new slot for a field of up to `count` numbers or texts."""
+        if path.count("[*]") > 2:
+            raise DefinitionError(path, "a sequence in each element of a sequence of sequences is not read")
+        nested = path.count("[*]") > 1
+        self._numbers_taken += MOST_TAKEN if nested else count * (MOST_ELEMENTS if self._loops else 1)
+        if self._numbers_taken > MOST_NUMBERS:
+            raise DefinitionError("message", f"more than {MOST_NUMBERS} numbers of each message would be taken")
+        self.slots[path] = Slot(kind, self.taken)
+        self.taken += 1
+        return self.taken - 1
+
+    def _array(self, path: str, kind: str, count: int) -> None:
+        """Write an array (of fixed length) or sequence of numbers."""
+        size, all_of_it = SIZES[kind], f"{path}[*]"
+        is_wanted = any(name.startswith(f"{path}[") for name in self._wanted)
+        if count > LONGEST_UNROLLED and is_wanted:
+            raise DefinitionError(path, f"an array of {count} numbers is not read")
+        if all_of_it in self._wanted:
+            slot = self._slot(all_of_it, kind, MOST_ELEMENTS if count == COUNTED else count)
+            self.program.append(Operation(NUMBERS, size, count, slot, self._counter(path)))
+        elif count == COUNTED:
+            self.program.append(Operation(NUMBERS, size, COUNTED, -1))
+        elif is_wanted:
+            for i in range(count):
+                self._base(f"{path}[{i}]", kind)
+        else:
+            self._skip(size, count)
+
+    def _counter(self, path: str) -> int:
+        """Return the slot that takes the number of elements of a sequence, -1 where it is not wanted."""
+        return self._slot(f"{path}[#]", "uint32") if f"{path}[#]" in self._wanted else -1
+
+    def _loop(self, path: str, element: int, inner: FieldDetail, count: int) -> None:
+        """Write a loop over the elements of an array or sequence of strings or messages."""
+        before, self.program, counter = self.program, [], self._counter(path.removesuffix("[*]"))
+        self._loops += 1
+        if element == BASE:
+            self._base(path, inner[0])
+        else:
+            self.message(inner, f"{path}.")
+        self._loops -= 1
+        body, self.program = tuple(self.program), before
+        is_constant = all(step.number != COUNTED and step.slot < 0 for step in body)
+        is_constant = is_constant and all(step.is_constant for step in body if step.kind == LOOP)
+        self.program.append(Operation(LOOP, 0, count, -1, counter, body, is_constant))
+
+    def _skip(self, size: int, count: int) -> None:
+        if not self.cdr:
+            size, count = 1, size * count
+        last = self.program[-1] if self.program else None
+        if last is not None and last[:2] == (NUMBERS, size) and last.number != COUNTED and last.slot < 0:
+            self.program[-1] = last._replace(number=last.number + count)
+        else:
+            self.program.append(Operation(NUMBERS, size, count, -1))
+
+
+def compile_layout(
+    definitions: Definitions,
+    message_type: str,
+    wanted: Sequence[str],
+    encoding: Literal["cdr", "ros1"],
+) -> Layout:
+    """Compile the layout of a message type.
+
+    Parameters
+    ----------
+    definitions : of the type and all types it contains
+    message_type : ``package/Name``
+    wanted : paths such as ``header.stamp.sec``, ``orientation_covariance[0]``, ``position[*]``,
+        ``drivers[*].measured_travel``; those the type does not have are left out of the layout's slots. Of a sequence
+        in each element of a sequence (``a[*].b[*]``) all elements come in a row; ``a[*].b[#]`` are their numbers
+
+    Raises
+    ------
+    DefinitionError
+        The definition of a type in it is missing, or a field has a type that cannot be skipped.
+    """
+    package, _, name = message_type.partition("/")
+    compiler = _Compiler(definitions, wanted, cdr=encoding == "cdr")
+    compiler.message(f"{package}/msg/{name}", "")
+    program = compiler.program
+    while program and not program[-1].takes:
+        program.pop()
+    return Layout(tuple(program), compiler.slots, compiler.taken, compiler.cdr)

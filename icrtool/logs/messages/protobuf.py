@@ -14,7 +14,8 @@ from struct import Struct
 from typing import Any, NamedTuple
 
 from icrtool.errors import DefinitionError
-from icrtool.logs.messages.schema import BASE, DEEPEST, MOST_ELEMENTS, MOST_FIELDS, NAME, SEQUENCE, Definitions, Step
+from icrtool.logs.messages.definitions import BASE, MOST_ELEMENTS, MOST_FIELDS, NAME, SEQUENCE, Definitions, Step
+from icrtool.records.text import LONGEST_TEXT
 
 LONGEST_DESCRIPTORS = 1 << 20
 """Bytes of a FileDescriptorSet; that of all schemas of Foxglove has 60,000."""
@@ -31,7 +32,7 @@ KINDS = {
 }  # fmt: skip
 """By the number of a type in FieldDescriptorProto; 14 is an enumeration. Groups and bytes are not read."""
 
-_MESSAGE, _STRING, _REPEATED = 11, 9, 3
+_MESSAGE, _STRING, _INT32, _REPEATED = 11, 9, 5, 3
 _FIXED = {
     1: (Struct("<d"), _FIXED64), 2: (Struct("<f"), _FIXED32), 6: (Struct("<Q"), _FIXED64),
     7: (Struct("<I"), _FIXED32), 15: (Struct("<i"), _FIXED32), 16: (Struct("<q"), _FIXED64),
@@ -98,60 +99,32 @@ def _wire_fields(data: bytes, at: int, stop: int) -> Iterator[tuple[int, int, in
         yield number, wire, begin, at
 
 
-class _DescriptorReader:
-    """Reads the message types of a FileDescriptorSet."""
+@dataclass(slots=True)
+class _Node:
+    """The wanted fields of a message: by number, each with those of the message in it; and values of lacking ones."""
 
-    def __init__(self) -> None:
-        self.found: dict[str, list[ProtobufField]] = {}
-        self._left = MOST_FIELDS
+    fields: dict[int, tuple[ProtobufField, _Node | None]] = field(default_factory=dict)
+    default: dict[str, Any] = field(default_factory=dict)
 
-    def files(self, data: bytes) -> None:
-        for number, wire, begin, end in _wire_fields(data, 0, len(data)):
-            if (number, wire) == (1, _BYTES):
-                self._file(data[begin:end])
-
-    def _parts(self, data: bytes) -> dict[int, list[Any]]:
-        """Return the values of a descriptor's fields by number: bytes, or numbers."""
-        parts: dict[int, list[Any]] = {}
-        for number, wire, begin, end in _wire_fields(data, 0, len(data)):
-            self._left -= 1
-            if self._left < 0:
-                raise _UnreadableError
-            parts.setdefault(number, []).append(begin if wire == _VARINT else data[begin:end])
-        return parts
-
-    def _file(self, data: bytes) -> None:
-        parts = self._parts(data)
-        package = _last_text(parts, 2)
-        for message in parts.get(4, ()):
-            self._message(message, f"{package}." if package else "", 0, implicit=_last_text(parts, 12) == "proto3")
-
-    def _message(self, data: bytes, prefix: str, depth: int, *, implicit: bool) -> None:
-        if depth > DEEPEST:
-            raise _UnreadableError
-        parts = self._parts(data)
-        name = f"{prefix}{_last_text(parts, 1)}"
-        self.found[name] = [self._field(one, implicit=implicit) for one in parts.get(2, ())]
-        for nested in parts.get(3, ()):
-            self._message(nested, f"{name}.", depth + 1, implicit=implicit)
-
-    def _field(self, data: bytes, *, implicit: bool) -> ProtobufField:
-        parts = self._parts(data)
-        number, label, kind = (one[-1] if (one := parts.get(part)) else 0 for part in (3, 4, 5))
-        if not all(isinstance(one, int) for one in (number, label, kind)):
-            raise _UnreadableError
-        in_group = bool(parts.get(9))  # of a oneof, which `optional` makes too
-        refers = _last_text(parts, 6).removeprefix(".")
-        return ProtobufField(_last_text(parts, 1), number, kind, refers, label == _REPEATED, implicit and not in_group)
+    def add(self, name: str, number: int, kind: int, inner: _Node | None = None) -> None:
+        """Add a field of a descriptor; those that hold messages are repeated."""
+        self.fields[number] = ProtobufField(name, number, kind, "", inner is not None, is_default=False), inner
 
 
-def _last_text(parts: Mapping[int, list[Any]], number: int) -> str:
-    found = parts.get(number)
-    if found is None:
-        return ""
-    if not isinstance(found[-1], bytes):
-        raise _UnreadableError
-    return found[-1].decode("utf-8", "replace")
+def _descriptor_set() -> _Node:
+    """Return the wanted fields of a FileDescriptorSet, as google/protobuf/descriptor.proto has them."""
+    files, file, message, described = _Node(), _Node(), _Node(), _Node()
+    files.add("file", 1, _MESSAGE, file)
+    file.add("package", 2, _STRING)
+    file.add("message_type", 4, _MESSAGE, message)
+    file.add("syntax", 12, _STRING)
+    message.add("name", 1, _STRING)
+    message.add("field", 2, _MESSAGE, described)
+    message.add("nested_type", 3, _MESSAGE, message)
+    for name, number, kind in (("name", 1, _STRING), ("number", 3, _INT32), ("label", 4, _INT32), ("type", 5, _INT32),
+                               ("type_name", 6, _STRING), ("oneof_index", 9, _INT32)):  # fmt: skip
+        described.add(name, number, kind)
+    return files
 
 
 @lru_cache(maxsize=64)
@@ -169,15 +142,40 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
     """
     if len(text) > LONGEST_DESCRIPTORS:
         raise DefinitionError(message_type, f"the schema in the log has more than {LONGEST_DESCRIPTORS} bytes")
-    reader = _DescriptorReader()
-    try:
-        reader.files(text.encode("latin-1"))
-    except (_UnreadableError, IndexError) as err:
+    found: dict[str, list[ProtobufField]] = {}
+    described = ProtobufParser(_descriptor_set(), MOST_FIELDS, MOST_FIELDS).parse(text.encode("latin-1"))
+    if described is None:
         why = f"the schema in the log is no FileDescriptorSet, or has more than {MOST_FIELDS} parts"
-        raise DefinitionError(message_type, why) from err
-    if message_type not in reader.found:
+        raise DefinitionError(message_type, why)
+    for file in described.get("file", ()):
+        package = file.get("package", "")
+        is_implicit = file.get("syntax") == "proto3"
+        _add_types(found, file.get("message_type", ()), f"{package}." if package else "", is_implicit=is_implicit)
+    if message_type not in found:
         raise DefinitionError(message_type, "the schema in the log lacks it")
-    return reader.found
+    return found
+
+
+def _add_types(
+    found: dict[str, list[ProtobufField]], messages: Sequence[dict[str, Any]], prefix: str, *, is_implicit: bool
+) -> None:
+    """Add descriptors of messages, and of those within them."""
+    for message in messages:
+        # a name of megabytes before each of thousands of types would fill the memory
+        name = f"{prefix}{message.get('name', '')}"[:LONGEST_TEXT]
+        found[name] = [
+            ProtobufField(
+                name=one.get("name", ""),
+                number=one.get("number", 0),
+                type=one.get("type", 0),
+                refers=one.get("type_name", "").removeprefix("."),
+                repeated=one.get("label") == _REPEATED,
+                # `optional` makes a oneof, too
+                is_default=is_implicit and "oneof_index" not in one,
+            )
+            for one in message.get("field", ())
+        ]
+        _add_types(found, message.get("nested_type", ()), f"{name}.", is_implicit=is_implicit)
 
 
 def definitions_in(descriptors: Descriptors) -> Definitions:
@@ -193,47 +191,44 @@ def definitions_in(descriptors: Descriptors) -> Definitions:
     return definitions
 
 
-@dataclass(slots=True)
-class _Node:
-    """The wanted fields of a message: by number, each with those of the message in it; and values of lacking ones."""
+def parser_of(descriptors: Descriptors, message_type: str, paths: Sequence[Sequence[Step]]) -> ProtobufParser:
+    """Return what takes the fields at the steps of each path of messages of one type."""
+    return ProtobufParser(_wanted(descriptors, message_type, paths), MOST_WIRE_FIELDS, MOST_ELEMENTS)
 
-    fields: dict[int, tuple[ProtobufField, _Node | None]] = field(default_factory=dict)
-    default: dict[str, Any] = field(default_factory=dict)
+
+def _wanted(descriptors: Descriptors, name: str, paths: Sequence[Sequence[Step]]) -> _Node:
+    rests: dict[Step, list[Sequence[Step]]] = {}
+    for path in paths:
+        behind = path[1:] if len(path) < 2 or isinstance(path[1], str) else path[2:]
+        rests.setdefault(path[0], []).append(behind)
+    node = _Node()
+    for one in descriptors.get(name, ()):
+        if one.name in rests and (one.type in KINDS or one.type == _MESSAGE):
+            inner = _wanted(descriptors, one.refers, [rest for rest in rests[one.name] if rest])
+            node.fields[one.number] = (one, inner if one.type == _MESSAGE else None)
+            if one.is_default and not one.repeated and one.type != _MESSAGE:
+                node.default[one.name] = "" if one.type == _STRING else 0
+    return node
 
 
 class ProtobufParser:
-    """Takes the wanted fields of messages of one type.
+    """Takes the wanted fields of messages.
 
     Parameters
     ----------
-    paths : steps to each wanted field
+    most_fields, most_elements : of a message, and of one field; with more fields it is unreadable
     """
 
-    def __init__(self, descriptors: Descriptors, message_type: str, paths: Sequence[Sequence[Step]]) -> None:
-        self._descriptors = descriptors
-        self._root = self._node(message_type, paths)
+    def __init__(self, wanted: _Node, most_fields: int, most_elements: int) -> None:
+        self._wanted, self._most_fields, self._most_elements = wanted, most_fields, most_elements
         self._left = 0
-
-    def _node(self, name: str, paths: Sequence[Sequence[Step]]) -> _Node:
-        rests: dict[Step, list[Sequence[Step]]] = {}
-        for path in paths:
-            behind = path[1:] if len(path) < 2 or isinstance(path[1], str) else path[2:]
-            rests.setdefault(path[0], []).append(behind)
-        node = _Node()
-        for one in self._descriptors.get(name, ()):
-            if one.name in rests and (one.type in KINDS or one.type == _MESSAGE):
-                inner = self._node(one.refers, [rest for rest in rests[one.name] if rest])
-                node.fields[one.number] = (one, inner if one.type == _MESSAGE else None)
-                if one.is_default and not one.repeated and one.type != _MESSAGE:
-                    node.default[one.name] = "" if one.type == _STRING else 0
-        return node
 
     def parse(self, data: bytes) -> dict[str, Any] | None:
         """Return the wanted values of a message, None where it cannot be read."""
-        self._left = MOST_WIRE_FIELDS
+        self._left = self._most_fields
         try:
-            return self._message(data, 0, len(data), self._root, dict(self._root.default))
-        except (_UnreadableError, IndexError):
+            return self._message(data, 0, len(data), self._wanted, dict(self._wanted.default))
+        except (_UnreadableError, IndexError, RecursionError):
             return None
 
     def _message(self, data: bytes, at: int, stop: int, node: _Node, into: dict[str, Any]) -> dict[str, Any]:
@@ -254,7 +249,7 @@ class ProtobufParser:
                 values = _values(data, one, wire, begin, end)
             if not one.repeated:
                 into[one.name] = values[-1]
-            elif len(kept := into.setdefault(one.name, [])) < MOST_ELEMENTS:
+            elif len(kept := into.setdefault(one.name, [])) < self._most_elements:
                 kept += values
         return into
 
@@ -273,18 +268,14 @@ def _values(data: bytes, one: ProtobufField, wire: int, begin: int, end: int) ->
             raise _UnreadableError
         end = min(end - (end - begin) % fixed.size, begin + MOST_ELEMENTS * fixed.size)
         return [value for (value,) in fixed.iter_unpack(data[begin:end])]
-    if wire == _VARINT:
-        return [_of_varint(begin, one.type)]
-    if wire != _BYTES or not one.repeated:
-        raise _UnreadableError
-    found: list[Any] = []
-    while begin < end and len(found) < MOST_ELEMENTS:
-        value, begin = _varint(data, begin)
-        found.append(_of_varint(value, one.type))
-    return found
-
-
-def _of_varint(value: int, kind: int) -> int:
-    if kind in _ZIGZAG:
-        return value >> 1 ^ -(value & 1)
-    return value - (1 << 64) if kind in _SIGNED and value >> 63 else value
+    found: list[int] = [begin]
+    if wire != _VARINT:
+        if wire != _BYTES or not one.repeated:
+            raise _UnreadableError
+        found = []
+        while begin < end and len(found) < MOST_ELEMENTS:
+            value, begin = _varint(data, begin)
+            found.append(value)
+    if one.type in _ZIGZAG:
+        return [value >> 1 ^ -(value & 1) for value in found]
+    return [value - (1 << 64) if one.type in _SIGNED and value >> 63 else value for value in found]

@@ -5,7 +5,6 @@ The decoder is chosen by message type and by how messages are serialized.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -13,20 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Ints
+from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Block, Channel
 from icrtool.logs.messages.decoded_values import (
     NMEA_SENTENCE,
-    MessageColumns,
-    MessageDecoder,
+    DecodedValues,
     SentenceDecoder,
     ValueDecoder,
-    parse_json,
+    value_decoder,
 )
 from icrtool.logs.messages.decoder import Decoded, Decoder, ros_decoder
-from icrtool.logs.messages.definitions import definitions_of, full_name, kind_at
-from icrtool.logs.messages.protobuf import ProtobufParser, descriptors_of
-from icrtool.logs.messages.schema import Slot, steps_of
+from icrtool.logs.messages.definitions import Slot
 from icrtool.records.text import LogText
 
 _MOST_EXPECTED = 1 << 22
@@ -207,6 +203,9 @@ class TopicTable:
         return texts[0] if texts else LogText("")
 
 
+MessageDecoder = Decoder | ValueDecoder | SentenceDecoder
+
+
 @dataclass(slots=True)
 class TopicCollector:
     """Gathers the columns of one topic while blocks go by: a ROS 1 bag gives each publisher a channel of its own.
@@ -232,7 +231,7 @@ class TopicCollector:
             if len(readable):
                 self._add(decoded, block.log_time_ns[readable], number)
 
-    def _add(self, decoded: MessageColumns, times: Ints, number: int) -> None:
+    def _add(self, decoded: Decoded | DecodedValues, times: Ints, number: int) -> None:
         expected = self.channel.count or 0
         self._times.add(times, expected)
         self._numbers.add(np.full(len(times), number), expected)
@@ -280,55 +279,24 @@ DYNAMIC_JOINT_STATE = "control_msgs/DynamicJointState"
 _NAMES, _INTERFACES, _VALUES = "joint_names[*]", "interface_values[*].interface_names", "interface_values[*].values"
 
 
-@dataclass(frozen=True, slots=True)
-class InterfaceDecoder:
-    """Decodes messages of DynamicJointState as those of a JointState; NaN where a joint has no such interface.
-
-    Attributes
-    ----------
-    inner : takes the header, the joints' names, and the names and values of all their interfaces in a row
-    """
-
-    inner: Decoder
-
-    @property
-    def slots(self) -> dict[str, Slot]:
-        """The wanted fields that the messages have, by path."""
-        made = {"name[*]": Slot("string", 0), "position[*]": Slot("float64", 1), "velocity[*]": Slot("float64", 2)}
-        return {path: slot for path, slot in self.inner.slots.items() if path in HEADER} | made
-
-    def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, JointColumns]]:
-        """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
-        for rows, decoded in self.inner.decode(block, number):
-            yield rows, JointColumns(decoded)
-
-
-@dataclass(frozen=True, slots=True)
-class JointColumns:
-    """Some messages of DynamicJointState with the columns of a JointState."""
-
-    inner: Decoded
-
-    @property
-    def readable(self) -> Bools:
-        """Which of the messages given (m,) are readable."""
-        return self.inner.readable
+class JointColumns(Decoded):
+    """Some messages of DynamicJointState with the columns of a JointState; NaN where a joint has no such interface."""
 
     def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
         """Return the numbers of a text field's texts; new texts become known."""
-        return self.inner.text_numbers(_NAMES if path == "name[*]" else path, known)
+        return super().text_numbers(_NAMES if path == "name[*]" else path, known)
 
     def numbers(self, path: str) -> NDArray[Any]:
         """Return a field of the header, or the interface of each joint that the path names (n, longest)."""
-        if path in HEADER:
-            return self.inner.numbers(path)
+        if path in self.layout.slots:
+            return super().numbers(path)
         texts: dict[bytes, int] = {}
-        joints = self.inner.text_numbers(_NAMES, texts).shape[1]
-        interfaces = self.inner.text_numbers(f"{_INTERFACES}[*]", texts)
-        values = self.inner.numbers(f"{_VALUES}[*]")
-        named, valued = (self.inner.numbers(f"{of}[#]")[:, :joints] for of in (_INTERFACES, _VALUES))
+        joints = self.text_numbers(_NAMES, texts).shape[1]
+        interfaces = self.text_numbers(f"{_INTERFACES}[*]", texts)
+        values = self.numbers(f"{_VALUES}[*]")
+        named, valued = (self.numbers(f"{of}[#]")[:, :joints] for of in (_INTERFACES, _VALUES))
         wanted, column = texts.get(path.removesuffix("[*]").encode(), -2), np.full((len(values), joints), np.nan)
-        for _, some in self.inner.by_shape():
+        for _, some in self.by_shape():
             # messages of a shape have as many interfaces of each joint: their places in a row are the same
             rows = np.arange(len(values))[some]
             names, numbers = named[rows[0]], valued[rows[0]]
@@ -346,13 +314,6 @@ class JointColumns:
 READ_ENCODINGS = ("cdr", "ros1", "protobuf", "json")
 """Serializations of messages that are read: of ROS 2, of ROS 1, and those of Foxglove."""
 
-_OTHER_NAMES = {
-    "header.stamp.sec": ("timestamp.sec", "timestamp.seconds"),
-    "header.stamp.nanosec": ("timestamp.nsec", "timestamp.nanos", "header.stamp.nsec"),
-    "header.frame_id": ("frame_id",),
-}
-"""Fields that stand for those of a ROS header in JSON and in Protobuf."""
-
 
 def collector_for(channel: Channel, wanted: tuple[str, ...], before: TopicCollector | None = None) -> TopicCollector:
     """Return what gathers the wanted columns of a channel: `before`, where another one of the topic came already.
@@ -369,7 +330,7 @@ def collector_for(channel: Channel, wanted: tuple[str, ...], before: TopicCollec
     if channel.message_type == DYNAMIC_JOINT_STATE:
         decoder = _interface_decoder(channel)
     elif channel.encoding in ("protobuf", "json"):
-        decoder = _value_decoder(channel, wanted)
+        decoder = value_decoder(channel, wanted)
     elif channel.message_type == NMEA_SENTENCE:
         decoder = SentenceDecoder(ros_decoder(channel, (*HEADER, "sentence")))
     else:
@@ -378,40 +339,15 @@ def collector_for(channel: Channel, wanted: tuple[str, ...], before: TopicCollec
     return collector
 
 
-def _interface_decoder(channel: Channel) -> InterfaceDecoder:
+def _interface_decoder(channel: Channel) -> Decoder:
+    """Return the decoder of DynamicJointState: it takes names and values of all interfaces of the joints in a row."""
     if channel.encoding not in ("cdr", "ros1"):
         raise DefinitionError(channel.topic, f"its lists within lists are not read in {str(channel.encoding)!r}")
-    decoder = ros_decoder(
-        channel, (*HEADER, _NAMES, *(f"{of}[{each}]" for of in (_INTERFACES, _VALUES) for each in "*#"))
-    )
+    in_a_row = (f"{of}[{each}]" for of in (_INTERFACES, _VALUES) for each in "*#")
+    decoder = ros_decoder(channel, (*HEADER, _NAMES, *in_a_row))
     kinds = {path: slot.kind for path, slot in decoder.slots.items()}
     if f"{_VALUES}[*]" not in kinds or any(kinds.get(path) != "string" for path in (_NAMES, f"{_INTERFACES}[*]")):
         raise DefinitionError(channel.message_type, "its definition in the log lacks names or values of the joints")
-    return InterfaceDecoder(decoder)
-
-
-def _value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
-    """Return the decoder of Protobuf or JSON; a JSON schema without fields leaves it to the messages what they hold."""
-    definitions = definitions_of(channel)
-    paths: dict[str, str] = {}
-    slots: dict[str, Slot] = {}
-    for column in wanted:
-        for path in (column, *_OTHER_NAMES.get(column, ())):
-            kind = kind_at(definitions, full_name(channel.message_type), steps_of(path)) if definitions else None
-            if kind is None and not definitions:
-                path, kind = _as_foxglove(column)  # noqa: PLW2901 - no schema has another name for it
-            if kind is not None:
-                paths[column], slots[column] = path, Slot(kind, len(slots))
-                break
-    if channel.encoding == "json":
-        return ValueDecoder(slots, paths, parse_json)
-    descriptors = descriptors_of(channel.definition, channel.message_type)
-    parser = ProtobufParser(descriptors, channel.message_type, [steps_of(path) for path in paths.values()])
-    return ValueDecoder(slots, paths, parser.parse)
-
-
-def _as_foxglove(column: str) -> tuple[str, str]:
-    """Return the path that Foxglove's schemas have for a column, and the type of the field there."""
-    path = _OTHER_NAMES.get(column, (column,))[0]
-    kinds = {"frame_id": "string", "name": "string", "sec": "int64", "nsec": "int64"}
-    return path, kinds.get(path.rpartition(".")[2], "float64")
+    slots = {path: slot for path, slot in decoder.slots.items() if path in HEADER}
+    slots |= {"name[*]": Slot("string", 0), "position[*]": Slot("float64", 1), "velocity[*]": Slot("float64", 2)}
+    return Decoder(decoder.layout, slots, JointColumns)

@@ -15,7 +15,7 @@ from icrtool.config import Config, TopicsConfig
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.definitions import number_fields
+from icrtool.logs.messages.decoded_values import number_fields
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.sources import StampedRows, Unit, WheelMotion, motion_of, of_topic, stamp_rows

@@ -23,9 +23,10 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
 from icrtool.errors import LogError
-from icrtool.logs.containers import bag_directory, unpack
+from icrtool.logs.containers import unpack
 from icrtool.logs.containers.container import MOST_PROBLEMS
-from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.containers.open_log import BagDirectory, open_log
+from icrtool.logs.containers.sqlite_bag import SqliteBag
 
 START_NS = 1_760_000_000_000_000_000
 KINDS = {"/a": "std_msgs/msg/String", "/b": "std_msgs/msg/Float64"}
@@ -752,10 +753,10 @@ def test_a_compressed_file_that_is_a_bomb_does_not_fill_the_disk(tmp_path, monke
         return opened(self, mode, *args, **kwargs)
 
     monkeypatch.setattr(Path, "open", watched)
-    monkeypatch.setattr(bag_directory.SqliteBag, "__init__", lambda *_: written.append(written[0].stat().st_size))
-    monkeypatch.setattr(bag_directory.BagDirectory, "_merge_channels", lambda _: [])
-    monkeypatch.setattr(bag_directory.SqliteBag, "close", lambda _: None)
-    monkeypatch.setattr(bag_directory.SqliteBag, "problems", [], raising=False)
+    monkeypatch.setattr(SqliteBag, "__init__", lambda *_: written.append(written[0].stat().st_size))
+    monkeypatch.setattr(BagDirectory, "_merge_channels", lambda _: [])
+    monkeypatch.setattr(SqliteBag, "close", lambda _: None)
+    monkeypatch.setattr(SqliteBag, "problems", [], raising=False)
     with pytest.raises(LogError, match="more than 10 times its size"):
         open_log(path)
     assert written[1] < 40_000_000

@@ -13,7 +13,7 @@ from icrtool.logs.containers.mcap_file import McapFile, scan_mcap
 from icrtool.logs.containers.ros1_bag import scan_bag
 from icrtool.logs.messages import decoder
 from icrtool.logs.messages.decoder import Decoder
-from icrtool.logs.messages.schema import COUNTED, LOOP, NUMBERS, TEXT, Layout, Operation, compile_layout
+from icrtool.logs.messages.definitions import COUNTED, LOOP, NUMBERS, TEXT, Layout, Operation, compile_layout
 from icrtool.records.text import LONGEST_TEXT
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -17,17 +17,11 @@ from mcap.writer import CompressionType, Writer
 from icrtool.config import Config, load_config
 from icrtool.errors import ConfigError, DefinitionError, IcrToolError, LogError
 from icrtool.estimation.fit import fit
-from icrtool.logs.containers.chunk import (
-    LARGEST_CHUNK_BYTES,
-    DecompressionError,
-    Inflation,
-    Packed,
-    decompress,
-)
+from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Packed, decompress
 from icrtool.logs.containers.container import Block, Channel, Cut, unpack_messages
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
 from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
-from icrtool.logs.messages.schema import ARRAY, BASE, NAME, SEQUENCE, compile_layout
+from icrtool.logs.messages.definitions import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.logs.read_log import LONGEST_HEAD_BYTES, moment, read_log, survey_log
 from icrtool.logs.streams.message_types import read_source
@@ -235,7 +229,7 @@ def test_a_recording_of_too_many_files_is_refused(tmp_path: Path, monkeypatch: p
     for number in range(3):
         good_db3(tmp_path / f"log_{number}.db3")
     open_log(tmp_path).close()
-    monkeypatch.setattr("icrtool.logs.containers.bag_directory._MOST_FILES", 2)
+    monkeypatch.setattr("icrtool.logs.containers.open_log.MOST_FILES", 2)
     with pytest.raises(LogError, match="3 storage files; at most 2"):
         open_log(tmp_path)
 
@@ -429,22 +423,22 @@ def test_a_header_of_empty_fields_costs_no_time(tmp_path: Path) -> None:
 def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool import config
     from icrtool.fleet import recordings
-    from icrtool.logs.containers import bag_directory, chunk, open_log, sqlite_bag, unpack
-    from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf, schema
+    from icrtool.logs.containers import chunk, open_log, recording_files, sqlite_bag, unpack
+    from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf
     from icrtool.logs.streams import wheel_pairs, wheels
     from icrtool.records import text
 
     promised = (Path(__file__).parents[3] / "SECURITY.md").read_text(encoding="utf-8")
     rows = [line for line in promised.splitlines() if line.startswith("|")][2:]
     stated = [int(number.replace(",", "")) for row in rows for number in re.findall(r"(?<!\w)\d[\d,]*(?= |;)", row)]
-    assert definitions.LONGEST_SCHEMA == protobuf.LONGEST_DESCRIPTORS
+    assert decoded_values.LONGEST_SCHEMA == protobuf.LONGEST_DESCRIPTORS
     assert stated == [
         chunk.LARGEST_CHUNK_BYTES, chunk.LARGEST_RATIO, chunk.FREE_BYTES,
         unpack._MOST_ENTRIES, unpack._LARGEST_READ_BYTES, unpack._LARGEST_EXTRA_BYTES,
         sqlite_bag._LARGEST_MESSAGE_BYTES, decoded_values.LONGEST_MESSAGE_BYTES, protobuf.LONGEST_DESCRIPTORS,
-        schema.DEEPEST, schema.MOST_FIELDS,
+        definitions.DEEPEST, definitions.MOST_FIELDS,
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
-        bag_directory._LARGEST_METADATA_BYTES, bag_directory._MOST_FILES, wheels.MOST_WHEELS,
+        recording_files.LARGEST_METADATA_BYTES, open_log.MOST_FILES, wheels.MOST_WHEELS,
             wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PAIRS,
         LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, recordings.LARGEST_MANIFEST_BYTES,
     ]  # fmt: skip

@@ -19,8 +19,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.decoded_values import LONGEST_MESSAGE_BYTES
-from icrtool.logs.messages.definitions import number_fields
+from icrtool.logs.messages.decoded_values import LONGEST_MESSAGE_BYTES, number_fields
 from icrtool.logs.messages.protobuf import LONGEST_DESCRIPTORS
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.records.text import LogText
