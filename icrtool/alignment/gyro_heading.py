@@ -299,6 +299,7 @@ class _Problem:
             events = self.events(noises, alike)
             passes = filter_headings(events, model)
         states, covariances = smooth_headings(events, model, passes)
+        del passes  # of a long log, as large as what the pass below makes
         fixed = np.ones(len(model.x), np.bool_)
         fixed[[PSI, BIAS]] = False
         fixed[STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats
 from icrtool.kernels.compiled import njit, njit_part
 
 
@@ -73,10 +73,13 @@ def smooth_passes(F: Floats, x_predicted: Floats, P_predicted: Floats, x: Floats
     -----
     C = P F^T (P-)^-1, with P- predicted at the next event; x + C (x_next - x-), P + C (P_next - P-) C^T.
     """
-    certain = np.diagonal(P_predicted[1:], axis1=1, axis2=2) == 0.0
-    # a state that is known for certain (no process noise) has nothing to smooth: any variance solves for that
-    solved = np.linalg.solve(P_predicted[1:] + certain[:, :, None] * np.eye(x.shape[1]), F @ P[:-1])
-    step_back(solved, x_predicted, P_predicted, x, P, np.empty(P.shape[1:]))
+    for lo in reversed(range(0, len(F), ROWS_AT_ONCE)):
+        hi = min(lo + ROWS_AT_ONCE, len(F))
+        following, both = slice(lo + 1, hi + 1), slice(lo, hi + 1)
+        certain = np.diagonal(P_predicted[following], axis1=1, axis2=2) == 0.0
+        # a state that is known for certain (no process noise) has nothing to smooth: any variance solves for that
+        solved = np.linalg.solve(P_predicted[following] + certain[:, :, None] * np.eye(x.shape[1]), F[lo:hi] @ P[lo:hi])
+        step_back(solved, x_predicted[both], P_predicted[both], x[both], P[both], np.empty(P.shape[1:]))
 
 
 @njit
