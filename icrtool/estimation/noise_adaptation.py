@@ -13,6 +13,7 @@ from icrtool.kernels.arrays import Bools, Floats
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutput
 from icrtool.records.measurements import SensorData
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import WarmStart
 
 TOLERATED_NIS = 1.25
@@ -50,6 +51,7 @@ def run_adaptively(
 
     def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterSetup, FilterOutput]:
         setup = set_up_filter(one, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
+        give_back_freed()
         return setup, run_ekf(*setup)
 
     noise, settings = configured_noise(config), config.filter

@@ -72,12 +72,6 @@ class Filtered(NamedTuple):
     began_with: WarmStart | None
     changes_s: tuple[float, ...]
 
-    @property
-    def in_use(self) -> tuple[MeasurementOutcome, MeasurementOutcome]:
-        """Fixes and headings while the robot was in use."""
-        gnss, heading = (one.rows(self.sensors.moving(one.stamp_ns)) for one in (self.gnss, self.heading))
-        return gnss, heading
-
 
 def run_filter(
     sensors: SensorData,
@@ -99,24 +93,19 @@ def run_filter(
     _check_motion(sensors)
     changes_s = tuple(sorted(set(changes_s)))
     setup, output, noise = run_adaptively(sensors, config, warm_start, changes_s)
+    gap_s, start_std_m = wheel_gap_s(config, setup.data.wheel_t), np.sqrt(np.diag(setup.P0)[3:])
+    least_icr_m = setup.parameters.least_icr
+    del setup  # of a long log, as large as three columns of the states
     table = _states(sensors.wheels, output)
     if table.fault:
         advice = "check warm start and configuration, or cut the log there (--from, --to)"
         raise DataError(sensors.name, f"the filter failed: {table.fault}", advice)
-    fixes_ns, headings_ns = sensors.fixes.stamp_ns, sensors.headings.stamp_ns
-    fixes_s, headings_s = ((one - table.stamp_ns[0]) / 1e9 for one in (fixes_ns, headings_ns))
-    residual_m = np.hypot(*output.gnss_residual.T)
-    gnss = MeasurementOutcome(fixes_ns, fixes_s, output.gnss_nis, output.gnss_code, residual_m)
+    start_ns, residual_m = int(table.stamp_ns[0]), np.hypot(*output.gnss_residual.T)
+    gnss = MeasurementOutcome(sensors.fixes.stamp_ns, start_ns, output.gnss_nis, output.gnss_code, residual_m)
     heading = MeasurementOutcome(
-        headings_ns,
-        headings_s,
-        output.heading_nis,
-        output.heading_code,
-        output.heading_innovation,
+        sensors.headings.stamp_ns, start_ns, output.heading_nis, output.heading_code, output.heading_innovation
     )
-    in_gap = np.append(np.diff(table.t_s) > wheel_gap_s(config, setup.data.wheel_t), False)
-    start_std_m, least_icr_m = np.sqrt(np.diag(setup.P0)[3:]), setup.parameters.least_icr
-    del setup  # of a long log, a quarter of what is alive
+    in_gap = np.append(np.diff(table.t_s) > gap_s, False)
     carry_headings(table, sensors, heading.used)
     return Filtered(
         sensors=sensors,
@@ -196,18 +185,19 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
     """
     if not (sensors.headings_are_precise and used.any()):
         return
-    headings = sensors.headings
-    stamps, psi = headings.stamp_ns[used], table.heading_rad
-    seen, var_rad2 = (stamps - table.stamp_ns[0]) / 1e9, headings.var_rad2[used]
-    off = np.angle(np.exp(1j * (headings.heading_rad[used] - np.interp(seen, table.t_s, psi))))
-    for lo in range(0, len(psi), ROWS_AT_ONCE):
+    headings, psi, rows = sensors.headings, table.heading_rad, np.flatnonzero(used)
+    stamps = headings.stamp_ns[rows]
+    # from the end on: a heading is compared with the states before it, which are then still the filter's
+    for lo in reversed(range(0, len(psi), ROWS_AT_ONCE)):
         some = slice(lo, lo + ROWS_AT_ONCE)
-        last = np.searchsorted(seen, table.t_s[some], side="right") - 1
-        age = table.t_s[some] - seen[last]
+        last = np.searchsorted(stamps, table.stamp_ns[some], side="right") - 1
+        row, seen_s = rows[last], (stamps[last] - table.stamp_ns[0]) / 1e9
+        age = table.t_s[some] - seen_s
         recent = (last >= 0) & (age < LONGEST_CARRY_S)
-        std = np.sqrt(var_rad2[last] + TURN_WANDER_RAD**2 * np.abs(age))
+        std = np.sqrt(headings.var_rad2[row] + TURN_WANDER_RAD**2 * np.abs(age))
         clear = recent & (CLEARLY * std < table.std_heading_rad[some])
-        np.add(psi[some], off[last], out=psi[some], where=clear)
+        off = np.angle(np.exp(1j * (headings.heading_rad[row] - np.interp(seen_s, table.t_s, psi))))
+        np.add(psi[some], off, out=psi[some], where=clear)
         np.copyto(table.std_heading_rad[some], std, where=clear)
 
 

@@ -11,10 +11,10 @@ from icrtool.alignment.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
 from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
-from icrtool.kernels.arrays import Floats
-from icrtool.kernels.filter_records import UNSEEN
+from icrtool.kernels.arrays import Bytes, Floats
+from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.records.measurements import Finding
-from icrtool.records.run import ICR_WORDS, MeasurementOutcome
+from icrtool.records.run import ICR_WORDS
 from icrtool.records.run_document import ExcitationDocument
 from icrtool.records.tables import States
 
@@ -49,8 +49,7 @@ UNUSABLE_SHARE = 0.3
 
 def unusable_reasons(
     excitation: ExcitationDocument,
-    gnss: MeasurementOutcome,
-    heading: MeasurementOutcome,
+    rejected: Mapping[str, float],
     noise: ProcessNoise,
     wheel_scale: Finding | None = None,
     twist_separation: float | None = None,
@@ -63,6 +62,7 @@ def unusable_reasons(
 
     Parameters
     ----------
+    rejected : `rejected_share` of the fixes, and of the headings
     contradiction : of `contradicts_windows`
     filtered : how the wheels show that a filter made them; nothing else is then worth a reason
     twist_separation : (y_r - y_l) / b by a body twist that was converted with b, None for other wheels
@@ -74,8 +74,7 @@ def unusable_reasons(
     why = "it turns too little, or its sensors disagree"
     reasons = [f"this drive does not show {', '.join(hidden)}: {why}"] if hidden else []
     reasons += ["the ICRs ended inverted: check sides and signs of the wheels"] if inverted and not hidden else []
-    for word, outcome in (("fixes", gnss), ("headings", heading)):
-        share = rejected_share(outcome)
+    for word, share in rejected.items():
         if share > UNUSABLE_SHARE:
             reasons.append(f"{100 * share:.0f} % of the {word} rejected")
     if noise.position_mps * STEP > LARGEST_POSITION_MPS:
@@ -124,10 +123,10 @@ def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str
     return f"wheels and reference contradict each other ({'; '.join(apart)}): clocks or slip" if apart else ""
 
 
-def rejected_share(outcome: MeasurementOutcome) -> float:
-    """Return the share of the measurements within the run that the innovation gate rejected; 0 for none."""
-    seen = outcome.code > UNSEEN
-    return float(outcome.rejected[seen].mean()) if seen.any() else 0.0
+def rejected_share(code: Bytes) -> float:
+    """Return the share of the measurements within the run, by their codes (m,), that the gate rejected; 0 for none."""
+    seen = code[code > UNSEEN]
+    return float((seen == GATED).mean()) if len(seen) else 0.0
 
 
 def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
@@ -147,8 +146,7 @@ def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
 def run_warnings(
     name: str,
     table: States,
-    gnss: MeasurementOutcome,
-    heading: MeasurementOutcome,
+    rejected: Mapping[str, float],
     multiplier: tuple[float, float] | None,
     excitation: ExcitationDocument,
     findings: Mapping[str, Finding],
@@ -157,6 +155,7 @@ def run_warnings(
 
     Parameters
     ----------
+    rejected : `rejected_share` of the fixes, and of the headings
     multiplier : (y_r - y_l) / b and its standard deviation; None where b is not known, or the run is not usable
     findings : of the alignment
     """
@@ -167,9 +166,10 @@ def run_warnings(
         found.append(
             "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
         )
-    for word, outcome, key in (("fixes", gnss, "position_delay_s"), ("headings", heading, "heading_delay_s")):
-        if (share := rejected_share(outcome)) > WORTH_WARNING_SHARE:
-            cause = _cause_of_rejection(findings.get(key))
+    delays = {"fixes": "position_delay_s", "headings": "heading_delay_s"}
+    for word, share in rejected.items():
+        if share > WORTH_WARNING_SHARE:
+            cause = _cause_of_rejection(findings.get(delays[word]))
             found.append(f"{100 * share:.0f} % of the {word} were rejected: {cause}")
     return [f"{name}: {warning}" for warning in found]
 

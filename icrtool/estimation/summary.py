@@ -25,6 +25,7 @@ from icrtool.estimation.run_warnings import (
     antenna_warning,
     contradicts_windows,
     noise_warnings,
+    rejected_share,
     run_warnings,
     unusable_reasons,
 )
@@ -92,8 +93,11 @@ def summarise(
     field = config.filter.preset == "field"
     scale = measurements.findings["wheel_scale"] if field else None
     of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
+    measured = {"fixes": filtered.gnss, "headings": filtered.heading}
+    # while the robot was in use
+    rejected = {word: rejected_share(one.code[sensors.moving(one.stamp_ns)]) for word, one in measured.items()}
     unusable = unusable_reasons(
-        excitation, *filtered.in_use, filtered.noise, scale, multiplier if of_twist else None,
+        excitation, rejected, filtered.noise, scale, multiplier if of_twist else None,
         contradicts_windows(table, covariance, measurements.findings) if field and not changes_s else "",
         measurements.wheels.filtered or "" if field else "",
         inverted=bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]),
@@ -109,7 +113,8 @@ def summarise(
         config=config,
         streams=measurements.streams,
         warnings=_warnings(
-            measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance
+            measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance,
+            rejected,
         ),
         alignment=measurements.findings,
         drive=drive_summary(table),
@@ -143,6 +148,7 @@ def summarise(
 def _warnings(
     measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None,
     excitation: ExcitationDocument, changes_s: Sequence[float], covariance: Floats,
+    rejected: dict[str, float],
 ) -> tuple[str, ...]:  # fmt: skip
     """Return the warnings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
     name, table, width = filtered.sensors.name, filtered.table, config.robot.track_width_m
@@ -150,7 +156,7 @@ def _warnings(
     end_s = float(table.t_s[-1])
     return (
         *measurements.warnings,
-        *run_warnings(name, table, *filtered.in_use, apart, excitation, measurements.findings),
+        *run_warnings(name, table, rejected, apart, excitation, measurements.findings),
         *(
             []
             if measurements.antenna_is_known or not excitation.verdict.shows_sides
@@ -236,8 +242,9 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
         start_std_m=filtered.start_std_m,
         least_icr_m=filtered.least_icr_m,
     )
-    turning = np.diff(table.t_s, append=table.t_s[-1:]) * (track.v_left - track.v_right) ** 2
-    speed = float((turning * (track.v_left + track.v_right)).sum() / 2 / max(float(turning.sum()), 1e-12))
+    turning = (track.v_left - track.v_right) ** 2
+    turning *= np.diff(table.t_s, append=table.t_s[-1:])
+    speed = float(turning @ (track.v_left + track.v_right)) / 2 / max(float(turning.sum()), 1e-12)
     x_clock_std_m = abs(speed) * clock_std_s
     return covariance + np.diag([0.0, 0.0, x_clock_std_m**2]), excitation, x_clock_std_m
 

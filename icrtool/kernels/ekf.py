@@ -115,9 +115,9 @@ def keep_sides(x: Floats, P: Floats, least: float) -> None:
 
 @njit_part
 def take_fix(
-    data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, found: Floats
+    data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, out: FilterOutput
 ) -> tuple[float, float, float]:
-    """Gate and apply a fix, and fill its column of `FilterOutput.fixes`; return what it adds to P (3,) first.
+    """Gate and apply a fix, and fill its row of the output; return what it adds to P (3,) first.
 
     A fix that ends a lock-out makes north and east uncertain by its innovation [m^2]; others add nothing.
     North and east are applied one after the other, which equals the joint update since their noises are independent.
@@ -148,16 +148,16 @@ def take_fix(
         correct(x, P, PH, S_ee, nu_e - (x[1] - E) - a_n * (x[2] - psi), None, 6)
         keep_sides(x, P, parameters.least_icr)
     a_n, a_e = antenna(x, parameters.antenna_forward, parameters.antenna_right)
-    found[0, row], found[1, row], found[2, row] = code, nis, det
-    found[3, row], found[4, row] = z_n - x[0] - a_n, z_e - x[1] - a_e
+    out.gnss_code[row], out.gnss_nis[row], out.gnss_det[row] = code, nis, det
+    out.gnss_residual[row, 0], out.gnss_residual[row, 1] = z_n - x[0] - a_n, z_e - x[1] - a_e
     return more_n, more_e, 0.0
 
 
 @njit_part
 def take_heading(
-    data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, found: Floats
+    data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, out: FilterOutput
 ) -> tuple[float, float, float]:
-    """Gate and apply a heading, and fill its column of `FilterOutput.headings`; return what it adds to P (3,) first.
+    """Gate and apply a heading, and fill its row of the output; return what it adds to P (3,) first.
 
     The gate tests this sample alone (variance r). The update uses variance r times the correlation, because the errors
     of neighbouring samples are not independent.
@@ -177,7 +177,7 @@ def take_heading(
         S = measured_column(P, PSI, 0.0, PH) + r * parameters.heading_correlation
         correct(x, P, PH, S, nu, None, 6)
         keep_sides(x, P, parameters.least_icr)
-    found[0, row], found[1, row], found[2, row] = code, nis, nu
+    out.heading_code[row], out.heading_nis[row], out.heading_innovation[row] = code, nis, nu
     return 0.0, 0.0, more
 
 
@@ -275,9 +275,9 @@ def filter_events(
             begin_node(nodes, count, state, dt, space.G)
             count += 1
         if kind == FIX:
-            more = take_fix(data, row, state, parameters, space.PH, out.fixes)
+            more = take_fix(data, row, state, parameters, space.PH, out)
         elif kind == HEADING:
-            more = take_heading(data, row, state, parameters, space.PH, out.headings)
+            more = take_heading(data, row, state, parameters, space.PH, out)
         recorded = kind == WHEELS
         if recorded:
             record(state, out.states, row - first)

@@ -92,31 +92,40 @@ class FilterInputs(NamedTuple):
 
 
 class FilterOutput(NamedTuple):
-    """What a run makes, a column for each recorded state, fix and heading; filled in place as it goes on.
+    """What a run makes, for each recorded state, fix and heading; filled in place as it goes on.
 
     Attributes
     ----------
     states : (13, k) x, diagonal of P, path length [m], after all updates at the stamps of the last k wheel samples
-    fixes : (5, m) code, NIS, determinant of S [m^4], fix minus estimate after the update, north and east [m]
-    headings : (3, h) code, NIS, innovation [rad]
+    gnss_code : (m,) what was done with each fix: `UNSEEN`, `USED`, `GATED` or `RECOVERED`
+    gnss_nis : (m,) normalised innovation squared; gnss_det : (m,) determinant of S [m^4]; both NaN where unseen
+    gnss_residual : (m, 2) fix minus estimate after the update, north and east [m]
+    heading_code, heading_nis, heading_innovation : (h,) likewise; the last is before the update [rad]
     P : (6, 6) covariance at the end
     P_at_stops : (s, 6, 6) likewise at the rows that were asked for
-
-    Codes are `UNSEEN`, `USED`, `GATED` or `RECOVERED`; the numbers of what is unseen are NaN.
     """
 
     states: Floats
-    fixes: Floats
-    headings: Floats
+    gnss_code: Codes
+    gnss_nis: Floats
+    gnss_det: Floats
+    gnss_residual: Floats
+    heading_code: Codes
+    heading_nis: Floats
+    heading_innovation: Floats
     P: Floats
     P_at_stops: Floats = np.zeros((0, 6, 6))
 
     @classmethod
     def empty(cls, data: FilterInputs, rows: int) -> FilterOutput:
         """Return the output of a run of so many recorded states, before it has run."""
-        fixes, headings = np.full((5, len(data.gnss_t)), np.nan), np.full((3, len(data.heading_t)), np.nan)
-        fixes[0] = headings[0] = UNSEEN
-        return cls(np.empty((13, rows)), fixes, headings, np.empty((6, 6)))
+        m, h = len(data.gnss_t), len(data.heading_t)
+        shapes = (m, m, (m, 2), h, h)
+        nis, det, residual, heading_nis, innovation = (np.full(shape, np.nan) for shape in shapes)
+        codes = np.full(m, UNSEEN, np.uint8), np.full(h, UNSEEN, np.uint8)
+        return cls(
+            np.empty((13, rows)), codes[0], nis, det, residual, codes[1], heading_nis, innovation, np.empty((6, 6))
+        )
 
     @property
     def x(self) -> Floats:
@@ -132,41 +141,6 @@ class FilterOutput(NamedTuple):
     def distance(self) -> Floats:
         """Path length (k,) [m]."""
         return np.asarray(self.states[12])
-
-    @property
-    def gnss_code(self) -> Codes:
-        """What was done with each fix (m,)."""
-        return np.asarray(self.fixes[0].astype(np.uint8))
-
-    @property
-    def gnss_nis(self) -> Floats:
-        """Normalised innovation squared of each fix (m,)."""
-        return np.asarray(self.fixes[1])
-
-    @property
-    def gnss_det(self) -> Floats:
-        """Determinant of the innovation covariance of each fix (m,) [m^4]."""
-        return np.asarray(self.fixes[2])
-
-    @property
-    def gnss_residual(self) -> Floats:
-        """Fix minus estimate after the update (m, 2) [m]."""
-        return np.asarray(self.fixes[3:].T)
-
-    @property
-    def heading_code(self) -> Codes:
-        """What was done with each heading (h,)."""
-        return np.asarray(self.headings[0].astype(np.uint8))
-
-    @property
-    def heading_nis(self) -> Floats:
-        """Normalised innovation squared of each heading (h,)."""
-        return np.asarray(self.headings[1])
-
-    @property
-    def heading_innovation(self) -> Floats:
-        """Innovation of each heading (h,) [rad]."""
-        return np.asarray(self.headings[2])
 
 
 class Events(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints
 from icrtool.records.plain_data import Record
 from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
@@ -124,9 +124,13 @@ class SensorData:
         turning = np.abs(self.wheels.v_left_mps) + np.abs(self.wheels.v_right_mps) > 2.0 * TURNING_MPS
         so_far = np.concatenate([[0], np.cumsum(turning)])
         near = max(round(MOVING_S * 1e9), 2 * int(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0
-        # the value before holds, too
-        first = np.maximum(np.searchsorted(stamps, stamp_ns - near) - 1, 0)
-        moving: Bools = so_far[np.searchsorted(stamps, stamp_ns + near, side="right")] > so_far[first]
+        moving = np.empty(len(stamp_ns), np.bool_)
+        for lo in range(0, len(stamp_ns), ROWS_AT_ONCE):
+            some = slice(lo, lo + ROWS_AT_ONCE)
+            # the value before holds, too
+            first = np.maximum(np.searchsorted(stamps, stamp_ns[some] - near) - 1, 0)
+            last = np.searchsorted(stamps, stamp_ns[some] + near, side="right")
+            moving[some] = so_far[last] > so_far[first]
         return moving if moving.any() else np.ones(len(stamp_ns), np.bool_)
 
     def part(self, rows: slice) -> SensorData:

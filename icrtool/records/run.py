@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -57,21 +57,22 @@ class MeasurementOutcome:
 
     Attributes
     ----------
-    stamp_ns : int64 (m,); t_s : (m,) seconds since the first recorded state
+    stamp_ns : int64 (m,); start_ns : of the first recorded state
     nis : (m,) normalised innovation squared, NaN where unseen
     code : uint8 (m,), see `icrtool.kernels.filter_records`
     difference : (m,) fix minus estimate after the update [m], or heading innovation [rad]
     """
 
     stamp_ns: Ints
-    t_s: Floats
+    start_ns: int
     nis: Floats
     code: Bytes
     difference: Floats
 
-    def rows(self, kept: Bools) -> MeasurementOutcome:
-        """Return the measurements marked in `kept` (m,)."""
-        return MeasurementOutcome(*(getattr(self, field.name)[kept] for field in fields(self)))
+    @property
+    def t_s(self) -> Floats:
+        """Seconds since the first recorded state (m,)."""
+        return np.asarray((self.stamp_ns - self.start_ns) / 1e9)
 
     @property
     def used(self) -> Bools:

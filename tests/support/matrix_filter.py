@@ -165,8 +165,8 @@ def _measure(
         P = (P + P.T) / 2
         x = _keep_sides(x, P, parameters.least_icr)
     if kind == 1:
-        residual = data.gnss_z[i] - x[:2] - _antenna(x[2], parameters)
-        out.fixes[:, i] = code, nis, innovation_det, *residual
+        out.gnss_code[i], out.gnss_nis[i], out.gnss_det[i] = code, nis, innovation_det
+        out.gnss_residual[i] = data.gnss_z[i] - x[:2] - _antenna(x[2], parameters)
     else:
-        out.headings[:, i] = code, nis, nu[0]
+        out.heading_code[i], out.heading_nis[i], out.heading_innovation[i] = code, nis, nu[0]
     return x, P

@@ -285,7 +285,7 @@ def read_measurements(
             found = [_checked(columns, f"{group}_{name}", name) for name in OUTCOME_COLUMNS]
             if {len(column) for column in found} != {len(stamps_ns)}:
                 raise ValueError(f"the outcomes of the {group} are not as many as those")
-            outcomes.append(MeasurementOutcome(stamps_ns, (stamps_ns - table.stamp_ns[0]) / 1e9, *found))
+            outcomes.append(MeasurementOutcome(stamps_ns, int(table.stamp_ns[0]), *found))
     except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError, SyntaxError, TokenError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
     first = len(stamps) - len(table)

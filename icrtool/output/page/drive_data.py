@@ -143,11 +143,12 @@ def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
 def _differences(outcome: MeasurementOutcome, chosen: Bools, difference: Floats) -> tuple[Ints, dict[str, object]]:
     """Return the rows of the chosen measurements, the extremes of many; their differences, and where a line breaks."""
     rows = np.flatnonzero(chosen)
-    t = outcome.t_s[rows]
-    after = breaks_after(t)
-    breaks = (t[after] + t[after + 1]) / 2
+    t_s = outcome.t_s
+    used_s = t_s[rows]
+    after = breaks_after(used_s)
+    breaks = (used_s[after] + used_s[after + 1]) / 2
     rows = rows[extremes(difference[rows], points=FIX_POINTS)]
-    columns = {"t": packed(outcome.t_s[rows]), "difference": packed(difference[rows])}
+    columns = {"t": packed(t_s[rows]), "difference": packed(difference[rows])}
     return rows, {**columns, "breaks_s": breaks.tolist()}
 
 

@@ -18,7 +18,7 @@ from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
 from icrtool.kernels.filter_records import GATED, UNSEEN, USED
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
-from icrtool.records.run import MeasurementOutcome, Run
+from icrtool.records.run import Run
 from icrtool.records.run_document import ExcitationDocument, VerdictByIcr
 from support.drives import make_log
 
@@ -43,7 +43,7 @@ def with_wrong(share: float, stream: str) -> Run:
 def test_a_run_that_rejected_a_third_of_a_stream_is_not_usable(stream: str) -> None:
     run = with_wrong(0.4, stream)
     outcome = run.gnss if stream == "fixes" else run.heading
-    assert rejected_share(outcome) > 0.3
+    assert rejected_share(outcome.code) > 0.3
     assert not run.usable
     assert f"% of the {stream} rejected" in run.summary["unusable_because"]
     assert format_run(run).startswith("Do not use: ")
@@ -72,10 +72,8 @@ def test_a_run_that_rejected_a_tenth_is_usable(stream: str) -> None:
     ],
 )
 def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, words: str) -> None:
-    code, none = np.full(4, USED, np.uint8), np.zeros(4)
-    outcome = MeasurementOutcome(np.arange(4), none, none, code, none)
     excitation = SimpleNamespace(verdict=VerdictByIcr("shown", "shown", "shown"))
-    reasons = unusable_reasons(cast(ExcitationDocument, excitation), outcome, outcome, noise)
+    reasons = unusable_reasons(cast(ExcitationDocument, excitation), {}, noise)
     assert bool(reasons) is bool(words)
     assert words in " ".join(reasons)
 
@@ -95,9 +93,8 @@ def test_a_body_twist_that_turns_as_the_robot_does_makes_a_run_unusable() -> Non
 
 def test_the_rejected_share_counts_what_the_filter_saw() -> None:
     code = np.array([UNSEEN, UNSEEN, USED, GATED], np.uint8)
-    none = np.zeros(4)
-    assert rejected_share(MeasurementOutcome(np.arange(4), none, none, code, none)) == 0.5
-    assert rejected_share(MeasurementOutcome(np.arange(4), none, none, 0 * code, none)) == 0.0
+    assert rejected_share(code) == 0.5
+    assert rejected_share(0 * code) == 0.0
 
 
 def test_icrs_that_ended_inverted_are_not_usable() -> None:
