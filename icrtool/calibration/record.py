@@ -27,15 +27,7 @@ from icrtool.motion.models import (
     find_model,
     wheel_motion,
 )
-from icrtool.records.calibration_document import (
-    CalibratedRobot,
-    CalibrationDocument,
-    ControllerErrors,
-    FittedDocument,
-    GyroDocument,
-    HeldOutScore,
-    PooledScore,
-)
+from icrtool.records import calibration_document as documents
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart, call_output
@@ -53,7 +45,7 @@ class Odometry(NamedTuple):
     heading_rad: Floats
 
 
-class Calibration(CalibrationDocument, frozen=True, kw_only=True):
+class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     """Constant parameters of a robot's motion model, their covariance, and the error that they give.
 
     Its fields are the keys of a calibration file.
@@ -114,10 +106,10 @@ class Calibration(CalibrationDocument, frozen=True, kw_only=True):
         return (self.fitted if five is None else fitted_model(FIVE, five)).geometry(self.width_m)
 
     @property
-    def controller_errors(self) -> ControllerErrors | None:
+    def controller_errors(self) -> documents.ControllerErrors | None:
         """Errors of what a controller can express; None where the drive is too short to measure them."""
         errors = msgspec.structs.asdict(self.controller)
-        return None if errors["pose_variance"] is UNSET else msgspec.convert(errors, ControllerErrors)
+        return None if errors["pose_variance"] is UNSET else msgspec.convert(errors, documents.ControllerErrors)
 
     def log_names(self) -> str:
         """Return the names of the logs that it was fitted to, and their number."""
@@ -129,7 +121,7 @@ class Calibration(CalibrationDocument, frozen=True, kw_only=True):
 
         A file of an earlier version has them by log or block alone: then the median over these.
         """
-        scores: tuple[PooledScore | HeldOutScore, ...] = self.held_out_pooled or self.held_out
+        scores: tuple[documents.PooledScore | documents.HeldOutScore, ...] = self.held_out_pooled or self.held_out
         rows = [one for one in scores if one.model == model and one.horizon_m == horizon_m]
         if not rows:
             return float("nan"), float("nan")
@@ -221,7 +213,7 @@ class Calibration(CalibrationDocument, frozen=True, kw_only=True):
         return found
 
 
-def stored_calibration(document: CalibrationDocument) -> Calibration:
+def stored_calibration(document: documents.CalibrationDocument) -> Calibration:
     """Return the calibration that a report holds.
 
     Raises
@@ -233,7 +225,7 @@ def stored_calibration(document: CalibrationDocument) -> Calibration:
 
 
 def fitted_document(
-    fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: CalibratedRobot
+    fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: documents.CalibratedRobot
 ) -> RecommendedDocument:
     """Return a model for one robot: parameters with covariance, ICRs, and what a controller is given."""
     std = np.sqrt(np.diag(covariance)).tolist()
@@ -243,7 +235,9 @@ def fitted_document(
     )  # fmt: skip
 
 
-def controller_numbers(geometry: TrackGeometry, covariance: Floats, robot: CalibratedRobot) -> ControllerNumbers:
+def controller_numbers(
+    geometry: TrackGeometry, covariance: Floats, robot: documents.CalibratedRobot
+) -> ControllerNumbers:
     """Return multiplier and radius factors with one standard deviation each."""
     std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     left, right = (1.0 if scale is UNSET else scale for scale in (robot.left_scale, robot.right_scale))
@@ -266,7 +260,9 @@ LARGEST = 1e6
 """Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
 
 
-def fitted_model(name: str, document: CalibrationDocument | FittedDocument | GyroDocument) -> FittedModel:
+def fitted_model(
+    name: str, document: documents.CalibrationDocument | documents.FittedDocument | documents.GyroDocument
+) -> FittedModel:
     """Return the motion model that a document holds.
 
     Raises

@@ -18,14 +18,7 @@ from icrtool.calibration.pooled import known_antenna_m
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.estimation.observability import TURNS_NEEDED_RAD, lacking_turns
-from icrtool.records.calibration_document import (
-    CALIBRATION_SCHEMA,
-    CalibrationFile,
-    SensorDocument,
-    SensorDrive,
-    SensorParameter,
-    SensorVerdict,
-)
+from icrtool.records import calibration_document as documents
 from icrtool.records.measurements import RESPONSE_S, Finding
 from icrtool.records.plain_data import known
 from icrtool.records.run import Run
@@ -77,7 +70,7 @@ LABELS = {key: kind.label for key, kind in KINDS.items()} | {
 """Words for each parameter, by its key in files."""
 
 
-def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> SensorDocument:
+def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.SensorDocument:
     """Return the findings of a run's alignment with their verdicts, and the settings to configure.
 
     Parameters
@@ -97,7 +90,7 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> SensorDocument:
     driven, parameters = _drive(run), {}
     for key, kind in KINDS.items():
         value, std = _numbers(found[kind.finding or key])
-        verdict: SensorVerdict = "not shown"
+        verdict: documents.SensorVerdict = "not shown"
         if std <= WEAK * kind.useful:
             verdict = "shown" if std <= kind.useful else "weak"
         note = RESPONSE_PART if key in DELAYS else ""
@@ -105,19 +98,21 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> SensorDocument:
             note = _reason(key, driven)
         parameters[key] = _parameter(value, std, verdict, note)
     parameters |= _derive(run, parameters, x_icr_m)
-    return SensorDocument(
-        schema=CALIBRATION_SCHEMA, log=run.name, inputs=run.document.inputs, windows=wheels.windows,
+    return documents.SensorDocument(
+        schema=documents.CALIBRATION_SCHEMA, log=run.name, inputs=run.document.inputs, windows=wheels.windows,
         independent_stretches=wheels.stretches, window_miss_m=wheels.residual_m, drive=driven,
         settings=_settings(parameters, run), alignment=parameters, parameters=parameters,
     )  # fmt: skip
 
 
-def with_sensors(calibration: Calibration, sensors: SensorDocument) -> Calibration:
+def with_sensors(calibration: Calibration, sensors: documents.SensorDocument) -> Calibration:
     """Return a calibration with what its only log shows of its sensors."""
-    return replace(calibration, **{name: getattr(sensors, name) for name in CalibrationFile.__struct_fields__[1:]})
+    return replace(
+        calibration, **{name: getattr(sensors, name) for name in documents.CalibrationFile.__struct_fields__[1:]}
+    )
 
 
-def _drive(run: Run) -> SensorDrive:
+def _drive(run: Run) -> documents.SensorDrive:
     table, excitation = run.table, run.document.excitation
     left, right = (
         speed / scale for speed, scale in zip((table.v_left_mps, table.v_right_mps), run.wheel_scales, strict=True)
@@ -126,7 +121,7 @@ def _drive(run: Run) -> SensorDrive:
     speed = (left + right)[moving] / 2
     rate = np.degrees(np.abs(left - right)[moving] / max(_numbers(run.document.alignment[SEPARATION])[0], 1e-3))
     turning = rate[rate > TURNING_DEGPS]
-    return SensorDrive(
+    return documents.SensorDrive(
         run.document.drive.distance_m,
         excitation.turned_right_deg,
         excitation.turned_left_deg,
@@ -136,16 +131,16 @@ def _drive(run: Run) -> SensorDrive:
     )
 
 
-def _numbers(one: Finding | SensorParameter) -> tuple[float, float]:
+def _numbers(one: Finding | documents.SensorParameter) -> tuple[float, float]:
     """Return an estimate and its standard deviation, NaN where the drive does not show it."""
     return math.nan if one.value is None else one.value, math.nan if one.std is None else one.std
 
 
-def _parameter(value: float, std: float, verdict: SensorVerdict, note: str = "") -> SensorParameter:
-    return SensorParameter(known(value), known(std), verdict, note)
+def _parameter(value: float, std: float, verdict: documents.SensorVerdict, note: str = "") -> documents.SensorParameter:
+    return documents.SensorParameter(known(value), known(std), verdict, note)
 
 
-def _reason(key: str, driven: SensorDrive) -> str:
+def _reason(key: str, driven: documents.SensorDrive) -> str:
     """Return why the drive does not determine a parameter well, and what to drive."""
     mean, std = driven.speed_mean_mps, driven.speed_std_mps
     if key.startswith("gnss_delay") and std < STEADY * mean:
@@ -159,7 +154,9 @@ def _reason(key: str, driven: SensorDrive) -> str:
     return f"too short a drive for this noise: {driven.distance_m:.0f} m"
 
 
-def _derive(run: Run, direct: Mapping[str, SensorParameter], x_icr_m: float | None) -> dict[str, SensorParameter]:
+def _derive(
+    run: Run, direct: Mapping[str, documents.SensorParameter], x_icr_m: float | None
+) -> dict[str, documents.SensorParameter]:
     """Return antenna and ICRs, as far as one of them is known; else the middle of the ICRs is assumed at y = 0."""
     of_antenna_and_icrs = [direct[key] for key in (AHEAD, ASIDE, SEPARATION)]
     (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, of_antenna_and_icrs)
@@ -194,7 +191,7 @@ def _derive(run: Run, direct: Mapping[str, SensorParameter], x_icr_m: float | No
     }
 
 
-def _settings(parameters: Mapping[str, SensorParameter], run: Run) -> dict[str, float]:
+def _settings(parameters: Mapping[str, documents.SensorParameter], run: Run) -> dict[str, float]:
     """Return the settings of parameters that are known well enough, and are large enough, to be configured."""
     wheels = run.config.wheels
     left, right = (1.0 if given == "auto" else given for given in (wheels.left_scale, wheels.right_scale))

@@ -16,16 +16,7 @@ from icrtool import __version__
 from icrtool.calibration.pooled import predictor, turning_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_models import FITTED_TO, ComparedModels, ComparedRow, Model, compare_models
-from icrtool.dropout_analysis import shown_paths
-from icrtool.dropout_analysis.report import (
-    BaselineReport,
-    DropoutReport,
-    OpenLoopErrors,
-    budget_distances,
-    check_gate,
-    parse_gate,
-    verdict_on,
-)
+from icrtool.dropout_analysis import report, shown_paths
 from icrtool.dropout_analysis.starts import Starts, split_by_turning, with_smoothed_reference
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
 from icrtool.errors import ConfigError, DataError
@@ -51,7 +42,7 @@ def dropout(
     models: Sequence[Model] | None = None,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
-) -> DropoutReport:
+) -> report.DropoutReport:
     """Return how far the predicted position is off after distances without GNSS (Pentzer 2014, Section 6.4).
 
     Parameters
@@ -108,12 +99,12 @@ def dropout_report(
     calibrations: Sequence[Calibration] = (),
     comparison: bool = True,
     reference: Literal["filter", "smoothed"] = "filter",
-    baseline: BaselineReport | None = None,
+    baseline: report.BaselineReport | None = None,
     strict: bool = False,
     allow_unusable: bool = False,
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
-) -> DropoutReport:
+) -> report.DropoutReport:
     """Return how far a robot can drive without GNSS, with all that ``icrtool dropout-report`` gives.
 
     Parameters
@@ -154,7 +145,7 @@ def dropout_report(
     if without_events:
         # A gap in place of each slip event: no trial, window or forced outage crosses a gap.
         run = replace(run, in_gap=run.in_gap | run.slipping)
-    limits = [gate if isinstance(gate, Gate) else parse_gate(gate) for gate in gates]
+    limits = [gate if isinstance(gate, Gate) else report.parse_gate(gate) for gate in gates]
     lengths_s = forced_lengths_s(run, outage_s)
     if outage_at_s and not lengths_s:
         raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
@@ -175,6 +166,7 @@ def dropout_report(
     for at_m in (gate.horizon_m for gate in limits):
         if at_m is not None and not any(math.isclose(at_m, horizon, rel_tol=1e-9) for horizon in horizons):
             horizons.append(at_m)
+    budgets_m = () if unusable else budgets_m
     errors = measure_errors(
         compared, horizons, further=[*rows, *further], starts=starts, seed=seed, sink=sink,
         starts_of_further=None if found is None else found.trials.starts, track=None if found is None else found.track,
@@ -195,11 +187,11 @@ def dropout_report(
         examples=shown_paths.example_trials(compared),
         worst=shown_paths.worst_trials(compared, found, starts=starts),
         outages=(*forced, *shown_paths.real_outages(compared)),
-        budgets=() if unusable else tuple(one for budget in budgets_m for one in budget_distances(errors, budget)),
+        budgets=tuple(one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)),
         gates=tuple(
-            verdict_on(gate, run.name, passed=False, unusable=unusable)
+            report.verdict_on(gate, run.name, passed=False, unusable=unusable)
             if unusable
-            else check_gate(gate, errors, baseline, strict=strict)
+            else report.check_gate(gate, errors, baseline, strict=strict)
             for gate in limits
         ),
         usable=not unusable,
@@ -209,13 +201,14 @@ def dropout_report(
 
 
 def _report(
-    run: Run, errors: OpenLoopErrors, *, starts: Starts, seed: int, smoothed: bool = False, with_jumps: bool = False,
-    with_events: OpenLoopErrors | None = None, calibrations: tuple[UsedCalibration, ...] = (),
-    budgets: tuple[BudgetDistance, ...] = (), gates: tuple[Verdict, ...] = (),
-    by_turning: tuple[TurningSplit, ...] = (), compared_models: ComparedModels | None = None, no_comparison: str = "",
+    run: Run, errors: report.OpenLoopErrors, *, starts: Starts, seed: int, smoothed: bool = False,
+    with_jumps: bool = False, with_events: report.OpenLoopErrors | None = None,
+    calibrations: tuple[UsedCalibration, ...] = (), budgets: tuple[BudgetDistance, ...] = (),
+    gates: tuple[Verdict, ...] = (), by_turning: tuple[TurningSplit, ...] = (),
+    compared_models: ComparedModels | None = None, no_comparison: str = "",
     worst: tuple[documents.ExampleTrial, ...] = (), examples: tuple[documents.ExampleTrial, ...] = (),
-    outages: tuple[documents.Outage, ...] = (), baseline: BaselineReport | None = None, usable: bool = True,
-) -> DropoutReport:  # fmt: skip
+    outages: tuple[documents.Outage, ...] = (), baseline: report.BaselineReport | None = None, usable: bool = True,
+) -> report.DropoutReport:  # fmt: skip
     """Return the report of a run.
 
     Parameters
@@ -274,14 +267,16 @@ def _report(
         worst=tuple(one.document for one in worst),
         examples=tuple(one.document for one in examples),
     )
-    return DropoutReport(
+    return report.DropoutReport(
         **{field.name: getattr(errors, field.name) for field in fields(errors)}, document=document,
         run_directory=run.directory, reference_north_m=run.table.north_m, reference_east_m=run.table.east_m,
         usable=usable, worst=worst, examples=examples, outages=outages, calibration=made, baseline=baseline,
     )  # fmt: skip
 
 
-def _counts(errors: OpenLoopErrors, with_events: OpenLoopErrors | None) -> Iterator[documents.CountDocument]:
+def _counts(
+    errors: report.OpenLoopErrors, with_events: report.OpenLoopErrors | None
+) -> Iterator[documents.CountDocument]:
     """Yield how many starts were a trial at each horizon, and why the others were none."""
     # starts at a gap, at an outage or at a standstill are counted as without the option
     counts = (with_events or errors).counts
@@ -304,7 +299,7 @@ def _counts(errors: OpenLoopErrors, with_events: OpenLoopErrors | None) -> Itera
 
 
 def _ladder(
-    errors: OpenLoopErrors, calibrations: Sequence[UsedCalibration], found: ComparedModels | None, why_none: str
+    errors: report.OpenLoopErrors, calibrations: Sequence[UsedCalibration], found: ComparedModels | None, why_none: str
 ) -> documents.LadderDocument:
     """Return how the models were compared; why there is no comparison where it was left out."""
     if found is None:
