@@ -308,19 +308,14 @@ def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
 def export_warnings(calibration: Calibration) -> tuple[str, ...]:
     """Return what to know before a controller uses a calibration, a sentence each."""
     warnings = [one for one in unfit_reasons(calibration) if one not in calibration.warnings]
-    warnings += not_shown_sentences(calibration.fitted)
+    warnings += [
+        f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
+        for name in calibration.fitted.not_shown
+    ]
     if (multiplier := calibration.controller.multiplier) < 1.0:
         why = "a skid-steer robot turns less than its wheels, not more"
         warnings.append(f"a multiplier of {multiplier:.2f} is below 1: {why}")
     return (*calibration.warnings, *warnings)
-
-
-def not_shown_sentences(fitted: FittedModel) -> list[str]:
-    """Return a sentence for each parameter that rests on its prior."""
-    return [
-        f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
-        for name in fitted.not_shown
-    ]
 
 
 def factor_to_old(calibration: Calibration) -> float | None:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from msgspec.structs import astuple, replace
+from msgspec.structs import asdict, astuple, replace
 
 from icrtool import __version__
 from icrtool.errors import ConfigError
@@ -124,11 +124,9 @@ class DropoutReport(OpenLoopErrors):
         """The rows of summary.csv as a DataFrame."""
         import pandas as pd
 
-        h, models = len(self.horizons_m), self.document.models
-        rows = [row for one in models for row in one.by_horizon]
-        columns = {name: documents.column_of(rows, name) for name in documents.SummaryRow.__struct_fields__}
-        columns["trials"] = columns["trials"].astype(np.int64)
-        return pd.DataFrame({"model": [one.name for one in models for _ in range(h)], **columns})
+        rows = [{"model": one.name} | asdict(row) for one in self.document.models for row in one.by_horizon]
+        types = dict.fromkeys(documents.SummaryRow.__struct_fields__, "float64") | {"trials": "int64"}
+        return pd.DataFrame(rows, columns=["model", *types]).astype(types)
 
     def write(
         self, path: str | Path | None = None, *, plots: tuple[str, ...] = ("png",), figures: FigureSet = "default"

@@ -106,7 +106,6 @@ def _example(
     horizon_m: float,
 ) -> ExampleTrial:  # fmt: skip
     paths: dict[str, OpenLoopPath] = {}
-    errors: dict[str, float | None] = {}
     for model in models:
         if model.name in PICTURED:
             right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
@@ -114,8 +113,10 @@ def _example(
     for row in rows:
         if row.name in PICTURED and row.path is not None and (path := row.path(start, end)) is not None:
             paths[row.name] = path
-    for name, path in paths.items():
-        errors[name] = known(float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end])))
+    errors = {
+        name: known(float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end])))
+        for name, path in paths.items()
+    }
     table = run.table
     columns = (table.t_s, table.heading_rad, table.distance_m)
     duration, turned, driven = (float(column[end] - column[start]) for column in columns)

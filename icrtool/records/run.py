@@ -184,11 +184,6 @@ class Run:
         return max((span[1] for span in self.convergence_s.values() if span is not None), default=0.0)
 
     @property
-    def process_position_mps(self) -> float:
-        """Position process noise the run ended with."""
-        return self.document.filter.process_position_mps
-
-    @property
     def began_with(self) -> WarmStart | None:
         """What the run was warm-started with, None where it was not."""
         stored = self.document.filter.warm_start

@@ -90,7 +90,7 @@ def test_rtk_that_is_lost_and_regained_neither_moves_the_icrs_nor_locks_the_filt
     lossy, float_ = lose_rtk(log, at_once=at_once)
     run = fit(confess(lossy, float_, how), load_config(sets=[WIDTH]))
     assert np.abs(icrs(run) - expected).max() < ICR_TOLERANCE_M
-    assert run.process_position_mps == 0.3
+    assert run.document.filter.process_position_mps == 0.3
     # A return to fixed is taken at once: without classes each locks the filter out for 20 fixes or more.
     assert np.count_nonzero(run.gnss.code == GATED) <= 3
     assert np.count_nonzero(run.sensors.fixes.down_weighted & float_) > 0.95 * np.count_nonzero(float_)
@@ -163,7 +163,7 @@ def test_noise_beyond_what_is_stated_is_put_down_to_the_fixes_not_to_the_wheels(
     log = replace(make_log(3, seconds=140.0, gnss_std=0.05), datum=Datum(40.8, -77.9, 350.0))
     said = np.full(len(log.gnss.stamp_ns), 1e-4)
     run = fit(replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said)), load_config(sets=[WIDTH]))
-    assert run.process_position_mps == 0.3
+    assert run.document.filter.process_position_mps == 0.3
     assert np.sqrt(run.sensors.fixes.var_north_m2) == pytest.approx(0.05, rel=0.1)
     assert any("scatter by" in warning for warning in run.warnings)
     assert icrs(run) == pytest.approx(ICRS, abs=0.05)
@@ -338,7 +338,7 @@ def test_poses_that_are_noisier_than_they_state_neither_lose_their_fixes_nor_spo
     said = np.full(len(log.gnss.stamp_ns), stated_m**2)
     run = fit(replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said)), CONFIG)
     assert np.count_nonzero(run.gnss.code == GATED) < 0.01 * len(said)
-    assert run.process_position_mps == 0.3
+    assert run.document.filter.process_position_mps == 0.3
     assert list(run.summary["gnss"]["classes"]) == ["reference"]
     assert any("the poses state" in warning and "scatter by" in warning for warning in run.warnings)
     assert icrs(run) == pytest.approx(ICRS, abs=0.02)

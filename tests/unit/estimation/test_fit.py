@@ -162,10 +162,10 @@ def test_wheels_that_contradict_the_fixes_raise_the_position_noise_and_say_so() 
     slip = slip[: len(log.wheels.stamp_ns)]
     late = replace(log.wheels, left=slip * log.wheels.left, right=slip * log.wheels.right)
     run = fit(replace(log, wheels=late), load_config(sets=[WIDTH]))
-    assert run.process_position_mps > 0.3
+    assert run.document.filter.process_position_mps > 0.3
     assert any("position noise raised" in warning for warning in run.warnings)
     fixed = fit(replace(log, wheels=late), load_config(sets=[WIDTH, "filter.process_position_mps=0.3"]))
-    assert fixed.process_position_mps == 0.3
+    assert fixed.document.filter.process_position_mps == 0.3
 
 
 def still(log: RobotLog) -> RobotLog:
