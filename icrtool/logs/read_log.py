@@ -15,7 +15,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -361,26 +361,27 @@ def survey_document(survey: Survey) -> SurveyDocument:
     tables = {table.topic: table for table in survey.tables}
     topics = []
     for channel in {channel.topic: channel for channel in survey.channels}.values():
-        found: dict[str, Any] = {"messages": channel.count}
-        if (table := tables.get(channel.topic)) is not None:
-            rate_hz, _ = rate_and_jitter(table.log_time_ns)
-            found = {"messages": len(table), "read": True, "rate_hz": rate_hz, "unreadable": table.unreadable}
-            interval = np.diff(table.log_time_ns) / 1e9
-            if len(interval) > 1:
-                long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), SHORTEST_GAP_S)
-                found["gaps"] = int(np.count_nonzero(long))
-                found["longest_gap_s"] = float(interval.max()) if long.any() else None
-        why = survey.candidates.unread.get(channel.topic)
-        topic, message_type = str(channel.topic), str(channel.message_type)
-        topics.append(SurveyedTopic(topic=topic, message_type=message_type, not_read_because=why, **found))
+        table = tables.get(channel.topic)
+        stamps = np.empty(0, np.int64) if table is None else table.log_time_ns
+        interval, long = np.diff(stamps) / 1e9, np.zeros(0, np.bool_)
+        if len(interval) > 1:
+            long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), SHORTEST_GAP_S)
+        topics.append(
+            SurveyedTopic(
+                topic=str(channel.topic), message_type=str(channel.message_type),
+                messages=channel.count if table is None else len(table), read=table is not None,
+                rate_hz=rate_and_jitter(stamps)[0], gaps=int(np.count_nonzero(long)),
+                longest_gap_s=float(interval.max()) if long.any() else None,
+                unreadable=0 if table is None else table.unreadable,
+                not_read_because=survey.candidates.unread.get(channel.topic),
+            )
+        )  # fmt: skip
     candidates: dict[Role, tuple[SurveyedSource, ...]] = {}
     for role, sources in survey.candidates.by_role().items():
-        clocks = (
-            one.stamps.note or f"header stamps, {round(one.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms before log time"
-            for one in sources
-        )
-        candidates[role] = tuple(
-            SurveyedSource(str(one.topic), str(one.message_type), one.why, one.problem or None, clock)
-            for one, clock in zip(sources, clocks, strict=True)
-        )
+        found = []
+        for one in sources:
+            delay = f"{round(one.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms"
+            clock = one.stamps.note or f"header stamps, {delay} before log time"
+            found.append(SurveyedSource(str(one.topic), str(one.message_type), one.why, one.problem or None, clock))
+        candidates[role] = tuple(found)
     return SurveyDocument(survey.inputs, survey.transfer or None, tuple(topics), candidates)

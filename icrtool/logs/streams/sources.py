@@ -289,31 +289,22 @@ UNITS = {"deg": math.radians(1.0), "rad": math.degrees(1.0)}
 """Of a bearing that is recorded in degrees, and of a latitude that is recorded in radians."""
 
 
-class Term(NamedTuple):
-    """A field of numbers.
-
-    Attributes
-    ----------
-    names : in each spelling that drivers use
-    largest : recorded numbers as large, of either sign, stand for "not known"
-    unit : what 1 means: in m, radians, degrees of latitude or longitude
-    """
-
-    names: list[str]
-    largest: float
-    unit: float
-
-
 @cache
-def terms_of(text: str) -> list[Term]:
-    """Return the sum that a text describes: ``h_accuracy < 65535 * 0.01``, ``lat * 1e-7 + latHp|lat_hp * 1e-9``."""
+def terms_of(text: str) -> list[tuple[list[str], float, float]]:
+    """Return the sum that a text describes: ``h_accuracy < 65535 * 0.01``, ``lat * 1e-7 + latHp|lat_hp * 1e-9``.
+
+    Returns
+    -------
+    Of each field its names, in each spelling that drivers use; the number from which on recorded ones, of either sign,
+    stand for "not known"; and its unit, what 1 means: in m, radians, degrees of latitude or longitude.
+    """
     terms = []
     for one in text.split(" + "):
         if (found := _TERM.fullmatch(one)) is None:
             raise ValueError(f"{text!r} describes no number")
         names, largest, units = found.groups()
         unit = math.prod(UNITS[one] if one in UNITS else float(one) for one in units.split(" * ") if one)
-        terms.append(Term(names.split("|"), float(largest or "inf"), unit))
+        terms.append((names.split("|"), float(largest or "inf"), unit))
     return terms
 
 
@@ -336,36 +327,25 @@ def number(table: TopicTable, text: str, *, needed: bool = False) -> Floats:
     return np.asarray(total)
 
 
-class Check(NamedTuple):
-    """A field by which messages are valid; all are where the type lacks it.
-
-    Attributes
-    ----------
-    names : the field, in each spelling that drivers use
-    mask : the bits of a whole number that count
-    relation, values : ``==`` one of these numbers or words, ``!=`` none of them, ``>=`` the number
-    unset : the number that drivers leave in it which never set it: where all messages have it, all are valid
-    """
-
-    names: list[str]
-    mask: int | None
-    relation: str
-    values: list[int | str]
-    unset: float
-
-
 @cache
-def check_of(text: str) -> Check:
-    """Return the check that a text describes: ``flags & 1 == 1``, ``ins_status == INS_SOLUTION_GOOD|3``."""
+def check_of(text: str) -> tuple[list[str], int | None, str, list[int | str], float]:
+    """Return the check that a text describes: ``flags & 1 == 1``, ``ins_status == INS_SOLUTION_GOOD|3 unless 0``.
+
+    Returns
+    -------
+    The names of the field, in each spelling that drivers use; the bits of a whole number that count; ``==`` one of the
+    numbers or words that follow, ``!=`` none of them, ``>=`` the number; and the number that drivers leave in it which
+    never set it: where all messages have it, all are valid.
+    """
     if (found := _CHECK.fullmatch(text)) is None:
         raise ValueError(f"{text!r} describes no check")
     names, mask, relation, values, unset = found.groups()
     of_any = [int(one) if one.lstrip("-").isdecimal() else one for one in values.split("|")]
-    return Check(names.split("|"), int(mask) if mask else None, relation, of_any, float(unset or "nan"))
+    return names.split("|"), int(mask) if mask else None, relation, of_any, float(unset or "nan")
 
 
 def all_valid(table: TopicTable, checks: Sequence[str]) -> Bools:
-    """Return which messages (n,) pass all checks."""
+    """Return which messages (n,) pass all checks; those of a field that the type lacks do."""
     valid = np.ones(len(table), np.bool_)
     for names, mask, relation, wanted, unset in map(check_of, checks):
         if (path := names[0]) in table.texts:
@@ -386,5 +366,5 @@ def all_valid(table: TopicTable, checks: Sequence[str]) -> Bools:
 
 def fields_in(numbers: Sequence[str], checks: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the fields that numbers and checks are read from; an empty text is no number."""
-    fields = [name for one in numbers if one for term in terms_of(one) for name in term.names]
-    return (*fields, *(name for one in checks for name in check_of(one).names))
+    fields = [name for one in numbers if one for names, _, _ in terms_of(one) for name in names]
+    return (*fields, *(name for one in checks for name in check_of(one)[0]))

@@ -213,40 +213,41 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
 
     Positions are interpolated, speeds are held.
     """
-    stamps, times, held = _common_stamps(left.table, right.table)
+    topic = LogText(f"{left.name.raw} + {right.name.raw}")
+    kind = LogText(" + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right))))
     commanded = bool(COMMANDED.search(left.name))
-    why = "a number of each side" + (" (commanded)" if commanded else "")
-    of: dict[str, Any] = {
-        "topic": LogText(f"{left.name.raw} + {right.name.raw}"),
-        "message_type": LogText(
-            " + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right)))
-        ),
-        "score": 80.0 - (COMMAND if commanded else 0.0),
-    }
-    if not (len(times) and len(held)):
-        problem = f"{(right if len(times) else left).table.topic} holds no message"
-        return WheelMotion(**of, stamps=stamps, problem=problem)
+    score, why = 80.0 - (COMMAND if commanded else 0.0), "a number of each side" + (" (commanded)" if commanded else "")
+    stamps, times, held = _common_stamps(left.table, right.table)
     try:
-        values = left.values(), right.values()
+        if not (len(times) and len(held)):
+            raise DefinitionError(topic, f"{(right if len(times) else left).table.topic} holds no message")
+        lefts, rights = left.values(), right.values()
+        # While both were recorded: a side that is held for long would look like a turn.
+        slack = max(_half_interval(times), _half_interval(held))
+        both = (times >= held[0] - slack) & (times <= held[-1] + max(slack, _HOLD_NS))
+        if not both.any():
+            raise DefinitionError(topic, "the two sides were not recorded at the same time")
     except DefinitionError as err:
-        return WheelMotion(**of, stamps=stamps, problem=err.why)
-    # While both were recorded: a side that is held for long would look like a turn.
-    slack = max(_half_interval(times), _half_interval(held))
-    both = (times >= held[0] - slack) & (times <= held[-1] + max(slack, _HOLD_NS))
-    if not both.any():
-        return WheelMotion(**of, stamps=stamps, problem="the two sides were not recorded at the same time")
-    moments, first = times[both], values[0][both].astype(np.float64)
+        return WheelMotion(topic=topic, message_type=kind, stamps=stamps, score=score, problem=err.why)
+    moments, first, integer = times[both], lefts[both].astype(np.float64), lefts.dtype.kind == "i"
+    position = speed = None, None
+    unit: Unit = "unknown"
+    if _is_position(left, lefts, config, integer=integer):
+        unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
+        what, position = (
+            "ticks" if unit == "counts" else "angles or distances",
+            (first, np.interp(moments, held, rights)),
+        )
+    else:
+        place = np.clip(np.searchsorted(held, moments + _half_interval(times), side="right") - 1, 0, None)
+        what, speed = "speeds", (first, rights[place].astype(np.float64))
     header = None if stamps.header_ns is None else stamps.header_ns[both]
-    of["stamps"] = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both])
-    of["note"] = COMMAND_NOTE if commanded else ""
-    integer = values[0].dtype.kind == "i"
-    if _is_position(left, values[0], config, integer=integer):
-        unit: Unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
-        what = "ticks" if unit == "counts" else "angles or distances"
-        return motion_of(**of, unit=unit, why=f"{why}: {what}", position=(first, np.interp(moments, held, values[1])))
-    place = np.clip(np.searchsorted(held, moments + _half_interval(times), side="right") - 1, 0, None)
-    second = values[1][place].astype(np.float64)
-    return motion_of(**of, unit="unknown", why=f"{why}: speeds", speed=(first, second))
+    stamps = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both])
+    why, note = f"{why}: {what}", COMMAND_NOTE if commanded else ""
+    return motion_of(
+        topic=topic, message_type=kind, stamps=stamps, position=position, speed=speed, unit=unit, score=score, why=why,
+        note=note,
+    )  # fmt: skip
 
 
 def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, Ints, Ints]:

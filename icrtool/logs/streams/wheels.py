@@ -30,73 +30,63 @@ MOST_WHEELS = 32
 
 
 def of_wheels(
-    wheels: Callable[[Quantity], NDArray[Any] | None], lefts: int, names: Sequence[str], unit: Unit, **others: Any
+    wheels: Callable[[Quantity], list[NDArray[Any]]], lefts: int, names: Sequence[str], unit: Unit, **others: Any
 ) -> WheelMotion:
     """Return the mean over the wheels of each side, those left out that have no encoder, or a dead one.
 
     Parameters
     ----------
-    wheels : returns the positions, or the speeds, of each wheel (n, k), the left ones first; None where not recorded
+    wheels : returns the positions, or the speeds, (n,) of each wheel, the left ones first; none where not recorded
     lefts : how many are left
-    names : (k,)
+    names : of the wheels
     others : what else `motion_of` takes
     """
     means: dict[Quantity, Sides] = {"position": (None, None), "speed": (None, None)}
     dead: set[int] = set()
     # One after the other: the columns of all wheels of a long log are large.
     for quantity in means:
-        values = wheels(quantity)
-        if values is not None:
+        columns = wheels(quantity)
+        if columns:
+            # before a side is averaged: a front and a rear wheel do not begin a turn at the same time
             turns_modulo = quantity == "position" and unit == "rad"
-            means[quantity], stuck = _side_means(_unwound(values) if turns_modulo else values, lefts)
+            means[quantity], stuck = _side_means([*map(_unwound, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
     note = f"{some_of([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
     note = note if dead else ""
     return motion_of(position=means["position"], speed=means["speed"], unit=unit, note=note, **others)
 
 
-def _side_means(values: NDArray[Any], lefts: int) -> tuple[Sides, set[int]]:
+def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set[int]]:
     """Return the mean over the wheels of each side that have finite values, None where none has; and the dead ones.
 
     A wheel that never changes while another one of its side does has a dead encoder.
     """
-    with np.errstate(invalid="ignore"):  # infinite ones are left out later
-        changes = np.fmax.reduce(values, axis=0) > np.fmin.reduce(values, axis=0)
+    changes = np.array([np.fmax.reduce(column) > np.fmin.reduce(column) for column in columns])
     means: list[Floats | None] = []
     dead: set[int] = set()
-    for side in (range(lefts), range(lefts, len(changes))):
+    for side in (range(lefts), range(lefts, len(columns))):
         dead |= {wheel for wheel in side if not changes[wheel] and changes[side].any()}
-        finite = [wheel for wheel in side if wheel not in dead and np.isfinite(values[:, wheel]).any()]
-        if len(finite) == 1:
-            means.append(values[:, finite[0]].astype(np.float64, copy=False))
-        elif finite:
-            total = np.zeros(len(values))
-            for wheel in finite:
-                # infinity less infinity would warn
-                total += np.where(np.isinf(values[:, wheel]), np.nan, values[:, wheel])
-            total /= len(finite)
-            means.append(total)
+        found = [columns[wheel] for wheel in side if wheel not in dead and np.isfinite(columns[wheel]).any()]
+        if len(found) > 1:
+            # infinity less infinity would warn
+            finite = (np.where(np.isinf(column), np.nan, column) for column in found)
+            means.append(sum(finite, np.zeros(len(found[0]))) / len(found))
         else:
-            means.append(None)
+            means.append(found[0].astype(np.float64) if found else None)
     return (means[0], means[1]), dead
 
 
-def _unwound(positions: Floats) -> Floats:
-    """Return joint positions [rad] (n, k); those recorded modulo one turn are unwrapped.
-
-    This is done before a side is averaged: a front and a rear wheel do not begin a turn at the same time.
-    """
-    unwound = positions
-    with np.errstate(invalid="ignore"):  # infinite ones are left out later
-        spread = np.fmax.reduce(positions, axis=0, initial=-np.inf) - np.fmin.reduce(positions, axis=0, initial=np.inf)
-    for place in np.flatnonzero(spread <= ONE_TURN_RAD).tolist():
-        column = positions[:, place]
-        finite = np.flatnonzero(np.isfinite(column))
-        steps = np.abs(np.diff(column[finite]))
-        wraps = steps > np.pi
-        if np.count_nonzero(wraps) >= FEWEST_WRAPS and float(steps[wraps].min()) > LEAST_WRAP_RAD:
-            unwound = unwound.copy("K") if unwound is positions else unwound
-            unwound[finite, place] = np.unwrap(column[finite])
+def _unwound(position: Floats) -> Floats:
+    """Return positions [rad] (n,) of a wheel; those recorded modulo one turn are unwrapped."""
+    finite = np.flatnonzero(np.isfinite(position))
+    steps = np.abs(np.diff(position[finite]))
+    wraps = steps > np.pi
+    if np.count_nonzero(wraps) < FEWEST_WRAPS or float(steps[wraps].min()) <= LEAST_WRAP_RAD:
+        return position
+    if np.ptp(position[finite]) > ONE_TURN_RAD or np.isinf(position).any():
+        return position
+    unwound = position.copy()
+    unwound[finite] = np.unwrap(position[finite])
     return unwound
 
 
@@ -176,18 +166,21 @@ def _rows_alike(listed: Bools, lefts: int) -> Bools:
     return both
 
 
-def _by_wheel(values: NDArray[Any] | None, places: Ints) -> Floats | None:
-    """Return the value of each wheel in each message (n, k), NaN where it is not listed."""
+def _by_wheel(values: NDArray[Any] | None, places: Ints) -> list[Floats]:
+    """Return the values (n,) of each wheel, NaN where it is not listed; none where nothing is recorded."""
     if values is None:
-        return None
-    by_wheel = np.full((places.shape[1], len(values)), np.nan).T
-    for wheel, place in enumerate(places.T):
+        return []
+    columns = []
+    for place in places.T:
         rows = (place >= 0) & (place < values.shape[1])
-        if (place == place[0]).all():
-            by_wheel[:, wheel] = values[:, place[0]] if rows[0] else np.nan
+        if rows[0] and (place == place[0]).all():
+            columns.append(values[:, place[0]])
         else:
-            by_wheel[rows, wheel] = values[rows, place[rows]]
-    return by_wheel
+            column = np.full(len(values), np.nan)
+            if len(place) == len(column):
+                column[rows] = values[rows, place[rows]]
+            columns.append(column)
+    return columns
 
 
 _ELEMENTS = re.compile(r"\[([\d,]+)\]")
@@ -233,16 +226,16 @@ class FixedWheels:
         """
         paths = {"position": self.position, "speed": self.speed}
 
-        def wheels_of(quantity: Quantity) -> Floats | None:
+        def wheels_of(quantity: Quantity) -> list[NDArray[Any]]:
             wheels: list[NDArray[Any]] = []
             for column, places in map(elements, paths[quantity]):
                 values = table.find(column)
                 if values is None:
-                    return None
+                    return []
                 if places and (values.ndim != 2 or max(places) >= values.shape[1]):
                     raise DefinitionError(table.topic, f"{column} holds fewer than {max(places) + 1} elements")
-                wheels += [values[:, place] for place in places] or [values]
-            return (np.array(wheels, np.float64) * self.factor).T if wheels else None
+                wheels += [values[:, place] * self.factor for place in places] or [values * self.factor]
+            return wheels
 
         lefts, rights = (len(elements(path)[1]) or 1 for path in self.position or self.speed)
         names = [f"wheel {i}" for i in range(lefts + rights)]
