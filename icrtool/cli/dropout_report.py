@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.fleet.one_log import ReportOptions, TrialOptions
     from icrtool.output.dropout_directory import Baseline
-    from icrtool.records.run import Run
 
 EPILOG_GATE = (
     'A limit of --gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "recommended.p95@10m <= 1.2"'
@@ -127,8 +125,11 @@ def dropout_report_command(
                 document["report"] = found.document
     printer.json("dropout-report", {"reports": inputs.documents})
     outcomes = [(str(source), (inputs.errors | reports)[str(source)]) for source in sources]
-    suites = [acceptance.suite_of(*one) for one in outcomes]
-    exports.write("dropout-report", lambda: suites, lambda: acceptance.format_outcomes(outcomes))
+    exports.write(
+        "dropout-report",
+        lambda: [acceptance.suite_of(*one) for one in outcomes],
+        lambda: acceptance.format_outcomes(outcomes),
+    )
     verdicts = [verdict for one in reports.values() for verdict in one.document.gates]
     options.check_compared(verdicts)
     inputs.leave("runs and logs", gate_failed=not all(one.passed for one in verdicts))
@@ -160,7 +161,17 @@ def plan_sources(
 def _report_one(source: Path, place: RunPlace | None, request: Request) -> DropoutReport:
     """Report on one source; `place` is the run directory of a log, None for a run."""
     printer, further = request.printer, request.further
-    with _run_of(source, place, request) as (run, folder):
+    with ExitStack() as stack:
+        if place is None:
+            folder = stack.enter_context(remote_place.on_disk(source, needed=bool))
+            run = run_directory.open_run(folder)
+        else:
+            # One result: where the report fails, an old run in this place stays, with its report.
+            asked = one_log.FitOptions(
+                request.overwrite, request.asked.plots, request.asked.figures, smooth=further.reference == "smoothed"
+            )
+            fitting = fitted_log(source, place.directory, request.config, asked, printer, place.inside)
+            run, folder = stack.enter_context(fitting)
         if further.outage_at_s and not dropout_report.forced_lengths_s(run, further.outage_s):
             raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
         baseline = request.baseline.find(run.name, run.document.content) if request.baseline is not None else None
@@ -179,17 +190,3 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
             if not verdict.passed:
                 click.echo(verdict.verdict, err=True)
     return report
-
-
-@contextmanager
-def _run_of(source: Path, place: RunPlace | None, request: Request) -> Iterator[tuple[Run, Path]]:
-    """Give the run of a source, and the folder on disk that the report goes into."""
-    if place is None:
-        with remote_place.on_disk(source, needed=bool) as folder:
-            yield run_directory.open_run(folder), folder
-        return
-    # One result: where the report fails, an old run in this place stays, with its report.
-    smooth = request.further.reference == "smoothed"
-    asked = one_log.FitOptions(request.overwrite, request.asked.plots, request.asked.figures, smooth=smooth)
-    with fitted_log(source, place.directory, request.config, asked, request.printer, place.inside) as found:
-        yield found

@@ -39,6 +39,8 @@ DEFAULT_MULTIPLIER = 1.5
 """The true ICRs where none are given: this many half track widths to either side, x 0."""
 
 ENCODER_RATE_HZ, COMMAND_RATE_HZ = 100.0, 10.0
+PAPER_COUNTS = 8192.0
+"""Of a wheel revolution, where the robot states none."""
 
 
 def change_text(text: str) -> tuple[float, tuple[float, ...]]:
@@ -180,7 +182,7 @@ def simulate_command(
     duration_s = 100.0 if isinstance(driven, drives.PathPlan) else float(driven.t_s[-1])
     drive = plan(drives.DrivePlan(icrs_m=default_icrs(config), path=driven, duration_s=duration_s))
     check_changes(drive.changes, drive.duration_s)
-    counts = encoder_counts or encoder_counts_of(config)
+    counts = encoder_counts or config.robot.encoder_counts_per_rev or PAPER_COUNTS
     radius_m = needed(config, "wheel_radius_m")
     metres = 2 * math.pi * radius_m / counts
     given = drives.Sensors(metres_per_count=metres, antenna_forward_m=antenna[0], antenna_right_m=antenna[1])
@@ -223,11 +225,6 @@ def needed(config: Config, key: Literal["track_width_m", "wheel_radius_m"]) -> f
         advice = f"--set robot.{key}=…, or --robot NAME"
         raise errors.ConfigError(f"robot.{key}", "needed to simulate a robot", advice)
     return value
-
-
-def encoder_counts_of(config: Config) -> float:
-    """Return the counts of a wheel revolution: the robot's, or the paper's."""
-    return config.robot.encoder_counts_per_rev or 8192.0
 
 
 def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> str:
@@ -302,24 +299,24 @@ def study_command(
     """  # noqa: D301 - click reads the escape
     config, given = settings.load(), click.get_current_context().params
     check_varied(studies.STUDIES[name], name, given)
-    asked = request(studies.default_request(name, config))
-    if config.robot.track_width_m is not None:
-        asked = replace(asked, plan=replace(asked.plan, icrs_m=default_icrs(config)))
-    asked = replace(asked, plan=plan(replace(asked.plan, path=path(asked.path))), sensors=sensors(asked.sensors))
-    check_changes(asked.plan.changes, asked.plan.duration_s)
+    asked, robot = request(studies.default_request(name, config)), config.robot
+    driven, drive, sensed = path(asked.path), asked.plan, sensors(asked.sensors)
+    if robot.track_width_m is not None:
+        drive = replace(drive, icrs_m=default_icrs(config))
+    drive = plan(replace(drive, path=driven))
+    check_changes(drive.changes, drive.duration_s)
     if rate is not None:
-        asked = replace(asked, sensors=replace(asked.sensors, wheel_rate_hz=rate, heading_rate_hz=rate))
-    if (radius_m := config.robot.wheel_radius_m) is not None:
-        metres = 2 * math.pi * radius_m / (encoder_counts or encoder_counts_of(config))
-        asked = replace(asked, sensors=replace(asked.sensors, metres_per_count=metres))
-    if given["kind"] is not None and asked.paths:
-        asked = replace(asked, paths=(asked.path.kind,))
+        sensed = replace(sensed, wheel_rate_hz=rate, heading_rate_hz=rate)
+    if robot.wheel_radius_m is not None:
+        counts = encoder_counts or robot.encoder_counts_per_rev or PAPER_COUNTS
+        sensed = replace(sensed, metres_per_count=2 * math.pi * robot.wheel_radius_m / counts)
+    paths = (driven.kind,) if given["kind"] is not None and asked.paths else asked.paths
     if preset is None and "filter.preset" in config.given:
         preset = config.filter.preset
-    if preset is None and name == "convergence" and config.robot.track_width_m is not None:
+    if preset is None and name == "convergence" and robot.track_width_m is not None:
         preset = "field"
-    if preset is not None:
-        asked = replace(asked, presets=(preset,))
+    presets = asked.presets if preset is None else (preset,)
+    asked = replace(asked, plan=drive, sensors=sensed, paths=paths, presets=presets)
     directory = output if output is not None else RUNS / f"study-{name}"
     simulation_files.check_study_target(directory)
     with printer.progress(f"study {name}") as progress:

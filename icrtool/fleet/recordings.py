@@ -327,7 +327,13 @@ def read_manifest(path: Path) -> list[Entry]:
     """
     try:
         text = read_regular(path, most_bytes=LARGEST_MANIFEST_BYTES).decode("utf-8-sig")
-        rows = _toml_rows(path, text) if path.suffix.lower() == ".toml" else _csv_rows(path, text)
+        if path.suffix.lower() == ".toml":
+            document = parse_toml(text)
+            rows = document.get("logs")
+            if set(document) - {"logs"} or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+                raise ConfigError(path, "not a manifest", "it holds tables [[logs]] and nothing else")
+        else:
+            rows = _csv_rows(path, text)
     except OSError as err:
         raise ConfigError(path, "cannot be read", err.strerror or str(err)) from err
     except (ValueError, RecursionError, csv.Error) as err:
@@ -361,18 +367,9 @@ def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
     rows: list[Mapping[str, Any]] = []
     for number, row in enumerate(reader, start=2):
         if None in row or None in row.values():
-            raise ConfigError(
-                f"{path}:{number}", "has more or fewer values than the first line has names", "give one each"
-            )
+            why = "has more or fewer values than the first line has names"
+            raise ConfigError(f"{path}:{number}", why, "give one each")
         rows.append({**row, "tags": [tag.strip() for tag in (row.get("tags") or "").split(";") if tag.strip()]})
-    return rows
-
-
-def _toml_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
-    document = parse_toml(text)
-    rows = document.get("logs")
-    if set(document) - {"logs"} or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise ConfigError(path, "not a manifest", "it holds tables [[logs]] and nothing else")
     return rows
 
 

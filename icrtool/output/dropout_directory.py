@@ -244,7 +244,13 @@ def open_baseline(path: Path) -> Baseline:
         sources: tuple[Path, ...] = (path / FLEET_FILE,)
     else:
         reports, files = {}, {}
-        for file in [path] if path.is_file() else _report_files(path):
+        if not (path.is_file() or path.is_dir()):
+            if is_special(path):
+                raise ConfigError(f"--baseline {path}", NOT_REGULAR, SAVE_IT)
+            raise ConfigError(f"--baseline {path}", "no such file or directory", BASELINE_ADVICE)
+        one_file = path if path.is_file() else path / REPORT_FILE
+        below = f"**/{DROPOUT_DIRECTORY}/{REPORT_FILE}"
+        for file in [one_file] if one_file.is_file() else sorted(path.glob(below)):
             one = read_report(file, inside=None if file == path else path)
             if one.log in reports:
                 why = f"two reports of logs named {one.log}"
@@ -278,13 +284,3 @@ def read_report(path: Path, log: str = "", inside: Path | None = None) -> Baseli
         raise ConfigError(f"--baseline {path}", "cannot be read", err.strerror or str(err)) from err
     except (ValueError, RecursionError) as err:
         raise ConfigError(f"--baseline {path}", "not a complete dropout report", BASELINE_ADVICE) from err
-
-
-def _report_files(path: Path) -> list[Path]:
-    if not path.is_dir():
-        if is_special(path):
-            raise ConfigError(f"--baseline {path}", NOT_REGULAR, SAVE_IT)
-        raise ConfigError(f"--baseline {path}", "no such file or directory", BASELINE_ADVICE)
-    if (path / REPORT_FILE).is_file():
-        return [path / REPORT_FILE]
-    return sorted(path.glob(f"**/{DROPOUT_DIRECTORY}/{REPORT_FILE}"))
