@@ -60,8 +60,7 @@ def runs_of(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run
                 found.append(run_directory.open_run(path))
             else:
                 found.append(fit.fit(read_log.read_log(path, config), config))
-            if progress is not None:
-                progress(len(found) / len(paths))
+            progress(len(found) / len(paths))
     return found
 
 

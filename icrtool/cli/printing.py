@@ -190,11 +190,11 @@ class Printer(NamedTuple):
         return Stages(name, quiet=self.quiet, verbose=self.verbose)
 
     @contextmanager
-    def progress(self, label: str) -> Iterator[Callable[[float], None] | None]:
-        """Give a function that shows the share done of work of one stage; None where there is no terminal."""
+    def progress(self, label: str) -> Iterator[Callable[[float], None]]:
+        """Give a function that shows the share done of work of one stage."""
         with Stages(label, quiet=self.quiet) as stages:
             stages.begin("")
-            yield stages.share if stages.on_terminal else None
+            yield stages.share
 
 
 class Inputs:

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from icrtool import __version__
 from icrtool.config import ConfigSources, builtin_robots
+from icrtool.dropout_analysis.report import parse_gate
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
 from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
@@ -23,6 +24,8 @@ from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import about, as_text, find_recordings, is_manifest, logs_among, read_manifest
 from icrtool.logs.containers.recording_files import files_of_log
 from icrtool.logs.containers.source import RemoteFile
+from icrtool.output.files.formats import CHECKSUM_FILE
+from icrtool.output.run_directory import PAGE_FILE, RUN_FILE
 from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
 from icrtool.records.places import UrlPath, read_regular
 
@@ -71,9 +74,6 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions, folder: Pa
     OutputError
         `output` is a run, or something else than a directory, or holds somebody's own file of the name of a result.
     """
-    from icrtool.dropout_analysis.report import parse_gate
-    from icrtool.output.run_directory import RUN_FILE
-
     for gate in options.report.gates:
         parse_gate(gate)
     folder = folder or output
@@ -130,9 +130,6 @@ def finished(request: Request, folder: Path) -> FleetLog | None:
     ----------
     folder : on disk, of the results
     """
-    from icrtool.output.files.formats import CHECKSUM_FILE
-    from icrtool.output.run_directory import PAGE_FILE
-
     try:
         row = msgspec.json.decode(read_regular(folder / request.row_file, folder), type=FleetLog)
     except (OSError, ValueError):

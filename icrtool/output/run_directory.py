@@ -18,7 +18,7 @@ from icrtool.logs.containers.recording_files import file_sha256, files_of_log, n
 from icrtool.output.files import formats, run_columns
 from icrtool.output.files.atomic import atomic_directory, check_directory, own_files
 from icrtool.output.files.remote_place import lies_there, on_disk
-from icrtool.output.files.run_columns import MEASUREMENTS_FILE, StatesFileError, StatesFormat
+from icrtool.output.files.run_columns import MEASUREMENTS_FILE, StatesFormat
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of, read_regular
 from icrtool.records.plain_data import Record
 from icrtool.records.process_resources import give_back_freed
@@ -32,9 +32,7 @@ RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
 PAGE_FILE = "report.html"
 
-STATES_FILES: dict[str, StatesFormat] = {"states.csv": "csv", "states.parquet": "parquet"}
-
-SMOOTHED_FILES: dict[str, StatesFormat] = {"smoothed.csv": "csv", "smoothed.parquet": "parquet"}
+STATES_FORMATS: tuple[StatesFormat, ...] = ("csv", "parquet")
 
 MOST_CSV_STATES = 1_000_000
 """With more states, states.csv would have over 300 MB, and take longer to read than the log."""
@@ -222,14 +220,14 @@ def _run_in(directory: Path, place: Path) -> Run:
     try:
         config = parse_config(msgspec.convert(stored.get("config"), dict[str, Any]))
         document = msgspec.convert(stored | {"config": config}, RunDocument)
-        table = _read_states(directory, STATES_FILES, sums)
+        table = _read_states(directory, "states", sums)
         if table is None:
             raise RunError(directory, f"{formats.CHECKSUM_FILE} names no states", FIT_AGAIN)
         if table.fault:
             raise ValueError(table.fault)
         check_sum(directory, MEASUREMENTS_FILE, sums)
         table, sensors, gnss, heading = run_columns.read_measurements(directory, table, document)
-        smoothed = _read_states(directory, SMOOTHED_FILES, sums)
+        smoothed = _read_states(directory, "smoothed", sums)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
         run = Run(
@@ -245,7 +243,7 @@ def _run_in(directory: Path, place: Path) -> Run:
         )
     except ConfigError as err:
         raise RunError(directory, f"its configuration is not of this version ({err.what})", FIT_AGAIN) from err
-    except (OSError, StatesFileError, ValueError, OverflowError) as err:
+    except (OSError, ValueError, OverflowError) as err:
         raise RunError(directory, f"cannot be read ({err})", FIT_AGAIN) from err
     give_back_freed()
     return run
@@ -312,18 +310,18 @@ def _read_document(directory: Path) -> dict[str, Any]:
     return {key: value if key == "inputs" else escaped_texts(value, NAMES) for key, value in document.items()}
 
 
-def _read_states(directory: Path, names: Mapping[str, StatesFormat], sums: Mapping[str, str]) -> States | None:
-    """Read the first of the named files that the run has; None where it has none of them."""
-    name = next((name for name in names if name in sums), None)
-    if name is None:
-        return None
-    with ThreadPoolExecutor(1) as pool:
-        # Both read the file from end to end; hashing leaves the interpreter to the other.
-        checked = pool.submit(check_sum, directory, name, sums)
-        try:
-            return run_columns.read_states(directory / name, names[name], directory)
-        finally:
-            checked.result()
+def _read_states(directory: Path, stem: str, sums: Mapping[str, str]) -> States | None:
+    """Read the states of this name, in the format that the run has; None where it has none of them."""
+    for states in STATES_FORMATS:
+        if (name := f"{stem}.{states}") in sums:
+            with ThreadPoolExecutor(1) as pool:
+                # Both read the file from end to end; hashing leaves the interpreter to the other.
+                checked = pool.submit(check_sum, directory, name, sums)
+                try:
+                    return run_columns.read_states(directory / name, states, directory)
+                finally:
+                    checked.result()
+    return None
 
 
 def check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:

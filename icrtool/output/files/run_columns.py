@@ -52,10 +52,6 @@ FREE_STATES_BYTES = 1 << 29
 """States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
 
 
-class StatesFileError(ValueError):
-    """A file that does not hold the columns of the states. Only `read_run` sees it, and raises a clearer one."""
-
-
 def write_states(table: States, path: Path, states: StatesFormat) -> str:
     """Write the states to a new file.
 
@@ -117,7 +113,7 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None) ->
 
     Raises
     ------
-    StatesFileError
+    ValueError
         The columns are not those of the states.
     OSError
         The file cannot be read.
@@ -132,7 +128,7 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None) ->
             with open_regular(path, inside) as source, pq.ParquetFile(source) as file:
                 numbers = file.metadata.num_rows * len(COLUMNS)
                 if 8 * numbers > FREE_STATES_BYTES + LARGEST_RATIO * os.fstat(source.fileno()).st_size:
-                    raise StatesFileError(f"it claims {numbers} numbers, too many for its size")
+                    raise ValueError(f"it claims {numbers} numbers, too many for its size")
                 _check_columns(file.schema_arrow, types)
                 # One at a time: each one's memory is used again for the next.
                 read = partial(file.read, use_threads=False)
@@ -148,18 +144,18 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None) ->
         # Each column's memory goes back before the next is copied.
         return States(**{name: _array(columns.pop(name)) for name in COLUMNS})
     except pa.ArrowException as err:
-        raise StatesFileError(" ".join(str(err).split())) from err
+        raise ValueError(" ".join(str(err).split())) from err
 
 
 def _check_columns(schema: pa.Schema, types: dict[str, pa.DataType]) -> None:
     if {name: schema.field(name).type for name in schema.names if name in types} != types:
-        raise StatesFileError("its columns are not those of the states")
+        raise ValueError("its columns are not those of the states")
 
 
 def _array(column: pa.ChunkedArray) -> NDArray[Any]:
     """Return a column without nulls as an array; pyarrow's own conversion would import pandas."""
     if column.null_count:
-        raise StatesFileError("a cell is empty")
+        raise ValueError("a cell is empty")
     return np.concatenate([np.from_dlpack(chunk) for chunk in column.chunks])
 
 
