@@ -316,7 +316,7 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
         ),
     },
 }  # fmt: skip
-"""By role and type. A number is read as ``lat|latitude * 1e-7 + lat_hp * 1e-9`` states (`sources.number`), a check as
+"""By role and type. A number is read as ``lat|latitude * 1e-7 + lat_hp * 1e-9`` states (`sources.terms_of`), a check as
 ``flags & 1 == 1`` (`sources.check_of`)."""
 
 

@@ -329,7 +329,7 @@ def number(table: TopicTable, text: str, *, needed: bool = False) -> Floats:
 
 @cache
 def check_of(text: str) -> tuple[list[str], int | None, str, list[int | str], float]:
-    """Return the check that a text describes: ``flags & 1 == 1``, ``ins_status == INS_SOLUTION_GOOD|3 unless 0``.
+    """Return the check that a text describes: ``flags & 1 == 1``, ``status.status >= 0 unless -2``.
 
     Returns
     -------

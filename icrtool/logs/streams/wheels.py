@@ -78,12 +78,13 @@ def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set
 
 def _unwound(position: Floats) -> Floats:
     """Return positions [rad] (n,) of a wheel; those recorded modulo one turn are unwrapped."""
+    with np.errstate(invalid="ignore"):  # infinity less infinity is not within a turn
+        if not np.fmax.reduce(position) - np.fmin.reduce(position) <= ONE_TURN_RAD:
+            return position
     finite = np.flatnonzero(np.isfinite(position))
     steps = np.abs(np.diff(position[finite]))
     wraps = steps > np.pi
     if np.count_nonzero(wraps) < FEWEST_WRAPS or float(steps[wraps].min()) <= LEAST_WRAP_RAD:
-        return position
-    if np.ptp(position[finite]) > ONE_TURN_RAD or np.isinf(position).any():
         return position
     unwound = position.copy()
     unwound[finite] = np.unwrap(position[finite])
