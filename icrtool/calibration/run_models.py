@@ -23,7 +23,7 @@ from icrtool.estimation.fit import fit as fit_filter
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
-from icrtool.motion.models import FIVE, ICRS, NO_SLIP, RECOMMENDED, FittedModel, TrackGeometry
+from icrtool.motion.models import FIVE, ICRS, NO_SLIP, RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.dropout import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
@@ -162,21 +162,16 @@ class ComparedModels(NamedTuple):
 
     Attributes
     ----------
-    trials : that they are tested in; track : the run's drive
-    blocks : of distance, which a trial's own is left out with its neighbours
-    fits : of all windows, by model name: what to use, not what was tested
-    width_m : track width b, or what stands for it
+    table : of the run's recording: its trials, blocks of distance, and fits
+    track : the run's drive
     heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
     notes : what was left out of the table and why, and what was corrected
     calibration : what ``icrtool calibrate`` gives for this run alone; None where the track width is not known
     """
 
     rows: tuple[ComparedRow, ...]
-    trials: Trials
+    table: HeldOut
     track: Track
-    blocks: int
-    fits: dict[str, FittedModel]
-    width_m: float
     heading: str
     notes: tuple[str, ...]
     calibration: Calibration | None
@@ -212,16 +207,8 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     calibration = None
     if run.track_width_m is not None:
         calibration = pooled.calibration_from(found, pooled.robot_of(run, recording.width_m), pooled.use_warnings(run))
-    return ComparedModels(
-        tuple(rows), found.trials[0],
-        recording.track._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps),
-        blocks=len(found.folds),
-        fits={name: fit.fitted for name, fit in found.fits.items()},
-        width_m=recording.width_m,
-        heading=heading,
-        notes=tuple(notes),
-        calibration=calibration,
-    )  # fmt: skip
+    track = recording.track._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
+    return ComparedModels(tuple(rows), found, track, heading, tuple(notes), calibration)
 
 
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, list[str]]:

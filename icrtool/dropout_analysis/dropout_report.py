@@ -161,15 +161,16 @@ def dropout_report(
         except DataError as err:
             why = f"{err.why}, {err.advice}"
     give_back_freed()
-    rows = found.rows if found is not None else ()
     horizons = list(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
     for at_m in (gate.horizon_m for gate in limits):
         if at_m is not None and not any(math.isclose(at_m, horizon, rel_tol=1e-9) for horizon in horizons):
             horizons.append(at_m)
     budgets_m = () if unusable else budgets_m
+    rows = () if found is None else found.rows
+    track, sparse = (None, None) if found is None else (found.track, found.table.trials[0].starts)
     errors = measure_errors(
         compared, horizons, further=[*rows, *further], starts=starts, seed=seed, sink=sink,
-        starts_of_further=None if found is None else found.trials.starts, track=None if found is None else found.track,
+        starts_of_further=sparse, track=track,
     )  # fmt: skip
     give_back_freed()
     cost = None
@@ -315,18 +316,18 @@ def _ladder(
             models.append(
                 documents.ScoreDocument(one.name, one.label, fitted, heading, *map(list, zip(*rows, strict=True)))
             )
-    fits = {}
-    for name, fit in found.fits.items():
+    table, fits = found.table, {}
+    for name, fit in table.fits.items():
         value, std = (dict(zip(fit.model.terms, column.tolist(), strict=True)) for column in (fit.parameters, fit.std))
         fits[name] = documents.FitDocument(plain(value), plain(std))
     return documents.LadderDocument(
         horizons_m=errors.horizons_m.tolist(),
-        blocks=found.blocks,
-        starts=int(np.count_nonzero((found.trials.ends >= 0).any(axis=1))),
+        blocks=len(table.folds),
+        starts=int(np.count_nonzero((table.trials[0].ends >= 0).any(axis=1))),
         heading=found.heading or None,
         notes=list(found.notes),
         models=models,
-        width_m=found.width_m,
+        width_m=table.recordings[0].width_m,
         fits=fits,
     )
 

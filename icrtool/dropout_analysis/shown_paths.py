@@ -56,7 +56,7 @@ def worst_trials(
     ends, rows = counted_ends(track, horizon_m, starts), compared.rows if compared is not None else ()
     held_out = next((row for row in rows if row.name == RECOMMENDED), None)
     if compared is not None and held_out is not None:
-        some = compared.trials.starts
+        some = compared.table.trials[0].starts
         errors = np.full(len(ends), np.nan)
         errors[some] = held_out.errors_of(Trials(some, ends[some])).position[:, 0]
     else:

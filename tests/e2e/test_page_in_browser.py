@@ -180,7 +180,7 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
     for row, of in (
         ("controller", "five"), ("controller_heading", "five_gyro"), ("recommended_heading", "recommended_gyro"),
     ):  # fmt: skip
-        fitted = compared.fits[of]
+        fitted = compared.table.fits[of].fitted
         own = own_constants(cut_windows(turned), fitted, turned.width_m)
         if of.startswith("five"):
             fitted = controller_model(fitted, turned.lever, turned.width_m)

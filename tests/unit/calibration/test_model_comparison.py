@@ -31,7 +31,7 @@ CHORD_M = 1e-5
 def compared_errors(run: Run, headings: Sequence[MeasuredHeading] = ()) -> tuple[ComparedModels, dict[str, Floats]]:
     """Return the comparison, and by row the errors in its trials."""
     found = compare_models(run, headings)
-    return found, {row.name: row.errors_of(found.trials).position for row in found.rows}
+    return found, {row.name: row.errors_of(found.table.trials[0]).position for row in found.rows}
 
 
 @pytest.fixture(scope="module")
@@ -91,12 +91,12 @@ def test_all_rows_have_errors_in_the_same_trials(run: Run) -> None:
         "icr_final_heading",
     ]  # fmt: skip
     for one in errors.values():
-        assert np.array_equal(np.isfinite(one), found.trials.ends >= 0)
+        assert np.array_equal(np.isfinite(one), found.table.trials[0].ends >= 0)
 
 
 def test_the_path_of_a_row_ends_where_its_trial_does(run: Run) -> None:
     found, errors = compared_errors(run, measured_headings(run))
-    drive, (start, end) = track_of(run), (found.trials.starts, found.trials.ends[:, 1])
+    drive, (start, end) = track_of(run), (found.table.trials[0].starts, found.table.trials[0].ends[:, 1])
     for row in found.rows:
         if row.path is None:
             continue

@@ -42,11 +42,11 @@ def test_the_worst_trials_are_those_of_the_recommended_model(make_run: Callable[
     run = make_run(duration_s=150.0, troubles=False)
     compared = compare_models(run)
     row = next(row for row in compared.rows if row.name == "recommended")
-    ends = trial_ends(track_of(run), np.array([5.0]))[compared.trials.starts]
-    errors = row.errors_of(Trials(compared.trials.starts, ends)).position[:, 0]
+    ends = trial_ends(track_of(run), np.array([5.0]))[compared.table.trials[0].starts]
+    errors = row.errors_of(Trials(compared.table.trials[0].starts, ends)).position[:, 0]
     worst = worst_trials(run, compared, 5.0, count=3)
     assert {one.document.model for one in worst} == {"recommended"}
-    assert worst[0].start == compared.trials.starts[np.nanargmax(errors)]
+    assert worst[0].start == compared.table.trials[0].starts[np.nanargmax(errors)]
     assert worst[0].document.errors_m["recommended"] == pytest.approx(np.nanmax(errors), abs=1e-4)
     assert set(worst[0].paths) == {"icr", "no_slip", "recommended", "controller"}
 
