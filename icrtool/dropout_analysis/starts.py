@@ -129,8 +129,8 @@ def reference_error(
         start = start[np.linspace(0, len(start) - 1, DRAWS).astype(np.int64)]
         end = column[start]
         north, east = track.north[end] - track.north[start], track.east[end] - track.east[start]
-        north_std = [np.sqrt(position) * table.std_north_m[rows] for rows in (start, end)]
-        east_std = [np.sqrt(position) * table.std_east_m[rows] for rows in (start, end)]
+        north_std = [np.sqrt(position) * table.std_north_m[states] for states in (start, end)]
+        east_std = [np.sqrt(position) * table.std_east_m[states] for states in (start, end)]
         std_heading = np.sqrt(heading) * table.std_heading_rad[start]
         drawn = rng.standard_normal((5, DRAWS))
         turned = std_heading * drawn[0]
