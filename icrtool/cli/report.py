@@ -26,7 +26,7 @@ with when_used():
     from icrtool.output.files import atomic, formats
     from icrtool.output.page import pages, render
     from icrtool.output.tables import calibration as tables
-    from icrtool.records import fleet_document, places
+    from icrtool.records import calibration_document, fleet_document, places
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
@@ -75,7 +75,8 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
             return pages.fleet_page(formats.read_fleet(source), source)
     if (file := pages.comparison_in(source)) is not None:
         with _as_written(file, "run icrtool compare again"):
-            comparison = pages.read_comparison(file, source if source.is_dir() else None)
+            inside = source if source.is_dir() else None
+            comparison = formats.read_document(file, calibration_document.GroupComparison, inside)
             return pages.comparison_page(comparison, file.stem)
     if places.is_special(source):
         raise errors.RunError(source, places.NOT_REGULAR, places.SAVE_IT)

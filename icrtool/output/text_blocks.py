@@ -209,7 +209,7 @@ def printed(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:
             else:
                 yield from (Line(name, "title"), Line(f"{'':{LABEL + 2}}{block.facts}", "as is"))
         elif isinstance(block, Facts | Checks):
-            for first, text, most in _fact_lines(block) if isinstance(block, Facts) else _check_lines(block, verbose):
+            for first, text, most in _labelled(block, verbose):
                 yield _sentence(first, text, most, verbose=verbose)
         elif isinstance(block, Items):
             most = len(block.texts) if verbose else MOST_ITEMS
@@ -233,9 +233,15 @@ def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
     yield from printed(section.blocks, verbose=verbose)
 
 
-def _check_lines(checks: Checks, verbose: bool) -> Iterator[tuple[str, str, int]]:
-    """Yield what stands before each finding, the finding, and in how many lines of a brief answer."""
-    for number, one in enumerate(one for one in checks.rows if verbose or one.grade != "fact"):
+def _labelled(block: Facts | Checks, verbose: bool) -> Iterator[tuple[str, str, int]]:
+    """Yield what stands before each sentence, the sentence, and in how many lines of a brief answer."""
+    if isinstance(block, Facts):
+        widest = max((len(name) for name, _ in block.rows), default=0)
+        for number, (name, text) in enumerate(block.rows):
+            of_all = f"{'' if number else block.label:{LABEL + 2}}{name:{widest}}  "
+            yield of_all if block.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
+        return
+    for number, one in enumerate(one for one in block.rows if verbose or one.grade != "fact"):
         first = f"{'' if number else 'checks':{LABEL + 2}}{MARKS[one.grade]:4}{one.what:{LABEL + 3}}"
         yield first, one.text, 1 if one.grade == "good" else BRIEF_LINES
         yield from ((" " * len(first), more, BRIEF_LINES) for more in (one.more if verbose else ()))
@@ -246,14 +252,6 @@ def _sentence(first: str, text: str, most: int, look: Look = "as is", *, verbose
     if verbose:
         return Table("l", [(first[:-2], text)])
     return Line("\n".join(_wrap(text, first, " " * len(first), BRIEF_WIDTH, most)) or first.rstrip(), look)
-
-
-def _fact_lines(facts: Facts) -> Iterator[tuple[str, str, int]]:
-    """Yield what stands before each sentence, the sentence, and in how many lines of a brief answer."""
-    widest = max((len(name) for name, _ in facts.rows), default=0)
-    for number, (name, text) in enumerate(facts.rows):
-        of_all = f"{'' if number else facts.label:{LABEL + 2}}{name:{widest}}  "
-        yield of_all if facts.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
 
 
 def narrowed(table: Table, width: int) -> Table:

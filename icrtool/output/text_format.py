@@ -18,11 +18,7 @@ from icrtool.records.text import counted, distance_text
 if TYPE_CHECKING:
     from icrtool.motion.models import FittedModel
     from icrtool.records.calibration_document import ControllerErrors
-    from icrtool.records.run_document import (
-        DriveDocument,
-        ReferenceJumpDocument,
-        RunDocument,
-    )
+    from icrtool.records.run_document import DriveDocument, ReferenceJumpDocument, RunDocument
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 

@@ -20,15 +20,7 @@ from numpy.typing import NDArray
 from icrtool.dropout_analysis.trials import errors_from_states
 from icrtool.kernels.arrays import Ints
 from icrtool.kernels.kinematics import body_velocity
-from icrtool.logs.write_log import (
-    TopicMessages,
-    TopicPlan,
-    blank_message,
-    header_stamps,
-    load_typestore,
-    serialise_topic,
-    write_mcap,
-)
+from icrtool.logs import write_log
 from icrtool.output.exports.paths import (
     ERROR_HORIZON_M,
     ExportPath,
@@ -114,7 +106,7 @@ def write_foxglove(run: Run, path: Path) -> None:
         _icrs(run, rows),
         _errors(run, rows),
     ]
-    topics = [serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
+    topics = [write_log.serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
     topics += [_whole_path(path, store) for path in paths]
     slip = ({**plain(event), "x_m": event.east_m, "y_m": event.north_m} for event in run.document.events)
     outages: list[dict[str, Any]] = []
@@ -125,39 +117,39 @@ def write_foxglove(run: Run, path: Path) -> None:
     topics += [_event_topic("/events", slip, store), _event_topic("/outages", outages, store)]
     about = {name: "" if value is None else str(value) for name, value in about_run(run).items()}
     about["datum"] = "" if globe is None else " ".join(f"{value!r}" for value in globe)
-    write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about, library=LIBRARY)
+    write_log.write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about, library=LIBRARY)
 
 
 @cache
 def _typestore() -> Typestore:
     from rosbags.typesys import get_types_from_msg
 
-    store = load_typestore(ros1=False)
+    store = write_log.load_typestore(ros1=False)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     return store
 
 
-def _transforms(paths: Sequence[ExportPath], rows: Ints, store: Typestore) -> TopicPlan:
+def _transforms(paths: Sequence[ExportPath], rows: Ints, store: Typestore) -> write_log.TopicPlan:
     """Return /tf: one message a state, with the pose of each path."""
     stamps = paths[0].stamp_ns[rows]
     kind = "geometry_msgs/msg/TransformStamped"
-    fixed: dict[str, object] = {"transforms": [blank_message(store, kind) for _ in paths]}
+    fixed: dict[str, object] = {"transforms": [write_log.blank_message(store, kind) for _ in paths]}
     columns: dict[str, NDArray[Any]] = {}
     for number, path in enumerate(paths):
         place, (z, w) = f"transforms.{number}", path.quaternion
         fixed |= {f"{place}.header.frame_id": WORLD, f"{place}.child_frame_id": BODIES[path.name]}
-        columns |= {f"{place}.{name}": values for name, values in header_stamps(stamps).items()}
+        columns |= {f"{place}.{name}": values for name, values in write_log.header_stamps(stamps).items()}
         columns |= {
             f"{place}.transform.translation.x": path.x_m[rows],
             f"{place}.transform.translation.y": path.y_m[rows],
             f"{place}.transform.rotation.z": z[rows],
             f"{place}.transform.rotation.w": w[rows],
         }
-    return TopicPlan("/tf", "tf2_msgs/msg/TFMessage", stamps, fixed, columns)
+    return write_log.TopicPlan("/tf", "tf2_msgs/msg/TFMessage", stamps, fixed, columns)
 
 
-def _odometry(run: Run, path: ExportPath, rows: Ints) -> TopicPlan:
+def _odometry(run: Run, path: ExportPath, rows: Ints) -> write_log.TopicPlan:
     """Return the poses of a path; its twist is what its ICRs make of the wheel speeds."""
     table, stamps, (z, w) = run.table, path.stamp_ns[rows], path.quaternion
     icrs = (column[rows] if len(column) > 1 else column for column in path.icrs)
@@ -182,25 +174,27 @@ def _odometry(run: Run, path: ExportPath, rows: Ints) -> TopicPlan:
     return _plan(topic, "nav_msgs/msg/Odometry", stamps, WORLD, columns, fixed)
 
 
-def _whole_path(path: ExportPath, store: Typestore) -> TopicMessages:
+def _whole_path(path: ExportPath, store: Typestore) -> write_log.TopicMessages:
     """Return a message at the first state that holds all of a path, thinned."""
     name = "nav_msgs/msg/Path"
-    message: Any = blank_message(store, name)
+    message: Any = write_log.blank_message(store, name)
     rows, (z, w) = line_rows(path.x_m, path.y_m), path.quaternion
     message.header.frame_id = WORLD
     _set_stamp(message, int(path.stamp_ns[0]))
     columns = (path.x_m, path.y_m, z, w, path.stamp_ns)
     for x_m, y_m, qz, qw, stamp in zip(*(column[rows].tolist() for column in columns), strict=True):
-        pose: Any = blank_message(store, "geometry_msgs/msg/PoseStamped")
+        pose: Any = write_log.blank_message(store, "geometry_msgs/msg/PoseStamped")
         pose.header.frame_id = WORLD
         _set_stamp(pose, stamp)
         pose.pose.position.x, pose.pose.position.y = x_m, y_m
         pose.pose.orientation.z, pose.pose.orientation.w = qz, qw
         message.poses.append(pose)
-    return TopicMessages(f"/{path.name}/path", name, path.stamp_ns[:1], [bytes(store.serialize_cdr(message, name))])
+    return write_log.TopicMessages(
+        f"/{path.name}/path", name, path.stamp_ns[:1], [bytes(store.serialize_cdr(message, name))]
+    )
 
 
-def _fixes(run: Run, rows: Ints, globe: Globe) -> Iterator[TopicPlan]:
+def _fixes(run: Run, rows: Ints, globe: Globe) -> Iterator[write_log.TopicPlan]:
     """Yield the filter's position, the fixes that it used and those that it rejected, as NavSatFix."""
     table, fixes = run.table, run.sensors.fixes
     variances = table.std_east_m**2, table.std_north_m**2
@@ -229,12 +223,14 @@ def _fixes(run: Run, rows: Ints, globe: Globe) -> Iterator[TopicPlan]:
 def _plan(
     topic: str, kind: str, stamp_ns: Ints, frame: str, columns: dict[str, NDArray[Any]],
     fixed: Mapping[str, object] = MappingProxyType({}),
-) -> TopicPlan:  # fmt: skip
+) -> write_log.TopicPlan:  # fmt: skip
     """Return a topic whose messages begin with a header."""
-    return TopicPlan(topic, kind, stamp_ns, {"header.frame_id": frame, **fixed}, header_stamps(stamp_ns) | columns)
+    return write_log.TopicPlan(
+        topic, kind, stamp_ns, {"header.frame_id": frame, **fixed}, write_log.header_stamps(stamp_ns) | columns
+    )
 
 
-def _icrs(run: Run, rows: Ints) -> TopicPlan:
+def _icrs(run: Run, rows: Ints) -> write_log.TopicPlan:
     table = run.table
     columns: dict[str, NDArray[Any]] = {}
     for name in ICR_COLUMNS:
@@ -244,7 +240,7 @@ def _icrs(run: Run, rows: Ints) -> TopicPlan:
     return _plan("/icrs", ICRS, table.stamp_ns[rows], BODIES["filter"], columns)
 
 
-def _errors(run: Run, rows: Ints) -> TopicPlan:
+def _errors(run: Run, rows: Ints) -> write_log.TopicPlan:
     """Return the open-loop errors from the states that have a trial."""
     errors, unknown = errors_from_states(run, ERROR_HORIZON_M), np.full(len(run.table), np.nan)
     rows = rows[np.isfinite(errors["icr"][rows])]
@@ -253,12 +249,12 @@ def _errors(run: Run, rows: Ints) -> TopicPlan:
     return _plan("/open_loop_error", ERROR, stamps, BODIES["filter"], columns, {"horizon_m": ERROR_HORIZON_M})
 
 
-def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore) -> TopicMessages:
+def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore) -> write_log.TopicMessages:
     """Return a message at the begin of each event, and one of kind none at its end."""
     stamps, payload = [], []
     for event in events:
         for kind, stamp in ((event["kind"], event["begin_ns"]), ("none", event["end_ns"])):
-            message: Any = blank_message(store, EVENT)
+            message: Any = write_log.blank_message(store, EVENT)
             message.header.frame_id, message.kind = WORLD, kind
             _set_stamp(message, stamp)
             for name in ("x_m", "y_m", "distance_m", "severity", "confidence"):
@@ -266,7 +262,7 @@ def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore)
             message.duration_s = (event["end_ns"] - event["begin_ns"]) / 1e9
             stamps.append(stamp)
             payload.append(bytes(store.serialize_cdr(message, EVENT)))
-    return TopicMessages(topic, EVENT, np.array(stamps, np.int64), payload)
+    return write_log.TopicMessages(topic, EVENT, np.array(stamps, np.int64), payload)
 
 
 def _set_stamp(message: Any, stamp_ns: int) -> None:  # noqa: ANN401 - a message with a header

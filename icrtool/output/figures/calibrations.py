@@ -68,19 +68,13 @@ def forecast_figure(
 SHOWN_PERCENT = 97.0
 """The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
 
-BEFORE: style.Look = {
-    "label": "before: as configured, ICR separation estimated",
-    "marker": "s",
-    "color": "0.62",
-    "markersize": 3.2,
-    "linestyle": "none",
+BEFORE: style.Look = style.spot("0.62", 3.2, "s", "0.62") | {
     "markeredgewidth": 0.0,
+    "label": "before: as configured, ICR separation estimated",
 }
-AFTER: style.Look = BEFORE | {
+AFTER: style.Look = style.spot(style.ICR["color"], 2.8, "o", style.ICR["color"]) | {
+    "markeredgewidth": 0.0,
     "label": "after: calibrated",
-    "marker": "o",
-    "color": style.ICR["color"],
-    "markersize": 2.8,
 }
 
 

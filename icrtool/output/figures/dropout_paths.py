@@ -13,14 +13,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
-from icrtool.output.figures.trajectory import (
-    CELLS,
-    JUMP_LOOK,
-    draw_path,
-    fitted_box_in,
-    look_down,
-    name_directions,
-)
+from icrtool.output.figures.trajectory import CELLS, JUMP_LOOK, draw_path, fitted_box_in, look_down, name_directions
 from icrtool.output.series import places
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout_document import ExampleTrial, Outage, TrialDocument

@@ -19,12 +19,6 @@ if TYPE_CHECKING:
 
 
 SEGMENT = style.line("#e08214", width=1.6)
-# Plain text: mathtext costs more than the rest of a figure.
-NAMES = {
-    "y_icr_right_m": "ICR y right [m]",
-    "y_icr_left_m": "ICR y left [m]",
-    "x_icr_m": "ICR x [m]",
-}
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 """Where no slip puts an ICR, in half track widths."""
 
@@ -78,7 +72,7 @@ def icr_estimates(run: Run) -> Figure:
     for row, column in zip(panels, ICR_COLUMNS, strict=True):
         for axes, span in zip(row, spans, strict=True):
             _draw_estimate(axes, run, column, span, first=axes is row[0])
-        row[0].set_ylabel(NAMES[column])
+        row[0].set_ylabel(f"ICR {ICR_WORDS[column]} [m]")
         settling, final = run.convergence_s[column], finals[column]
         found = f"10–90 % in {settling[1] - settling[0]:.1f} s" if settling else "starts near its final value"
         row[0].set_title(found, loc="left", pad=4.0)
@@ -189,7 +183,7 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
             axes.axvline(place, **NO_SLIP_PLACE)
         title += f"\nno slip: {signed(place)} m"
     axes.set_title(title, pad=4.0)
-    axes.set_xlabel(NAMES[column])
+    axes.set_xlabel(f"ICR {ICR_WORDS[column]} [m]")
     axes.locator_params(axis="x", nbins=3, min_n_ticks=2)
     axes.grid(visible=False, axis="x")
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -276,10 +276,9 @@ def fates(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
     values = sorted(set(result.request.values))
     picture = np.zeros((len(values), len(values), 3))
     for level in levels:
-        place = tuple(
-            values.index(cast(float, level.names[f"start_{name}_m"])) for name in ("y_icr_right", "y_icr_left")
-        )
-        picture[place] = np.array([level.found[fate].mean() for fate in FATES]) @ FATE_COLORS
+        starts_m = [level.names[f"start_{name}_m"] for name in ("y_icr_right", "y_icr_left")]
+        row, column = np.searchsorted(values, np.array(starts_m, np.float64))
+        picture[row, column] = np.array([level.found[fate].mean() for fate in FATES]) @ FATE_COLORS
     half = (values[-1] - values[0]) / max(2 * (len(values) - 1), 1) or 0.5
     span = (values[0] - half, values[-1] + half)
     axes.imshow(picture, origin="lower", extent=(*span, *span), aspect="auto")

@@ -84,7 +84,13 @@ def trajectory(run: Run) -> Figure:
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, style.FILTER, label="filter", zorder=4)
     for name, path in paths.items():
-        _draw_odometry(axes, path, cell, *ODOMETRIES[name])
+        (low, high), (pen, label, order) = _corners(path), ODOMETRIES[name]
+        leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
+        label = f"{label}, ends {distance_text(path.end_error_m)} off{leaves}"
+        draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
+        # copies: views would keep the whole path in memory with the picture
+        ends_m = path.east_m[-1:].copy(), path.north_m[-1:].copy()
+        axes.plot(*ends_m, marker="D", color=pen["color"], markersize=5.0, zorder=4.8)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
     # Where the slip events were: the filter's path through each, and a ring at its begin.
@@ -105,18 +111,6 @@ def _corners(path: States | OdometryPath) -> Corners:
     """Return the least and the greatest (north, east) of a path [m]."""
     north, east = path.north_m, path.east_m
     return np.array([north.min(), east.min()]), np.array([north.max(), east.max()])
-
-
-def _draw_odometry(axes: Axes, path: OdometryPath, cell_m: float, pen: style.Look, name: str, order: int) -> None:
-    """Draw a wheels-only path and its end; the label states where it leaves the view."""
-    low, high = _corners(path)
-    lowest, highest = np.column_stack([axes.get_ylim(), axes.get_xlim()])
-    leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
-    label = f"{name}, ends {distance_text(path.end_error_m)} off{leaves}"
-    draw_path(axes, path.north_m, path.east_m, cell_m, pen, label=label, zorder=order)
-    # copies: views would keep the whole path in memory with the picture
-    ends = path.east_m[-1:].copy(), path.north_m[-1:].copy()
-    axes.plot(*ends, marker="D", color=pen["color"], markersize=5.0, zorder=4.8)
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:

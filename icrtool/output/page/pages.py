@@ -365,17 +365,6 @@ def comparison_page(found: GroupComparison, title: str) -> str:
     )  # fmt: skip
 
 
-def read_comparison(file: Path, inside: Path | None = None) -> GroupComparison:
-    """Return what ``icrtool compare -o`` wrote.
-
-    Raises
-    ------
-    OSError, ValueError, RecursionError
-        It cannot be read, or is not of this version.
-    """
-    return read_document(file, GroupComparison, inside)
-
-
 def comparison_in(place: Path) -> Path | None:
     """Return the file of a comparison: `place` itself, or the one in that folder; None where there is none."""
     inside = place if place.is_dir() else None

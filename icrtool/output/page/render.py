@@ -73,10 +73,12 @@ def render(
         f"default-src 'none'; img-src data:; style-src {of_style}; "
         f"script-src {' '.join(of_scripts)}; base-uri 'none'; form-action 'none'"
     )
+    # JSON that can stand in a script element, whatever text it holds.
+    written = json.dumps(plain(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
     return _environment().get_template("base.html").render(
         # Ours, not of a log: they stand in the page as they are.
         policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(one) for one in code[1:]],  # noqa: S704
-        data=Markup(script_json(data)) if data is not None else None,  # noqa: S704 - escaped for a script element
+        data=None if data is None else Markup(written),  # noqa: S704 - escaped for a script element
         tool_version=__version__, title=title, kind=kind, blocks=blocks, figures=FIGURES,
         **{"pictures": {}, **content},
     )  # fmt: skip
@@ -110,11 +112,6 @@ def _environment() -> Environment:
         "named": lambda pictures, names: [one for name, one in pictures.items() if name.startswith(names)],
     }
     return environment
-
-
-def script_json(data: Mapping[str, object]) -> str:
-    """Return JSON that can stand in a script element, whatever text it holds."""
-    return json.dumps(plain(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
 
 
 def _static(name: str) -> str:

@@ -20,29 +20,9 @@ from icrtool.motion.models import TERMS
 from icrtool.output.files.formats import csv_bytes
 from icrtool.output.tables.dropout import REACH_ROWS, parameter_table, reach_row
 from icrtool.output.tables.run import numbers_of
-from icrtool.output.text_blocks import (
-    PAGE,
-    VERBOSE,
-    Block,
-    Facts,
-    Figure,
-    Items,
-    Line,
-    Section,
-    Table,
-    Title,
-)
+from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import model_text
-from icrtool.records.calibration_document import (
-    ComparedPair,
-    ErrorsAt,
-    ForecastBudget,
-    ForecastColumns,
-    ForecastDocument,
-    ForecastSource,
-    GroupComparison,
-    SensorDocument,
-)
+from icrtool.records import calibration_document as documents
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS
@@ -52,7 +32,7 @@ BUDGET_M = 0.5
 """Error within which a distance counts."""
 
 
-def calibration_blocks(result: CalibrationResult | None, sensors: SensorDocument | None) -> list[Block]:
+def calibration_blocks(result: CalibrationResult | None, sensors: documents.SensorDocument | None) -> list[Block]:
     """Return what `icrtool calibrate` prints: numbers, how far on what they were not fitted to, settings of one log."""
     blocks = _result_blocks(result) if result is not None else []
     return [*blocks, *_sensor_blocks(sensors)] if sensors is not None else blocks
@@ -110,7 +90,7 @@ FORMS = {"_deg": ("+.2f", "°"), "_m": ("+.3f", "m"), "_s": ("+.3f", "s"), "scal
 """Of value and standard deviation, and their unit, by the end of the key."""
 
 
-def _sensor_blocks(calibration: SensorDocument) -> list[Block]:
+def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
     """Return the settings that one log proposes, and the estimates that they come from."""
     facts = calibration.drive
     right, left = facts.turned_right_deg, facts.turned_left_deg
@@ -163,23 +143,24 @@ def _columns(forecast: Forecast, gyro: Forecast | None) -> dict[str, Floats]:
 
 def forecast_document(
     forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
-) -> ForecastDocument:
+) -> documents.ForecastDocument:
     """Return what ``icrtool forecast --json`` prints."""
     columns = {name: column.tolist() for name, column in _columns(forecast, gyro).items()}
-    return ForecastDocument(
+    reaches = [
+        (metres, known(reach(forecast, metres)), UNSET if gyro is None else known(reach(gyro, metres)))
+        for metres in budgets_m
+    ]
+    return documents.ForecastDocument(
         schema="icrtool/forecast/1",
         tool_version=__version__,
-        calibration=ForecastSource(calibration.name or "", calibration.recommended, calibration.created or ""),
-        measured_to_m=measured_to_m(calibration),
-        budgets=tuple(
-            ForecastBudget(
-                budget, known(reach(forecast, budget)), UNSET if gyro is None else known(reach(gyro, budget))
-            )
-            for budget in budgets_m
+        calibration=documents.ForecastSource(
+            calibration.name or "", calibration.recommended, calibration.created or ""
         ),
+        measured_to_m=measured_to_m(calibration),
+        budgets=tuple(documents.ForecastBudget(*reached) for reached in reaches),
         not_shown=calibration.fitted.not_shown,
         warnings=calibration.warnings,
-        along=ForecastColumns(**columns),
+        along=documents.ForecastColumns(**columns),
     )
 
 
@@ -224,13 +205,13 @@ def forecast_blocks(
     return [*blocks, *calibration.warnings]
 
 
-def transfer_csv(found: GroupComparison) -> bytes:
+def transfer_csv(found: documents.GroupComparison) -> bytes:
     """Return the transfer matrix as CSV, a row and column of it and a horizon each."""
-    columns = ("calibrated_on", "tested_on", "horizon_m", "trials", *ErrorsAt.__struct_fields__[1:])
+    columns = ("calibrated_on", "tested_on", "horizon_m", "trials", *documents.ErrorsAt.__struct_fields__[1:])
     return csv_bytes(columns, ([getattr(cell, name) for name in columns] for cell in found.transfer))
 
 
-def transfer_blocks(found: GroupComparison) -> list[Block]:
+def transfer_blocks(found: documents.GroupComparison) -> list[Block]:
     """Return what `icrtool compare` prints: verdicts, the transfer matrix, differences of each pair, the logs."""
     names = list(found.groups)
     cells = dict.fromkeys(product(names, names), "-")
@@ -254,7 +235,7 @@ def transfer_blocks(found: GroupComparison) -> list[Block]:
     ]
 
 
-def _pair_section(pair: ComparedPair) -> Section:
+def _pair_section(pair: documents.ComparedPair) -> Section:
     """Return how parameters and held-out errors of two groups differ."""
     rows, errors = [], []
     for one in pair.parameters:

@@ -192,11 +192,8 @@ def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
     if not cost.events:
         return ["slip events: none in this log; --without-events changes nothing"]
     left_out = f"{counted(cost.events, 'slip event')} left out"
-    both = [
-        (after, before, counts)
-        for after, before, counts in zip(icr.by_horizon, cost.with_events["icr"], report.trials, strict=True)
-        if after.trials and before.trials
-    ]
+    rows = zip(icr.by_horizon, cost.with_events["icr"], report.trials, strict=True)
+    both = [row for row in rows if row[0].trials and row[1].trials]
     if not both:
         return [f"{left_out}: no trial remains"]
     after, before, counts = both[-1]

@@ -32,13 +32,24 @@ const icrtoolCharts = (() => {
     ];
   }
 
-  /** Add the keys of a chart below it: a sample of each line, and its name. */
-  function keys(list, entries) {
+  /** Fill a list with samples of lines and their labels; `change(one, shown)` is called by the boxes of those with a name. */
+  function keys(list, entries, isShown, change) {
     list.replaceChildren(...entries.map((one) => {
       const item = document.createElement("li");
-      item.append(sample(one), document.createTextNode(one.label));
+      if (isShown) item.append(toggle(one, isShown(one), one.name && ((shown) => change(one, shown))));
+      else item.append(sample(one), one.label);
       return item;
     }));
+  }
+
+  /** Call `build` where light and dark change, and `resize`, a moment later, where the page has another width. */
+  function onChange(build, resize) {
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", build);
+    let waiting = 0;
+    new ResizeObserver(() => {
+      clearTimeout(waiting);
+      waiting = setTimeout(resize, 120);
+    }).observe(document.querySelector("main"));
   }
 
   function sample(one) {
@@ -328,13 +339,10 @@ const icrtoolCharts = (() => {
     const entries = [...modelKeys(models.filter((model) => !folded.includes(model))),
       ...(reference.p95.length ? [{ color: "reference", dash: "dotted", label: "position reference alone" }] : []),
       ...data.budgets_m.map((budget) => ({ color: "budget", dash: "dashed", label: `budget ${budget} m` }))];
-    const boxes = (id, of) => document.getElementById(id).replaceChildren(...of.map((one) => {
-      const item = document.createElement("li");
-      item.append(toggle(one, !hidden.has(one.name), one.name && ((shown) => { hidden[shown ? "delete" : "add"](one.name); draw(); })));
-      return item;
-    }));
-    boxes("error-keys", entries);
-    if (folded.length) boxes("error-others", modelKeys(folded));
+    const isShown = (one) => !hidden.has(one.name);
+    const change = (one, shown) => { hidden[shown ? "delete" : "add"](one.name); draw(); };
+    keys(document.getElementById("error-keys"), entries, isShown, change);
+    if (folded.length) keys(document.getElementById("error-others"), modelKeys(folded), isShown, change);
     const inputs = [...document.querySelectorAll("input[name=measure], #log")];
     for (const input of inputs) input.addEventListener("change", draw);
     draw();
@@ -347,5 +355,5 @@ const icrtoolCharts = (() => {
     };
   }
 
-  return { timeCharts, errorChart, color, clock, lookOf, toggle };
+  return { timeCharts, errorChart, color, clock, lookOf, toggle, keys, onChange };
 })();

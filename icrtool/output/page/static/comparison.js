@@ -12,10 +12,5 @@
 
   draw();
   group.addEventListener("change", draw);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-  let waiting = 0;
-  new ResizeObserver(() => {
-    clearTimeout(waiting);
-    waiting = setTimeout(() => chart?.resize?.(), 120);
-  }).observe(document.querySelector("main"));
+  icrtoolCharts.onChange(draw, () => chart?.resize?.());
 })();

@@ -7,7 +7,7 @@ const icrtoolMap = (() => {
 
   /** Make the map; onMoment(row) is called where a pointer is near the drive, onPick(row) where it was clicked. */
   function make(data, { onMoment, onPick }) {
-    const { color, lookOf, toggle } = icrtoolCharts, d3 = window.d3;
+    const { color, lookOf, keys } = icrtoolCharts, d3 = window.d3;
     const element = document.getElementById("map"), s = data.series, steps = data.steps;
     const origin = data.origin || [0, 0];
     const { north, east } = steps, odometry = Object.fromEntries(["icr_final", "no_slip"].filter((name) => data.paths[name]).map((name) => [name, data.paths[name]]));
@@ -89,12 +89,13 @@ const icrtoolMap = (() => {
       return parts.join("");
     }
 
+    /** Return the step at the first row of the series from a moment on; behind the end, the last one. */
+    function stepAt(t) {
+      return s.step[Math.min(firstAtLeast(s.t, t), s.t.length - 1)];
+    }
+
     function during(spans, x, y) {
-      return spans.map((one) => {
-        const from = s.step[Math.min(firstAtLeast(s.t, one.begin_s), s.t.length - 1)];
-        const to = s.step[Math.min(firstAtLeast(s.t, one.end_s), s.t.length - 1)];
-        return line(north, east, x, y, from, to) || "";
-      }).join("");
+      return spans.map((one) => line(north, east, x, y, stepAt(one.begin_s), stepAt(one.end_s))).join("");
     }
 
     function drawAxes(x, y) {
@@ -119,9 +120,7 @@ const icrtoolMap = (() => {
       drawAxes(x, y);
       layers.fixes.attr("d", dots(data.fixes.used, x, y, "h0"));
       layers.rejected.attr("d", dots(data.fixes.rejected, x, y, "m-3 -3l6 6m0 -6l-6 6"));
-      const from = Number.isFinite(span[0]) ? s.step[Math.min(firstAtLeast(s.t, span[0]), s.t.length - 1)] : 0;
-      const to = Number.isFinite(span[1]) ? s.step[Math.min(firstAtLeast(s.t, span[1]), s.t.length - 1)] : north.length - 1;
-      layers.filter.attr("d", line(north, east, x, y, from, to));
+      layers.filter.attr("d", line(north, east, x, y, ...span.map(stepAt)));
       for (const [name, path] of Object.entries(odometry)) layers[name].attr("d", line(path.north, path.east, x, y));
       layers.outages.attr("d", during(data.outages, x, y));
       layers.events.attr("d", during(data.events, x, y));
@@ -212,7 +211,7 @@ const icrtoolMap = (() => {
       draw();
     }
 
-    function keys() {
+    function addKeys() {
       const entries = [
         { name: "filter", label: "filter", color: "filter" }, { name: "fixes", label: "fixes used", color: "fix", marker: "dot" },
         ...(data.fixes.rejected.t.length ? [{ name: "rejected", label: "fixes rejected", color: "rejected", marker: "cross" }] : []),
@@ -221,11 +220,7 @@ const icrtoolMap = (() => {
         ...(data.events.length ? [{ name: "events", label: "slip events", color: "slip", width: 5 }] : []),
         ...(data.outages.length ? [{ name: "outages", label: "outages", color: "final", width: 5 }] : []),
       ];
-      document.getElementById("layers").replaceChildren(...entries.map((one) => {
-        const item = document.createElement("li");
-        item.append(toggle(one, !hidden.has(one.name), (shown) => hide(one.name, !shown)));
-        return item;
-      }));
+      keys(document.getElementById("layers"), entries, (one) => !hidden.has(one.name), (one, shown) => hide(one.name, !shown));
     }
 
     function resize() {
@@ -237,7 +232,7 @@ const icrtoolMap = (() => {
       draw();
     }
 
-    keys();
+    addKeys();
     resize();
     return {
       resize,

@@ -18,6 +18,10 @@ const icrtoolPage = (() => {
     return row >= 0 && Math.abs(used.t[row] - t) < 2 ? used.difference[row] : null;
   }
 
+  function metres(error) {
+    return `${error.toFixed(error < 1 ? 3 : 2)} m`;
+  }
+
   function signed(value) {
     return `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(3)}`;
   }
@@ -30,7 +34,7 @@ const icrtoolPage = (() => {
     const parts = [`${clock(t)} (${t.toFixed(1)} s), ${data.steps.distance[series.step[row]].toFixed(1)} m driven`,
       `wheels left ${series.v_left[row].toFixed(2)}, right ${series.v_right[row].toFixed(2)} m/s`,
       `ICR y right ${signed(series.y_right[row])} ± ${series.std_y_right[row].toFixed(3)}, y left ${signed(series.y_left[row])} ± ${series.std_y_left[row].toFixed(3)}, x ${signed(series.x[row])} ± ${series.std_x[row].toFixed(3)} m`];
-    if (off !== null) parts.push(`filter to fix ${off.toFixed(off < 1 ? 3 : 2)} m`);
+    if (off !== null) parts.push(`filter to fix ${metres(off)}`);
     readout.textContent = parts.join(" · ").replace(/(\d) (?=m|cm|s\)|±)|± /g, (found) => found.replace(" ", "\u00a0"));
     charts.mark(t);
     map.mark(row);
@@ -59,7 +63,7 @@ const icrtoolPage = (() => {
       const line = text("tr", "", body), name = text("th", "", line, { scope: "row" });
       const look = { ...icrtoolCharts.lookOf(model.name), label: model.label };
       name.append(icrtoolCharts.toggle(look, !map.hidesModel(model.name), (shown) => map.hideModel(model.name, !shown)));
-      for (const error of model.errors) text("td", error === null ? "–" : error < 1 ? `${error.toFixed(3)} m` : `${error.toFixed(2)} m`, line);
+      for (const error of model.errors) text("td", error === null ? "–" : metres(error), line);
     }
     box.replaceChildren(table);
     const notes = [];
@@ -95,12 +99,7 @@ const icrtoolPage = (() => {
       document.getElementById("map").scrollIntoView({ block: "center" });
     });
   }
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", build);
-  let waiting = 0;
-  new ResizeObserver(() => {
-    clearTimeout(waiting);
-    waiting = setTimeout(() => { charts.resize(); errors?.resize?.(); map.resize(); setMoment(moment); }, 120);
-  }).observe(document.querySelector("main"));
+  icrtoolCharts.onChange(build, () => { charts.resize(); errors?.resize?.(); map.resize(); setMoment(moment); });
 
   return { data, openLoop, setMoment, rowAt, moment: () => moment, map: () => map, charts: () => charts };
 })();
