@@ -105,16 +105,6 @@ class StreamDelays(NamedTuple):
         agree = PRIOR_STD[TP] / std * math.exp(-0.5 * (value / std) ** 2)
         return math.sqrt((std**2 + value**2) / (1.0 + agree))
 
-    def apply(self, log: RobotLog) -> RobotLog:
-        """Return the log with heading and position reference taken earlier; the same log where nothing is applied."""
-        heading_s = self.applied_gnss_s if self.together else self.applied_heading_s
-        moved: dict[str, Any] = {
-            name: replace(stream, stamp_ns=stream.stamp_ns - round(delay_s * 1e9))
-            for name, stream, delay_s in (("gnss", log.gnss, self.applied_gnss_s), ("heading", log.heading, heading_s))
-            if delay_s != 0.0
-        }
-        return replace(log, **moved) if moved else log
-
 
 def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tuple[StreamDelays, list[str]]:
     """Return the delays of heading and positions against the wheels, those that are corrected, and what to report."""
@@ -212,7 +202,7 @@ class AlignedStreams(NamedTuple):
         if self.fit is None:
             none = np.empty(0, np.complex128)
             return measure_steps(track.place_t, track.place, track.laid), measure_steps(np.empty(0), none, none)
-        place, turn = self.fit.expected_motion()
+        place, turn = self.fit.model.until_fixes(self.fit.fit.x)
         turned = track.heading_at(track.place_t)
         return measure_steps(track.place_t, track.place, place), measure_steps(track.place_t, turned, turn)
 
@@ -256,7 +246,15 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         configured = configured[::-1]
     wheels, scales, of_wheels = align_wheels(log, config, fit, configured, sound=sound)
     delays, of_delays = find_delays(log, config, fit)
-    log = delays.apply(scaled(log, *scales))
+    log = scaled(log, *scales)
+    lags = {"gnss": delays.applied_gnss_s, "heading": delays.applied_heading_s}
+    lags["heading"] = lags["gnss"] if delays.together else lags["heading"]
+    moved: dict[str, Any] = {
+        name: replace(stream, stamp_ns=stream.stamp_ns - round(lags[name] * 1e9))
+        for name, stream in (("gnss", log.gnss), ("heading", log.heading))
+        if lags[name] != 0.0
+    }
+    log = replace(log, **moved) if moved else log
     warnings = tuple(f"{log.name}: {note}" for note in (*notes, *of_wheels, *of_heading, *of_delays))
     return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, warnings)
 

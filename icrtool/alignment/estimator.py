@@ -176,10 +176,6 @@ class AlignmentFit(NamedTuple):
         """Whether the wheels slip too much to show a scale or a delay."""
         return self.scatter[0] > SLIPPING or self.turn_slip > TURNS_SLIPPING
 
-    def expected_motion(self) -> tuple[Complexes, Floats]:
-        """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,), by this estimate."""
-        return self.model.until_fixes(self.fit.x)
-
     def geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs about the antenna, multiplier and side scales, and their covariance (6, 6)."""
         x, b, speed = self.fit.x, self.width_m, self.turning_speed_mps
@@ -317,7 +313,7 @@ class MotionOfWindows:
         )
 
     def until_fixes(self, x: Floats) -> tuple[Complexes, Floats]:
-        """Return place [m] and turn [rad] of the wheels until each fix (m,)."""
+        """Return place, north + j east [m], and turn [rad] of the wheels until each fix (m,)."""
         nose, rate, ahead, aside = self._motion(x)
         path = self.track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
         t = self.track.place_t

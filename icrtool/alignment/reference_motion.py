@@ -94,11 +94,6 @@ class Knots(NamedTuple):
         """Times of the fixes (m,) [s] since `epoch_ns`."""
         return self.track.place_t
 
-    @property
-    def place(self) -> Complexes:
-        """Fixes (m,), north + j east [m]."""
-        return self.track.place
-
 
 class Motion(NamedTuple):
     """Motion that an estimate expects at the knots.
@@ -184,6 +179,13 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     holes = np.zeros(len(t), np.int64)
     for sampled in (track.t, track.heading_t, t):
         holes += np.searchsorted(sampled[:-1][is_hole(np.diff(sampled), LONGEST_HOLE_S)], t)
+    gyro, by_gyro = sensors.gyro, None
+    if gyro is not None and len(gyro.stamp_ns) >= FEWEST_FIXES:
+        at = (gyro.stamp_ns - wheels.stamp_ns[0]) / 1e9
+        turned = trapezoids(at, gyro.rate_radps)
+        line = fit_gyro_line(at, gyro.rate_radps, turned, t, heading)
+        if line.is_yaw:
+            by_gyro = line.scale * np.interp(t + line.lead_s, at, turned) + line.bias_radps * t
     return Knots(
         epoch_ns=int(wheels.stamp_ns[0]), track=track,
         variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2)[rows] / 2, USUAL_POSITION_STD_M**2),
@@ -192,19 +194,8 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         velocity=(v_left + v_right) / 2 * np.exp(1j * heading), apart=v_left - v_right,
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
         holes=holes, fix_class=fixes.fix_class[rows], turn_follows_place=sensors.heading_is_estimated,
-        gyro=_turn_by_gyro(sensors, t, heading),
+        gyro=by_gyro,
     )  # fmt: skip
-
-
-def _turn_by_gyro(sensors: SensorData, t: Floats, heading: Floats) -> Floats | None:
-    """Return the turn of the gyro at times (m,) [rad], in sense and scale of the headings (m,), without its bias."""
-    gyro = sensors.gyro
-    if gyro is None or len(gyro.stamp_ns) < FEWEST_FIXES:
-        return None
-    at = (gyro.stamp_ns - sensors.wheels.stamp_ns[0]) / 1e9
-    turned = trapezoids(at, gyro.rate_radps)
-    line = fit_gyro_line(at, gyro.rate_radps, turned, t, heading)
-    return line.scale * np.interp(t + line.lead_s, at, turned) + line.bias_radps * t if line.is_yaw else None
 
 
 def window_durations(knots: Knots) -> list[float]:
@@ -248,7 +239,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     fit = estimate_alignment(windows.rows(kept, turns_kept), width_m)
     if fit is None:
         return None
-    place, turn = fit.expected_motion()
+    place, turn = fit.model.until_fixes(fit.fit.x)
     gain = max(abs(fit.estimate("turn")[0]), LEAST_TURN_GAIN)
     return Motion(place, turn, abs(fit.estimate("scale")[0]), width_m / 2 / gain)
 
@@ -262,7 +253,7 @@ def compare(knots: Knots, motion: Motion, first: Ints, last: Ints, response_s: f
     """
     level = np.exp(-0.5j * (knots.heading[first] + knots.heading[last]))
     place, model, change = (
-        level * (column[last] - column[first]) for column in (knots.place, motion.place, knots.velocity)
+        level * (column[last] - column[first]) for column in (knots.track.place, motion.place, knots.velocity)
     )
     turn, model_turn, spin = (column[last] - column[first] for column in (knots.heading, motion.turn, knots.apart))
     missed, path_m, lever = place - model, knots.track.distance[last] - knots.track.distance[first], motion.lever_m
@@ -341,7 +332,7 @@ def _beyond(knots: Knots, first: Ints, last: Ints, width_m: float) -> Bools:
     path, duration = knots.track.distance[last] - knots.track.distance[first], knots.t[last] - knots.t[first]
     by_robot = JUMP_SPEED_SHARE * path + JUMP_MPS * duration
     noise = np.sqrt(knots.variance[first] + knots.variance[last])
-    moved = np.abs(knots.place[last] - knots.place[first]) > OUTLIER_SIGMAS * noise + by_robot
+    moved = np.abs(knots.track.place[last] - knots.track.place[first]) > OUTLIER_SIGMAS * noise + by_robot
     if knots.turn_follows_place:
         return np.asarray(moved)
     turned = width_m * np.abs(knots.heading[last] - knots.heading[first])
@@ -394,7 +385,7 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     level = np.exp(0.5j * (knots.heading[first] + knots.heading[last]))
     by = (windows.ahead + 1j * windows.aside) * level
     turn = np.zeros(len(first)) if knots.turn_follows_place else windows.turned / motion.lever_m
-    stamps, place = knots.epoch_ns + np.rint(knots.t * 1e9).astype(np.int64), knots.place
+    stamps, place = knots.epoch_ns + np.rint(knots.t * 1e9).astype(np.int64), knots.track.place
     return tuple(
         ReferenceJump(
             kind="heading" if abs(turn[row]) * motion.lever_m > abs(by[row]) else "position",

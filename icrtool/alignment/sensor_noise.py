@@ -110,27 +110,21 @@ def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Compl
     with np.errstate(invalid="ignore"):
         usual_step = np.where(np.abs(step) <= OUTLIER_SIGMAS * scale, step, np.nan)
     product = -(usual_step[1:] * np.conj(usual_step[:-1])).real
-    return FixSteps(
-        step, product, moves, _jump_rows(step, scale, max(3, round(PERSISTS_S / usual)) if usual > 0 else 3)
-    )
-
-
-def _jump_rows(step: Complexes, scale: float, span: int) -> Ints:
-    """Return the first row after each jump."""
-    count = len(step)
+    # steps after which the fixes stay away
+    span = max(3, round(PERSISTS_S / usual)) if usual > 0 else 3
     with np.errstate(invalid="ignore"):
-        found = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, JUMP_SIGMAS * scale))
-    found = found[(found >= span) & (found + span < count)]
-    if not len(found):
-        return np.empty(0, np.int64)
+        row = np.flatnonzero(np.abs(step) > max(SMALLEST_JUMP_M, JUMP_SIGMAS * scale))
+    row = row[(row >= span) & (row + span < len(step))]
+    if not len(row):
+        return FixSteps(step, product, moves, row)
     level = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step))])
     around = sliding_window_view(level, span)
-    # level[k] is fix k's; the step k leads from fix k to fix k + 1.
-    before, after = around[found - span + 1], around[found + 1]
+    # level[k] is fix k's; the step k leads from fix k to fix k + 1
+    before, after = around[row - span + 1], around[row + 1]
     change = np.median(after.real, axis=1) - np.median(before.real, axis=1)
     shift = change + 1j * (np.median(after.imag, axis=1) - np.median(before.imag, axis=1))
-    stays = np.abs(shift - step[found]) < PERSISTS_SHARE * np.abs(step[found])
-    return np.asarray(found[stays] + 1, np.int64)
+    stays = np.abs(shift - step[row]) < PERSISTS_SHARE * np.abs(step[row])
+    return FixSteps(step, product, moves, row[stays] + 1)
 
 
 def is_hole(interval_s: Floats, least_s: float = 1e-6) -> Bools:

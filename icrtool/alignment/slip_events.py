@@ -154,7 +154,7 @@ def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) ->
             continue
         free[extent.first : extent.last] = False
         quiet[max(extent.first - 1, 0) : extent.last + 2] = False
-        place, far = complex(knots.place[extent.first]), float(distance2[at])
+        place, far = complex(knots.track.place[extent.first]), float(distance2[at])
         # the probability that chi-squared with 3 degrees of freedom is larger
         tail = math.erfc(math.sqrt(far / 2)) + math.sqrt(2 * far / math.pi) * math.exp(-far / 2)
         events.append(
