@@ -149,24 +149,25 @@ NOT_COMPARED = CourseComparison(0, math.nan, math.nan, False, 0.0)
 
 def compare_with_course(windows: DriveWindows) -> CourseComparison:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
-    track, (begin, end) = windows.track, (edge[::STARTS_A_WINDOW] for edge in (windows.begin, windows.end))
+    track, apart = windows.track, slice(None, None, STARTS_A_WINDOW)
     v, nose = track.mean_speed, track.nose
-    seen = track.place[end] - track.place[begin]
-    laid, other = (at[end] - at[begin] for at in (track.at_places(v * one) for one in (nose, nose.conj())))
-    travel = track.at_places(v)
+    seen, laid, other = (
+        windows.over(at)[apart] for at in (track.place, track.at_places(v * nose), track.at_places(v * nose.conj()))
+    )
+    gone, lasted_s = windows.over(track.at_places(v))[apart], windows.over(track.place_t)[apart]
     moved = (np.abs(seen) > windows.length_m / 3) & (np.abs(laid) > windows.length_m / 3)
     if not moved.any():
         return NOT_COMPARED
     angle, turned_over = (np.exp(1j * np.angle(one * np.conj(seen)))[moved] for one in (laid, other))
-    backwards = (travel[end] < travel[begin])[moved]
+    backwards = (gone < 0.0)[moved]
     ahead, back = angle[~backwards], angle[backwards]
     turns_about = False
     if min(len(ahead), len(back)) >= FEWEST_WINDOWS:
         about = (back * np.conj(ahead.mean())).real < 0.0
         turns_about = abs(ahead.mean()) > EXPLAINED and float(about.mean()) > EXPLAINED
-    duration_s = float(np.median((track.place_t[end] - track.place_t[begin])[moved]))
+    agreement, mirrored_agreement = float(abs(angle.mean())), float(abs(turned_over.mean()))
     return CourseComparison(
-        len(angle), float(abs(angle.mean())), float(abs(turned_over.mean())), bool(turns_about), duration_s
+        len(angle), agreement, mirrored_agreement, bool(turns_about), float(np.median(lasted_s[moved]))
     )
 
 

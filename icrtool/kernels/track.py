@@ -169,28 +169,24 @@ class Track(NamedTuple):
         return np.divide(risen, apart, out=np.zeros(len(rows)), where=apart > 0.0)
 
 
-class Cut(NamedTuple):
-    """Windows of driven distance: rows of the positions at begin and end (w,), and their nominal length (w,) [m]."""
-
-    begin: Ints
-    end: Ints
-    length_m: Floats
-
-
-def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Cut:
+def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> tuple[Ints, Ints, Floats]:
     """Cut a drive into windows of driven distance; none crosses a gap, a jump or a slip event, or ends in an outage.
 
     Parameters
     ----------
     every_m : a window of each length starts every so much distance
+
+    Returns
+    -------
+    rows of the positions at begin and end (w,), and nominal length (w,) [m] of the windows
     """
     lengths, begins = np.asarray(lengths_m, np.float64), rows_at_steps(track.distance, every_m)
     begins = begins[~track.in_outage[begins]]
     ends = ends_from(track, lengths, begins)
     column, row = np.nonzero(ends.T >= 0)
-    found = Cut(begins[row], ends[row, column], lengths[column])
-    quiet = _before(track.slipping, found.begin) == _before(track.slipping, found.end)
-    return Cut(*(values[quiet] for values in found))
+    begin, end = begins[row], ends[row, column]
+    quiet = _before(track.slipping, begin) == _before(track.slipping, end)
+    return begin[quiet], end[quiet], lengths[column][quiet]
 
 
 def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Ints:
