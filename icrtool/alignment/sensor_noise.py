@@ -188,31 +188,34 @@ def position_variance(fixes: PositionFixes, settings: FilterConfig, measured_m: 
     ----------
     measured_m : of `reference_noise`; a number is used throughout
     """
-    if math.isfinite(measured_m):
-        return np.full((len(fixes.stamp_ns), 2), measured_m**2)
-    default = unstated_position_std_m(settings) ** 2
-    if settings.preset == "paper":
-        return np.full((len(fixes.stamp_ns), 2), default)
     # The diagonal plus the covariance's size is never below the full matrix: correlated fixes are not overrated.
     correlated = np.nan_to_num(np.abs(fixes.cov_north_east_m2))
     stated = np.column_stack([fixes.var_north_m2 + correlated, fixes.var_east_m2 + correlated])
-    sane = np.isfinite(stated) & (stated > 0) & (stated < LARGEST_SANE_GNSS_STD_M**2)
-    return np.maximum(np.where(sane, stated, default), settings.gnss_std_floor_m**2)
+    usual, floor = unstated_position_std_m(settings), settings.gnss_std_floor_m
+    return _variance(stated, settings, usual, LARGEST_SANE_GNSS_STD_M, floor, measured_m, 0.0)
 
 
 def heading_variance(
     headings: HeadingSamples, settings: FilterConfig, at_least_rad: float = 0.0, measured_rad: float = math.nan
 ) -> Floats:
     """Return the variances (h,) [rad^2], nowhere below `at_least_rad` squared; other arguments as above."""
-    if math.isfinite(measured_rad):
-        return np.full(len(headings.stamp_ns), max(measured_rad, at_least_rad) ** 2)
-    default = math.radians(USUAL_HEADING_STD_DEG if settings.heading_std_deg == "auto" else settings.heading_std_deg)
+    usual_deg = USUAL_HEADING_STD_DEG if settings.heading_std_deg == "auto" else settings.heading_std_deg
+    usual, floor = math.radians(usual_deg), math.radians(settings.heading_std_floor_deg)
+    largest = LARGEST_SANE_HEADING_STD_RAD
+    return _variance(headings.var_rad2, settings, usual, largest, floor, measured_rad, at_least_rad)
+
+
+def _variance(
+    stated: Floats, settings: FilterConfig, usual: float, largest_sane: float, floor: float, measured: float,
+    at_least: float,
+) -> Floats:  # fmt: skip
+    """Return variances: what is measured, else in preset ``paper`` the usual, else what is stated, if that is sane."""
+    if math.isfinite(measured):
+        return np.full(stated.shape, max(measured, at_least) ** 2)
     if settings.preset == "paper":
-        return np.full(len(headings.stamp_ns), default**2)
-    stated = headings.var_rad2
-    sane = np.isfinite(stated) & (stated > 0) & (stated < LARGEST_SANE_HEADING_STD_RAD**2)
-    floor = max(math.radians(settings.heading_std_floor_deg), at_least_rad)
-    return np.maximum(np.where(sane, stated, default**2), floor**2)
+        return np.full(stated.shape, usual**2)
+    sane = np.isfinite(stated) & (stated > 0) & (stated < largest_sane**2)
+    return np.maximum(np.where(sane, stated, usual**2), max(floor, at_least) ** 2)
 
 
 def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn: FixSteps) -> tuple[float, float]:
