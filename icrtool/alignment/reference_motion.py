@@ -385,14 +385,14 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     level = np.exp(0.5j * (knots.heading[first] + knots.heading[last]))
     by = (windows.ahead + 1j * windows.aside) * level
     turn = np.zeros(len(first)) if knots.turn_follows_place else windows.turned / motion.lever_m
-    stamps, place = knots.epoch_ns + np.rint(knots.t * 1e9).astype(np.int64), knots.track.place
+    stamps = knots.epoch_ns + np.rint(knots.t * 1e9).astype(np.int64)
     return tuple(
         ReferenceJump(
             kind="heading" if abs(turn[row]) * motion.lever_m > abs(by[row]) else "position",
             begin_ns=int(stamps[first[row]]),
             end_ns=int(stamps[last[row]]),
-            north_m=float(place[first[row]].real),
-            east_m=float(place[first[row]].imag),
+            north_m=float(knots.track.north[first[row]]),
+            east_m=float(knots.track.east[first[row]]),
             size_m=float(abs(by[row])),
             turn_deg=math.degrees(turn[row]),
             moved_north_m=float(by[row].real),

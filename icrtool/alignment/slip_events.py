@@ -139,10 +139,12 @@ def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) ->
     quiet : (m,) knots that the model's error is taken from; it is this quantile of what they show
     """
     windows, distance2, false_rate, error = _weigh(knots, motion, quiet, quantile)
-    row = np.arange(len(knots.t))
+    row, everything = np.arange(len(knots.t)), np.ones(len(knots.t), np.bool_)
+    if not len(windows.begin):
+        return [], everything
     steps = compare(knots, motion, row[:-1], row[1:], RESPONSE_S)
     whole = knots.holes[1:] == knots.holes[:-1]
-    free, quiet, events = whole.copy(), np.ones(len(knots.t), np.bool_), list[SlipEvent]()
+    free, quiet, events = whole.copy(), everything, list[SlipEvent]()
     tests = max(1.0, float(knots.t[-1] - knots.t[0]) / WINDOWS_S[0])
     # the clearest first
     for at in np.argsort(-distance2, kind="stable"):
@@ -154,7 +156,7 @@ def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) ->
             continue
         free[extent.first : extent.last] = False
         quiet[max(extent.first - 1, 0) : extent.last + 2] = False
-        place, far = complex(knots.track.place[extent.first]), float(distance2[at])
+        far = float(distance2[at])
         # the probability that chi-squared with 3 degrees of freedom is larger
         tail = math.erfc(math.sqrt(far / 2)) + math.sqrt(2 * far / math.pi) * math.exp(-far / 2)
         events.append(
@@ -162,8 +164,8 @@ def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) ->
                 kind=extent.kind,
                 begin_ns=knots.epoch_ns + round(extent.begin_s * 1e9),
                 end_ns=knots.epoch_ns + round(extent.end_s * 1e9),
-                north_m=place.real,
-                east_m=place.imag,
+                north_m=float(knots.track.north[extent.first]),
+                east_m=float(knots.track.east[extent.first]),
                 distance_m=extent.distance_m,
                 severity=extent.severity,
                 confidence=(1.0 - float(false_rate[at])) * max(0.0, 1.0 - tests * tail),
