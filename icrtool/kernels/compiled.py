@@ -272,16 +272,14 @@ def writable_place() -> Path | None:
 
 def _keep(name: str, content: bytes) -> None:
     """Keep a file where it can be; on a full disk, or where nothing can be written, it serves this process alone."""
-    place = writable_place()
-    if place is None:
-        return
-    with suppress(OSError), tempfile.NamedTemporaryFile(dir=place, delete=False) as file:
+    if place := writable_place():
+        # as readable as other files: who builds an image is not who runs it
+        temporary = place / f"{name}.{os.getpid()}"
         try:
-            file.write(content)
-            file.close()
-            Path(file.name).replace(place / name)
+            temporary.write_bytes(content)
+            temporary.replace(place / name)
         except OSError:
-            Path(file.name).unlink()
+            temporary.unlink(missing_ok=True)
 
 
 def njit(function: Function) -> Function:
