@@ -179,11 +179,6 @@ class Config:
         """Return it with other values in ``[filter]``."""
         return replace(self, filter=replace(self.filter, **changes))  # type: ignore[arg-type]  # as the caller names them
 
-    @property
-    def given_sections(self) -> frozenset[str]:
-        """The sections in which a key was set."""
-        return frozenset(key.partition(".")[0] for key in self.given)
-
 
 SECTIONS: dict[str, type] = {part.name: type(part.default) for part in fields(Config) if part.name != "given"}
 """The sections of a configuration file, and what each holds."""

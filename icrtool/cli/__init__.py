@@ -121,7 +121,8 @@ def when_used() -> Iterator[None]:
 
     So the help of a command loads no numba, pandas or pyarrow. Two threads must not be the first to use a module.
     """
-    sys.meta_path.insert(sys.meta_path.index(PathFinder), _Unloaded)
+    # Before that of files, the last one.
+    sys.meta_path.insert(-1, _Unloaded)
     try:
         yield
     finally:

@@ -26,7 +26,6 @@ with when_used():
     from icrtool.output.tables import calibration as tables
 
 if TYPE_CHECKING:
-    from icrtool.calibration.error_growth import Forecast
     from icrtool.calibration.record import Calibration
     from icrtool.config import ConfigSources
     from icrtool.records.calibration_document import CalibrationFile
@@ -79,15 +78,13 @@ def calibrate_command(
             # takes as long as to read a run of an hour, most of which is done outside of the interpreter
             other.submit(import_module, "icrtool.calibration.pooled")
         runs = runs_of(sources, config, printer)
-    from icrtool.calibration.pooled import calibrate_runs
-
     sensors = None
     if len(runs) == 1:
         printer.warn_of(runs[0])
         sensors = sensor_findings.calibrate_log(runs[0], x_icr_m=x_icr)
     result = None
     try:
-        result = calibrate_runs(runs, allow_unusable=allow_unusable)
+        result = pooled.calibrate_runs(runs, allow_unusable=allow_unusable)
         printer.warn(map(str, result.left_out))
     except errors.IcrToolError as err:
         if sensors is None or not (runs[0].usable or allow_unusable):
@@ -157,7 +154,7 @@ def forecast_command(
     printer.show(tables.forecast_blocks(forecast, calibration, budgets_m, gyro))
 
 
-def _forecasts(calibration: Calibration, path: Path) -> tuple[Forecast, Forecast | None]:
+def _forecasts(calibration: Calibration, path: Path) -> tuple[error_growth.Forecast, error_growth.Forecast | None]:
     """Forecast along a run's path or the points of a table: wheels alone, and with a gyro where both have one."""
     with_gyro = calibration.gyro is not None and calibration.gyro.error_sources is not None
     if run_directory.is_run_directory(path):

@@ -27,7 +27,6 @@ with when_used():
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
     from icrtool.dropout_analysis.report import DropoutReport
-    from icrtool.fleet.one_log import ReportOptions, TrialOptions
     from icrtool.output.dropout_directory import Baseline
 
 EPILOG_GATE = (
@@ -47,9 +46,9 @@ class Request(NamedTuple):
     """
 
     config: Config
-    asked: ReportOptions
+    asked: one_log.ReportOptions
     baseline: Baseline | None
-    further: TrialOptions
+    further: one_log.TrialOptions
     trials: bool
     overwrite: bool
     printer: Printer
@@ -93,8 +92,8 @@ FURTHER = options.together(
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def dropout_report_command(
-    sources: tuple[Path, ...], place: ResultPlace, overwrite: bool, further: TrialOptions, trials: bool,
-    calibration_files: tuple[Path, ...], report: ReportOptions, baseline: Path | None, exports: Exports,
+    sources: tuple[Path, ...], place: ResultPlace, overwrite: bool, further: one_log.TrialOptions, trials: bool,
+    calibration_files: tuple[Path, ...], report: one_log.ReportOptions, baseline: Path | None, exports: Exports,
     settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Report how far off a robot is without GNSS: open loop from every recorded state, over 1 to 20 m.

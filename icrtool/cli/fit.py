@@ -31,7 +31,6 @@ with when_used():
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
-    from icrtool.fleet.one_log import FitOptions
     from icrtool.records.run import Run
 
 ASKED = options.together(
@@ -56,7 +55,7 @@ ASKED = options.together(
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def fit_command(
-    logs: tuple[Path, ...], place: ResultPlace, asked: FitOptions, settings: ConfigSources, printer: Printer
+    logs: tuple[Path, ...], place: ResultPlace, asked: one_log.FitOptions, settings: ConfigSources, printer: Printer
 ) -> None:
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
@@ -86,7 +85,7 @@ def fit_command(
 
 @contextmanager
 def fitted_log(
-    log: Path, directory: Path, config: Config, asked: FitOptions, printer: Printer, inside: Path | None
+    log: Path, directory: Path, config: Config, asked: one_log.FitOptions, printer: Printer, inside: Path | None
 ) -> Iterator[tuple[Run, Path]]:
     """Fit a log, and give as `icrtool.fleet.one_log.fitted` does; print warnings and chosen streams on stderr."""
     notes: list[str] = []

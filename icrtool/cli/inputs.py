@@ -66,7 +66,7 @@ def runs_of(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run
 
 def check_run_config(config: Config, *, free: str = "") -> None:
     """Refuse settings for a finished run, but those of the section that a report on it is free to change."""
-    if given := sorted(config.given_sections - {free}):
+    if given := sorted({key.partition(".")[0] for key in config.given} - {free}):
         advice = "fit the log again with it, or name the log in place of its run"
         raise errors.ConfigError(f"[{given[0]}]", "a finished run keeps the configuration it was made with", advice)
 

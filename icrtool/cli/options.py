@@ -35,8 +35,6 @@ with when_used():
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
-    from icrtool.output.dropout_directory import Baseline
-    from icrtool.output.exports.acceptance import Suite
     from icrtool.records.dropout import Verdict
     from icrtool.records.fleet_document import FleetVerdict
 
@@ -293,7 +291,7 @@ class Exports(NamedTuple):
     junit: Path | None = None
     markdown: Path | None = None
 
-    def write(self, command: str, suites: Callable[[], Sequence[Suite]], text: Callable[[], str]) -> None:
+    def write(self, command: str, suites: Callable[[], Sequence[acceptance.Suite]], text: Callable[[], str]) -> None:
         """Write what is asked for: the acceptance limits of the logs, and a summary in Markdown."""
         if self.junit is not None:
             acceptance.write_junit(self.junit, suites(), command)
@@ -324,7 +322,7 @@ REPORT = together("exports", Exports, together(
 """The options of a dropout report that are the same for one log and for many, as `report`, `exports` and `baseline`."""
 
 
-def baseline_of(place: Path | None, gates: Sequence[str]) -> Baseline | None:
+def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.Baseline | None:
     """Find the reports of --baseline; refuse gates that cannot be read, or need one where there is none."""
     relative = [gate.text for gate in map(report.parse_gate, gates) if gate.baseline_factor]
     if place is not None:

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import msgspec
     from rich.console import Console
 
-    from icrtool.errors import IcrToolError
     from icrtool.records.run import Run
 
 CLEAR = "\r\x1b[K"
@@ -209,7 +208,7 @@ class Inputs:
     def __init__(self, key: str) -> None:
         self._key = key
         self.documents: list[dict[str, Any]] = []
-        self.errors: dict[str, IcrToolError] = {}
+        self.errors: dict[str, errors.IcrToolError] = {}
 
     @contextmanager
     def each(self, source: Path) -> Iterator[dict[str, Any]]:

@@ -149,35 +149,29 @@ def executor_of(
         raise ConfigError(f"--scheduler {scheduler}", "no Dask scheduler answers there", str(err)) from err
     with client:
         # Its shutdown would wait for logs that a lost cluster never ends; all others are done by then.
-        yield client.get_executor(), _ClusterWatch(client, worker_timeout_s)
+        yield client.get_executor(), _loss_of(client, worker_timeout_s)
 
 
-class _ClusterWatch:
-    """Whether a cluster is lost: it has no scheduler, or no worker, for some time; then it is given up for good."""
+def _loss_of(client: Client, worker_timeout_s: float) -> Lost:
+    """Return what reports that a cluster had no scheduler, or no worker, for some time: it is then given up."""
+    fine_s, given_up = time.monotonic(), ""
 
-    def __init__(self, client: Client, worker_timeout_s: float) -> None:
-        self._client = client
-        self._timeout_s = worker_timeout_s
-        self._fine_s = time.monotonic()
-        self._lost = ""
-
-    def __call__(self) -> str:
-        """Return why it is lost; empty while it is not."""
-        why = self._lost or self._trouble()
+    def lost() -> str:
+        nonlocal fine_s, given_up
+        if given_up:
+            return given_up
+        why = "the scheduler of the cluster is gone"
+        if client.status == "running":
+            with suppress(OSError, TimeoutError):
+                workers = client.scheduler_info(n_workers=-1)["workers"]
+                why = "" if workers else f"the cluster had no worker for {worker_timeout_s:g} s"
         if not why:
-            self._fine_s = time.monotonic()
-        elif not self._lost and (self._client.status == "closed" or time.monotonic() - self._fine_s > self._timeout_s):
-            self._lost = why
-        return self._lost
+            fine_s = time.monotonic()
+        elif client.status == "closed" or time.monotonic() - fine_s > worker_timeout_s:
+            given_up = why
+        return given_up
 
-    def _trouble(self) -> str:
-        if self._client.status != "running":
-            return "the scheduler of the cluster is gone"
-        try:
-            workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        except (OSError, TimeoutError):
-            return "the scheduler of the cluster is gone"
-        return "" if workers else f"the cluster had no worker for {self._timeout_s:g} s"
+    return lost
 
 
 def default_jobs(logs: Sequence[Path]) -> int:
