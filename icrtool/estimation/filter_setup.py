@@ -10,9 +10,9 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import REFERENCE_STEP_S, FilterInputs, FilterParameters
-from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData, SlipEvent, intervals_in
+from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData, intervals_in
 from icrtool.records.run import WarmStart, width_or_usual_m
 
 
@@ -138,6 +138,8 @@ def set_up_filter(
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
     epoch = int(wheels.stamp_ns[0])
     fix, sample = _kept(fixes.stamp_ns, outages_ns), _kept(headings.stamp_ns, outages_ns)
+    margin = round(EVENT_MARGIN_S * 1e9)
+    events = ((event.begin_ns - margin, event.end_ns + margin) for event in sensors.events)
     data = FilterInputs(
         wheel_t=_seconds(wheels.stamp_ns, epoch),
         v_left=wheels.v_left_mps,
@@ -149,7 +151,8 @@ def set_up_filter(
         heading_z=headings.heading_rad[sample],
         heading_r=headings.var_rad2[sample],
         change_t=np.empty(0),
-        slipping=_slipping(wheels.stamp_ns, sensors.events, outages_ns),
+        # none in an outage that is made: what a run does there must not know what only the fixes showed
+        slipping=intervals_in(wheels.stamp_ns, events) & ~intervals_in(wheels.stamp_ns, outages_ns),
     )
     icrs, icr_std = _initial_icrs(config, sensors.icr_start)
     if sensors.headings_are_precise:
@@ -157,10 +160,7 @@ def set_up_filter(
     t0 = _start_time(sensors.name, data)
     first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
-    # Of the whole stream: what an outage takes away must not change how the rest is weighed.
-    noise = noise or configured_noise(config)
-    alike = _samples_that_err_alike(_seconds(headings.stamp_ns, epoch), _heading_correlation_s(sensors, noise))
-    parameters = _parameters(config, data, sensors.antenna_m, noise, alike)
+    parameters = _parameters(config, data, sensors, noise or configured_noise(config))
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
     return FilterSetup(data, t0, x0, P0, parameters)
 
@@ -184,16 +184,6 @@ def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints | sl
     for begin, end in outages_ns:
         kept &= (stamps_ns < begin) | (stamps_ns >= end)
     return np.flatnonzero(kept)
-
-
-def _slipping(stamps_ns: Ints, events: tuple[SlipEvent, ...], outages_ns: tuple[tuple[int, int], ...]) -> Bools:
-    """Return the intervals after wheel samples (n,) that lie in an event.
-
-    None in an outage that is made: what a run does there must not know what only the fixes showed.
-    """
-    margin = round(EVENT_MARGIN_S * 1e9)
-    slipping = intervals_in(stamps_ns, ((event.begin_ns - margin, event.end_ns + margin) for event in events))
-    return slipping & ~intervals_in(stamps_ns, outages_ns)
 
 
 def _start_time(name: str, data: FilterInputs) -> float:
@@ -259,13 +249,6 @@ def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Float
     return np.array([right, left, x]), np.full(3, std if std is not None else default_std)
 
 
-def _terrain_icr_std_m(config: Config) -> float:
-    given = config.filter.terrain_icr_std_m
-    if given is not None:
-        return given
-    return PAPER_TERRAIN_ICR_STD_M if config.filter.preset == "paper" else width_or_usual_m(config.robot.track_width_m)
-
-
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
     """Return the interval between wheel samples [s] above which they are a gap: never less than a few samples."""
     return max(config.filter.wheel_gap_s, GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
@@ -293,34 +276,26 @@ def process_variance(config: Config, noise: ProcessNoise) -> tuple[float, float,
     return position, position, math.radians(noise.heading_degps) ** 2, icr, icr, icr
 
 
-def _heading_correlation_s(sensors: SensorData, noise: ProcessNoise) -> float:
-    """Return how long headings err alike.
-
-    Notes
-    -----
-    Precise headings of variance s^2 that err alike over tau, in process noise of density q, leave sqrt(2 tau s^2 q):
-    with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more. Its memory is then
-    sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise.
-    """
-    if not sensors.headings_are_precise:
-        return sensors.heading_correlation_s
-    density, usual = (
-        math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2 for one in (noise, FIELD_NOISE)
-    )
-    variance = float(np.median(sensors.headings.var_rad2))
-    return max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))
-
-
-def _samples_that_err_alike(times: Floats, correlation_s: float) -> float:
-    """Return 2 tau / interval, at least 1: the number of samples with as much information as one independent sample.
+def _samples_that_err_alike(sensors: SensorData, noise: ProcessNoise) -> float:
+    """Return 2 tau / interval, at least 1: the number of headings with as much information as one independent heading.
 
     Notes
     -----
     An error with correlation exp(-|t|/tau), sampled much faster than tau, averages over time T like T / (2 tau)
-    independent samples.
+    independent samples. Precise headings of variance s^2 that err alike over tau, in process noise of density q, leave
+    sqrt(2 tau s^2 q): with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more. Its memory is
+    then sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise. All headings count: what an outage takes away
+    must not change how the rest is weighed.
     """
-    interval = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    return max(1.0, 2.0 * correlation_s / interval) if interval > 0 else 1.0
+    tau_s, stamps = sensors.heading_correlation_s, sensors.headings.stamp_ns
+    if sensors.headings_are_precise:
+        density, usual = (
+            math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2 for one in (noise, FIELD_NOISE)
+        )
+        variance = float(np.median(sensors.headings.var_rad2))
+        tau_s = max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))
+    interval_s = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else 0.0
+    return max(1.0, 2.0 * tau_s / interval_s) if interval_s > 0 else 1.0
 
 
 def _response_variance(data: FilterInputs, width_m: float) -> Floats:
@@ -337,29 +312,26 @@ def _response_variance(data: FilterInputs, width_m: float) -> Floats:
     return np.asarray((RESPONSE_S * change) ** 2 / CHANGE_S)
 
 
-def _parameters(
-    config: Config,
-    data: FilterInputs,
-    antenna: tuple[float, float],
-    noise: ProcessNoise,
-    headings_alike: float,
-) -> FilterParameters:
-    settings = config.filter
+def _parameters(config: Config, data: FilterInputs, sensors: SensorData, noise: ProcessNoise) -> FilterParameters:
+    settings, width_m = config.filter, width_or_usual_m(config.robot.track_width_m)
     paper = settings.preset == "paper"
+    terrain_m = settings.terrain_icr_std_m
+    if terrain_m is None:
+        terrain_m = PAPER_TERRAIN_ICR_STD_M if paper else width_m
     return FilterParameters(
         process_variance=process_variance(config, noise),
         rate_invariant=rate_invariant(config),
         step_heading=0.0 if paper else MIDDLE_OF_THE_TURN,
         gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),
         heading_gate=math.inf if paper else chi2_gate(settings.gate_probability, 1),
-        heading_correlation=1.0 if paper else headings_alike,
-        antenna_forward=0.0 if paper else antenna[0],
-        antenna_right=0.0 if paper else antenna[1],
+        heading_correlation=1.0 if paper else _samples_that_err_alike(sensors, noise),
+        antenna_forward=0.0 if paper else sensors.antenna_m[0],
+        antenna_right=0.0 if paper else sensors.antenna_m[1],
         wheel_gap_s=math.inf if paper else wheel_gap_s(config, data.wheel_t),
         gap_speed_variance=GAP_SPEED_STD_MPS**2,
         gap_turn_variance=GAP_TURN_STD_RADPS**2,
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
-        icr_inflation_m2=_terrain_icr_std_m(config) ** 2,
-        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * width_or_usual_m(config.robot.track_width_m) / 2,
+        icr_inflation_m2=terrain_m**2,
+        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * width_m / 2,
     )

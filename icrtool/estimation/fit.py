@@ -6,6 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import replace
+from operator import attrgetter
 
 import msgspec
 import numpy as np
@@ -40,7 +41,7 @@ def fit(
     start (``paper``) and those made for field logs (``field``).
     """
     config = config if config is not None else Config()
-    begin = watch if watch is not None else _ignore
+    begin = watch if watch is not None else lambda _: None
     begin("aligning")
     log = choose_reference(log, config)
     measurements = align(log, config)
@@ -65,11 +66,7 @@ def fit(
     return replace(run, smoothed=smooth_run(run)) if smooth else run
 
 
-def _ignore(stage: str) -> None:
-    """Take no notice of a stage."""
-
-
-NEAR_S = 1.0
+NEAR_NS = 10**9
 """Jumps closer together than this are one: no trial fits between them."""
 
 SETTLED_SIGMAS, SETTLES_S = 3.0, 5.0
@@ -100,31 +97,32 @@ def followed_jumps(
 
     def followed(jump: ReferenceJump) -> ReferenceJump:
         stamps = used[jump.kind == "heading"]
-        begin, end = _last_until(stamps, jump.begin_ns), _first_from(stamps, jump.end_ns)
-        return msgspec.structs.replace(jump, begin_ns=begin, end_ns=end)
+        before = int(np.searchsorted(stamps, jump.begin_ns, side="right")) - 1
+        begin_ns = int(stamps[before]) if before >= 0 else jump.begin_ns
+        return msgspec.structs.replace(jump, begin_ns=begin_ns, end_ns=_first_from(stamps, jump.end_ns))
 
     def settled(jump: ReferenceJump) -> ReferenceJump:
         end = jump.end_ns if jump.kind == "heading" else _first_from(near, jump.end_ns)
         return msgspec.structs.replace(jump, end_ns=min(end, jump.end_ns + round(SETTLES_S * 1e9)))
 
-    spans = _joined([followed(jump) for jump in sensors.jumps], _in_one_rejection)
-    spans = [settled(one) for one in spans if one.kind == "heading" or _remains(one)]
+    # the filter follows nothing between the jumps of one rejection
+    spans = [
+        settled(one)
+        for one in _joined([followed(jump) for jump in sensors.jumps], -1)
+        # steps that have taken each other back are no jump
+        if one.kind == "heading" or math.hypot(one.moved_north_m, one.moved_east_m) >= BRIDGED * one.size_m
+    ]
     # what is decided takes in what is undecided about it
-    decided = _joined([one for one in spans if not one.undecided], _near)
-    begins = [one.begin_ns for one in decided]
-
-    def is_apart(one: ReferenceJump) -> bool:
+    decided = _joined([one for one in spans if not one.undecided], NEAR_NS)
+    begins, free = [one.begin_ns for one in decided], []
+    for one in spans:
         row = bisect_right(begins, one.begin_ns)
         before, after = decided[max(row - 1, 0) : row], decided[row : row + 1]
-        return not (any(_near(other, one) for other in before) or any(_near(one, other) for other in after))
-
-    free = [one for one in spans if one.undecided and is_apart(one)]
-    return tuple(sorted((*decided, *_joined(free, _near)), key=_begin))
-
-
-def _last_until(stamps: Ints, at: int) -> int:
-    row = int(np.searchsorted(stamps, at, side="right")) - 1
-    return int(stamps[row]) if row >= 0 else at
+        joins = any(one.begin_ns <= other.end_ns + NEAR_NS for other in before)
+        joined = any(other.begin_ns <= one.end_ns + NEAR_NS for other in after)
+        if one.undecided and not joins and not joined:
+            free.append(one)
+    return tuple(sorted((*decided, *_joined(free, NEAR_NS)), key=attrgetter("begin_ns")))
 
 
 def _first_from(stamps: Ints, at: int) -> int:
@@ -132,24 +130,11 @@ def _first_from(stamps: Ints, at: int) -> int:
     return int(stamps[row]) if row < len(stamps) else at
 
 
-def _begin(jump: ReferenceJump) -> int:
-    return jump.begin_ns
-
-
-def _in_one_rejection(one: ReferenceJump, other: ReferenceJump) -> bool:
-    """Return whether the filter followed nothing between two jumps."""
-    return other.begin_ns < one.end_ns
-
-
-def _near(one: ReferenceJump, other: ReferenceJump) -> bool:
-    return other.begin_ns <= one.end_ns + round(NEAR_S * 1e9)
-
-
-def _joined(jumps: list[ReferenceJump], belongs: Callable[[ReferenceJump, ReferenceJump], bool]) -> list[ReferenceJump]:
-    """Return jumps, each joined to the one before where it belongs to that."""
+def _joined(jumps: list[ReferenceJump], near_ns: int) -> list[ReferenceJump]:
+    """Return jumps, each joined to the one before where it begins at most so long after its end."""
     found: list[ReferenceJump] = []
-    for jump in sorted(jumps, key=_begin):
-        if not (found and belongs(found[-1], jump)):
+    for jump in sorted(jumps, key=attrgetter("begin_ns")):
+        if not found or jump.begin_ns > found[-1].end_ns + near_ns:
             found.append(jump)
             continue
         before = found[-1]
@@ -166,8 +151,3 @@ def _joined(jumps: list[ReferenceJump], belongs: Callable[[ReferenceJump, Refere
             moved_east_m=before.moved_east_m + jump.moved_east_m,
         )
     return found
-
-
-def _remains(jump: ReferenceJump) -> bool:
-    """Return whether the steps of a jump have not taken each other back."""
-    return math.hypot(jump.moved_north_m, jump.moved_east_m) >= BRIDGED * jump.size_m

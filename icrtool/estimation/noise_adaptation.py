@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import FilterSetup, ProcessNoise, configured_noise, set_up_filter
-from icrtool.kernels.arrays import Bools, Floats
+from icrtool.kernels.arrays import Bools
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutput
 from icrtool.records.measurements import SensorData
@@ -103,25 +104,19 @@ def find_noise(
     One coordinate after the other, each over all its doublings: too small a noise rejects nearly all measurements, and
     the first doublings may change nothing. Smallest: every noise whose cost is within `FLAT` of the least is as good.
     """
-    known: dict[ProcessNoise, float] = {}
-
-    def best_of(ladder: Iterable[ProcessNoise]) -> ProcessNoise:
-        tried = list(ladder)
-        for one in tried:
-            if one not in known:
-                known[one] = cost(one)
-        limit = min(known[one] for one in tried) + FLAT
-        return next(one for one in tried if known[one] <= limit)
-
+    cost_of = functools.cache(cost)
+    largest = (LARGEST_POSITION_MPS if positions else 0.0, largest_degps if headings else 0.0)
     best = start
     for _ in range(MOST_ROUNDS if positions and headings else 1):
         before = best
-        if positions:
-            steps = _doublings(start.position_mps, LARGEST_POSITION_MPS)
-            best = best_of(best._replace(position_mps=value) for value in steps)
-        if headings:
-            steps = _doublings(start.heading_degps, largest_degps)
-            best = best_of(best._replace(heading_degps=value) for value in steps)
+        for name, first, last in zip(ProcessNoise._fields, start, largest, strict=True):
+            steps = [first]
+            while 0.0 < steps[-1] * STEP <= last:
+                steps.append(steps[-1] * STEP)
+            if last > 0.0:
+                tried = [best._replace(**{name: value}) for value in steps]
+                limit = min(map(cost_of, tried)) + FLAT
+                best = next(one for one in tried if cost_of(one) <= limit)
         if best == before:
             break
     return best
@@ -150,33 +145,19 @@ def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float
     if moving is not None:
         fixes, headings = fixes & moving[0], headings & moving[1]
     variance = output.heading_innovation[headings] ** 2 / output.heading_nis[headings]
-    return _student_cost(output.gnss_nis[fixes], output.gnss_det[fixes], 2) + _student_cost(
-        output.heading_nis[headings], variance, 1
+    streams = (2, output.gnss_nis[fixes], output.gnss_det[fixes]), (1, output.heading_nis[headings], variance)
+    return sum(
+        float(np.mean((TAIL_DEGREES + degrees) * np.log1p(nis / TAIL_DEGREES) + np.log(det)))
+        for degrees, nis, det in streams
+        if len(nis)
     )
-
-
-def _student_cost(nis: Floats, det: Floats, degrees: int) -> float:
-    if not len(nis):
-        return 0.0
-    return float(np.mean((TAIL_DEGREES + degrees) * np.log1p(nis / TAIL_DEGREES) + np.log(det)))
-
-
-def _doublings(start: float, largest: float) -> list[float]:
-    """Return start and its doublings up to the largest; of zero there are none."""
-    steps = [start]
-    while 0.0 < steps[-1] * STEP <= largest:
-        steps.append(steps[-1] * STEP)
-    return steps
 
 
 def _capped_nis(setup: FilterSetup, output: FilterOutput, moving: Moving) -> tuple[float, float]:
     """Return mean NIS of fixes and of headings per degree of freedom, each counted up to its gate; 0 for none."""
-    nis = (
-        output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]],
-        output.heading_nis[(output.heading_code > UNSEEN) & moving[1]],
+    fixes = output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]]
+    headings = output.heading_nis[(output.heading_code > UNSEEN) & moving[1]]
+    return (
+        float(np.minimum(fixes, setup.parameters.gnss_gate).mean()) / 2.0 if len(fixes) else 0.0,
+        float(np.minimum(headings, setup.parameters.heading_gate).mean()) if len(headings) else 0.0,
     )
-    gates = setup.parameters.gnss_gate, setup.parameters.heading_gate
-    fixes, headings = (
-        float(np.minimum(one, gate).mean()) if len(one) else 0.0 for one, gate in zip(nis, gates, strict=True)
-    )
-    return fixes / 2.0, headings

@@ -13,7 +13,7 @@ from icrtool.kernels.filter_records import REFERENCE_STEP_S
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
 from icrtool.kernels.track import Track
-from icrtool.kernels.window_residuals import PathKnots, path_at, window_residuals
+from icrtool.kernels.window_residuals import path_at, window_residuals
 from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.plain_data import known
 from icrtool.records.process_resources import give_back_freed
@@ -86,7 +86,11 @@ def cut_states(table: States, track: Track, icrs_m: Floats) -> StateWindows:
     parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
     give_back_freed()
-    path = _path(track, rows, parameters)
+
+    def twists(some: slice) -> tuple[Floats, Ints, Floats]:
+        return model_columns(FULL_LINEAR, wheel_motion(track.v_left[some], track.v_right[some], WIDTH_M))
+
+    path = path_at(track, twists, parameters, track.t[rows])
     place, heading = table.north_m[rows] + 1j * table.east_m[rows], table.heading_rad[rows]
     moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
     missed, jacobian = window_residuals(path, start, end, moved, 0.0, np.ones(len(start)))
@@ -105,16 +109,6 @@ def cut_states(table: States, track: Track, icrs_m: Floats) -> StateWindows:
         place_std_m=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
         heading_std_rad=float(np.median(table.std_heading_rad)),
     )
-
-
-def _path(track: Track, rows: Ints, parameters: Floats) -> PathKnots:
-    """Return the path that the wheels of a drive make at some rows (m,) of its states."""
-
-    def twists(some: slice) -> tuple[Floats, Ints, Floats]:
-        motion = wheel_motion(track.v_left[some], track.v_right[some], WIDTH_M)
-        return model_columns(FULL_LINEAR, motion)
-
-    return path_at(track, twists, parameters, track.t[rows])
 
 
 def prior_std(width_m: float) -> Floats:
@@ -221,19 +215,20 @@ def find_excitation(
     """
     p = nominal_icrs(table, track_width_m)
     width = float(p[0] - p[1])
-    std = _posterior(windows, width)
-    omega = (track.v_left - track.v_right) / width
-    spins = np.abs(track.v_left - track.v_right) > SPIN_RATIO * np.abs(track.v_left + track.v_right) / 2
+    slip = SLIP_SHARE * np.abs([windows.length_m, windows.length_m, windows.turned_rad])
+    rows = windows.jacobian / np.hypot(slip, np.maximum(windows.noise, 1e-6)[:, None]).ravel()[:, None]
+    information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
+    std: Floats = np.sqrt(np.diag(np.linalg.solve(information, np.eye(6)))[:3])
     # noise of standing encoders is no turn
     moving = np.abs(track.v_left) + np.abs(track.v_right) > 0.02
-    turns = np.where(moving, track.held * omega, 0.0)
+    turns = np.where(moving, track.held * (track.v_left - track.v_right) / width, 0.0)
+    spins = np.abs(track.v_left - track.v_right) > SPIN_RATIO * np.abs(track.v_left + track.v_right) / 2
     right, left, spun_right, spun_left = (
-        float(turns[turns > 0].sum()), abs(float(turns[turns < 0].sum())),
-        float(turns[spins & (turns > 0)].sum()), abs(float(turns[spins & (turns < 0)].sum())),
-    )  # fmt: skip
-    stds: dict[str, float] = dict(zip(ICR_COLUMNS, (float(value) for value in std), strict=True))
+        float(np.maximum(side * some, 0.0).sum()) for some in (turns, turns[spins]) for side in (1.0, -1.0)
+    )
+    stds: dict[str, float] = dict(zip(ICR_COLUMNS, std.tolist(), strict=True))
     verdicts: dict[str, Excited] = {name: _verdict(value / width) for name, value in stds.items()}
-    sentences = _sentences(stds, verdicts, right, left, windows.distance_m, _turned_otherwise(table, windows))
+    sentences = _sentences(stds, verdicts, right, left, table, windows)
     return ExcitationDocument(
         NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(right),
         math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), sentences,
@@ -281,15 +276,6 @@ def nominal_icrs(table: States, track_width_m: float | None) -> Floats:
     return np.array([right, left, x])
 
 
-def _posterior(windows: StateWindows, width: float) -> Floats:
-    """Return standard deviations (3,) of the ICRs, heading offset and scales marginalised."""
-    slip = SLIP_SHARE * np.abs([windows.length_m, windows.length_m, windows.turned_rad])
-    rows = windows.jacobian / np.hypot(slip, np.maximum(windows.noise, 1e-6)[:, None]).ravel()[:, None]
-    information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
-    deviations: Floats = np.sqrt(np.diag(np.linalg.solve(information, np.eye(6)))[:3])
-    return deviations
-
-
 def _verdict(share: float) -> Excited:
     if share <= SHOWN_SHARE:
         return "shown"
@@ -297,26 +283,23 @@ def _verdict(share: float) -> Excited:
 
 
 def _sentences(
-    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, distance_m: float, steered: float
-) -> tuple[str, ...]:
-    """Return sentences: what is not shown, why, and what to drive; `steered` of `_turned_otherwise`."""
+    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, table: States,
+    windows: StateWindows,
+) -> tuple[str, ...]:  # fmt: skip
+    """Return sentences: what is not shown, why, and what to drive."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return ()
     unshown = ", ".join(f"{ICR_WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
     first = f"this drive could not show the ICRs well: {unshown}"
+    turned = np.abs(np.diff(np.interp(windows.end_s, table.t_s, table.heading_rad)))
+    steered = float(turned[turned > SURELY_TURNED_RAD].sum())
     if steered > TURNS_NEEDED_RAD and right + left < STEERS * steered:
         angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(right + left):.0f}°"
         return (first, f"{angles}: it steers as a car does, and has no track ICRs, or one side is a copy of the other")
     if lacks := lacking_turns(right, left):
         return (first, lacks)
-    return (first, f"too few turns in {distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}")
-
-
-def _turned_otherwise(table: States, windows: StateWindows) -> float:
-    """Return how far the robot turned in the windows, by its headings, to whichever side [rad]."""
-    turned = np.abs(np.diff(np.interp(windows.end_s, table.t_s, table.heading_rad)))
-    return float(turned[turned > SURELY_TURNED_RAD].sum())
+    return (first, f"too few turns in {windows.distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}")
 
 
 def lacking_turns(right_rad: float, left_rad: float) -> str:

@@ -116,14 +116,6 @@ def _pieces(table: States, in_gap: Bools, icrs: Icrs) -> Iterator[tuple[slice, O
         turned = float(path.heading[-1] - track.heading[last])
 
 
-def path_speed(table: States) -> Floats:
-    """Return the speed over each interval between states (n - 1,) [m/s]; NaN where no time passes."""
-    interval = np.diff(table.t_s)
-    speed = np.full(len(interval), np.nan)
-    np.divide(np.diff(table.distance_m), interval, out=speed, where=interval > 0)
-    return speed
-
-
 def drive_summary(table: States) -> DriveDocument:
     """Return duration, distance of the positions, and mean and standard deviation of the speed over time.
 
@@ -133,32 +125,24 @@ def drive_summary(table: States) -> DriveDocument:
     parked robot stays where it is. Wheels that turn on the spot do not count. Between the ends of a chord the speed
     follows the model's, or is constant where the model shows less than half of it.
     """
-    weight = np.diff(table.t_s)
-    duration = float(table.t_s[-1])
+    interval, duration = np.diff(table.t_s), float(table.t_s[-1])
     noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m)))
-    rows, chords = _chords(table, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
+    rows = chord_rows(table.north_m, table.east_m, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
+    chords = np.hypot(np.diff(table.north_m[rows]), np.diff(table.east_m[rows]))
+    if rows[-1] != len(table) - 1:
+        # what is left at the end is shorter than a step, and counts for nothing
+        rows, chords = np.append(rows, len(table) - 1), np.append(chords, 0.0)
     distance = float(chords.sum())
     modelled, lasted = np.diff(table.distance_m[rows]), np.diff(table.t_s[rows])
     # in a gap of the wheel data the model stands still
     known = LEAST_MODELLED * chords < modelled
     stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=known)
     even = np.divide(chords, lasted, out=np.zeros(len(chords)), where=~known & (lasted > 0))
-    speed = np.nan_to_num(path_speed(table)) * np.repeat(stretched, np.diff(rows)) + np.repeat(even, np.diff(rows))
+    speed = np.divide(np.diff(table.distance_m), interval, out=np.zeros(len(interval)), where=interval > 0)
+    speed = speed * np.repeat(stretched, np.diff(rows)) + np.repeat(even, np.diff(rows))
     mean = distance / duration if duration > 0 else 0.0
-    spread = float(np.sqrt(np.average((speed - mean) ** 2, weights=weight))) if duration > 0 else 0.0
+    spread = float(np.sqrt(np.average((speed - mean) ** 2, weights=interval))) if duration > 0 else 0.0
     return DriveDocument(duration, distance, mean, spread)
-
-
-def _chords(table: States, step_m: float) -> tuple[Ints, Floats]:
-    """Return rows of states (c + 1,), first and last included, at least a step apart, and the chords between (c,) [m].
-
-    The last chord may be shorter than a step; it counts for nothing then.
-    """
-    rows, last = chord_rows(table.north_m, table.east_m, step_m), len(table) - 1
-    chords = np.hypot(np.diff(table.north_m[rows]), np.diff(table.east_m[rows]))
-    if rows[-1] != last:
-        rows, chords = np.append(rows, last), np.append(chords, 0.0)
-    return rows, chords
 
 
 LONGEST_HOLE_S = 1.0

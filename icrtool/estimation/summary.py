@@ -58,7 +58,7 @@ from icrtool.records.run_document import (
     WarmStartDocument,
 )
 from icrtool.records.samples import Datum, InputFile
-from icrtool.records.tables import Icrs, States
+from icrtool.records.tables import States
 
 SETTLED_S = 2.0
 """An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""
@@ -122,8 +122,10 @@ def summarise(
         unusable_because="; ".join(unusable) if unusable else None,
         icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, width, hidden),
         odometry=OdometryDocument(
-            _end_error(table, filtered.in_gap, table.icrs_at(-1)),
-            None if width is None else _end_error(table, filtered.in_gap, no_slip_icrs(width)),
+            EndErrorDocument(odometry_end_error(table, filtered.in_gap, table.icrs_at(-1))),
+            None
+            if width is None
+            else EndErrorDocument(odometry_end_error(table, filtered.in_gap, no_slip_icrs(width))),
         ),
         terrain=TerrainDocument(tuple(map(ChangeDocument, changes_s))),
         segments=segment_summary(table, changes_s),
@@ -254,11 +256,6 @@ def _seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, float]
     return {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
 
 
-def _end_error(table: States, in_gap: Bools, icrs: Icrs) -> EndErrorDocument:
-    """Return how far from the filter's last position the path by wheels alone ends, with constant ICRs."""
-    return EndErrorDocument(odometry_end_error(table, in_gap, icrs))
-
-
 def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, ClassDocument]:
     """Return how many fixes of each class there were and how they were used."""
     return {
@@ -303,16 +300,11 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
             continue
         gone = (estimate - estimate[0]) / change
         first = int(np.argmax(np.abs(gone) >= 0.1))
-        last = _first_stay(settled_by, np.abs(gone - 1.0) <= 0.1)
-        spans[column] = (float(t_s[first]), float(t_s[last])) if last is not None else None
+        inside = np.abs(gone - 1.0) <= 0.1
+        outside = np.concatenate([[0], np.cumsum(~inside)])
+        stays = inside & (outside[settled_by] == outside[:-1]) & (settled_by < len(inside))
+        spans[column] = (float(t_s[first]), float(t_s[np.argmax(stays)])) if stays.any() else None
     return spans
-
-
-def _first_stay(until: Ints, inside: Bools) -> int | None:
-    """Return the first row from which `inside` holds up to row `until` of it, which must be one; None if none does."""
-    outside = np.concatenate([[0], np.cumsum(~inside)])
-    stays = inside & (outside[until] == outside[:-1]) & (until < len(inside))
-    return int(np.argmax(stays)) if stays.any() else None
 
 
 def icr_summary(

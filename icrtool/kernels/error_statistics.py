@@ -221,20 +221,13 @@ def block_sums(
     trials = np.diff(first, append=len(errors))
     sums = np.add.reduceat(errors, first)
     above = [np.add.reduceat(errors > limit, first, dtype=np.int64) for limit in (p50_m, p95_m)]
-    growth = [
-        _slope(ordered, share, np.asarray((count - (1.0 - share) * trials) / len(errors)))
-        for share, count in zip(SHARES.values(), above, strict=True)
-    ]
+    growth = []
+    for share, count in zip(SHARES.values(), above, strict=True):
+        # how a percentile grows with its share, over the uncertainty of the share (Woodruff 1952)
+        std = math.sqrt(variance_of_sum(np.asarray((count - (1.0 - share) * trials) / len(errors))))
+        low, high = max(share - std, 0.0), min(share + std, 1.0)
+        growth.append((quantile(ordered, high) - quantile(ordered, low)) / (high - low) if high > low else 0.0)
     return BlockSums(trials, sums, above[0], above[1], *growth)
-
-
-def _slope(ordered: Floats, share: float, influence: Floats) -> float:
-    """Return the growth of a percentile [m] with its share, over the uncertainty of the share (Woodruff 1952)."""
-    std = variance_of_sum(influence) ** 0.5
-    low, high = np.clip([share - std, share + std], 0.0, 1.0)
-    if not high > low:
-        return 0.0
-    return (quantile(ordered, float(high)) - quantile(ordered, float(low))) / float(high - low)
 
 
 def quantile(ordered: Floats, share: float) -> float:

@@ -40,14 +40,6 @@ class PathKnots(NamedTuple):
     place_by: Complexes
 
 
-def locate(t: Floats, held: Floats, at: Floats) -> tuple[Ints, Floats]:
-    """Return the step in which each time (m,) lies and how much of it has passed; a gap's speeds end with its step."""
-    row = np.maximum(np.searchsorted(t, at, side="right") - 1, 0)
-    lasting = held[row]
-    passed = np.clip(at - t[row], 0.0, lasting)
-    return row, np.divide(passed, lasting, out=np.zeros(len(at)), where=lasting > 0.0)
-
-
 def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> PathKnots:
     """Return the path that a model makes of the wheel samples of a track, at knots.
 
@@ -58,7 +50,10 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
     at : (m,) time of each knot [s], ascending
     """
     k, m = len(parameters), len(at)
-    row, part = locate(track.t, track.held, at)
+    # the step in which each time lies, and how much of it has passed; a gap's speeds end with its step
+    row = np.maximum(np.searchsorted(track.t, at, side="right") - 1, 0)
+    held = track.held[row]
+    part = np.divide(np.clip(at - track.t[row], 0.0, held), held, out=np.zeros(m), where=held > 0.0)
     found = PathKnots(
         np.empty(m), np.empty(m), np.empty(m, np.complex128), np.empty(m, np.complex128),
         np.zeros((k, m)), np.empty((k, m), np.complex128),
