@@ -40,6 +40,14 @@ def test_a_process_needs_no_compiler_where_machine_code_is_kept(tmp_path: Path) 
     assert [called(tmp_path), called(tmp_path)] == [["1.5", "1", "True"], ["1.5", "0", "False"]]
 
 
+def test_machine_code_is_as_readable_as_other_files(tmp_path: Path) -> None:
+    called(tmp_path)
+    [file] = tmp_path.iterdir()
+    other = tmp_path / "other"
+    other.touch()
+    assert file.stat().st_mode == other.stat().st_mode
+
+
 @pytest.mark.parametrize(
     "damage", [lambda data: data[:-100], lambda data: data + b"x", lambda _: b""], ids=("cut", "longer", "empty")
 )
