@@ -237,21 +237,36 @@ def record_starts(
     data: Bytes,
     begin: int,
     hint: Ints | None,
-    follow: Callable[[memoryview, int, int], tuple[list[int], int]],
+    behind: Callable[[memoryview, int, int], int],
     ends: Callable[[Bytes, Ints], Ints],
 ) -> tuple[Ints, int]:
-    """Return where records begin (n,), and the first byte behind them."""
+    """Return where records begin (n,), and the first byte behind them.
+
+    Parameters
+    ----------
+    behind : returns where the record at a place ends, if that is before an end; the place itself where there is none
+    ends : returns where messages (n,) end; their begin where there is none
+    """
     view = data.data
     if hint is not None and 0 < len(hint) <= MOST_ROWS and hint[0] >= begin:
         first, last = np.append(begin, ends(data, hint)), np.append(hint, len(data))
         gaps = np.flatnonzero(first != last)
         if (first <= last).all() and (last[:-1] < first[1:]).all() and len(gaps) <= _MOST_GAPS:
-            found = [follow(view, *gap) for gap in zip(first[gaps].tolist(), last[gaps].tolist(), strict=True)]
+            found = [follow(view, *gap, behind) for gap in zip(first[gaps].tolist(), last[gaps].tolist(), strict=True)]
             if all(stop == last[gap] for gap, (_, stop) in zip(gaps, found, strict=True)):
                 others = np.array([at for some, _ in found for at in some], np.int64)
                 return (np.sort(np.append(hint, others)) if len(others) else hint), len(data)
-    starts, stop = follow(view, begin, len(data))
+    starts, stop = follow(view, begin, len(data), behind)
     return np.array(starts, np.int64), stop
+
+
+def follow(data: memoryview, at: int, end: int, behind: Callable[[memoryview, int, int], int]) -> tuple[list[int], int]:
+    """Return where the records [at, end) begin, one after the other, and where they stop."""
+    starts: list[int] = []
+    while len(starts) < MOST_ROWS and (after := behind(data, at, end)) > at:
+        starts.append(at)
+        at = after
+    return starts, at
 
 
 def unaligned(data: Bytes, kind: str | np.dtype[Any]) -> NDArray[Any]:

@@ -344,7 +344,9 @@ class ChunkedFile(Container):
         if length > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {length} bytes")
         length = max(min(length, self._size - at), 0)
-        if held is not None and held.has(at, at + length):
+        if isinstance(self._source, RemoteFile):
+            if held is None or not held.has(at, at + length):
+                held = self._source.hold(at, length)
             return np.frombuffer(held.data, np.uint8, length, at - held.at)
         content = space.of(length)
         return content[: self._source.read_into(at, content)]

@@ -16,7 +16,6 @@ from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.chunk import (
     LARGEST_CHUNK_BYTES,
-    MOST_ROWS,
     Chunk,
     DecompressionError,
     Packed,
@@ -63,7 +62,7 @@ def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
     ----------
     hint : (n,) where messages are by the index, ascending; None without one
     """
-    starts, stop = record_starts(data, begin, hint, _follow_mcap, _mcap_ends)
+    starts, stop = record_starts(data, begin, hint, _behind_record, _message_ends)
     codes = data[starts]
     is_message = codes == _MESSAGE
     at = starts if is_message.all() else starts[is_message]
@@ -78,23 +77,15 @@ def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
     return Records(messages, others, stop)
 
 
-def _follow_mcap(data: memoryview, begin: int, end: int) -> tuple[list[int], int]:
-    """Return where the records [begin, end) begin, one after the other, and where they stop."""
-    starts: list[int] = []
-    at, unpack = begin, _HEAD.unpack_from
-    while at + 9 <= end and len(starts) < MOST_ROWS:
-        code, length = unpack(data, at)
-        behind = at + 9 + length
-        if behind > end or not _SCHEMA <= code <= _MESSAGE:
-            break
-        if code == _MESSAGE and length < _LEAST_MESSAGE_BYTES:
-            break
-        starts.append(at)
-        at = behind
-    return starts, at
+def _behind_record(data: memoryview, at: int, end: int) -> int:
+    """Return where the record at a place ends, the place where it is cut off or of another kind."""
+    code, length = _HEAD.unpack_from(data, at) if at + _HEAD_BYTES <= end else (0, 0)
+    is_record = _SCHEMA <= code <= _MESSAGE and (code != _MESSAGE or length >= _LEAST_MESSAGE_BYTES)
+    behind: int = at + _HEAD_BYTES + length
+    return behind if is_record and behind <= end else at
 
 
-def _mcap_ends(data: Bytes, at: Ints) -> Ints:
+def _message_ends(data: Bytes, at: Ints) -> Ints:
     """Return where messages (n,) end; their begin where there is none."""
     if at[-1] > len(data) - _MESSAGE_HEADS.itemsize:
         return at

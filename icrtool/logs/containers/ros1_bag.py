@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.chunk import (
-    MOST_ROWS,
     STORED,
     Chunk,
     DecompressionError,
@@ -103,7 +102,7 @@ def _message_index(index: bytes) -> tuple[Ints, Ints]:
 
 def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
     """Find the message and connection records of a ROS 1 bag from `begin` on; as `scan_mcap`."""
-    starts, stop = record_starts(data, begin, hint, _follow_bag, _bag_ends)
+    starts, stop = record_starts(data, begin, hint, _behind_record, _record_ends)
     sizes = unaligned(data, "<u4")[starts] + np.int64(8)
     table = np.empty((5, len(starts)), np.int64)
     left, rounds = np.arange(len(starts)), 0
@@ -142,23 +141,14 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
     return Records(messages if is_message.all() else messages[:, is_message], others, stop)
 
 
-def _follow_bag(data: memoryview, begin: int, end: int) -> tuple[list[int], int]:
-    """Return where the records [begin, end) of a bag begin, one after the other, and where they stop."""
-    starts: list[int] = []
-    at, unpack = begin, _LENGTH.unpack_from
-    while at + 8 <= end and len(starts) < MOST_ROWS:
-        content = at + 8 + unpack(data, at)[0]
-        if content > end:
-            break
-        behind = content + unpack(data, content - 4)[0]
-        if behind > end:
-            break
-        starts.append(at)
-        at = behind
-    return starts, at
+def _behind_record(data: memoryview, at: int, end: int) -> int:
+    """Return where the record at a place ends, the place where it is cut off."""
+    content = at + 8 + _LENGTH.unpack_from(data, at)[0] if at + 8 <= end else end + 1
+    behind: int = content + _LENGTH.unpack_from(data, content - 4)[0] if content <= end else end + 1
+    return behind if behind <= end else at
 
 
-def _bag_ends(data: Bytes, at: Ints) -> Ints:
+def _record_ends(data: Bytes, at: Ints) -> Ints:
     """Return where records (n,) of a bag end that have headers as long as the first; the begin of others."""
     lengths, last = unaligned(data, "<u4"), len(data) - 4
     size = 8 + int(lengths[at[0]]) if at[-1] <= last else len(data)

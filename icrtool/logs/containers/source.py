@@ -206,12 +206,6 @@ class RemoteFile:
             held = self.hold(first, max(end - first, _LEAST_BYTES))
         return held.data[at - held.at : end - held.at]
 
-    def read_into(self, at: int, space: Bytes) -> int:
-        """Fill some space with bytes of the file, and return how many there are."""
-        data = self._range(at, len(space))
-        space[: len(data)] = np.frombuffer(data, np.uint8)
-        return len(data)
-
     def hold(self, at: int, count: int) -> Held:
         """Return bytes that `read_at` gives to this thread without another request."""
         if not self._last.held.has(at, min(at + count, self.size)):

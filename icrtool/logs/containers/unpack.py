@@ -17,6 +17,7 @@ import weakref
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from gzip import GzipFile
 from io import BufferedReader
@@ -188,12 +189,12 @@ def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = Non
     return found, f"{budget.trouble}; what could be unpacked was read" if budget.trouble else ""
 
 
+@dataclass(slots=True)
 class _Budget:
     """The bytes that a file may still be unpacked to, and the first thing that went wrong."""
 
-    def __init__(self, left: int) -> None:
-        self.left = left
-        self.trouble = ""
+    left: int
+    trouble: str = ""
 
     def stop(self, trouble: object) -> None:
         """Let nothing more be read."""

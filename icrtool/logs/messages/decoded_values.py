@@ -36,7 +36,7 @@ from icrtool.logs.messages.definitions import (
     ros_definitions,
     steps_of,
 )
-from icrtool.logs.messages.protobuf import definitions_in, descriptors_of, parser_of
+from icrtool.logs.messages.protobuf import ProtobufParser, definitions_in, descriptors_of, wanted_fields
 from icrtool.records.text import LONGEST_TEXT
 
 LONGEST_MESSAGE_BYTES = 1 << 20
@@ -312,8 +312,8 @@ def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
     if channel.encoding == "json":
         return ValueDecoder(slots, paths, parse_json)
     descriptors = descriptors_of(channel.definition, channel.message_type)
-    parser = parser_of(descriptors, channel.message_type, [steps_of(path) for path in paths.values()])
-    return ValueDecoder(slots, paths, parser.parse)
+    fields = wanted_fields(descriptors, channel.message_type, [steps_of(path) for path in paths.values()])
+    return ValueDecoder(slots, paths, ProtobufParser(fields).parse)
 
 
 @lru_cache(maxsize=64)

@@ -281,7 +281,12 @@ class Decoded:
         if len(offsets) == 1 and (width == 1 or first == [*range(first[0], first[-1] + step, step)]):
             values = self._fields(first[0], kind, width, step)
         else:
-            values = self._scattered(offsets, kind, width)
+            table = np.zeros((len(offsets), width), np.int64)
+            for row, one in zip(table, offsets, strict=True):
+                row[: len(one)] = one
+            # a message that lacks the number may be too near to the end of the data to be read there
+            places = np.minimum(self.start[:, None] + table[self.shape_of], len(self.data) - kind.itemsize)
+            values = unaligned(self.data, kind)[places]
         if any(shape.big for shape in self.shapes):
             big = np.array([shape.big for shape in self.shapes])
             values = np.where(big[self.shape_of, None], values.byteswap(), values)
@@ -299,16 +304,6 @@ class Decoded:
         """Return a field of `width` values (n, width), each `step` bytes behind the other; of one shape, a view."""
         strides = (self.shapes[0].size, step)
         return np.ndarray((len(self.start), width), kind, self.data, int(self.start[0]) + offset, strides)
-
-    def _scattered(self, offsets: list[list[int]], kind: np.dtype[Any], width: int) -> NDArray[Any]:
-        """Return the values (n, width) at the offsets of each shape; anything where a shape has less."""
-        table = np.zeros((len(offsets), width), np.int64)
-        for row, one in zip(table, offsets, strict=True):
-            row[: len(one)] = one
-        # a message that lacks the number may be too near to the end of the data to be read there
-        last = len(self.data) - kind.itemsize
-        values: NDArray[Any] = unaligned(self.data, kind)[np.minimum(self.start[:, None] + table[self.shape_of], last)]
-        return values
 
     def text_numbers(self, path: str, known: dict[bytes, int]) -> Ints:
         """Return the numbers of a text field's texts (n,) or (n, longest), -1 for none; new texts become known."""

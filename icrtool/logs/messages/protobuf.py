@@ -100,20 +100,20 @@ def _wire_fields(data: bytes, at: int, stop: int) -> Iterator[tuple[int, int, in
 
 
 @dataclass(slots=True)
-class _Node:
+class WantedFields:
     """The wanted fields of a message: by number, each with those of the message in it; and values of lacking ones."""
 
-    fields: dict[int, tuple[ProtobufField, _Node | None]] = field(default_factory=dict)
+    fields: dict[int, tuple[ProtobufField, WantedFields | None]] = field(default_factory=dict)
     default: dict[str, Any] = field(default_factory=dict)
 
-    def add(self, name: str, number: int, kind: int, inner: _Node | None = None) -> None:
+    def add(self, name: str, number: int, kind: int, inner: WantedFields | None = None) -> None:
         """Add a field of a descriptor; those that hold messages are repeated."""
         self.fields[number] = ProtobufField(name, number, kind, "", inner is not None, is_default=False), inner
 
 
-def _descriptor_set() -> _Node:
+def _descriptor_set() -> WantedFields:
     """Return the wanted fields of a FileDescriptorSet, as google/protobuf/descriptor.proto has them."""
-    files, file, message, described = _Node(), _Node(), _Node(), _Node()
+    files, file, message, described = WantedFields(), WantedFields(), WantedFields(), WantedFields()
     files.add("file", 1, _MESSAGE, file)
     file.add("package", 2, _STRING)
     file.add("message_type", 4, _MESSAGE, message)
@@ -191,20 +191,16 @@ def definitions_in(descriptors: Descriptors) -> Definitions:
     return definitions
 
 
-def parser_of(descriptors: Descriptors, message_type: str, paths: Sequence[Sequence[Step]]) -> ProtobufParser:
-    """Return what takes the fields at the steps of each path of messages of one type."""
-    return ProtobufParser(_wanted(descriptors, message_type, paths), MOST_WIRE_FIELDS, MOST_ELEMENTS)
-
-
-def _wanted(descriptors: Descriptors, name: str, paths: Sequence[Sequence[Step]]) -> _Node:
+def wanted_fields(descriptors: Descriptors, name: str, paths: Sequence[Sequence[Step]]) -> WantedFields:
+    """Return the fields of a message type at the steps of each path."""
     rests: dict[Step, list[Sequence[Step]]] = {}
     for path in paths:
         behind = path[1:] if len(path) < 2 or isinstance(path[1], str) else path[2:]
         rests.setdefault(path[0], []).append(behind)
-    node = _Node()
+    node = WantedFields()
     for one in descriptors.get(name, ()):
         if one.name in rests and (one.type in KINDS or one.type == _MESSAGE):
-            inner = _wanted(descriptors, one.refers, [rest for rest in rests[one.name] if rest])
+            inner = wanted_fields(descriptors, one.refers, [rest for rest in rests[one.name] if rest])
             node.fields[one.number] = (one, inner if one.type == _MESSAGE else None)
             if one.is_default and not one.repeated and one.type != _MESSAGE:
                 node.default[one.name] = "" if one.type == _STRING else 0
@@ -219,7 +215,9 @@ class ProtobufParser:
     most_fields, most_elements : of a message, and of one field; with more fields it is unreadable
     """
 
-    def __init__(self, wanted: _Node, most_fields: int, most_elements: int) -> None:
+    def __init__(
+        self, wanted: WantedFields, most_fields: int = MOST_WIRE_FIELDS, most_elements: int = MOST_ELEMENTS
+    ) -> None:
         self._wanted, self._most_fields, self._most_elements = wanted, most_fields, most_elements
         self._left = 0
 
@@ -231,7 +229,7 @@ class ProtobufParser:
         except (_UnreadableError, IndexError, RecursionError):
             return None
 
-    def _message(self, data: bytes, at: int, stop: int, node: _Node, into: dict[str, Any]) -> dict[str, Any]:
+    def _message(self, data: bytes, at: int, stop: int, node: WantedFields, into: dict[str, Any]) -> dict[str, Any]:
         for number, wire, begin, end in _wire_fields(data, at, stop):
             self._left -= 1
             if self._left < 0:

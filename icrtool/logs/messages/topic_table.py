@@ -14,13 +14,7 @@ from numpy.typing import NDArray
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Block, Channel
-from icrtool.logs.messages.decoded_values import (
-    NMEA_SENTENCE,
-    DecodedValues,
-    SentenceDecoder,
-    ValueDecoder,
-    value_decoder,
-)
+from icrtool.logs.messages.decoded_values import NMEA_SENTENCE, SentenceDecoder, ValueDecoder, value_decoder
 from icrtool.logs.messages.decoder import Decoded, Decoder, ros_decoder
 from icrtool.logs.messages.definitions import Slot
 from icrtool.records.text import LogText
@@ -225,20 +219,22 @@ class TopicCollector:
 
     def feed(self, block: Block, number: int) -> None:
         """Add the messages of a block whose channel is `number`."""
-        for rows, decoded in self.decoders[number].decode(block, number):
+        decoder, expected = self.decoders[number], self.channel.count or 0
+        for rows, decoded in decoder.decode(block, number):
             readable = rows[decoded.readable]
             self._unreadable += len(rows) - len(readable)
-            if len(readable):
-                self._add(decoded, block.log_time_ns[readable], number)
-
-    def _add(self, decoded: Decoded | DecodedValues, times: Ints, number: int) -> None:
-        expected = self.channel.count or 0
-        self._times.add(times, expected)
-        self._numbers.add(np.full(len(times), number), expected)
-        for path, slot in self.decoders[number].slots.items():
-            is_text = slot.kind == "string"
-            values = decoded.text_numbers(path, self._texts.setdefault(path, {})) if is_text else decoded.numbers(path)
-            self._columns.setdefault((path, is_text), GrowingColumn(-1 if is_text else 0)).add(values, expected)
+            if not len(readable):
+                continue
+            self._times.add(block.log_time_ns[readable], expected)
+            self._numbers.add(np.full(len(readable), number), expected)
+            for path, slot in decoder.slots.items():
+                values: NDArray[Any]
+                if is_text := slot.kind == "string":
+                    values = decoded.text_numbers(path, self._texts.setdefault(path, {}))
+                else:
+                    values = decoded.numbers(path)
+                column = self._columns.setdefault((path, is_text), GrowingColumn(-1 if is_text else 0))
+                column.add(values, expected)
 
     def table(self) -> TopicTable:
         """Return what was gathered, sorted by log time, and forget it.
