@@ -47,6 +47,7 @@ WHEELS: dict[tuple[str, ...], tuple[WheelUnit, bool]] = {
 """Columns of data frames: unit, and whether they are positions."""
 
 POSITION = (("north_m", "east_m"), ("latitude_deg", "longitude_deg"))
+POSITION_STD = (("north_std_m", "east_std_m"), ("position_std_m", "position_std_m"))
 HEADING = (("heading_rad",), ("heading_deg",), ("yaw_rad",), ("yaw_deg",))
 GYRO = (("turn_rate_radps",), ("yaw_rate_radps",))
 
@@ -185,7 +186,7 @@ def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str,
             return columns
     half = [column for columns in options for column in columns if column in frame]
     found = f"only {half[0]} of a pair" if half else f"the columns are {', '.join(map(str, list(frame)[:12]))}"
-    wanted = " or ".join(" and ".join(columns) for columns in options)
+    wanted = " or ".join(" and ".join(dict.fromkeys(columns)) for columns in options)
     raise DataError(name, f"{group}: no column {wanted}", found)
 
 
@@ -235,7 +236,8 @@ def _wheels(frame: pd.DataFrame, name: str) -> tuple[WheelSamples, tuple[str, ..
 
 def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | None, tuple[str, ...]]:
     columns = _chosen(frame, POSITION, "position", name)
-    stds = next((pair for pair in (("north_std_m", "east_std_m"), ("position_std_m",) * 2) if pair[0] in frame), ())
+    stated = any(column in frame for pair in POSITION_STD for column in pair)
+    stds = _chosen(frame, POSITION_STD, "position", name) if stated else ()
     beside = [column for column in dict.fromkeys((*stds, "height_m")) if column in frame]
     stamps, (first, second) = _rows(frame, columns, "position", name)
     extra = {column: _at(frame, column, columns, stamps, name) for column in beside}

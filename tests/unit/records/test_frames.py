@@ -71,6 +71,7 @@ def test_a_table_is_cut_by_its_stamps(log: Log, tmp_path: Path) -> None:
         ("position", {"drop": "north_m"}, "north_m and east_m"),
         ("heading", {"drop": "yaw_rad"}, "heading_rad or heading_deg"),
         ("position", {"text": "east_m"}, "column east_m"),
+        ("position", {"drop": "east_std_m"}, "only north_std_m of a pair"),
         ("heading", {"empty": "yaw_rad"}, "yaw_rad"),
         ("heading", {"huge": "t_s"}, "column t_s"),
     ],
