@@ -74,24 +74,20 @@ def survey_log(
     path = place_of(path) if isinstance(path, str) else path
     begin, stop = moment(start, "start"), moment(end, "end")
     before = states_of(path)
-    container = open_log(path, progress)
     ended = Event()
-    try:
-        with ThreadPoolExecutor(1) as pool:
-            try:
-                inputs = pool.submit(container.inputs, ended)
-                cut = cut_of(container, begin, stop, path)
-                tables, unread = _collect(container, config, progress, cut)
-                problems = tuple(container.problems)
-                candidates = find_candidates(tables, config, unread)
-                inputs.result()
-            except BaseException:
-                # The pool waits for its threads before it passes on Ctrl-C or an error.
-                ended.set()
-                raise
+    with contextlib.closing(open_log(path, progress)) as container, ThreadPoolExecutor(1) as pool:
+        try:
+            inputs = pool.submit(container.inputs, ended)
+            cut = cut_of(container, begin, stop, path)
+            tables, unread = _collect(container, config, progress, cut)
+            problems = tuple(container.problems)
+            candidates = find_candidates(tables, config, unread)
+            inputs.result()
+        except BaseException:
+            # The pool waits for its threads before it passes on Ctrl-C or an error.
+            ended.set()
+            raise
         channels, transfer = tuple(container.channels), container.transfer()
-    finally:
-        container.close()
     check_unchanged(path, before, inputs.result())
     drop_used_columns(tables)
     names = LogText(log_name(path)), escaped(str(path))
@@ -177,9 +173,8 @@ def _collect(
                 progress(container.share_read())
     for number in wanted.keys() - collectors.keys():
         by_topic.setdefault(topics[number], TopicCollector(by_id[number]))
-    tables = [
-        by_topic[topic].table() for topic in dict.fromkeys(topics[number] for number in wanted) if topic in by_topic
-    ]
+    in_order = dict.fromkeys(topics[number] for number in wanted)
+    tables = [by_topic[topic].table() for topic in in_order if topic in by_topic]
     moving = {number for number in wanted if by_id[number].message_type in TRANSFORM_TYPES} - static
     poses = {by_id[number].topic for number in moving}
     for place, table in enumerate(tables):

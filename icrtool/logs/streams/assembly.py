@@ -128,12 +128,11 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         rate, jitter = rate_and_jitter(samples.stamp_ns)
         streams.append(StreamChoice(role, one.topic, one.message_type, count, rate, used, jitter, one.why + detail))
     # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
-    others = (
-        other
-        for other in found.gnss
-        if other.topic != position.topic and other.geodetic is not None and not other.is_empty and not other.problem
-    )
-    receivers = [OtherReceiver(one.topic, _fixes(one, config, clock, name, datum)[0]) for one in others if datum]
+    receivers = []
+    for other in found.gnss:
+        usable = other.geodetic is not None and not other.is_empty and not other.problem
+        if datum is not None and usable and other.topic != position.topic:
+            receivers.append(OtherReceiver(other.topic, _fixes(other, config, clock, name, datum)[0]))
     known: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
     units = inertial_units(survey.tables, GYRO_AXES, clock, known)
     log = RobotLog(
@@ -212,9 +211,8 @@ def _fixes(
         if datum is None:
             first = float(latitude[0]), float(longitude[0])
             datum = Datum(*(config.frames.datum or first), float(height[0]))
-        north, east, _ = geodetic2ned(
-            latitude, longitude, height, datum.latitude_deg, datum.longitude_deg, datum.height_m
-        )
+        origin = datum.latitude_deg, datum.longitude_deg, datum.height_m
+        north, east, _ = geodetic2ned(latitude, longitude, height, *origin)
     else:
         north, east = np.asarray(source.metric, np.float64)[rows].T
     north, east, var_north, var_east, covariance = (

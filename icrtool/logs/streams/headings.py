@@ -249,9 +249,8 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     if tilt(2) >= UPRIGHT_COSINE:
         return _of_rows(partial(_bearing, 0), ordered, norm), usable, note
     level = min(range(3), key=tilt)
-    note = (
-        f"mounted on its side: its {'xyz'[level]} axis is level and is used as heading, with an offset to be estimated"
-    )
+    used = "is level and is used as heading, with an offset to be estimated"
+    note = f"mounted on its side: its {'xyz'[level]} axis {used}"
     return _of_rows(partial(_bearing, level), ordered, norm), usable, note
 
 

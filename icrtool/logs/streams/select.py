@@ -211,8 +211,7 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
     pair = f"{topics.wheel_left} + {topics.wheel_right}" if topics.wheel_left is not None else None
     wheels = _chosen(found.wheels, topics.wheels or pair)
     check_joints(wheels, found.wheels, config)
-    for role in found.by_role():
-        _check_configured(role, found, getattr(topics, role), log, channels)
+    _check_roles(topics, found, log, channels)
     gnss, heading = _chosen(found.gnss, topics.gnss), _chosen(found.heading, topics.heading)
     if wheels is None or gnss is None:
         by_role: dict[Role, object] = {"wheels": wheels, "gnss": gnss, "heading": heading}
@@ -267,20 +266,19 @@ def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Se
         raise ConfigError("topics.wheel_left", why, "name another pair")
 
 
-def _check_configured(
-    role: Role, found: Candidates, configured: str | None, log: str, channels: Sequence[Channel]
-) -> None:
+def _check_roles(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
     """Refuse a configured topic that the log does not have or that has no usable row; other problems do not count."""
-    if configured is None:
-        return
-    key, needed, sources = f"topics.{role}", f"it needs {NEEDS[role]}", found.by_role()[role]
-    kind = _type_in(log, channels, found.unread, key, configured)
-    if not sources:
-        if role == "wheels" and kind in PAIR_TYPES:
-            needed = "name both sides in topics.wheel_left and topics.wheel_right"
-        raise ConfigError(key, f"{configured}: {found.unread.get(configured, f'{kind} cannot feed it')}", needed)
-    if sources[0].is_empty:
-        raise ConfigError(key, f"{configured}: {sources[0].problem or 'nothing usable in it'}", needed)
+    for role, sources in found.by_role().items():
+        if (configured := getattr(topics, role)) is None:
+            continue
+        key, needed = f"topics.{role}", f"it needs {NEEDS[role]}"
+        kind = _type_in(log, channels, found.unread, key, configured)
+        if not sources:
+            if role == "wheels" and kind in PAIR_TYPES:
+                needed = "name both sides in topics.wheel_left and topics.wheel_right"
+            raise ConfigError(key, f"{configured}: {found.unread.get(configured, f'{kind} cannot feed it')}", needed)
+        if sources[0].is_empty:
+            raise ConfigError(key, f"{configured}: {sources[0].problem or 'nothing usable in it'}", needed)
 
 
 def _type_in(log: str, channels: Sequence[Channel], unread: Mapping[str, str], key: str, topic: str) -> str:

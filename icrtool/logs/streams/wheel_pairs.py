@@ -186,9 +186,8 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelM
         if (right := right_twin(name, alike)) is not None
     )
     motions = [pair_motion(left, right, config) for left, right in islice(pairs, MOST_PAIRS)]
-    return motions + [
-        _array_motion(table, config) for table in tables if table.message_type in ARRAY_TYPES and len(table)
-    ]
+    arrays = (table for table in tables if table.message_type in ARRAY_TYPES and len(table))
+    return motions + [_array_motion(table, config) for table in arrays]
 
 
 def _array_motion(table: TopicTable, config: Config) -> WheelMotion:
@@ -234,10 +233,8 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
     unit: Unit = "unknown"
     if _is_position(left, lefts, config, integer=integer):
         unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
-        what, position = (
-            "ticks" if unit == "counts" else "angles or distances",
-            (first, np.interp(moments, held, rights)),
-        )
+        what = "ticks" if unit == "counts" else "angles or distances"
+        position = first, np.interp(moments, held, rights)
     else:
         place = np.clip(np.searchsorted(held, moments + _half_interval(times), side="right") - 1, 0, None)
         what, speed = "speeds", (first, rights[place].astype(np.float64))

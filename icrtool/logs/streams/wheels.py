@@ -260,7 +260,6 @@ def read_ticks(table: TopicTable, _: Config) -> WheelMotion:
     valid = table.integers("valid_wheels")
     bits = int(np.bitwise_or.reduce(valid)) if valid is not None else 0
     axles = [place for place, both in (("f", 3), ("r", 12)) if bits & both == both] or ["r"]
-
     with np.errstate(invalid="ignore"):  # infinite ones of both signs have no median
         per_metre = float(np.median(table.floats("wheel_tick_factor")))
     known = per_metre > 0
