@@ -297,9 +297,8 @@ def _parse_set(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
     section, dot, name = key.strip().partition(".")
     if not (equals and dot and section and name):
-        raise ConfigError(
-            f"--set {text}", "not of the form section.key=value", "for example --set topics.gnss=/gps/fix"
-        )
+        why = "not of the form section.key=value"
+        raise ConfigError(f"--set {text}", why, "for example --set topics.gnss=/gps/fix")
     if not value.strip():
         raise ConfigError(key.strip(), "its value is empty", "leave the option out for the default")
     found: Any = value.strip()

@@ -119,7 +119,8 @@ class _Unloaded:
 def when_used() -> Iterator[None]:
     """Have what the block imports (``from icrtool.output import series``) loaded when it is used first.
 
-    So the help of a command loads no numba, pandas or pyarrow. Two threads must not be the first to use a module.
+    So the help of a command loads no numpy, pandas or pyarrow. Two threads must not be the first to use a module.
+    Packages are loaded at once: `icrtool.output.figures`, which loads matplotlib, is imported where it is used.
     """
     # Before that of files, the last one.
     sys.meta_path.insert(-1, _Unloaded)

@@ -21,7 +21,6 @@ with when_used():
     from icrtool.calibration import error_growth, pooled, sensor_findings
     from icrtool.logs import read_log
     from icrtool.output import run_directory
-    from icrtool.output.figures import calibrations as figures
     from icrtool.output.files import atomic, formats
     from icrtool.output.tables import calibration as tables
 
@@ -111,7 +110,9 @@ def _draw_residuals(source: Path, run: Run, plot: Path) -> None:
     measured = wheel_units.with_wheel_speeds(align.choose_reference(log, run.config), run.config)
     fit = corrections.align_streams(measured, run.config).fit
     if fit is not None:
-        formats.save_picture(figures.residuals_figure(run.name, estimator.residuals_by_estimate(fit)), plot)
+        from icrtool.output.figures.calibrations import residuals_figure
+
+        formats.save_picture(residuals_figure(run.name, estimator.residuals_by_estimate(fit)), plot)
 
 
 @click.command("forecast")
@@ -148,8 +149,10 @@ def forecast_command(
     if output is not None:
         atomic.write_file(output, tables.forecast_csv(forecast, gyro))
     if plot is not None:
+        from icrtool.output.figures.calibrations import forecast_figure
+
         measured_m = tables.measured_to_m(calibration)
-        formats.save_picture(figures.forecast_figure(forecast, path.name, budgets_m, measured_m, gyro), plot)
+        formats.save_picture(forecast_figure(forecast, path.name, budgets_m, measured_m, gyro), plot)
     printer.json("forecast", tables.forecast_document(forecast, calibration, budgets_m, gyro))
     printer.show(tables.forecast_blocks(forecast, calibration, budgets_m, gyro))
 

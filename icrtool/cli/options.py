@@ -11,9 +11,9 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import wraps
-from importlib import import_module
 from inspect import signature
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import click
@@ -87,7 +87,7 @@ def together(name: str, home: str | Callable[..., Any], *options: Option, change
     def add(command: Command) -> Command:
         @wraps(command)
         def call(**given: Any) -> object:
-            record = _imported(home) if isinstance(home, str) else home
+            record = resolve_name(home) if isinstance(home, str) else home
             taken = {one: given.pop(one) for one in known.intersection(signature(record).parameters, given)}
             values = {one: value for one, value in taken.items() if value is not None}
             made = (lambda old: replace(old, **values)) if change else record(**values)
@@ -97,13 +97,6 @@ def together(name: str, home: str | Callable[..., Any], *options: Option, change
         return add_options(call, *options)
 
     return add
-
-
-def _imported(home: str) -> Callable[..., Any]:
-    """Return what is at ``module:name``."""
-    module, _, name = home.partition(":")
-    found: Callable[..., Any] = getattr(import_module(module), name)
-    return found
 
 
 def add_options(command: Command, *options: Option) -> Command:
@@ -136,7 +129,7 @@ class _Path(click.Path):
             return address
         path = cast("Path", super().convert(value, param, ctx))
         if self._check:
-            _imported(self._check)(path)
+            resolve_name(self._check)(path)
         return path
 
 

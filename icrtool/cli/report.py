@@ -22,7 +22,6 @@ with when_used():
     from icrtool.dropout_analysis import dropout_report
     from icrtool.fleet import fleet_files
     from icrtool.output import run_directory
-    from icrtool.output.figures import calibrations as figures
     from icrtool.output.files import atomic, formats
     from icrtool.output.page import pages, render
     from icrtool.output.tables import calibration as tables
@@ -146,7 +145,9 @@ def compare_command(
         if file is not None:
             atomic.write_file(file, content)
     if plot is not None:
-        formats.save_picture(figures.transfer(compared), plot)
+        from icrtool.output.figures.calibrations import transfer as transfer_figure
+
+        formats.save_picture(transfer_figure(compared), plot)
     printer.json("compare", compared)
     printer.show(tables.transfer_blocks(compared))
 

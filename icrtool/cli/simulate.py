@@ -19,7 +19,6 @@ with when_used():
     from icrtool import errors
     from icrtool.logs import write_log
     from icrtool.output import simulation_files
-    from icrtool.output.figures import study as study_output
     from icrtool.simulation import drives, studies
 
 if TYPE_CHECKING:
@@ -322,7 +321,9 @@ def study_command(
     with printer.progress(f"study {name}") as progress:
         result = studies.run_study(asked, progress)
     simulation_files.write_study(result, directory, plots=plots)
-    printer.show(study_output.study_blocks(result))
+    from icrtool.output.figures.study import study_blocks
+
+    printer.show(study_blocks(result))
     printer.text(f"\nwritten to {directory}")
     printer.detail(f"settings: {asked.settings()}")
 

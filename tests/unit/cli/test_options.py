@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import click
 import pytest
@@ -47,7 +48,7 @@ def test_options_become_a_record_that_keeps_its_defaults_and_the_others_stay() -
 
 
 def test_a_change_replaces_what_is_given_of_another_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("icrtool.cli.options.import_module", lambda _: SimpleNamespace(Pair=Pair))
+    monkeypatch.setattr("icrtool.cli.options.resolve_name", lambda _: Pair)
     change = call("--left", "-3", change=True)["pair"]
     assert callable(change)
     assert change(Pair(7.0, 8.0)) == Pair(-3.0, 8.0)
@@ -59,3 +60,15 @@ def test_no_record_of_a_command_has_the_name_of_one_of_its_options(name: str) ->
     assert command is not None
     made: set[str] = getattr(command.callback, "made", set())
     assert made.isdisjoint(one.name for one in command.params if one.name is not None)
+
+
+def test_help_loads_no_library_that_takes_long() -> None:
+    code = (
+        "import sys, click\n"
+        "from icrtool.cli.commands import icrtool\n"
+        f"for name in {COMMANDS}:\n"
+        "    icrtool.get_command(click.Context(icrtool), name).get_help(click.Context(icrtool))\n"
+        "print({'numpy', 'numba', 'pandas', 'pyarrow', 'matplotlib', 'scipy', 'rich'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"

@@ -1,4 +1,4 @@
-"""The roll-up of a batch: groups, pooled calibrations, figures."""
+"""What a batch leaves: groups, pooled calibrations, figures."""
 
 from __future__ import annotations
 
