@@ -279,7 +279,7 @@ def agreement(log: RobotLog, config: Config) -> Agreement:
     except (ConfigError, DataError):
         return NONE
     track = track_of_log(log)
-    windows = cut_windows(track, LENGTH_M)
+    windows = cut_windows(track, length_m=LENGTH_M)
     free = config.frames.heading == "auto"
     decision = decide_conventions(windows, metric=log.datum is None and free, mirror_allowed=free)
     named = apply_convention(log, decision.convention)

@@ -82,14 +82,6 @@ class DriveWindows(NamedTuple):
         begin, end = self.track.heading_at(np.stack([self.turn_begin, self.turn_end]))
         return np.asarray(end - begin)
 
-    def rows(self, kept: Bools, turn_kept: Bools) -> DriveWindows:
-        """Return the windows of distance (w,) and of time (u,) that are marked."""
-        return self._replace(
-            begin=self.begin[kept], end=self.end[kept], group=self.group[kept],
-            turn_begin=self.turn_begin[turn_kept], turn_end=self.turn_end[turn_kept],
-            turn_group=self.turn_group[turn_kept],
-        )  # fmt: skip
-
 
 def track_of_log(log: RobotLog, heading: HeadingSamples | None = None) -> Track:
     """Return a log as arrays; `heading` in place of its own."""
@@ -164,33 +156,27 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     return seen if seen > NOISIER * stated else stated
 
 
-def window_length(track: Track, least_m: float) -> float:
-    """Return how long windows are [m]: at least so, and as the noise of the fixes and held wheel values ask for."""
-    noise = WINDOW_IN_POSITION_STD * min(track.place_std_m, 10.0)
-    # the distance on which a wheel value lasts while the robot moves, however often it is repeated
-    travel = track.travel
-    moving = np.diff(travel) > 0
-    changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
-    lasts_m = float(travel[-1]) / max(sum(changes) / 2, 1.0)
-    return max(least_m, noise, min(WINDOW_IN_VALUES * lasts_m, LONGEST_WINDOW_M))
-
-
 def windows_of_log(log: RobotLog, width_m: float, heading: HeadingSamples | None = None) -> DriveWindows:
     """Return the windows of the alignment, for a robot of track width b [m]; `heading` in place of the log's."""
-    track = track_of_log(log, heading)
-    return cut_windows(track, window_length(track, min(WINDOW_M, WINDOW_IN_WIDTHS * width_m)))
+    return cut_windows(track_of_log(log, heading), min(WINDOW_M, WINDOW_IN_WIDTHS * width_m))
 
 
-def cut_windows(track: Track, length_m: float | None = None) -> DriveWindows:
+def cut_windows(track: Track, least_m: float = WINDOW_M, *, length_m: float = 0.0) -> DriveWindows:
     """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
 
     All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
 
     Parameters
     ----------
-    length_m : of a window; default that of the alignment of a robot of usual size
+    least_m : windows are at least so long, and as long as the noise of the fixes and held wheel values ask for
+    length_m : of a window, in place of that
     """
-    length = window_length(track, WINDOW_M) if length_m is None else length_m
+    travel, noise = track.travel, WINDOW_IN_POSITION_STD * min(track.place_std_m, 10.0)
+    # the distance on which a wheel value lasts while the robot moves, however often it is repeated
+    moving = np.diff(travel) > 0
+    changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
+    lasts_m = float(travel[-1]) / max(sum(changes) / 2, 1.0)
+    length = length_m or max(least_m, noise, min(WINDOW_IN_VALUES * lasts_m, LONGEST_WINDOW_M))
     begin, end, _ = cut(track, [length], length / STARTS_A_WINDOW)
     covers = [track.t, track.heading_t] if len(track.heading_t) else [track.t]
     first, last = max(t[0] for t in covers), min(t[-1] for t in covers)
@@ -200,7 +186,7 @@ def cut_windows(track: Track, length_m: float | None = None) -> DriveWindows:
     begin, end = begin[whole], end[whole]
     # windows of time in which wheels and heading were sampled and the wheels turned
     turn_begin = turn_end = np.empty(0)
-    travel, sampled = track.travel, track.heading_t
+    sampled = track.heading_t
     if len(sampled):
         usual = float(np.median(np.diff(sampled))) if len(sampled) > 1 else 0.0
         turn_begin = sampled[0] + TURN_STEP_S * np.unique(np.floor((sampled - sampled[0]) / TURN_STEP_S))

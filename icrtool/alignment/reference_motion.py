@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.alignment.estimator import estimate_alignment
-from icrtool.alignment.log_track import cut_windows, track_of_streams, window_length
+from icrtool.alignment.log_track import cut_windows, track_of_streams
 from icrtool.alignment.sensor_noise import FEWEST_FIXES, MOVES_MPS, OUTLIER_SIGMAS, USUAL_POSITION_STD_M, is_hole
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapezoids
 from icrtool.kernels.robust import mad_std
@@ -45,6 +45,9 @@ LEAST_TURN_GAIN = 1e-3
 WINDOWS_S = (0.5, 1.0, 2.0)
 LONGEST_WINDOW_S = 16.0
 """Windows are doubled to this where the fixes are too noisy for shorter ones."""
+
+FEWEST_INTERVALS = 2
+"""An event is seen in at least so many intervals between fixes: one alone may be a jump."""
 
 LEAST_DISTANCE2 = 36.0
 """Squared Mahalanobis distance of a window in which an event is seen."""
@@ -198,28 +201,27 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     )  # fmt: skip
 
 
-def window_durations(knots: Knots) -> list[float]:
-    """Return the durations of the windows: doubled until the usual distance stands out of the noise of the fixes."""
+def spans_by_duration(knots: Knots) -> list[tuple[float, Ints, Ints]]:
+    """Return the durations of the windows [s], the longest first, and first and last rows of those of each (w,).
+
+    Durations are doubled until the usual distance stands out of the noise of the fixes. A window lasts so long, or one
+    fix more, and spans no hole.
+    """
     path, dt = np.diff(knots.track.distance), np.diff(knots.t)
-    moving = path > MOVES_MPS * dt
-    if not moving.any():
-        return list(WINDOWS_S)
-    speed = float(np.median(path[moving] / dt[moving]))
-    needed = math.sqrt(2 * LEAST_DISTANCE2 * float(np.median(knots.variance)))
-    durations = list(WINDOWS_S)
-    while speed * durations[-1] < needed and durations[-1] < LONGEST_WINDOW_S:
-        durations.append(2 * durations[-1])
-    return durations
-
-
-def spans_of(knots: Knots, duration_s: float) -> tuple[Ints, Ints]:
-    """Return first and last rows of the windows (w,) of that duration, or one fix more, which span no hole."""
-    first = np.arange(len(knots.t))
-    last = np.searchsorted(knots.t, knots.t + duration_s - KNOT_S / 2)
-    inside = last < len(knots.t)
-    first, last = first[inside], last[inside]
-    whole = (last > first) & (knots.holes[first] == knots.holes[last])
-    return first[whole], last[whole]
+    moving, durations = path > MOVES_MPS * dt, list(WINDOWS_S)
+    if moving.any():
+        speed = float(np.median(path[moving] / dt[moving]))
+        needed = math.sqrt(2 * LEAST_DISTANCE2 * float(np.median(knots.variance)))
+        while speed * durations[-1] < needed and durations[-1] < LONGEST_WINDOW_S:
+            durations.append(2 * durations[-1])
+    found = []
+    for duration_s in reversed(durations):
+        last = np.searchsorted(knots.t, knots.t + duration_s - KNOT_S / 2)
+        first = np.flatnonzero(last < len(knots.t))
+        last = last[first]
+        whole = (last - first >= FEWEST_INTERVALS) & (knots.holes[first] == knots.holes[last])
+        found.append((duration_s, first[whole], last[whole]))
+    return found
 
 
 def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
@@ -229,14 +231,19 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     ----------
     quiet : (m,) knots that may be inside a window
     """
-    windows = cut_windows(knots.track, window_length(knots.track, WINDOW_M))
+    windows = cut_windows(knots.track, WINDOW_M)
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
     turns = np.searchsorted(knots.t, [windows.turn_begin, windows.turn_end]).clip(0, len(knots.t) - 1)
     kept, turns_kept = (
         (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])
         for begin, end in ((windows.begin, windows.end), turns)
     )
-    fit = estimate_alignment(windows.rows(kept, turns_kept), width_m)
+    windows = windows._replace(
+        begin=windows.begin[kept], end=windows.end[kept], group=windows.group[kept],
+        turn_begin=windows.turn_begin[turns_kept], turn_end=windows.turn_end[turns_kept],
+        turn_group=windows.turn_group[turns_kept],
+    )  # fmt: skip
+    fit = estimate_alignment(windows, width_m)
     if fit is None:
         return None
     place, turn = fit.model.until_fixes(fit.fit.x)

@@ -29,8 +29,7 @@ from icrtool.alignment.reference_motion import (
     fit_motion,
     lay_knots,
     model_error,
-    spans_of,
-    window_durations,
+    spans_by_duration,
     without_jumps,
 )
 from icrtool.alignment.sensor_noise import MOVES_MPS
@@ -45,9 +44,6 @@ LEAST_OF_SIDE = 0.12
 
 STUCK_SHARE = 0.2
 """Robot that moves and turns less than this share of what its wheels do: immobilised."""
-
-FEWEST_INTERVALS = 2
-"""An event is seen in at least so many intervals between fixes: one alone may be a jump."""
 
 KEEPING_SHARE = 1 / 3
 """A side that disagrees by less than this part of what the other does keeps to its wheels."""
@@ -186,10 +182,8 @@ def _weigh(
     """
     shown: list[tuple[ComparedWindows, Floats]] = []
     error = np.full(3, LEAST_MODEL_ERROR)
-    for duration in reversed(window_durations(knots)):
-        first, last = spans_of(knots, duration)
-        long = last - first >= FEWEST_INTERVALS
-        windows = compare(knots, motion, first[long], last[long], RESPONSE_S)
+    for duration, first, last in spans_by_duration(knots):
+        windows = compare(knots, motion, first, last, RESPONSE_S)
         error = model_error(windows, quiet, quantile)
         # while the robot parks, sensors without noise leave no variance to divide by
         windows = windows.rows(windows.path_m > MOVES_MPS * duration)
