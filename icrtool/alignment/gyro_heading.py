@@ -22,7 +22,7 @@ from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS
 from icrtool.alignment.log_track import FEWEST_WINDOWS
 from icrtool.alignment.turn_rates import Courses, Guess, TurnRate, fit_middle, measure_courses
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.heading_filter import (
+from icrtool.kernels.kalman import (
     HeadingEvents,
     HeadingModel,
     filter_headings,

@@ -10,7 +10,7 @@ import numpy as np
 from icrtool.alignment.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
-from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS, STEP
+from icrtool.estimation.run_filter import LARGEST_POSITION_MPS, STEP
 from icrtool.kernels.arrays import Bytes, Floats
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.records.measurements import Finding

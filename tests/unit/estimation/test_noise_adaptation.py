@@ -11,8 +11,7 @@ import pytest
 from icrtool.config import load_config
 from icrtool.estimation.filter_setup import FIELD_NOISE, PAPER_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
-from icrtool.estimation.noise_adaptation import find_noise, innovation_cost
-from icrtool.estimation.run_filter import noise_of, set_up_again
+from icrtool.estimation.run_filter import find_noise, innovation_cost, noise_of, set_up_again
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GATED
 from icrtool.records.run import Run
@@ -114,7 +113,7 @@ def test_a_clean_drive_takes_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
         passes.append(given)
         return run_ekf(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("icrtool.estimation.noise_adaptation.run_ekf", counted)
+    monkeypatch.setattr("icrtool.estimation.run_filter.run_ekf", counted)
     fit(make_log(), load_config(sets=[WIDTH]))
     assert len(passes) == 1
 

@@ -13,7 +13,7 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.estimation.filter_setup import FIELD_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
-from icrtool.estimation.noise_adaptation import LARGEST_POSITION_MPS
+from icrtool.estimation.run_filter import LARGEST_POSITION_MPS
 from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
 from icrtool.kernels.filter_records import GATED, UNSEEN, USED
 from icrtool.output.tables.dropout import format_dropout

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.kernels.heading_filter import HeadingEvents, HeadingModel, filter_headings, smooth_headings
+from icrtool.kernels.kalman import HeadingEvents, HeadingModel, filter_headings, smooth_headings
 
 
 def events(n: int = 30, seed: int = 6, k: int = 3) -> HeadingEvents:
