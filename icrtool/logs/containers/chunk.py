@@ -10,6 +10,7 @@ from __future__ import annotations
 import bz2
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import lz4.frame
@@ -49,8 +50,7 @@ class DecompressionError(Exception):
 class Space:
     """Memory that is used again and again: fresh memory of the system costs as much as reading a file into it."""
 
-    def __init__(self) -> None:
-        self._bytes: Bytes = np.empty(0, np.uint8)
+    _bytes: Bytes = np.empty(0, np.uint8)
 
     def of(self, size: int) -> Bytes:
         """Return `size` bytes (size,), the same ones as before where there are as many."""
@@ -168,6 +168,7 @@ def _in_pieces(decoder: Any, data: Bytes, size: int) -> Bytes:  # noqa: ANN401 -
     return np.frombuffer(out, np.uint8)
 
 
+@dataclass(slots=True)
 class Inflation:
     """Limits what the chunks of a log are decompressed to, to a multiple of their size in the file.
 
@@ -176,8 +177,7 @@ class Inflation:
     left : bytes that the next ones may take in addition
     """
 
-    def __init__(self, left: int = FREE_BYTES) -> None:
-        self.left = left
+    left: int = FREE_BYTES
 
     def count(self, packed: int, unpacked: int) -> None:
         """Count what is decompressed [bytes].

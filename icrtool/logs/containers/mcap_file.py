@@ -35,9 +35,8 @@ if TYPE_CHECKING:
 
 MAGIC = b"\x89MCAP0\r\n"
 PIECE_BYTES = 1 << 22
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = (
-    2, 3, 4, 5, 6, 7, 8, 11, 15
-)  # fmt: skip
+_SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
+_FOOTER, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 7, 8, 11, 15
 """Operation codes of records."""
 
 _HEAD, _INDEX_HEAD = struct.Struct("<BQ"), struct.Struct("<BQHI")

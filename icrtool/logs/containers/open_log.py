@@ -321,10 +321,9 @@ class BagDirectory(Container):
     def span_ns(self) -> tuple[int, int] | None:
         """Return first and last log time of all files, None where one of them has no index."""
         known = [span for part in self._parts.values() if (span := part.span_ns()) is not None]
-        if not known or len(known) < len(self._parts):
+        if len(known) < len(self._parts):
             return None
-        begins, ends = zip(*known, strict=True)
-        return min(begins), max(ends)
+        return min(begin for begin, _ in known), max(end for _, end in known)
 
     def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages of the wanted channels, file by file.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import bz2
 import hashlib
 import lzma
+import math
 import re
 import secrets
 import shutil
@@ -206,10 +207,10 @@ class _Stream:
 
     Parameters
     ----------
-    size : of the part of `source` that it is; None: all
+    size : of the part of `source` that it is, by default all [bytes]
     """
 
-    def __init__(self, source: Readable, budget: _Budget, size: int | None = None) -> None:
+    def __init__(self, source: Readable, budget: _Budget, size: float = math.inf) -> None:
         # What a decoder gives at once is kept where the next bytes are damaged.
         self._read: Callable[[int], bytes] = getattr(source, "read1", source.read)
         self._budget, self._left, self._head = budget, size, b""
@@ -219,8 +220,7 @@ class _Stream:
         if self._head:
             piece, self._head = self._head[:count], self._head[count:]
             return piece
-        if self._left is not None:
-            count = min(count, self._left)
+        count = int(min(count, self._left))
         if self._budget.trouble or not count:
             return b""
         try:
@@ -230,10 +230,9 @@ class _Stream:
                 raise  # of the disk, not of the data
             self._budget.stop(f"{CUT_OFF} or damaged ({err})")
             return b""
-        if self._left is not None:
-            self._left -= len(piece)
-            if not piece:
-                self._budget.stop(CUT_OFF)
+        self._left -= len(piece)
+        if not piece and self._left < math.inf:
+            self._budget.stop(CUT_OFF)
         self._budget.left -= len(piece)
         if self._budget.left < 0:
             self._budget.stop(f"more than {LARGEST_RATIO} times its size when unpacked")
@@ -248,10 +247,10 @@ class _Stream:
             count -= len(piece)
         return b"".join(pieces)
 
-    def skip(self, count: int | None = None) -> None:
-        """Pass over the next `count` bytes; None: over all."""
-        while count != 0 and (piece := self.read(_PIECE_BYTES if count is None else min(count, _PIECE_BYTES))):
-            count = None if count is None else count - len(piece)
+    def skip(self, count: float = math.inf) -> None:
+        """Pass over the next `count` bytes, by default over all."""
+        while count and (piece := self.read(int(min(count, _PIECE_BYTES)))):
+            count -= len(piece)
 
     def start(self) -> bytes:
         """Return the first 512 bytes, which stay there to be read."""

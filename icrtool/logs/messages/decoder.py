@@ -188,7 +188,7 @@ class Decoder:
 
     Attributes
     ----------
-    slots : the wanted fields that the messages have, by path; by default those of the layout
+    slots : the wanted fields that the messages have, by path
     columns : what holds the messages
     """
 
@@ -196,9 +196,6 @@ class Decoder:
     slots: Mapping[str, Slot] = field(default_factory=dict)
     columns: type[Decoded] = field(default_factory=lambda: Decoded)
     _known: list[Shape] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.slots = self.slots or self.layout.slots
 
     def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, Decoded]]:
         """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
@@ -379,4 +376,5 @@ def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:
         The layout of the channel's type is not known.
     """
     encoding: Literal["cdr", "ros1"] = "cdr" if channel.encoding == "cdr" else "ros1"
-    return Decoder(compile_layout(ros_definitions(channel), channel.message_type, wanted, encoding))
+    layout = compile_layout(ros_definitions(channel), channel.message_type, wanted, encoding)
+    return Decoder(layout, layout.slots)

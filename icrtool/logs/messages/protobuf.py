@@ -121,9 +121,10 @@ def _descriptor_set() -> WantedFields:
     message.add("name", 1, _STRING)
     message.add("field", 2, _MESSAGE, described)
     message.add("nested_type", 3, _MESSAGE, message)
-    for name, number, kind in (("name", 1, _STRING), ("number", 3, _INT32), ("label", 4, _INT32), ("type", 5, _INT32),
-                               ("type_name", 6, _STRING), ("oneof_index", 9, _INT32)):  # fmt: skip
-        described.add(name, number, kind)
+    for name, number in {"name": 1, "type_name": 6}.items():
+        described.add(name, number, _STRING)
+    for name, number in {"number": 3, "label": 4, "type": 5, "oneof_index": 9}.items():
+        described.add(name, number, _INT32)
     return files
 
 
@@ -207,25 +208,25 @@ def wanted_fields(descriptors: Descriptors, name: str, paths: Sequence[Sequence[
     return node
 
 
+@dataclass(slots=True)
 class ProtobufParser:
     """Takes the wanted fields of messages.
 
-    Parameters
+    Attributes
     ----------
     most_fields, most_elements : of a message, and of one field; with more fields it is unreadable
     """
 
-    def __init__(
-        self, wanted: WantedFields, most_fields: int = MOST_WIRE_FIELDS, most_elements: int = MOST_ELEMENTS
-    ) -> None:
-        self._wanted, self._most_fields, self._most_elements = wanted, most_fields, most_elements
-        self._left = 0
+    wanted: WantedFields
+    most_fields: int = MOST_WIRE_FIELDS
+    most_elements: int = MOST_ELEMENTS
+    _left: int = 0
 
     def parse(self, data: bytes) -> dict[str, Any] | None:
         """Return the wanted values of a message, None where it cannot be read."""
-        self._left = self._most_fields
+        self._left = self.most_fields
         try:
-            return self._message(data, 0, len(data), self._wanted, dict(self._wanted.default))
+            return self._message(data, 0, len(data), self.wanted, dict(self.wanted.default))
         except (_UnreadableError, IndexError, RecursionError):
             return None
 
@@ -247,7 +248,7 @@ class ProtobufParser:
                 values = _values(data, one, wire, begin, end)
             if not one.repeated:
                 into[one.name] = values[-1]
-            elif len(kept := into.setdefault(one.name, [])) < self._most_elements:
+            elif len(kept := into.setdefault(one.name, [])) < self.most_elements:
                 kept += values
         return into
 
