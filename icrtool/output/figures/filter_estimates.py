@@ -90,9 +90,8 @@ def icr_clusters(run: Run) -> Figure:
     settled = run.settled_s
     after = run.table.t_s >= settled
     mean, std = run.document.icr.mean, run.document.icr.std
-    spread = (f"{ICR_WORDS[column]} ±{std[column]:.3f} m" for column in ICR_COLUMNS if mean[column] is not None)
-    known = any(mean[column] is not None for column in ICR_COLUMNS)
-    title = f"The ICRs scatter by {', '.join(spread)}" if known else "No ICR is shown"
+    spread = [f"{ICR_WORDS[column]} ±{std[column]:.3f} m" for column in ICR_COLUMNS if mean[column] is not None]
+    title = f"The ICRs scatter by {', '.join(spread)}" if spread else "No ICR is shown"
     subtitle = f"{run_title(run.document)}: estimates from {settled:.1f} s on"
     figure = style.new_figure(title, subtitle, height_in=3.9, margins_in=(0.75, 0.2, 1.0, 0.9))
     panels = figure.subplots(1, 3, sharey=True)

@@ -95,17 +95,16 @@ def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator
     """Yield each topic that is used, or those that come nearest to it, and how many others there are."""
     used: set[str] = set()
     if log is not None:
-        uses = [(stream.topic, ROLE_WORDS[stream.role]) for stream in log.streams]
-        uses += [(log.gyro.topic, "gyro")] if log.gyro is not None else []
+        words: dict[str, list[str]] = {}
         for stream in log.streams:
-            if stream.topic not in used:
-                used.add(stream.topic)
-                first, *more = [word for topic, word in uses if topic == stream.topic]
-                also = f" ({', '.join(more)} too)" if more else ""
-                yield first, f"{stream.topic}{also}: {stream.rate_hz:.4g} Hz; {stream.why}"
-        if log.gyro is not None and log.gyro.topic not in used:
-            used.add(log.gyro.topic)
-            yield "gyro", f"{log.gyro.topic}: turn rates; not used by the filter"
+            words.setdefault(stream.topic, []).append(ROLE_WORDS[stream.role])
+        if log.gyro is not None:
+            words.setdefault(log.gyro.topic, []).append("gyro")
+        why = {stream.topic: f"{stream.rate_hz:.4g} Hz; {stream.why}" for stream in reversed(log.streams)}
+        for topic, (first, *more) in words.items():
+            also = f" ({', '.join(more)} too)" if more else ""
+            yield first, f"{topic}{also}: {why.get(topic, 'turn rates; not used by the filter')}"
+        used |= words.keys()
     elif survey is not None:
         for role, sources in survey.candidates.items():
             used |= {sources[0].topic} if sources else set()
