@@ -167,7 +167,8 @@ def _csv_chunks(table: States) -> Iterator[bytes]:
         stamps = np.ascontiguousarray(table.stamp_ns[rows])
         numbers = np.stack([columns[name][rows] for name in FLOAT_COLUMNS], 1, dtype=np.float64)
         if np.isfinite(numbers).all():
-            texts = orjson.dumps(numbers, option=orjson.OPT_SERIALIZE_NUMPY)[2:-2].split(b"],[")
+            # To find one byte is faster than the three between rows: each row begins with two that are left out.
+            texts = [row[2:] for row in orjson.dumps(numbers, option=orjson.OPT_SERIALIZE_NUMPY).split(b"]")[:-2]]
         else:  # JSON has no word for what is not finite
             texts = [",".join(map(repr, row)).encode() for row in numbers.tolist()]
         stamp_texts = orjson.dumps(stamps, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].split(b",")
