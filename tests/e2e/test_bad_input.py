@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -644,3 +645,19 @@ def test_info_of_a_log_without_heading_and_wheel_radius_states_what_is_missing(i
     assert status == 1
     assert "cannot be fitted: robot.wheel_radius_m" in out
     assert "all three overlap" not in out
+
+
+@pytest.mark.parametrize("few", [{name: count} for name in ("wheel", "gnss", "heading") for count in (1, 2)], ids=str)
+def test_info_of_a_log_with_hardly_a_sample_is_no_traceback(icrtool, tmp_path: Path, few: dict[str, int]) -> None:
+    _, out, _ = icrtool("info", str(log(tmp_path, first(drive(), **few))), *ROBOT)
+    assert re.match("verdict +(cannot be fitted|not usable|can be fitted, not all ICRs are shown)", out), out
+
+
+def test_info_of_a_log_without_messages_lists_no_topic(icrtool, tmp_path: Path) -> None:
+    with (tmp_path / "empty.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.finish()
+    status, out, _ = icrtool("info", str(tmp_path / "empty.mcap"), "-v")
+    assert status == 1
+    assert "no candidate" in out

@@ -10,6 +10,7 @@ import bz2
 import hashlib
 import lzma
 import math
+import os
 import re
 import secrets
 import shutil
@@ -374,7 +375,19 @@ class _FrugalFile:
 
     def __init__(self, file: BufferedReader) -> None:
         self._file = file
-        self.seek, self.tell, self.seekable, self.close = file.seek, file.tell, file.seekable, file.close
+        self.tell, self.seekable, self.close = file.tell, file.seekable, file.close
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        """Go to a place.
+
+        Raises
+        ------
+        zipfile.BadZipFile
+            It is before the file.
+        """
+        if whence == os.SEEK_SET and offset < 0:
+            raise zipfile.BadZipFile("its directory names a place before the file")
+        return self._file.seek(offset, whence)
 
     def read(self, count: int = -1, /) -> bytes:
         """Return the next bytes.

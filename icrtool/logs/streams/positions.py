@@ -388,7 +388,7 @@ def _links(table: TopicTable) -> dict[str, _Link]:
     """Return the frames that a topic holds by name, without their leading slash."""
     parents, parent_names = table.words(TRANSFORM_FIELDS[0])
     children, child_names = table.words(TRANSFORM_FIELDS[1])
-    numbers = np.stack([table.floats(path) for path in TRANSFORM_FIELDS[2:]], axis=-1)
+    numbers = np.stack([table.column(path) for path in TRANSFORM_FIELDS[2:]], axis=-1)
     length, size = (np.abs(part).max(axis=-1) for part in (numbers[..., :3], numbers[..., 3:]))
     sound = (length < LARGEST_TRANSLATION_M) & (size > 0.01) & (size < 100.0)  # a unit quaternion, or nearly
     all_rows, all_places = np.nonzero((children >= 0) & sound)

@@ -100,7 +100,8 @@ def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator
             words.setdefault(stream.topic, []).append(ROLE_WORDS[stream.role])
         if log.gyro is not None:
             words.setdefault(log.gyro.topic, []).append("gyro")
-        why = {stream.topic: f"{stream.rate_hz:.4g} Hz; {stream.why}" for stream in reversed(log.streams)}
+        rates = {one.topic: f"{one.rate_hz:.4g} Hz; " if one.rate_hz is not None else "" for one in log.streams}
+        why = {stream.topic: rates[stream.topic] + stream.why for stream in reversed(log.streams)}
         for topic, (first, *more) in words.items():
             also = f" ({', '.join(more)} too)" if more else ""
             yield first, f"{topic}{also}: {why.get(topic, 'turn rates; not used by the filter')}"
@@ -123,7 +124,7 @@ def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | N
     chosen = {stream.role: stream for stream in log.streams} if log is not None else {}
     if survey is not None:
         rows = [(one.topic, one.message_type, _topic_text(one)) for one in survey.topics]
-        yield Section(f"Topics of {path}", [Table("l", rows)], VERBOSE)
+        yield Section(f"Topics of {path}", [Table("l", rows) if rows else "  none"], VERBOSE)
     for role, word in ROLE_WORDS.items():
         stream, sources = chosen.get(role), survey.candidates[role] if survey is not None else ()
         blocks = ["  no candidate"] if survey is not None and not sources else []

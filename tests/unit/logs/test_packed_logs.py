@@ -283,6 +283,18 @@ def test_an_encrypted_archive_is_refused_in_one_line(tmp_path):
         open_log(path)
 
 
+def test_an_archive_whose_entries_begin_before_the_file_is_damaged(tmp_path):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.mcap", b"x")
+    data = bytearray(path.read_bytes())
+    end = data.index(b"PK\5\6")
+    data[end + 16 : end + 20] = (10_000).to_bytes(4, "little")
+    path.write_bytes(data)
+    with pytest.raises(LogError, match="does not decompress"):
+        open_log(path)
+
+
 def test_compressed_logs_in_a_folder_are_a_recording_each(tmp_path):
     for name in ("mon.mcap.zst", "tue.bag.gz", "wed/log.db3.lz4", "notes.txt.gz"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -42,13 +42,14 @@ def transform(parent: str, child: str, i: int, place: Any, turn: Rotation) -> An
     return TYPES["geometry_msgs/msg/TransformStamped"](header, child, moved)
 
 
-def write(path: Path, messages: Sequence[tuple[str, str, int, Any]]) -> Path:
+def write(path: Path, messages: Sequence[tuple[str, str, int, Any]], *, lacking: str = "") -> Path:
+    """Write a log; a field of its definitions that is to be lacking has another name."""
     with path.open("wb") as stream:
         writer, channels = McapWriter(stream), dict[str, int]()
         writer.start()
         for topic, name, i, message in messages:
             if topic not in channels:
-                text = STORE.generate_msgdef(name, ros_version=2)[0].encode()
+                text = STORE.generate_msgdef(name, ros_version=2)[0].replace(f" {lacking}\n", " other\n").encode()
                 channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(name, "ros2msg", text))
             stamp_ns = START_NS + i * STEP_NS
             writer.add_message(channels[topic], stamp_ns, bytes(STORE.serialize_cdr(message, name)), stamp_ns)
@@ -116,6 +117,12 @@ def test_transforms_that_are_no_reference_are_refused_with_the_reason(
     survey = surveyed(write(tmp_path / "log.mcap", messages))
     assert survey.candidates.gnss == ()
     assert reason in survey.candidates.unread["/tf"]
+
+
+def test_transforms_whose_definition_lacks_a_part_are_refused_with_the_reason(tmp_path: Path) -> None:
+    survey = surveyed(write(tmp_path / "log.mcap", odometry(root="map"), lacking="translation"))
+    assert survey.candidates.gnss == ()
+    assert "transform.translation.x" in survey.candidates.unread["/tf"]
 
 
 def test_transforms_are_not_read_where_a_topic_is_the_position(tmp_path: Path) -> None:
