@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,11 +43,19 @@ SHORTEST_BASELINE_M = 0.2
 LEAST_ATTITUDE_STD_RAD = math.radians(0.01)
 
 
-def antenna_heading(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | None, float]:
-    """Return the bearing from the chosen antenna to the furthest other one, and the baseline's length [m]; None, 0."""
+class AntennaPair(NamedTuple):
+    """Bearing from the chosen antenna to another one, the topic of that, and how far it is [m]."""
+
+    bearing: AbsoluteHeading
+    topic: str
+    baseline_m: float
+
+
+def antenna_pair(log: RobotLog, turn: TurnRate) -> AntennaPair | None:
+    """Return the bearing to the furthest other antenna; None where none shows one."""
     mine, epoch = log.gnss, int(log.wheels.stamp_ns[0])
-    best: tuple[AbsoluteHeading | None, float] = None, 0.0
-    for other in (receiver.fixes for receiver in log.other_receivers):
+    best: AntennaPair | None = None
+    for topic, other in ((receiver.topic, receiver.fixes) for receiver in log.other_receivers):
         if min(len(mine.stamp_ns), len(other.stamp_ns)) < 2:
             continue
         t, s = (mine.stamp_ns - epoch) / 1e9, (other.stamp_ns - epoch) / 1e9
@@ -57,10 +66,10 @@ def antenna_heading(log: RobotLog, turn: TurnRate) -> tuple[AbsoluteHeading | No
         length = float(np.median(np.abs(line))) if len(line) > 1 else 0.0
         noise = math.hypot(fix_std_m(mine), fix_std_m(other))
         good = np.abs(np.abs(line) - length) < max(5.0 * noise, 0.05 * length)
-        short = length < max(SHORTEST_BASELINE_M, 4.0 * noise, best[1])
+        short = length < max(SHORTEST_BASELINE_M, 4.0 * noise, best.baseline_m if best is not None else 0.0)
         if not short and np.count_nonzero(good) >= len(good) / 2:
             found = _averaged(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
-            best = found._replace(std=noise / length * found.std), length
+            best = AntennaPair(found._replace(std=noise / length * found.std), topic, length)
     return best
 
 
@@ -148,15 +157,15 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     if found is not None and (alive or _follows_wheels(found, track, width_m, log)):
         return found
     turn = wheel_rate(track, width_m)
-    pair, length = antenna_heading(log, turn)
-    estimate = estimate_heading(track, turn, [pair] if pair is not None else [], stands=False)
+    pair = antenna_pair(log, turn)
+    estimate = estimate_heading(track, turn, [pair.bearing] if pair is not None else [], stands=False)
     if estimate is not None and (found is None or estimate.median_std < found.estimate.median_std):
         why = "no turn rate in the log"
         if found is not None:
             why = "the turn rate drifts more"
         elif log.gyros:
             why = "the turn rate does not cover enough of the drive"
-        return _derived(log, estimate, turn, None, length, None, instead=why)
+        return _derived(log, estimate, turn, None, pair, None, instead=why)
     if found is None:
         refuse_standing(log)
         raise DataError(
@@ -214,20 +223,20 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
             noise = mad_std(np.angle(np.exp(1j * (step - np.median(step))))) / math.sqrt(2.0) if len(step) else 0.0
             std = np.full(len(one.t), max(noise, LEAST_ATTITUDE_STD_RAD))
             absolute.append(one._replace(std=std, aligned_std=ATTITUDE_STD_RAD))
-        pair, length = antenna_heading(log, turn)
-        absolute += [pair] if pair is not None else []
+        pair = antenna_pair(log, turn)
+        absolute += [pair.bearing] if pair is not None else []
         estimate = estimate_heading(track, turn, absolute)
         if estimate is None:
             continue
         topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
         if best is None or estimate.median_std < best.estimate.median_std:
-            best = _derived(log, estimate, turn, topic, length, stated)
+            best = _derived(log, estimate, turn, topic, pair, stated)
     return best
 
 
 def _derived(
     log: RobotLog, estimate: HeadingEstimate, turn: TurnRate, gyro_topic: str | None,
-    baseline_m: float, stated: HeadingSamples | None, instead: str = "",
+    pair: AntennaPair | None, stated: HeadingSamples | None, instead: str = "",
 ) -> DerivedHeading:  # fmt: skip
     """Return the record of an estimate; `instead` is why the wheels' turn is used and no gyro's."""
     epoch = int(log.wheels.stamp_ns[0])
@@ -235,10 +244,10 @@ def _derived(
     parts = [bias if gyro_topic else f"wheels ({instead})", "course over ground"]
     names = [gyro_topic or "wheels", log.topic("gnss", "positions")]
     source = "gyro_course" if gyro_topic else "wheels_course"
-    if baseline_m > 0.0:
+    if pair is not None:
         source = "antenna_pair"
-        parts.insert(0, f"two antennas {baseline_m:.2f} m apart")
-        names.insert(0, log.other_receivers[0].topic)
+        parts.insert(0, f"two antennas {pair.baseline_m:.2f} m apart")
+        names.insert(0, pair.topic)
     attitude, attitude_offset = None, None
     if stated is not None:
         source = "fused"

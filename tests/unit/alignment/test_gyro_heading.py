@@ -104,6 +104,16 @@ def with_second_antenna(log: RobotLog, truth: Truth, seed: int) -> RobotLog:
     return replace(log, other_receivers=(OtherReceiver("/rear", other),))
 
 
+def test_the_antenna_that_gives_the_heading_is_the_one_that_is_named() -> None:
+    log, truth = without_heading(3)
+    far = with_second_antenna(log, truth, 3)
+    [rear] = far.other_receivers
+    beside = OtherReceiver("/beside", replace(log.gnss, north_m=log.gnss.north_m + 0.01))
+    found = derive_heading(replace(far, other_receivers=(beside, rear)), WIDTH_M)
+    assert found.source == "antenna_pair"
+    assert found.topic.startswith("/rear + ")
+
+
 def with_mean_rates(log: RobotLog, truth: Truth, seed: int) -> RobotLog:
     """Return the log with a gyro that gives means over the interval before its stamps, or after them."""
     gyro, (stamps, psi) = log.gyros[0], truth
