@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -69,14 +67,9 @@ def calibrate_command(
         raise click.UsageError("--plot and --x-icr are for one log")
     if output is not None:
         formats.calibration_file(output)
-    finished = all(run_directory.is_run_directory(source) for source in sources)
-    if finished:
+    if all(run_directory.is_run_directory(source) for source in sources):
         check_run_config(config)
-    with ThreadPoolExecutor(1) as other:
-        if finished:
-            # takes as long as to read a run of an hour, most of which is done outside of the interpreter
-            other.submit(import_module, "icrtool.calibration.pooled")
-        runs = runs_of(sources, config, printer)
+    runs = runs_of(sources, config, printer)
     sensors = None
     if len(runs) == 1:
         printer.warn_of(runs[0])
