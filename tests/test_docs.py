@@ -20,7 +20,7 @@ from icrtool.cli.commands import icrtool as command_line
 from icrtool.config import Config, builtin_robots
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
-from icrtool.output.text_format import format_configuration
+from icrtool.output.tables.configuration import format_configuration
 
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = re.compile(r"icrtool/[a-z-]+/\d+")

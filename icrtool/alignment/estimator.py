@@ -261,7 +261,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
 
 
 class MotionOfWindows:
-    """Residuals of the windows and their Jacobian."""
+    """The motion that parameters expect: residuals of the windows with their Jacobian, place and turn to each fix."""
 
     def __init__(self, windows: DriveWindows, width_m: float) -> None:
         self.track, self.windows, self.b = windows.track, windows, width_m

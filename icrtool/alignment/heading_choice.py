@@ -66,7 +66,7 @@ def antenna_pair(log: RobotLog, turn: TurnRate) -> AntennaPair | None:
         length = float(np.median(np.abs(line))) if len(line) > 1 else 0.0
         noise = math.hypot(fix_std_m(mine), fix_std_m(other))
         good = np.abs(np.abs(line) - length) < max(5.0 * noise, 0.05 * length)
-        short = length < max(SHORTEST_BASELINE_M, 4.0 * noise, best.baseline_m if best is not None else 0.0)
+        short = length < max(SHORTEST_BASELINE_M, 4.0 * noise) or (best is not None and length <= best.baseline_m)
         if not short and np.count_nonzero(good) >= len(good) / 2:
             found = _averaged(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
             best = AntennaPair(found._replace(std=noise / length * found.std), topic, length)

@@ -135,12 +135,12 @@ def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) ->
     quiet : (m,) knots that the model's error is taken from; it is this quantile of what they show
     """
     windows, distance2, false_rate, error = _weigh(knots, motion, quiet, quantile)
-    row, everything = np.arange(len(knots.t)), np.ones(len(knots.t), np.bool_)
+    row, outside = np.arange(len(knots.t)), np.ones(len(knots.t), np.bool_)
     if not len(windows.begin):
-        return [], everything
+        return [], outside
     steps = compare(knots, motion, row[:-1], row[1:], RESPONSE_S)
     whole = knots.holes[1:] == knots.holes[:-1]
-    free, quiet, events = whole.copy(), everything, list[SlipEvent]()
+    free, events = whole.copy(), list[SlipEvent]()
     tests = max(1.0, float(knots.t[-1] - knots.t[0]) / WINDOWS_S[0])
     # the clearest first
     for at in np.argsort(-distance2, kind="stable"):
@@ -151,7 +151,7 @@ def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) ->
         if extent is None or not _is_slip(knots, steps, extent):
             continue
         free[extent.first : extent.last] = False
-        quiet[max(extent.first - 1, 0) : extent.last + 2] = False
+        outside[max(extent.first - 1, 0) : extent.last + 2] = False
         far = float(distance2[at])
         # the probability that chi-squared with 3 degrees of freedom is larger
         tail = math.erfc(math.sqrt(far / 2)) + math.sqrt(2 * far / math.pi) * math.exp(-far / 2)
@@ -167,7 +167,7 @@ def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) ->
                 confidence=(1.0 - float(false_rate[at])) * max(0.0, 1.0 - tests * tail),
             )
         )
-    return sorted(events, key=lambda event: event.begin_ns), quiet
+    return sorted(events, key=lambda event: event.begin_ns), outside
 
 
 def _weigh(

@@ -1,4 +1,4 @@
-"""What is known of the wheels: scales of the sides; dead, copied, held and fused encoders; a robot on a stand.
+"""What is known of the wheels: scales of the sides; dead, copied, held and fused encoders.
 
 Wheels that another filter made are low-passed, or turn by a heading from elsewhere. Wheels that slip lose or gain turn
 for good: how far their turn is from the heading's grows like a random walk. What a filter smooths, delays or pulls back

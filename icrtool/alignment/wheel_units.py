@@ -1,4 +1,7 @@
-"""Wheel speeds in m/s of what a log sends: metres per unit by the configuration, else by the position reference."""
+"""Wheel speeds in m/s of what a log sends: metres per unit by the configuration, else by the position reference.
+
+A robot that stands, or is on a stand, shows none: it is refused here.
+"""
 
 from __future__ import annotations
 

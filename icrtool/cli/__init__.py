@@ -122,8 +122,7 @@ def when_used() -> Iterator[None]:
     So the help of a command loads no numpy, pandas or pyarrow. Two threads must not be the first to use a module.
     Packages are loaded at once: `icrtool.output.figures`, which loads matplotlib, is imported where it is used.
     """
-    # Before that of files, the last one.
-    sys.meta_path.insert(-1, _Unloaded)
+    sys.meta_path.insert(sys.meta_path.index(PathFinder), _Unloaded)
     try:
         yield
     finally:

@@ -135,7 +135,7 @@ def run_all(
     ----------
     folder : on disk, that stands for the place of the results
     """
-    # Loaded from here on: at a signal, nothing can be loaded any more.
+    # Not one of those that are loaded when used: at a signal, nothing can be loaded any more.
     from icrtool.fleet.processes import executor_of
 
     rows: list[FleetLog] = []

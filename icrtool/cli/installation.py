@@ -20,7 +20,7 @@ from icrtool.output.text_blocks import Line, Table
 
 with when_used():
     from icrtool import config
-    from icrtool.output import text_format
+    from icrtool.output.tables import configuration
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
@@ -64,7 +64,7 @@ def config_command(settings: ConfigSources, output: Path | None) -> None:
       icrtool config --robot husky-a200 -o my-husky.toml
       icrtool fit field.mcap --config my-husky.toml
     """  # noqa: D301 - click reads the escape
-    write_or_print(text_format.format_configuration(settings.load()), output)
+    write_or_print(configuration.format_configuration(settings.load()), output)
 
 
 @click.group("cache")
@@ -120,19 +120,20 @@ def call_all_kernels() -> None:
     from icrtool.simulation.drives import DrivePlan, Sensors, simulate
     from icrtool.simulation.studies import default_request, run_study
 
-    robot = icrtool.load_config(robot="husky-a200")
+    config = icrtool.load_config(robot="husky-a200")
     columns, _ = simulate(DrivePlan(motor_lag_s=0.1), Sensors(), 0)
-    writing = WriteOptions(
-        wheel_radius_m=robot.robot.wheel_radius_m or 0.0, track_width_m=robot.robot.track_width_m or 0.0
-    )
+    robot = config.robot
+    assert robot.wheel_radius_m is not None  # noqa: S101 - for the type checker
+    assert robot.track_width_m is not None  # noqa: S101 - as above
+    writing = WriteOptions(wheel_radius_m=robot.wheel_radius_m, track_width_m=robot.track_width_m)
     with tempfile.TemporaryDirectory() as folder, unfinished(Path(folder)):
-        log = icrtool.read_log(write_log(Path(folder) / "drive.mcap", columns, writing), robot)
-    run = icrtool.fit(log, robot)
+        log = icrtool.read_log(write_log(Path(folder) / "drive.mcap", columns, writing), config)
+    run = icrtool.fit(log, config)
     icrtool.dropout(run)
     smooth(run)
     track = track_of(run)
     open_loop_errors_direct(track, FrozenIcrs.constant(0.4, -0.4, 0.0), trial_ends(track, np.array([1.0])))
-    request = default_request("consistency", robot)
+    request = default_request("consistency", config)
     run_study(replace(request, runs=1, plan=replace(request.plan, duration_s=10.0)))
 
 

@@ -13,7 +13,7 @@ from icrtool.cli import options, when_used
 from icrtool.cli.inputs import RUNS, runs_of, runs_or_logs
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, flag, option
 from icrtool.cli.printing import Printer
-from icrtool.records.places import UrlPath, place_of
+from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of
 from icrtool.records.text import LogText
 
 with when_used():
@@ -25,7 +25,7 @@ with when_used():
     from icrtool.output.files import atomic, formats
     from icrtool.output.page import pages, render
     from icrtool.output.tables import calibration as tables
-    from icrtool.records import calibration_document, fleet_document, places
+    from icrtool.records import calibration_document, fleet_document
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
@@ -77,8 +77,8 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
             inside = source if source.is_dir() else None
             comparison = formats.read_document(file, calibration_document.GroupComparison, inside)
             return pages.comparison_page(comparison, file.stem)
-    if places.is_special(source):
-        raise errors.RunError(source, places.NOT_REGULAR, places.SAVE_IT)
+    if is_special(source):
+        raise errors.RunError(source, NOT_REGULAR, SAVE_IT)
     what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
     raise errors.RunError(source, what, "icrtool fit, batch and compare make one")
 

@@ -19,6 +19,7 @@ with when_used():
     from icrtool import errors
     from icrtool.logs import write_log
     from icrtool.output import simulation_files
+    from icrtool.output.tables import study as study_tables
     from icrtool.simulation import drives, studies
 
 if TYPE_CHECKING:
@@ -321,9 +322,7 @@ def study_command(
     with printer.progress(f"study {name}") as progress:
         result = studies.run_study(asked, progress)
     simulation_files.write_study(result, directory, plots=plots)
-    from icrtool.output.figures.study import study_blocks
-
-    printer.show(study_blocks(result))
+    printer.show(study_tables.study_blocks(result))
     printer.text(f"\nwritten to {directory}")
     printer.detail(f"settings: {asked.settings()}")
 

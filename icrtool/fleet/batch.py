@@ -213,12 +213,7 @@ def _all_of(
 def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
     """Return whether a log's files are those of an earlier batch; content is compared where their time differs."""
     if isinstance(path, UrlPath):
-        try:
-            now = RemoteFile(path)
-        except LogError:
-            return False
-        version = next(iter(now.version.values()), "")
-        return bool(stored and version) and (now.size, version) == (stored[0].bytes, stored[0].version)
+        return bool(stored) and _is_unchanged(stored[0], path)
     try:
         files = files_of_log(path)
         if [as_text(file.name) for file in files] != [Path(file.path).name for file in stored]:
@@ -231,3 +226,13 @@ def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
     except OSError:
         return False
     return True
+
+
+def _is_unchanged(before: FleetFile, path: UrlPath) -> bool:
+    """Return whether what lies at an address has the size and version that it had."""
+    try:
+        now = RemoteFile(path)
+    except LogError:
+        return False
+    version = next(iter(now.version.values()), "")
+    return bool(version) and (now.size, version) == (before.bytes, before.version)

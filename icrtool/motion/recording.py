@@ -1,4 +1,7 @@
-"""Data to fit and test motion models: wheel speeds, reference, gyro; windows of distance, and open-loop trials."""
+"""Data to fit and test motion models: wheel speeds, reference, gyro; windows of distance, and open-loop trials.
+
+The gyro is compared with the heading by one line, which alignment uses too.
+"""
 
 from __future__ import annotations
 

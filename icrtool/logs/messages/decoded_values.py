@@ -1,4 +1,7 @@
-"""Messages that are decoded one by one, JSON, Protobuf and NMEA sentences: the wanted values of each, as columns."""
+"""Messages that are decoded one by one, JSON, Protobuf and NMEA sentences: the wanted values of each, as columns.
+
+Also which fields a channel's type has, by its schema or its definition.
+"""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
     Moving transforms are taken where no topic can be the position: reading them takes longer than the rest of a log. An
     odometry that is no reference by name does not count.
     """
-    topics, wanted, transforms = config.topics, {}, {}
+    topics, wanted, static, moving = config.topics, {}, {}, {}
     sides = side_fields(channels, topics)
     has_position = any(
         one.message_type in MESSAGE_TYPES["gnss"]
@@ -99,12 +99,13 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
         if paths:
             wanted[channel.id] = tuple(dict.fromkeys([*HEADER, *paths]))
         if is_static(channel):
-            transforms[channel.id] = TRANSFORM_FIELDS
+            static[channel.id] = TRANSFORM_FIELDS
         elif channel.message_type in TRANSFORM_TYPES and (
             topics.gnss == channel.topic or not (has_position or topics.gnss)
         ):
-            transforms[channel.id] = (*TRANSFORM_FIELDS, *TRANSFORM_STAMP)
-    return wanted | transforms
+            moving[channel.id] = (*TRANSFORM_FIELDS, *TRANSFORM_STAMP)
+    # of one frame in both, the moving transform counts
+    return wanted | static | moving
 
 
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:

@@ -86,10 +86,8 @@ def format_export(calibration: Calibration, target: Target) -> str:
     if errors is None:
         advice = "covariances need a longer drive"
         raise DataError(calibration.name or calibration.log_names(), "too short to measure the error growth", advice)
-    begin_ns, distance_m = (
-        min(log.begin_ns for log in calibration.logs),
-        sum(log.distance_m for log in calibration.logs),
-    )
+    begin_ns = min(log.begin_ns for log in calibration.logs)
+    distance_m = sum(log.distance_m for log in calibration.logs)
     date = "at an unknown date"
     if begin_ns:
         date = datetime.fromtimestamp(begin_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -154,8 +152,9 @@ def _parameters(calibration: Calibration, errors: ControllerErrors, target: Targ
         f"# of velocities over {TWIST_OVER_M:g} m",
         f"twist_covariance_diagonal: {twist}",
     ]
-    *_, last = place = CONTROLLER_PLACES[target]
-    return [*place, *textwrap.indent("\n".join(lines), " " * (len(last) - len(last.lstrip()) + 2)).splitlines()]
+    place = CONTROLLER_PLACES[target]
+    indent = len(place[-1]) - len(place[-1].lstrip()) + 2
+    return [*place, *textwrap.indent("\n".join(lines), " " * indent).splitlines()]
 
 
 def _header(calibration: Calibration, errors: ControllerErrors, driven: str) -> list[str]:

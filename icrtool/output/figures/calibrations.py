@@ -139,7 +139,7 @@ def transfer(found: GroupComparison) -> Figure:
     matrix.grid(visible=False)
     labels = []
     for y, one in enumerate(rows):
-        calibrated, tested = short[names.index(one.calibrated_on)], short[names.index(one.tested_on)]
+        calibrated, tested = (style.drawable(name, LONGEST_NAME) for name in (one.calibrated_on, one.tested_on))
         labels.append(f"{calibrated} on {tested}, {one.horizon_m:g} m")
         if one.p95_low_m is not None and one.p95_high_m is not None:
             costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **style.ICR | {"linestyle": "-"})

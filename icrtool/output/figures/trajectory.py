@@ -64,12 +64,12 @@ def trajectory(run: Run) -> Figure:
     table = run.table
     every = -(-len(table) // MOST_STATES)
     paths = {name: drive_wheels(table, run.in_gap, icrs, every) for name, icrs in odometry_icrs(run).items()}
-    lowest, highest = _corners(table)
-    detour = LARGEST_DETOUR * max(float((highest - lowest).max()), SMALLEST_DRIVE_M)
-    lows, highs = zip((lowest, highest), *map(_corners, paths.values()), strict=True)
-    lowest = np.maximum(np.min(lows, axis=0), lowest - detour)
-    highest = np.minimum(np.max(highs, axis=0), highest + detour)
-    norths, easts = np.column_stack([lowest, highest])
+    low, high = _corners(table)
+    detour = LARGEST_DETOUR * max(float((high - low).max()), SMALLEST_DRIVE_M)
+    lows, highs = zip((low, high), *map(_corners, paths.values()), strict=True)
+    norths, easts = np.column_stack(
+        [np.maximum(np.min(lows, axis=0), low - detour), np.minimum(np.max(highs, axis=0), high + detour)]
+    )
     width_in = style.WIDTH_IN - MARGINS_IN[0] - MARGINS_IN[1]
     box_in = fitted_box_in(norths, easts, width_in)
     ends = {"the final ICRs": run.document.odometry.icr, "no slip": run.document.odometry.no_slip}

@@ -212,8 +212,8 @@ def _keep_foreign(place: Path, partial: Path, names: Collection[str]) -> str:
     """
     new, there = files_in(partial), files_in(place)
     parents = {parent for path in there for parent in path.parents}
-    listed = {parent / name for parent in parents for name in own_files(place / parent).files}
-    own = {path for path in there if path.name == OWN_FILES or str(path) in names or path in listed}
+    of_lists = {parent / name for parent in parents for name in own_files(place / parent).files}
+    own = {path for path in there if path.name == OWN_FILES or str(path) in names or path in of_lists}
     removed = [path for path in there if path in own and path not in new and path.name != OWN_FILES]
     foreign = [path for path in there if path not in own]
     kept = [path for path in foreign if not os.path.lexists(partial / path)]

@@ -175,11 +175,19 @@ class _Store:
         if parts is None:
             found = self._done(lambda: self._files.find(self._name))
         else:
-            found = self._done(lambda: self._files.find(self._name, maxdepth=1))
+            found = self._done(self._at_top)
             found += self._done(lambda: [name for part in parts for name in self._files.find(self._of(part))])
         if found == [self._name]:
             raise OutputError(self._place, "a file is there", "name another place")
         return [name.removeprefix(f"{self._name}/") for name in found]
+
+    def _at_top(self) -> list[str]:
+        # `find` with a depth lists all files at az://, and passes over errors at s3://.
+        try:
+            entries = self._files.ls(self._name, detail=True)
+        except FileNotFoundError:
+            return []
+        return [entry["name"] for entry in entries if entry["type"] == "file"]
 
     def _of(self, name: str) -> str:
         return f"{self._name}/{name}" if name else self._name

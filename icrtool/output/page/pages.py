@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 from urllib.parse import quote
@@ -282,10 +283,9 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
     distances = dict.fromkeys(name for log in logs for name in log.errors if "_within_" in name)
     by_model = ([name for name in distances if name.startswith(f"{model}_within_")] for model in MODEL_WORDS)
     budgets = next(filter(None, by_model), [])
-    columns: dict[str, Cell] = {}
+    numbers_of = [_columns(log, budgets) for log in logs]
     rows, search = [], []
-    for log in logs:
-        columns = _columns(log, budgets)
+    for log, columns in zip(logs, numbers_of, strict=True):
         status = Cell("not usable", note=log.reason) if log.status == "done" and not log.usable else log.status
         names = [getattr(log, key) for key in named]
         page = PurePosixPath(log.run) / PAGE_FILE
@@ -299,7 +299,7 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
     caption = (
         f"One line a log; its name opens its page. Errors: 95 % of the trials of {CHOICE_HORIZON_M:g} m stay below."
     )
-    head = ("log", "status", *named, *columns)
+    head = ("log", "status", *named, *next(iter(numbers_of), ()))
     return Table(f"ll{'l' * len(named)}r", rows, head, caption, search=search)
 
 
@@ -308,7 +308,7 @@ def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
     columns = {}
     for name in budgets:
         bound, budget = "> " if name in log.bounds else "", name.rpartition("_within_")[2].removesuffix("m_m")
-        columns[f"within {budget} m for"] = _cell(log.errors.get(name), f"{bound}{{:.1f}} m".format)
+        columns[f"within {budget} m for"] = _cell(log.errors.get(name), partial("{}{:.1f} m".format, bound))
     for model, label in MODEL_WORDS.items():
         columns[f"error, {label}"] = _cell(log.errors.get(f"{model}_p95_{CHOICE_HORIZON_M:g}m_m"), error_text)
     columns["multiplier"] = _with_std(log.multiplier, log.multiplier_std, "")

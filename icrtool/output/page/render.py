@@ -108,10 +108,21 @@ def _environment() -> Environment:
         # A name may be broken behind its underscores, on a narrow screen.
         "breakable": lambda name: Markup("_<wbr>").join(map(escape, escaped(name).split("_"))),
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}",
+        "grouped": _grouped,
         "kind": lambda block: type(block).__name__,
         "named": lambda pictures, names: [one for name, one in pictures.items() if name.startswith(names)],
     }
     return environment
+
+
+def _grouped(rows: Sequence[tuple[str, str]]) -> list[tuple[str, list[str]]]:
+    """Return labelled sentences by label; one without a label belongs to that before it."""
+    found: list[tuple[str, list[str]]] = []
+    for name, text in rows:
+        if name or not found:
+            found.append((name, []))
+        found[-1][1].append(text)
+    return found
 
 
 def _static(name: str) -> str:

@@ -102,7 +102,8 @@ def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
     ]
     rows = []
     for key, one in calibration.parameters.items():
-        (form, unit), value = next(form for ending, form in FORMS.items() if key.endswith(ending)), "–"
+        form, unit = next(one for ending, one in FORMS.items() if key.endswith(ending))
+        value = "–"
         if one.value is not None:
             std = f" ± {one.std:{form.lstrip('+')}}" if one.verdict != "given" else ""
             value = f"{one.value:{form}}{std} {unit}".rstrip()

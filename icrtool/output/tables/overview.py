@@ -100,8 +100,10 @@ def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator
             words.setdefault(stream.topic, []).append(ROLE_WORDS[stream.role])
         if log.gyro is not None:
             words.setdefault(log.gyro.topic, []).append("gyro")
-        rates = {one.topic: f"{one.rate_hz:.4g} Hz; " if one.rate_hz is not None else "" for one in log.streams}
-        why = {stream.topic: rates[stream.topic] + stream.why for stream in reversed(log.streams)}
+        why: dict[str, str] = {}
+        for stream in log.streams:
+            rate = f"{stream.rate_hz:.4g} Hz; " if stream.rate_hz is not None else ""
+            why.setdefault(stream.topic, rate + stream.why)
         for topic, (first, *more) in words.items():
             also = f" ({', '.join(more)} too)" if more else ""
             yield first, f"{topic}{also}: {why.get(topic, 'turn rates; not used by the filter')}"

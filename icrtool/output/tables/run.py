@@ -12,6 +12,7 @@ import numpy as np
 from icrtool.alignment.corrections import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.observability import lacking_turns
+from icrtool.output.tables.configuration import format_settings
 from icrtool.output.text_blocks import (
     BRIEF_WIDTH,
     PAGE,
@@ -29,7 +30,6 @@ from icrtool.output.text_blocks import (
 from icrtool.output.text_format import (
     duration_text,
     error_text,
-    format_settings,
     jump_count,
     position_word,
     role_word,

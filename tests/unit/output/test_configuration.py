@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 import pytest
 
 from icrtool.config import SECTIONS, Config, key_texts, load_config, parse_config
-from icrtool.output.text_format import format_configuration
+from icrtool.output.tables.configuration import format_configuration
 
 KEYS = [(section, field.name) for section, kind in SECTIONS.items() for field in fields(kind)]
 

@@ -13,14 +13,7 @@ import pytest
 
 from icrtool.cli.printing import show
 from icrtool.errors import DataError, OutputError
-from icrtool.output.figures.study import (
-    finding_text,
-    runs_text,
-    study_blocks,
-    study_figure,
-    study_subtitle,
-    study_title,
-)
+from icrtool.output.figures.study import study_figure, study_subtitle, study_title
 from icrtool.output.figures.style import new_figure
 from icrtool.output.simulation_files import (
     check_study_target,
@@ -30,6 +23,7 @@ from icrtool.output.simulation_files import (
     write_study,
     write_truth,
 )
+from icrtool.output.tables.study import finding_text, runs_text, study_blocks
 from icrtool.output.text_blocks import Table, format_blocks
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, simulate
 from icrtool.simulation.studies import STUDIES, run_study
