@@ -88,7 +88,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used, so that ``icrtool --help`` loads no numba."""
+    """Import a public name when it is first used, so that ``icrtool --help`` loads no numpy."""
     if name == "figures":
         return importlib.import_module("icrtool.figures")
     home = _HOMES.get(name)

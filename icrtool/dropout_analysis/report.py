@@ -1,8 +1,7 @@
 """The dropout report, and what it is compared with: budgets, acceptance limits for CI, an earlier report.
 
 `DropoutReport` is what `icrtool.dropout` and `icrtool.dropout_report` return. It stands here and not among the records
-because it holds a calibration, which is made of fits. No code that makes it is here, and no kernel: a process that only
-draws it need not load numba.
+because it holds a calibration, which is made of fits. No code that makes it is here, and no kernel.
 """
 
 from __future__ import annotations

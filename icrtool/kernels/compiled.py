@@ -17,6 +17,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, TypeVar, cast
@@ -44,6 +45,7 @@ _POINTER, _INTEGER, _FLOAT, _BOOL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_do
 _LLVM_TYPES = {_POINTER: "ptr", _INTEGER: "i64", _FLOAT: "double", _BOOL: "i8"}
 _SCALARS = {"bool": _BOOL, "int": _INTEGER, "float": _FLOAT, "NoneType": _POINTER}
 _RESULTS = {"none": None, "int64": _INTEGER, "float64": _FLOAT}
+_DEBUGGING = ("NUMBA_BOUNDSCHECK", "NUMBA_DEBUGINFO")
 _RETURNED = (0, -2)
 """What machine code returns where it raised no exception: it has a result, or None."""
 
@@ -80,24 +82,25 @@ class _Arguments:
             for one in value:
                 self._add(one)
         else:
-            plain = value.item() if isinstance(value, np.generic) else value
+            plain: Any = value.item() if isinstance(value, np.generic) else value
             name = type(plain).__name__
+            if name not in _SCALARS or (name == "int" and not -(2**63) <= plain < 2**63):
+                raise TypeError(f"a kernel takes no {name} like {plain!r}")
             self.types.append(name)
             self.words.append(plain)
             self.forms.append(_SCALARS[name])
 
 
 class MachineCode(NamedTuple):
-    """A compiled kernel: the name of its function, what that returns (a key of `_RESULTS`), target, and object file."""
+    """A compiled kernel: the name of its function, what that returns (a key of `_RESULTS`), and the object file."""
 
     name: str
     result: str
-    target: str
     content: bytes
 
     def written(self) -> bytes:
         """Return the bytes of its file: a digest of what follows, a line for each text, the object file."""
-        rest = b"\n".join([*(text.encode() for text in self[:3]), self.content])
+        rest = b"\n".join([self.name.encode(), self.result.encode(), self.content])
         return hashlib.sha256(rest).digest() + rest
 
     @classmethod
@@ -106,13 +109,13 @@ class MachineCode(NamedTuple):
         with suppress(OSError):
             data = file.read_bytes()
             if hashlib.sha256(data[32:]).digest() == data[:32]:
-                name, result, target, content = data[32:].split(b"\n", 3)
-                return cls(name.decode(), result.decode(), target.decode(), content)
+                name, result, content = data[32:].split(b"\n", 2)
+                return cls(name.decode(), result.decode(), content)
         return None
 
     def function(self, forms: Sequence[Any]) -> Callable[[Sequence[object]], Result]:
         """Return what runs it, given the words of its arguments, which have these C types."""
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(self.target))
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
         engine.add_object_file(llvm.ObjectFileRef.from_data(self.content))
         engine.finalize_object()
         run = ctypes.CFUNCTYPE(ctypes.c_int32, _POINTER, _POINTER, *forms)(engine.get_function_address(self.name))
@@ -121,7 +124,7 @@ class MachineCode(NamedTuple):
         def call(words: Sequence[object], _: object = engine) -> Result:
             returned, raised = (result or _INTEGER)(), _POINTER()
             if run(ctypes.byref(returned), ctypes.byref(raised), *words) not in _RETURNED:
-                raise RuntimeError(f"{self.name} raised an exception")
+                raise RuntimeError(f"{self.name} raised an exception: kernels must not")
             return returned.value if result else None
 
         return call
@@ -144,11 +147,13 @@ class Kernel:
         functools.update_wrapper(self, function)
 
     def __call__(self, *values: object) -> Result:
-        """Run the machine code for arguments of these types."""
+        """Run the machine code for arguments of these types; the Python function where ``NUMBA_DISABLE_JIT`` is 1."""
+        if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
+            return cast(Result, self.py_func(*values))
         arguments = _Arguments(values)
         types = tuple(arguments.types)
-        if types not in self._functions:
-            with _lock:
+        with _lock:
+            if types not in self._functions:
                 code = self._machine_code(types, values, arguments)
                 self._functions[types] = code and code.function(arguments.forms)
         run = self._functions[types]
@@ -166,7 +171,7 @@ class Kernel:
         """Return the machine code that is kept, or that numba makes now; None where numba alone can run it."""
         name = f"{self.py_func.__module__.rpartition('.')[2]}.{self.py_func.__qualname__}"
         file = f"{name}-{hashlib.sha256(repr((_stamp(), types)).encode()).hexdigest()[:24]}.o"
-        for place in places():
+        for place in places() if _stamp() else ():
             if kept := MachineCode.read(place / file):
                 return kept
         self.compiled += 1
@@ -187,9 +192,9 @@ class Kernel:
         returned = str(numba.types.unliteral(result))
         if not called <= _MATHEMATICS or len(entries) != 1 or returned not in _RESULTS:
             return None
-        content = _machine(module.triple, numba.config.OPT).emit_object(module)
-        code = MachineCode(entries[0], returned, module.triple, content)
-        _keep(file, code.written())
+        code = MachineCode(entries[0], returned, _machine(numba.config.OPT).emit_object(module))
+        if _stamp():
+            _keep(file, code.written())
         return code
 
 
@@ -200,7 +205,7 @@ def _writable(value: object) -> object:
     if isinstance(value, tuple):
         made = tuple(_writable(one) for one in value)
         return value._make(made) if hasattr(value, "_make") else made
-    return value
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _numba() -> ModuleType:
@@ -224,18 +229,21 @@ def _numba() -> ModuleType:
     return numba
 
 
-def _machine(target: str, level: int = 0) -> llvm.TargetMachine:
-    """Return what makes machine code for a target, with a level of optimisation."""
+def _machine(level: int = 0) -> llvm.TargetMachine:
+    """Return what makes machine code for this processor, with a level of optimisation."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = processor()
-    return llvm.Target.from_triple(target).create_target_machine(
+    return llvm.Target.from_default_triple().create_target_machine(
         cpu=name, features=features, opt=level, codemodel="jitdefault", jit=True
     )
 
 
 def processor() -> tuple[str, str]:
-    """Return the name of the processor that is compiled for, and its features, as numba chooses them."""
+    """Return the name of the processor that is compiled for, and its features.
+
+    By numba's settings for both, of which ``NUMBA_ENABLE_AVX`` counts for what numba itself runs alone.
+    """
     name = os.environ.get("NUMBA_CPU_NAME") or llvm.get_host_cpu_name()
     own = "" if name == "generic" else llvm.get_host_cpu_features().flatten()
     return name, os.environ.get("NUMBA_CPU_FEATURES", own)
@@ -243,10 +251,19 @@ def processor() -> tuple[str, str]:
 
 @functools.cache
 def _stamp() -> tuple[str, ...]:
-    """Return what machine code depends on: the compiler, the processor, and all kernels, as one holds what it calls."""
+    """Return what machine code depends on: all kernels, as one holds what it calls, compiler, target and processor.
+
+    Empty where nothing is to be kept: the kernels' sources cannot be read, or numba compiles for a debugger.
+    """
     files = sorted(Path(__file__).parent.rglob("*.py"))
-    kernels = hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
-    return kernels, llvmlite.__version__, *processor()
+    if not files or any(os.environ.get(name, "0") not in {"", "0"} for name in _DEBUGGING):
+        return ()
+    numba = find_spec("numba")
+    if numba is not None and numba.origin is not None:
+        # its version, without importing it
+        files.append(Path(numba.origin).with_name("_version.py"))
+    sources = hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
+    return sources, llvmlite.__version__, llvm.get_default_triple(), *processor()
 
 
 def places() -> list[Path]:
@@ -254,9 +271,10 @@ def places() -> list[Path]:
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(given)]
     found = [Path(__file__).parent / "__pycache__"]
+    users = Path(os.environ.get("XDG_CACHE_HOME", ""))
     # a container's user may have no home
     with suppress(RuntimeError):
-        found.append(Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "icrtool")
+        found.append((users if users.is_absolute() else Path("~/.cache").expanduser()) / "icrtool")
     return found
 
 
@@ -272,13 +290,16 @@ def writable_place() -> Path | None:
 
 def _keep(name: str, content: bytes) -> None:
     """Keep a file where it can be; on a full disk, or where nothing can be written, it serves this process alone."""
-    if place := writable_place():
-        # as readable as other files: who builds an image is not who runs it
-        temporary = place / f"{name}.{os.getpid()}"
+    place = writable_place()
+    if place is None:
+        return
+    # as readable as other files: who builds an image is not who runs it
+    temporary = place / f"{name}.{os.urandom(8).hex()}"
+    with suppress(OSError):
         try:
             temporary.write_bytes(content)
             temporary.replace(place / name)
-        except OSError:
+        finally:
             temporary.unlink(missing_ok=True)
 
 

@@ -2,7 +2,7 @@
 
 Errors are float64 (n_starts, n_horizons) [m] with NaN where there was no trial, as `icrtool.kernels.open_loop` makes
 them. Trials from neighbouring starts share most of their path and are not independent: intervals come from blocks of
-path, not from trials. No kernel is here: who only reads or draws the records need not load numba.
+path, not from trials. No kernel is here.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Records of the filter: its constants, inputs, outputs, state. No kernel is here: to read them loads no numba."""
+"""Records of the filter: its constants, inputs, outputs, state. No kernel is here."""
 
 from __future__ import annotations
 

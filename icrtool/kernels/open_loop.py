@@ -89,7 +89,7 @@ def compiled_columns(track: Track) -> Columns:
 
     Notes
     -----
-    A read-only column (pandas hands those out) would be another type to numba, and cost a second compilation.
+    Kernels refuse a read-only column, as pandas hands those out.
     """
     columns = (track.held, track.v_left, track.v_right, track.north, track.east, track.heading)
     held, left, right, north, east, heading = (np.require(one, np.float64, ["C", "A", "W"]) for one in columns)

@@ -1,7 +1,4 @@
-"""Parts of a dropout report, for tables, files and figures.
-
-No kernel is here: a process that only draws them need not load numba.
-"""
+"""Parts of a dropout report, for tables, files and figures."""
 
 from __future__ import annotations
 

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -94,13 +96,71 @@ def test_machine_code_takes_what_the_python_function_takes(given: tuple[Any, ...
     assert kernel.compiled == 0
 
 
-def test_numba_runs_what_machine_code_cannot_do_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    # as where a version of numba passes arguments in another way, or its code calls functions of its own
-    monkeypatch.setattr(compiled, "_MATHEMATICS", set())
+def test_numba_runs_what_it_passes_arguments_to_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(compiled._LLVM_TYPES, compiled._INTEGER, "i128")
     kernel = njit(weigh)
     assert kernel(*arguments()) == pytest.approx(weigh(*arguments()), abs=1e-12)
     assert not list(places()[0].glob("*"))
+
+
+def rise(value: float) -> float:
+    return math.log1p(value)
+
+
+def test_numba_runs_what_calls_more_than_the_known_functions() -> None:
+    assert njit(rise)(0.5) == pytest.approx(math.log1p(0.5))
+    assert not list(places()[0].glob("*"))
+
+
+def double(value: float) -> float:
+    return value * 2
+
+
+def test_numbers_of_numpy_are_taken_as_those_of_python() -> None:
+    kernel = njit(double)
+    assert [kernel(one) for one in (np.uint64(3), -1, np.float32(0.5), 0.25)] == [6, -2, 1.0, 0.5]
+    assert kernel.compiled == 2
+    assert len(list(places()[0].glob("*.o"))) == 2
+
+
+@pytest.mark.parametrize("wrong", ["text", 2**63, [1.0]], ids=repr)
+def test_what_no_kernel_takes_is_refused(wrong: object) -> None:
+    with pytest.raises(TypeError, match="a kernel takes no"):
+        njit(double)(wrong)
+
+
+@pytest.mark.parametrize(("name", "compiles"), [("NUMBA_DISABLE_JIT", 0), ("NUMBA_BOUNDSCHECK", 1)])
+def test_nothing_is_kept_of_what_numba_does_to_find_faults(
+    monkeypatch: pytest.MonkeyPatch, name: str, compiles: int
+) -> None:
+    monkeypatch.setenv(name, "1")
+    compiled._stamp.cache_clear()
+    kernel = njit(double)
+    assert kernel(2.0) == 4.0
+    compiled._stamp.cache_clear()
+    assert kernel.compiled == compiles
+    assert not list(places()[0].glob("*"))
+
+
+def test_code_for_another_processor_or_target_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for name in ("get_default_triple", "get_host_cpu_name"):
+        compiled._stamp.cache_clear()
+        found.append(compiled._stamp())
+        with monkeypatch.context() as patch:
+            patch.setattr(compiled.llvm, name, lambda: "another")
+            compiled._stamp.cache_clear()
+            found.append(compiled._stamp())
+    compiled._stamp.cache_clear()
+    assert len(set(found)) == 3
+
+
+def test_threads_compile_a_kernel_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", os.devnull + "/cache")
+    kernel = njit(double)
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(kernel, [1.0, 2.0, 3.0, 4.0])) == [2.0, 4.0, 6.0, 8.0]
+    assert kernel.compiled == 1
 
 
 def test_an_array_that_machine_code_would_misread_is_refused() -> None:
