@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from struct import Struct
 from typing import Any, NamedTuple
@@ -39,7 +40,7 @@ _HEADER_BYTES = 1 << 12
 _LENGTH = Struct("<I")
 _NONE: Ints = np.empty(0, np.int64)
 _MOST_FIELDS = 100
-"""Of a header; real ones have ten at most."""
+"""Of a header outside chunks; real ones have ten at most."""
 
 _MOST_HEADERS = 1 << 4
 """Kinds of headers in a chunk that all records are compared with; further ones are read one by one."""
@@ -71,17 +72,14 @@ class _Record(NamedTuple):
 def _fields(header: bytes) -> Iterator[tuple[bytes, int, int]]:
     """Yield the fields of a record's or a connection's header: name, and begin and end of the value."""
     end = 0
-    for _ in range(_MOST_FIELDS):
-        begin = end + 4
-        if begin > len(header):
-            break
+    while (begin := end + 4) <= len(header):
         end = begin + _LENGTH.unpack_from(header, begin - 4)[0]
         name, equals, _ = header[begin:end].partition(b"=")
         yield name, begin + len(name + equals), end
 
 
 def _header_fields(header: bytes) -> dict[bytes, bytes]:
-    return {name: header[begin:end] for name, begin, end in _fields(header)}
+    return {name: header[begin:end] for name, begin, end in islice(_fields(header), _MOST_FIELDS)}
 
 
 def _message_index(index: bytes) -> tuple[Ints, Ints]:
@@ -115,7 +113,8 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
         values = [(name, begin + 4) for name, begin, end in _fields(header) if end - begin == _VALUES.get(name)]
         fields = {name: at for name, at in values if at + _VALUES[name] <= size - 4}
         same, end = np.ones(len(heads), np.bool_), 0
-        for name, at in [*fields.items(), (b"", size - 4)]:
+        # Sorted: a name that stands there twice is where it came first in the dict, with the place of its last value.
+        for name, at in [*sorted(fields.items(), key=lambda one: one[1]), (b"", size - 4)]:
             if at > end:
                 parts = _strided(heads, end, f"V{at - end}")
                 same &= parts == parts[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from mcap.writer import IndexType, Writer
@@ -238,16 +240,18 @@ def mcap_chunk(rng, count=12):
     return b"".join(parts)
 
 
-def bag_chunk(rng, count=12):
-    def field(name, value):
-        return (len(name) + 1 + len(value)).to_bytes(4, "little") + name + b"=" + value
+def bag_record(fields, content=b""):
+    parts = (name + b"=" + value for name, value in fields)
+    header = b"".join(len(part).to_bytes(4, "little") + part for part in parts)
+    return len(header).to_bytes(4, "little") + header + len(content).to_bytes(4, "little") + content
 
+
+def bag_chunk(rng, count=12):
     parts = []
     for row in range(count):
-        header = field(b"op", b"\x07" if row % 5 == 4 else b"\x02") + field(b"conn", rng.bytes(4))
-        header += field(b"time", rng.bytes(8)) if row % 5 != 4 else field(b"topic", b"/a")
-        content = rng.bytes(int(rng.integers(0, 60)))
-        parts.append(len(header).to_bytes(4, "little") + header + len(content).to_bytes(4, "little") + content)
+        fields = [(b"op", b"\x07" if row % 5 == 4 else b"\x02"), (b"conn", rng.bytes(4))]
+        fields.append((b"time", rng.bytes(8)) if row % 5 != 4 else (b"topic", b"/a"))
+        parts.append(bag_record(fields, rng.bytes(int(rng.integers(0, 60)))))
     return b"".join(parts)
 
 
@@ -316,6 +320,28 @@ def test_scan_of_damaged_records_finds_those_before_the_damage(kind):
         assert ([other[1] for other in others], stop) == expected[1:]
         if turn % 4 == 0:
             assert (messages.shape[1] + len(others), stop) == (12, len(chunk))
+
+
+def numbered_fields(row):
+    return [(b"op", b"\x02"), (b"conn", row.to_bytes(4, "little")), (b"time", bytes(4) + row.to_bytes(4, "little"))]
+
+
+def test_of_a_name_that_stands_twice_in_a_header_the_last_value_counts_and_costs_no_time():
+    # Read one by one these take seconds.
+    chunk = b"".join(bag_record([*numbered_fields(row), (b"op", b"\x02")]) for row in range(50_000))
+    begin = time.process_time()
+    messages, others, stop = scan_bag(np.frombuffer(chunk, np.uint8), 0)
+    assert time.process_time() - begin < 0.5
+    expected = records_one_by_one("bag", chunk)
+    assert ([*map(tuple, messages.T.tolist())], others, stop) == expected
+
+
+@pytest.mark.parametrize("count", [10, 120])
+def test_a_message_may_have_any_number_of_fields_before_its_own(count):
+    more = [(b"field%d" % one, b"x") for one in range(count)]
+    chunk = b"".join(bag_record(more + numbered_fields(row)) for row in range(3))
+    messages, _, _ = scan_bag(np.frombuffer(chunk, np.uint8), 0)
+    assert messages[:2].tolist() == [[0, 1, 2], [0, 1, 2]]
 
 
 @pytest.mark.parametrize("kind", SCANS)
