@@ -102,6 +102,9 @@ class ChunkedFile(Container):
     """
 
     _chunks: Sequence[Chunk] | None = None
+    _learns = False
+    """Whether channels are still learned from records: while a file without an index is opened."""
+
     _chunk_head = 0
     """Bytes before the content of a chunk, in which its record begins."""
 
@@ -127,8 +130,10 @@ class ChunkedFile(Container):
                 raise NotByRangesError
             if self._chunks is None:
                 # Its records state what its channels are.
+                self._learns = True
                 for _ in self._read_in_order():
                     pass
+                self._learns = False
             self.channels = self._described_channels()
         except BaseException:
             self.close()
@@ -378,9 +383,8 @@ class ChunkedFile(Container):
     def _scanned(self, data: Bytes, begin: int = 0) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
         messages, others, stop = self._scan(data, begin, None)
-        if self._chunks is None:
-            for record in others:
-                self._learn(data, record)
+        for record in others if self._learns else ():
+            self._learn(data, record)
         return self._with_possible_times(Block(data, *messages)), stop
 
 

@@ -267,7 +267,7 @@ class Ros1Bag(ChunkedFile):
                 yield from self._read_chunk(Part(_chunk_of(record)._replace(is_cut=is_cut)), next(spaces))
             if is_cut:
                 break
-            if record.op == _CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
+            if self._learns and record.op == _CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
                 content = self._source.read_at(record.at, record.length)
                 self._connect(record.fields, content)
             at = record.at + record.length

@@ -468,6 +468,28 @@ def test_ros_1_bag_of_a_recorder_that_was_killed_is_read(tmp_path):
     )
 
 
+@pytest.mark.parametrize("kind", ["mcap", "loose mcap", "bag", "whole bag"])
+def test_what_the_channels_are_is_learned_once_when_a_log_without_an_index_is_opened(tmp_path, monkeypatch, kind):
+    messages, path = make_messages(), tmp_path / kind.replace(" ", ".")
+    if kind.endswith("mcap"):
+        write_mcap(path, messages, index_types=IndexType.NONE, use_chunking=kind == "mcap")
+    else:
+        whole = write_bag(path, messages).read_bytes()
+        at, index = index_place(whole)
+        path.write_bytes(patched(whole, at, bytes(8))[: index if kind == "bag" else None])
+    container = open_log(path)
+
+    def learned(*_):
+        pytest.fail("learned again")
+
+    for name in ("_learn", "_connect"):
+        monkeypatch.setattr(type(container), name, learned, raising=False)
+    topics = {channel.id: channel.topic for channel in container.channels}
+    numbers = [number for block in container.blocks(frozenset(topics)) for number in block.channel.tolist()]
+    container.close()
+    assert [topics[number] for number in numbers] == [topic for topic, *_ in messages]
+
+
 def test_ros_1_bag_takes_a_topics_name_from_the_record_when_there_is_no_index(tmp_path):
     messages = make_messages()
     whole = write_bag(tmp_path / "log.bag", messages).read_bytes()
