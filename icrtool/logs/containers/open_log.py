@@ -71,9 +71,9 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
         The path does not exist, the file is empty, is not a known container, or nothing in it can be read.
     """
     try:
-        why_fetched = ""
-        if isinstance(path, UrlPath):
-            opened = _by_ranges(path)
+        remote, why_fetched = RemoteFile(path) if isinstance(path, UrlPath) else None, ""
+        if remote is not None:
+            opened = _by_ranges(path, remote)
             if not isinstance(opened, str):
                 return opened
             why_fetched = opened
@@ -82,7 +82,7 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
         with ExitStack() as undo:
             scratch = ScratchFolder()
             undo.callback(scratch.close)
-            log, origin, distant = _brought(path, scratch.path, why_fetched, share)
+            log, origin, distant = _brought(path, scratch.path, remote, why_fetched, share)
             problem = ""
             try:
                 if _is_packed_file(log):
@@ -152,7 +152,8 @@ def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
         It cannot be read.
     """
     with closing(ScratchFolder()) as scratch:
-        file, origin, _ = _brought(path, scratch.path)
+        remote = RemoteFile(path) if isinstance(path, UrlPath) else None
+        file, origin, _ = _brought(path, scratch.path, remote)
         if _is_packed_file(file):
             file, problem = unpack(file, scratch.path / "unpacked")
             if problem:
@@ -160,9 +161,8 @@ def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
         yield file, (origin.inputs or inputs_of([path], Event()))[0]
 
 
-def _by_ranges(path: UrlPath) -> Container | str:
+def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:
     """Return the container of a file at an address, where it has an index; else why it has to be fetched."""
-    remote = RemoteFile(path)
     if remote.is_folder:
         return "SQLite files, or packed"
     if not remote.has_ranges:
@@ -184,20 +184,28 @@ def _by_ranges(path: UrlPath) -> Container | str:
 
 
 def _brought(
-    path: Path, folder: Path, why_fetched: str = "", share: Callable[[float], None] | None = None
+    path: Path,
+    folder: Path,
+    remote: RemoteFile | None,
+    why_fetched: str = "",
+    share: Callable[[float], None] | None = None,
 ) -> tuple[Path, Origin, Mapping[str, RemoteFile]]:
     """Return where a log lies on disk, perhaps packed: in a folder to which it was fetched or saved, if it did not.
+
+    Parameters
+    ----------
+    remote : what is at an address; None: the log is no address
 
     Returns
     -------
     log, where it came from, and those of its files that are read by ranges, as in `BagDirectory`
     """
     distant: dict[str, RemoteFile] = {}
-    if isinstance(path, UrlPath):
-        log, remote = folder / (path.name or "log"), RemoteFile(path)
+    if remote is not None:
+        log = folder / (path.name or "log")
         if remote.is_folder:
             log.mkdir()
-            inputs, distant = fetch_folder(path, log, share)
+            inputs, distant = fetch_folder(remote.path, log, share)
         else:
             inputs = (remote.fetch(log, share),)
         size = sum(one.bytes for one in inputs if one.sha256 is not None) / 1e6

@@ -235,6 +235,15 @@ def test_a_log_without_an_index_is_fetched_and_read_to_its_end(tmp_path):
         assert messages(UrlPath(f"{server.url}/cut.mcap")) == messages(tmp_path / "cut.mcap")
 
 
+def test_about_a_file_that_is_fetched_the_server_is_asked_once(tmp_path, monkeypatch):
+    (tmp_path / "packed.gz").write_bytes(gzip.compress(MCAP.read_bytes()))
+    made = []
+    monkeypatch.setattr(source, "_about", lambda path, about=source._about: made.append(path) or about(path))
+    with file_server(tmp_path) as server:
+        assert messages(UrlPath(f"{server.url}/packed.gz")) == messages(MCAP)
+    assert len(made) == 1
+
+
 def test_a_broken_connection_is_made_again(monkeypatch):
     monkeypatch.setattr(source, "PAUSES_S", (0.01, 0.01))
     with file_server(SAMPLES, broken=2) as server:
