@@ -171,7 +171,11 @@ def unpack_messages(
         kept: list[int] = []
         messages: list[bytes] = []
         held = 0
-        rows = np.flatnonzero(np.isin(block.channel, list(wanted)))
+        is_wanted = np.isin(block.channel, list(wanted))
+        if not is_wanted.any():
+            # With each block the reader asks how much of the log is read.
+            yield block.rows(is_wanted)
+        rows = np.flatnonzero(is_wanted)
         for row in rows.tolist():
             packed = block.data[block.start[row] : block.end[row]].tobytes()
             try:

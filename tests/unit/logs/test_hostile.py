@@ -377,6 +377,13 @@ def test_messages_that_each_inflate_a_thousand_times_are_left_out() -> None:
     assert "inflates" in said[0]
 
 
+def test_of_blocks_without_a_wanted_message_the_reader_learns_too() -> None:
+    none = np.empty(0, np.int64)
+    blocks = [Block(np.zeros(8, np.uint8), *([np.ones(1, np.int64)] * 4)), Block(np.empty(0, np.uint8), *([none] * 4))]
+    found = [*unpack_messages(iter(blocks), frozenset({0}), "zstd", pytest.fail)]
+    assert [len(one.channel) for one in found] == [0, 0]
+
+
 def test_a_name_of_megabytes_costs_no_time() -> None:
     assert len(LogText("n\x1b" * 10_000_000).raw) < 1000
 
