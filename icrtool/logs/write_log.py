@@ -56,7 +56,8 @@ class WriteOptions:
     track_width_m : b, by which a wheel controller divides for its angular velocity [m]
     counts_per_rev : encoder counts of one wheel revolution
     heading_std_deg : written as the orientation's covariance
-    definitions : False: only the names of the types are written, as in ROS 2 Humble and older (not in a ROS 1 bag)
+    definitions : False: only the names of the types are written, as in ROS 2 Humble and older (not in a ROS 1 bag,
+        and not with ``zstd-file``)
     """
 
     container: Container = "mcap"
@@ -77,6 +78,8 @@ class WriteOptions:
             raise ConfigError("compression", why, f"choose {', '.join(offered)}")
         if not self.definitions and self.container == "bag":
             raise ConfigError("definitions", "a ROS 1 bag always carries them", "choose mcap or db3 to leave them out")
+        if not self.definitions and self.compression == "zstd-file":
+            raise ConfigError("definitions", "a zstd-file log always carries them", "choose zstd to leave them out")
         for name in ("wheel_radius_m", "track_width_m", "counts_per_rev"):
             if not getattr(self, name) > 0:
                 raise ConfigError(name, f"{getattr(self, name)} is not a positive number")
@@ -322,9 +325,15 @@ def write_mcap(
 
 
 def write_rosbag(
-    path: Path, topics: Sequence[TopicMessages], store: Typestore, *, ros1: bool, compression: str, definitions: bool
+    path: Path,
+    topics: Sequence[TopicMessages],
+    store: Typestore,
+    *,
+    ros1: bool,
+    compression: Compression,
+    definitions: bool,
 ) -> None:
-    """Write one ROS 1 bag, or a ROS 2 bag directory with sqlite3 storage."""
+    """Write one ROS 1 bag, which always carries definitions, or a ROS 2 bag directory with sqlite3 storage."""
     from rosbags import rosbag1, rosbag2
 
     bag: Any
@@ -341,7 +350,7 @@ def write_rosbag(
         connections = [bag.add_connection(topic.topic, topic.message_type, typestore=store) for topic in topics]
         for index, stamp_ns, data in _in_time_order(topics):
             bag.write(connections[index], stamp_ns, data)
-    if not definitions:
+    if not (ros1 or definitions):
         with closing(sqlite3.connect(path / f"{path.name}.db3")) as database:
             database.executescript(_TO_SCHEMA_3)
 

@@ -287,6 +287,14 @@ def test_an_sqlite3_log_without_definitions_looks_like_humble(tmp_path):
     check_position(read_back(path, default_types=True), columns)
 
 
+def test_a_ros_1_bag_is_written_whatever_is_asked_about_definitions(tmp_path):
+    store = load_typestore(ros1=True)
+    plan = topic_plans(make_columns(), replace(OPTIONS, container="bag"))[0]
+    path, topics = tmp_path / "drive.bag", [writing_log.serialise_topic(plan, store, ros1=True)]
+    writing_log.write_rosbag(path, topics, store, ros1=True, compression="none", definitions=False)
+    assert stamps_of(read_back(path), plan.topic) == plan.stamp_ns.tolist()
+
+
 def test_an_mcap_without_definitions_has_empty_schemas(tmp_path):
     from mcap.reader import make_reader
 
@@ -356,6 +364,10 @@ def test_a_folder_that_does_not_exist_is_an_output_error(tmp_path):
             "compression: bz2 does not exist in a mcap log; choose none, lz4, zstd",
         ),
         ({"container": "bag", "definitions": False}, "definitions: a ROS 1 bag always carries them"),
+        (
+            {"container": "db3", "compression": "zstd-file", "definitions": False},
+            "definitions: a zstd-file log always carries them; choose zstd",
+        ),
         ({"wheel_radius_m": 0.0}, "wheel_radius_m: 0.0 is not a positive number"),
         ({"track_width_m": float("nan")}, "track_width_m: nan is not a positive number"),
     ],
