@@ -129,7 +129,10 @@ class Fix:
         return (*numbers, *covariance, self.solution.name)
 
     def read(self, table: TopicTable, _: Config) -> PositionSource:
-        """Return its positions; rows without a fix, not finite, far from the others or at 0, 0 are not usable."""
+        """Return its positions; usable: finite, with a fix, and if geodetic on earth, not at 0, 0, near the others.
+
+        Metric positions of goals, of dead reckoning and of frames whose z is not up are refused.
+        """
         first, second = (number(table, one, needed=True) for one in self.place[:2])
         third = number(table, self.place[2])
         no_fix, finite = ~all_valid(table, self.valid), np.isfinite(first) & np.isfinite(second)

@@ -229,7 +229,8 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
     except DefinitionError as err:
         return WheelMotion(topic=topic, message_type=kind, stamps=stamps, score=score, problem=err.why)
     moments, first, integer = times[both], lefts[both].astype(np.float64), lefts.dtype.kind == "i"
-    position = speed = None, None
+    not_recorded = (None, None)
+    position = speed = not_recorded
     unit: Unit = "unknown"
     if _is_position(left, lefts, config, integer=integer):
         unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"

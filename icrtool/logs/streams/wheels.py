@@ -178,6 +178,7 @@ def _by_wheel(values: NDArray[Any] | None, places: Ints) -> list[Floats]:
             columns.append(values[:, place[0]])
         else:
             column = np.full(len(values), np.nan)
+            # Where one row stands for all messages, none of them has a value of this wheel.
             if len(place) == len(column):
                 column[rows] = values[rows, place[rows]]
             columns.append(column)
