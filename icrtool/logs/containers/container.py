@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import repeat
 from pathlib import Path
 from threading import Event
 from typing import Literal, NamedTuple, TypeVar
@@ -144,15 +143,17 @@ def made_ahead(blocks: Iterator[Block], stop: Callable[[], object] | None = None
     ----------
     stop : called where no more blocks are wanted, to end the making of the next one
     """
-    try:
-        for _, made in ahead(lambda _: next(blocks, None), repeat(None), threads=1, count=1):
-            if (block := made()) is None:
-                break
-            yield block
-    except BaseException:
-        if stop is not None:
-            stop()
-        raise
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            pending = pool.submit(next, blocks, None)
+            while (block := pending.result()) is not None:
+                pending = pool.submit(next, blocks, None)
+                yield block
+        except BaseException:
+            # before the pool ends, which waits for the next block
+            if stop is not None:
+                stop()
+            raise
 
 
 def unpack_messages(

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from icrtool.errors import LogError
+from icrtool.logs.containers.container import Block, made_ahead
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 
@@ -544,3 +547,24 @@ def test_links_that_lead_nowhere_are_refused(tmp_path):
     for name in ("loop", "gone"):
         with pytest.raises(LogError):
             open_log(tmp_path / name)
+
+
+@pytest.mark.parametrize("leave", [GeneratorExit, KeyboardInterrupt])
+def test_the_block_that_is_being_made_is_ended_when_no_more_are_wanted(leave: type[BaseException]) -> None:
+    begun, stopped, none = Event(), Event(), np.zeros(0, np.int64)
+    block = Block(np.zeros(0, np.uint8), none, none, none, none)
+
+    def slow() -> Iterator[Block]:
+        yield block
+        begun.set()
+        stopped.wait(3.0)
+        yield block
+
+    blocks = made_ahead(slow(), stopped.set)
+    assert next(blocks) is block
+    assert begun.wait(3.0)
+    begin = time.monotonic()
+    with pytest.raises(leave):
+        blocks.throw(leave())
+    assert stopped.is_set()
+    assert time.monotonic() - begin < 1.5
