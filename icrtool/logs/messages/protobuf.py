@@ -14,8 +14,17 @@ from struct import Struct
 from typing import Any, NamedTuple
 
 from icrtool.errors import DefinitionError
-from icrtool.logs.messages.definitions import BASE, MOST_ELEMENTS, MOST_FIELDS, NAME, SEQUENCE, Definitions, Step
-from icrtool.records.text import LONGEST_TEXT
+from icrtool.logs.messages.definitions import (
+    BASE,
+    DEEPEST,
+    MOST_ELEMENTS,
+    MOST_FIELDS,
+    NAME,
+    SEQUENCE,
+    Definitions,
+    Step,
+)
+from icrtool.records.text import LONGEST_TEXT, LogText
 
 LONGEST_DESCRIPTORS = 1 << 20
 """Bytes of a FileDescriptorSet; that of all schemas of Foxglove has 60,000."""
@@ -101,10 +110,18 @@ def _wire_fields(data: bytes, at: int, stop: int) -> Iterator[tuple[int, int, in
 
 @dataclass(slots=True)
 class WantedFields:
-    """The wanted fields of a message: by number, each with those of the message in it; and values of lacking ones."""
+    """The wanted fields of a message.
+
+    Attributes
+    ----------
+    fields : by number, each with those of the message in it
+    default : values of lacking ones
+    is_lenient : whether what is no message where one is wanted is passed over; else it makes all unreadable
+    """
 
     fields: dict[int, tuple[ProtobufField, WantedFields | None]] = field(default_factory=dict)
     default: dict[str, Any] = field(default_factory=dict)
+    is_lenient: bool = False
 
     def add(self, name: str, number: int, kind: int, inner: WantedFields | None = None) -> None:
         """Add a field of a descriptor; those that hold messages are repeated."""
@@ -112,19 +129,26 @@ class WantedFields:
 
 
 def _descriptor_set() -> WantedFields:
-    """Return the wanted fields of a FileDescriptorSet, as google/protobuf/descriptor.proto has them."""
-    files, file, message, described = WantedFields(), WantedFields(), WantedFields(), WantedFields()
-    files.add("file", 1, _MESSAGE, file)
-    file.add("package", 2, _STRING)
-    file.add("message_type", 4, _MESSAGE, message)
-    file.add("syntax", 12, _STRING)
-    message.add("name", 1, _STRING)
-    message.add("field", 2, _MESSAGE, described)
-    message.add("nested_type", 3, _MESSAGE, message)
+    """Return the wanted fields of a FileDescriptorSet, as google/protobuf/descriptor.proto has them.
+
+    Of types within one another there is one more level than is read: it shows that there are too many.
+    """
+    files, file, described = WantedFields(is_lenient=True), WantedFields(), WantedFields()
     for name, number in {"name": 1, "type_name": 6}.items():
         described.add(name, number, _STRING)
     for name, number in {"number": 3, "label": 4, "type": 5, "oneof_index": 9}.items():
         described.add(name, number, _INT32)
+    message = WantedFields()
+    message.add("name", 1, _STRING)
+    for _ in range(DEEPEST):
+        nested, message = message, WantedFields()
+        message.add("name", 1, _STRING)
+        message.add("field", 2, _MESSAGE, described)
+        message.add("nested_type", 3, _MESSAGE, nested)
+    file.add("package", 2, _STRING)
+    file.add("message_type", 4, _MESSAGE, message)
+    file.add("syntax", 12, _STRING)
+    files.add("file", 1, _MESSAGE, file)
     return files
 
 
@@ -139,7 +163,7 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
     Raises
     ------
     DefinitionError
-        It cannot be read, is too large, or lacks the type.
+        It cannot be read, is too large, nests too many types, has too long a name, or lacks the type.
     """
     if len(text) > LONGEST_DESCRIPTORS:
         raise DefinitionError(message_type, f"the schema in the log has more than {LONGEST_DESCRIPTORS} bytes")
@@ -151,19 +175,28 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
     for file in described.get("file", ()):
         package = file.get("package", "")
         is_implicit = file.get("syntax") == "proto3"
-        _add_types(found, file.get("message_type", ()), f"{package}." if package else "", is_implicit=is_implicit)
+        _add_types(found, file.get("message_type", ()), f"{package}." if package else "", 1, is_implicit=is_implicit)
     if message_type not in found:
         raise DefinitionError(message_type, "the schema in the log lacks it")
     return found
 
 
 def _add_types(
-    found: dict[str, list[ProtobufField]], messages: Sequence[dict[str, Any]], prefix: str, *, is_implicit: bool
+    found: dict[str, list[ProtobufField]],
+    messages: Sequence[dict[str, Any]],
+    prefix: str,
+    depth: int,
+    *,
+    is_implicit: bool,
 ) -> None:
-    """Add descriptors of messages, and of those within them."""
+    """Add descriptors of messages, which lie in `depth` - 1 others, and of those within them."""
     for message in messages:
+        name = f"{prefix}{message.get('name', '')}"
         # a name of megabytes before each of thousands of types would fill the memory
-        name = f"{prefix}{message.get('name', '')}"[:LONGEST_TEXT]
+        if len(name) > LONGEST_TEXT:
+            raise DefinitionError(LogText(name), f"its name has more than {LONGEST_TEXT} characters", "it is not read")
+        if depth > DEEPEST:
+            raise DefinitionError(LogText(name), f"it lies within more than {DEEPEST - 1} messages", "it is not read")
         found[name] = [
             ProtobufField(
                 name=one.get("name", ""),
@@ -176,7 +209,7 @@ def _add_types(
             )
             for one in message.get("field", ())
         ]
-        _add_types(found, message.get("nested_type", ()), f"{name}.", is_implicit=is_implicit)
+        _add_types(found, message.get("nested_type", ()), f"{name}.", depth + 1, is_implicit=is_implicit)
 
 
 def definitions_in(descriptors: Descriptors) -> Definitions:
@@ -227,7 +260,7 @@ class ProtobufParser:
         self._left = self.most_fields
         try:
             return self._message(data, 0, len(data), self.wanted, dict(self.wanted.default))
-        except (_UnreadableError, IndexError, RecursionError):
+        except (_UnreadableError, IndexError):
             return None
 
     def _message(self, data: bytes, at: int, stop: int, node: WantedFields, into: dict[str, Any]) -> dict[str, Any]:
@@ -240,6 +273,8 @@ class ProtobufParser:
             one, inner = node.fields[number]
             if inner is not None:
                 if wire != _BYTES:
+                    if node.is_lenient:
+                        continue
                     raise _UnreadableError
                 before = None if one.repeated else into.get(one.name)
                 found = self._message(data, begin, end, inner, dict(inner.default) if before is None else before)

@@ -20,9 +20,10 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import LONGEST_MESSAGE_BYTES, number_fields
+from icrtool.logs.messages.definitions import DEEPEST
 from icrtool.logs.messages.protobuf import LONGEST_DESCRIPTORS, descriptors_of
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
-from icrtool.records.text import LogText
+from icrtool.records.text import LONGEST_TEXT, LogText
 from support.tables import collected
 
 LONGEST_S = 2.0
@@ -217,6 +218,7 @@ def varint(value: int) -> bytes:
 
 SCHEMAS = {
     "types within one another": nested(5000),
+    "as many as messages of ROS may nest, and one": nested(33),
     "many types": b"\x0a" + varint(5 * 60_000) + b"\x22\x03\x0a\x01T" * 60_000,
     "many fields": b"\x0a" + varint(6 + 5 * 60_000) + b"\x22" + varint(5 * 60_000) + b"\x12\x03\x0a\x01f" * 60_000,
     "too long": bytes(LONGEST_DESCRIPTORS + 1),
@@ -232,15 +234,41 @@ def test_a_schema_made_to_take_time_is_refused(raw: bytes) -> None:
     assert time.process_time() - begin < LONGEST_S
 
 
-def test_a_long_name_before_thousands_of_types_takes_no_memory() -> None:
+@pytest.mark.parametrize("depth", [1, 2, DEEPEST])
+def test_types_within_one_another_are_read_as_deep_as_messages_of_ros(depth: int) -> None:
+    names = [".".join("T" * count) for count in range(1, depth + 1)]
+    assert [*descriptors_of(nested(depth).decode("latin-1"), "T")] == names
+
+
+def part(number: int, content: bytes) -> bytes:
+    return varint(number << 3 | 2) + varint(len(content)) + content
+
+
+def test_a_long_name_before_thousands_of_types_is_refused_and_takes_no_memory() -> None:
     """Each of them has the name of the type that it lies in before its own; before, these took 2 GB."""
-
-    def part(number: int, content: bytes) -> bytes:
-        return varint(number << 3 | 2) + varint(len(content)) + content
-
     inner = b"".join(part(3, part(1, b"%d" % number)) for number in range(4000))
     raw = part(1, part(4, part(1, b"T")) + part(4, part(1, b"N" * 500_000) + inner))
-    assert sum(map(len, descriptors_of(raw.decode("latin-1"), "T"))) < 5_000_000
+    tracemalloc.start()
+    with pytest.raises(DefinitionError):
+        descriptors_of(raw.decode("latin-1"), "T")
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 20e6
+
+
+def test_types_of_long_names_stay_apart() -> None:
+    longest = "N" * (LONGEST_TEXT - 2)
+    raw = part(1, part(4, part(1, longest.encode()) + part(3, part(1, b"a")) + part(3, part(1, b"b"))))
+    assert {*descriptors_of(raw.decode("latin-1"), longest)} == {longest, f"{longest}.a", f"{longest}.b"}
+    over = part(1, part(4, part(1, longest.encode()) + part(3, part(1, b"aa"))))
+    with pytest.raises(DefinitionError, match="name"):
+        descriptors_of(over.decode("latin-1"), longest)
+
+
+@pytest.mark.parametrize("other", [b"\x08\x07", b"\x09" + bytes(8), b"\x0d" + bytes(4)], ids=["number", "64", "32"])
+def test_what_is_no_file_among_the_files_of_a_schema_is_passed_over(other: bytes) -> None:
+    raw = other + descriptor_pb2.FileDescriptorSet(file=[schema()]).SerializeToString() + other
+    assert table_of(channel_of(raw), [b""], "double").columns["double"].tolist() == [0.0]
 
 
 def test_a_type_that_refers_to_itself_is_followed_as_far_as_a_path_goes() -> None:
