@@ -348,7 +348,7 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     length = length[used]
     if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_WINDOWS:
         return None
-    of_sources, of_parameters = ([getattr(one[1], name) for one in found] for name in ("of_sources", "of_parameters"))
+    of_sources, of_parameters = ([getattr(one[1], part) for one in found] for part in ("of_sources", "of_parameters"))
     sources, stated = (
         error_growth.Spread(*(np.concatenate(column)[used] for column in zip(*parts, strict=True)))
         for parts in (of_sources, of_parameters)
