@@ -45,11 +45,16 @@ def standing_states(track: Track) -> Bools:
     return standing
 
 
+def leave_out(ends: NDArray[np.signedinteger], standing: Bools) -> None:
+    """Mark the trials of standing starts as none, in the ends (n, h) of `trial_ends`."""
+    ends[standing[:, None] & (ends >= 0)] = STANDING
+
+
 def counted_ends(track: Track, horizon_m: float, starts: Starts) -> Ints:
     """Return `trial_ends` (n, 1) of one horizon, without the starts that do not count."""
     ends = trial_ends(track, np.array([horizon_m]))
     if starts == "moving":
-        ends[standing_states(track)[:, None] & (ends >= 0)] = STANDING
+        leave_out(ends, standing_states(track))
     return ends
 
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from icrtool.calibration.run_models import ComparedRow, Model, models_of
 from icrtool.dropout_analysis.report import OpenLoopErrors
-from icrtool.dropout_analysis.starts import Starts, first_learned, reference_error, standing_states
+from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out, reference_error, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels import error_statistics as statistics
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop import open_loop_errors
-from icrtool.kernels.track import STANDING, FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
+from icrtool.kernels.track import FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
 from icrtool.motion.recording import MOST_TRIALS, Trials
 from icrtool.records import dropout_document as documents
 from icrtool.records.plain_data import known, plain
@@ -203,7 +203,7 @@ def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tu
     def fill(lo: int) -> TrialCounts:
         hi = min(lo + STARTS_AT_ONCE, states)
         found = find(horizons, np.arange(lo, hi))
-        found[left_out[lo:hi, None] & (found >= 0)] = STANDING
+        leave_out(found, left_out[lo:hi])
         ends[:, lo:hi] = found.T
         return count_trials(found)
 

@@ -46,11 +46,18 @@ _LLVM_TYPES = {_POINTER: "ptr", _INTEGER: "i64", _FLOAT: "double", _BOOL: "i8"}
 _SCALARS = {"bool": _BOOL, "int": _INTEGER, "float": _FLOAT, "NoneType": _POINTER}
 _RESULTS = {"none": None, "int64": _INTEGER, "float64": _FLOAT}
 _DEBUGGING = ("NUMBA_BOUNDSCHECK", "NUMBA_DEBUGINFO")
+"""Settings of numba with which machine code is slower: it is not kept for later processes."""
+
 _RETURNED = (0, -2)
 """What machine code returns where it raised no exception: it has a result, or None."""
 
 _parts: list[Callable[..., Any]] = []
 _lock = threading.RLock()
+
+
+def _is_set(name: str) -> bool:
+    """Return whether a setting of numba's is on."""
+    return os.environ.get(name, "0") not in {"", "0"}
 
 
 class _Arguments:
@@ -143,19 +150,22 @@ class Kernel:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.py_func, self.compiled = function, 0
+        self._runs_python = _is_set("NUMBA_DISABLE_JIT")
         self._functions: dict[tuple[object, ...], Callable[[Sequence[object]], Result] | None] = {}
         functools.update_wrapper(self, function)
 
     def __call__(self, *values: object) -> Result:
         """Run the machine code for arguments of these types; the Python function where ``NUMBA_DISABLE_JIT`` is 1."""
-        if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
+        if self._runs_python:
             return cast(Result, self.py_func(*values))
         arguments = _Arguments(values)
         types = tuple(arguments.types)
-        with _lock:
-            if types not in self._functions:
-                code = self._machine_code(types, values, arguments)
-                self._functions[types] = code and code.function(arguments.forms)
+        if types not in self._functions:
+            with _lock:
+                # another thread may have been first
+                if types not in self._functions:
+                    code = self._machine_code(types, values, arguments)
+                    self._functions[types] = code and code.function(arguments.forms)
         run = self._functions[types]
         return run(arguments.words) if run else self._by_numba(*values)
 
@@ -199,7 +209,7 @@ class Kernel:
 
 
 def _writable(value: object) -> object:
-    """Return a value of the same type to numba, without its contents."""
+    """Return a value of the type that is compiled for: an array that can be written, a number of Python's."""
     if isinstance(value, np.ndarray):
         return np.empty((0,) * value.ndim, value.dtype)
     if isinstance(value, tuple):
@@ -209,13 +219,12 @@ def _writable(value: object) -> object:
 
 
 def _numba() -> ModuleType:
-    """Return numba, without scipy's BLAS, which knows the parts of kernels that were marked until now.
+    """Return numba, loaded without scipy's BLAS, with the parts of kernels that were marked until now.
 
     To look for BLAS takes longer than all the rest. No kernel multiplies matrices; numba finds it again when someone
     else's does.
     """
     numba, extending = (importlib.import_module(name) for name in ("numba", "numba.extending"))
-
     blas = "scipy.linalg.cython_blas"
     if blas not in sys.modules:
         sys.modules[blas] = None  # type: ignore[assignment]  # Python's mark for "cannot be imported"
@@ -256,12 +265,12 @@ def _stamp() -> tuple[str, ...]:
     Empty where nothing is to be kept: the kernels' sources cannot be read, or numba compiles for a debugger.
     """
     files = sorted(Path(__file__).parent.rglob("*.py"))
-    if not files or any(os.environ.get(name, "0") not in {"", "0"} for name in _DEBUGGING):
+    if not files or any(map(_is_set, _DEBUGGING)):
         return ()
     numba = find_spec("numba")
     if numba is not None and numba.origin is not None:
         # its version, without importing it
-        files.append(Path(numba.origin).with_name("_version.py"))
+        files += Path(numba.origin).parent.glob("_version.py")
     sources = hashlib.sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()
     return sources, llvmlite.__version__, llvm.get_default_triple(), *processor()
 
