@@ -355,20 +355,14 @@ def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unus
 
 def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
     """Return what a calibration holds of the robot of a run, of track width `width_m`."""
-    robot = run.config.robot
+    robot, of_twist = run.config.robot, any(stream.is_twist for stream in run.document.streams)
     return documents.CalibratedRobot(
         name=robot.name,
         wheel_radius_m=robot.wheel_radius_m,
         encoder_counts_per_rev=robot.encoder_counts_per_rev or UNSET,
-        twist_width_m=(run.config.wheels.twist_width_m or UNSET) if _from_twists(run) else UNSET,
+        twist_width_m=(run.config.wheels.twist_width_m or UNSET) if of_twist else UNSET,
         track_width_m=width_m,
     )
-
-
-def _from_twists(run: Run) -> bool:
-    """Return whether the wheels were read from the twists of an odometry."""
-    stream = next((one for one in run.document.streams if one.role == "wheels"), None)
-    return stream is not None and "Odometry" in stream.message_type
 
 
 def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
@@ -377,9 +371,9 @@ def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
     if alone:
         warnings += [] if run.usable else [f"not usable: {run.document.unusable_because}"]
         warnings += run.document.excitation.sentences
-    if _from_twists(run) and run.config.wheels.twist_width_m is None:
+    if any(stream.is_twist for stream in run.document.streams) and run.config.wheels.twist_width_m is None:
         warnings.append(
-            "the wheels were read from odometry twists, which hold the controller's own multipliers: "
+            "the wheels were read from body twists, which hold the controller's own multipliers: "
             "these numbers are right only where b and radius are those the twists were made with"
         )
     return tuple(warnings)

@@ -176,6 +176,21 @@ class Datum:
     height_m: float
 
 
+TWIST_TYPES = frozenset(
+    {
+        "geometry_msgs/Twist",
+        "geometry_msgs/TwistStamped",
+        "geometry_msgs/TwistWithCovarianceStamped",
+        "nav_msgs/Odometry",
+        "scout_msgs/ScoutStatus",
+    }
+)
+"""Message types whose wheels are a body twist, measured or commanded: wheel speeds are made of it with a width.
+
+Its turn rate is the difference of the sides over the width that the controller takes.
+"""
+
+
 @dataclass(frozen=True, slots=True)
 class StreamChoice:
     """Which topic feeds a role, and why.
@@ -204,8 +219,8 @@ class StreamChoice:
 
     @property
     def is_twist(self) -> bool:
-        """Whether the wheels' speeds were made of a body twist."""
-        return self.role == "wheels" and any(word in self.message_type for word in ("Odometry", "Twist", "ScoutStatus"))
+        """Whether the wheels' speeds were made of a body twist; a pair of topics or fields holds speeds of its own."""
+        return self.role == "wheels" and self.message_type in TWIST_TYPES and " + " not in self.topic
 
 
 def rate_and_jitter(stamps: Ints) -> tuple[float | None, float | None]:

@@ -17,6 +17,7 @@ from icrtool.calibration.pooled import (
     predictor,
     recording_of,
     robot_of,
+    use_warnings,
     with_turn_rate,
 )
 from icrtool.config import parse_config
@@ -31,6 +32,7 @@ from icrtool.output.tables.calibration import calibration_blocks
 from icrtool.output.text_blocks import format_blocks
 from icrtool.records.calibration_document import CalibratedRobot
 from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.samples import TWIST_TYPES
 from support.drives import make_log
 from support.recordings import WIDTH_M, make_recording, table_errors, trials_from_all
 
@@ -228,6 +230,18 @@ def test_a_run_with_configured_scales_gives_the_same_calibration(scales: tuple[f
         np.testing.assert_allclose(one, other, atol=1e-12)
     robots = [robot_of(run, 0.6) for run in runs]
     assert robots[0] == robots[1]
+
+
+@pytest.mark.parametrize("message_type", sorted(TWIST_TYPES))
+def test_wheels_of_any_body_twist_keep_the_width_of_their_controller(message_type: str) -> None:
+    log = make_log(0, 60.0)
+    of_twist = replace(log, streams=tuple(replace(one, message_type=message_type) for one in log.streams))
+    wide = {"robot": {"track_width_m": 0.6}, "wheels": {"twist_width_m": 0.9}}
+    known, unknown = (fit(of_twist, parse_config({**wide, **wheels})) for wheels in ({}, {"wheels": {}}))
+    assert robot_of(known, 0.6).twist_width_m == 0.9
+    assert robot_of(unknown, 0.6).twist_width_m is msgspec.UNSET
+    assert len(use_warnings(unknown)) == len(use_warnings(known)) + 1
+    assert robot_of(fit(log, parse_config(wide)), 0.6).twist_width_m is msgspec.UNSET
 
 
 def test_the_tables_name_what_they_show(result: CalibrationResult) -> None:

@@ -17,9 +17,11 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import survey_log
-from icrtool.logs.streams.message_types import read_source
+from icrtool.logs.streams.message_types import MESSAGE_TYPES, read_source
 from icrtool.logs.streams.sources import WheelMotion
 from icrtool.logs.streams.wheel_pairs import Side, pair_motion
+from icrtool.logs.streams.wheels import Twist
+from icrtool.records.samples import TWIST_TYPES, StreamChoice
 from support.tables import table_of
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 20_000_000
@@ -436,3 +438,14 @@ def test_an_autopilot_s_wheels_are_metres_or_rpm_as_the_topic_states() -> None:
     np.testing.assert_allclose(rpm.speed[1], [np.pi, 2 * np.pi, 2 * np.pi])
     with pytest.raises(DefinitionError, match="fewer than 2 elements"):
         read(column_table(kind, **{"data[*]": [[1.0]]}))
+
+
+def test_wheels_are_made_of_a_twist_by_the_meaning_of_their_type_not_by_words_in_its_name() -> None:
+    assert {name for name, row in MESSAGE_TYPES["wheels"].items() if isinstance(row, Twist)} == TWIST_TYPES
+
+    def stream(topic: str, message_type: str) -> StreamChoice:
+        return StreamChoice("wheels", topic, message_type, 100, 50.0, "header", 0.0, "")
+
+    assert stream("/cmd_vel", "geometry_msgs/Twist").is_twist
+    assert not stream("/base.left_ticks + /base.right_ticks", "made_msgs/WheelOdometry").is_twist
+    assert not stream("/left.linear.x + /right.linear.x", "geometry_msgs/Twist").is_twist
