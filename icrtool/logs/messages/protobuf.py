@@ -74,7 +74,7 @@ Descriptors = Mapping[str, Sequence[ProtobufField]]
 
 
 class _UnreadableError(Exception):
-    """Bytes are no message: a field does not end, or is of an unknown wire type."""
+    """Bytes are no message: a field does not end, or its wire type is none that is read."""
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
@@ -116,12 +116,10 @@ class WantedFields:
     ----------
     fields : by number, each with those of the message in it
     default : values of lacking ones
-    is_lenient : whether what is no message where one is wanted is passed over; else it makes all unreadable
     """
 
     fields: dict[int, tuple[ProtobufField, WantedFields | None]] = field(default_factory=dict)
     default: dict[str, Any] = field(default_factory=dict)
-    is_lenient: bool = False
 
     def add(self, name: str, number: int, kind: int, inner: WantedFields | None = None) -> None:
         """Add a field of a descriptor; those that hold messages are repeated."""
@@ -133,7 +131,7 @@ def _descriptor_set() -> WantedFields:
 
     Of types within one another there is one more level than is read: it shows that there are too many.
     """
-    files, file, described = WantedFields(is_lenient=True), WantedFields(), WantedFields()
+    files, file, described = WantedFields(), WantedFields(), WantedFields()
     for name, number in {"name": 1, "type_name": 6}.items():
         described.add(name, number, _STRING)
     for name, number in {"number": 3, "label": 4, "type": 5, "oneof_index": 9}.items():
@@ -271,16 +269,16 @@ class ProtobufParser:
             if number not in node.fields:
                 continue
             one, inner = node.fields[number]
-            if inner is not None:
-                if wire != _BYTES:
-                    if node.is_lenient:
-                        continue
-                    raise _UnreadableError
-                before = None if one.repeated else into.get(one.name)
-                found = self._message(data, begin, end, inner, dict(inner.default) if before is None else before)
-                values = [found]
-            else:
+            if inner is None:
                 values = _values(data, one, wire, begin, end)
+            elif wire == _BYTES:
+                before = None if one.repeated else into.get(one.name)
+                values = [self._message(data, begin, end, inner, dict(inner.default) if before is None else before)]
+            else:
+                values = []
+            if not values:
+                # a field of another wire type than its own is passed over, as an unknown one is
+                continue
             if not one.repeated:
                 into[one.name] = values[-1]
             elif len(kept := into.setdefault(one.name, [])) < self.most_elements:
@@ -289,24 +287,18 @@ class ProtobufParser:
 
 
 def _values(data: bytes, one: ProtobufField, wire: int, begin: int, end: int) -> list[Any]:
-    """Return the values of a field that holds no messages: one, or several that are packed."""
+    """Return the values of a field that holds no messages: one, several that are packed, none of another wire type."""
     if one.type == _STRING:
-        if wire != _BYTES:
-            raise _UnreadableError
-        return [data[begin:end].decode("utf-8", "replace")]
+        return [data[begin:end].decode("utf-8", "replace")] if wire == _BYTES else []
+    is_packed = wire == _BYTES and one.repeated
     if one.type in _FIXED:
         fixed, single = _FIXED[one.type]
         if wire == single:
             return [*fixed.unpack_from(data, begin)]
-        if wire != _BYTES or not one.repeated:
-            raise _UnreadableError
         end = min(end - (end - begin) % fixed.size, begin + MOST_ELEMENTS * fixed.size)
-        return [value for (value,) in fixed.iter_unpack(data[begin:end])]
-    found: list[int] = [begin]
-    if wire != _VARINT:
-        if wire != _BYTES or not one.repeated:
-            raise _UnreadableError
-        found = []
+        return [value for (value,) in fixed.iter_unpack(data[begin:end])] if is_packed else []
+    found: list[int] = [begin] if wire == _VARINT else []
+    if is_packed:
         while begin < end and len(found) < MOST_ELEMENTS:
             value, begin = _varint(data, begin)
             found.append(value)

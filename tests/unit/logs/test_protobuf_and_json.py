@@ -271,6 +271,29 @@ def test_what_is_no_file_among_the_files_of_a_schema_is_passed_over(other: bytes
     assert table_of(channel_of(raw), [b""], "double").columns["double"].tolist() == [0.0]
 
 
+OTHER_WIRES = {"number": b"\x01", "64": bytes(range(8)), "text": b"\x08(a(a(a(a", "32": bytes(range(4))}
+"""Content of a field by what stands in it; their order gives the wire types 0, 1, 2 and 5."""
+
+
+@pytest.mark.parametrize("content", OTHER_WIRES)
+def test_a_field_of_another_wire_type_is_passed_over_as_by_google_s_library(content: str) -> None:
+    file = schema()
+    kind, wire = class_of(file), [0, 1, 2, 5][[*OTHER_WIRES].index(content)]
+    known = kind(double=2.5, int32=-4, fixed32=9, string="s", strings=["a"], doubles=[1.0], loose_int32s=[6], sint64=-3)
+    known.one.uint32, known.many.add().float = 8, 0.5
+    raw = known.SerializeToString()
+    for one in kind.DESCRIPTOR.fields:
+        other = raw + varint(one.number << 3 | wire) + OTHER_WIRES[content] + raw
+        merged = kind.FromString(other)
+        table = table_of(channel_of(file), [other], "double", "one.uint32", "strings[*]", "many[*].float", *SCALARS)
+        assert len(table) == 1, one.name
+        check(table, "one.uint32", [merged.one.uint32])
+        check(table, "many[*].float", [[inner.float for inner in merged.many]])
+        check(table, "strings[*]", [list(merged.strings)])
+        for name in SCALARS:
+            check(table, name, [getattr(merged, name)])
+
+
 def test_a_type_that_refers_to_itself_is_followed_as_far_as_a_path_goes() -> None:
     file = schema()
     deep = class_of(file)(double=9.0)
