@@ -102,7 +102,7 @@ class Tested:
             found = pool.fit(FAMILY[FIVE if row.model == CONTROLLER else row.model])
             errors = [
                 errors_without(one, cut_trials(one, HORIZONS_M, pooled), folds, i,
-                               lambda fold, one=one: predict(row.model, found, fold, one), windows[i].steps).position
+                               lambda fold, one=one: predict(row.model, found, fold, one), windows[i].track).position
                 for i, one in enumerate(self.recordings)
             ]  # fmt: skip
         return np.asarray(np.nanmean(np.concatenate(errors), axis=0))

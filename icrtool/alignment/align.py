@@ -283,7 +283,7 @@ def agreement(log: RobotLog, config: Config) -> Agreement:
     free = config.frames.heading == "auto"
     decision = decide_conventions(windows, metric=log.datum is None and free, mirror_allowed=free)
     named = apply_convention(log, decision.convention)
-    found = estimate_alignment(windows if named is log else windows._replace(track=track_of_log(named)), width)
+    found = estimate_alignment(windows if named is log else replace(windows, track=track_of_log(named)), width)
     if found is None:
         return NONE
     count = len(windows.begin)

@@ -32,7 +32,7 @@ from icrtool.alignment.log_track import (
     DriveWindows,
     cut_chords,
 )
-from icrtool.kernels.arrays import Floats, trapezoids
+from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import mad_std, robust_regression, sandwich_covariance, soft_l1_loss
 from icrtool.kernels.track import Track
 from icrtool.motion.recording import fit_gyro_line
@@ -133,10 +133,11 @@ def decide_conventions(
     if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return Decision(AS_NAMED, None)
     track = windows.track
-    shown = {hand: _show(windows, hand) for hand in (1, -1)}
+    laid = windows.laid, windows.over(track.at_places(track.half_difference * track.nose))
+    shown = {1: _show(windows, laid, 1), -1: _show(windows, (np.conj(laid[0]), np.conj(laid[1])), -1)}
     # twice the negative log-likelihood of either handedness, both in the noise of the better one
     scale = min(mad_std(one.residuals, 0.0) for one in shown.values())
-    scale = max(scale, 0.5 * track.place_std_m / windows.length_m)
+    scale = max(scale, 0.5 * track.place_std_m / windows.length_m[0])
     losses = {hand: soft_l1_loss(one.residuals / scale) / STARTS_A_WINDOW for hand, one in shown.items()}
     costs, offsets = dict[Convention, float](), dict[Convention, float]()
     headings, positions = (1, -1) if mirror_allowed else (1,), (1, -1) if metric else (1,)
@@ -177,21 +178,24 @@ TIE = 9.0
 """Hypotheses this near the best are as good."""
 
 
-def _show(windows: DriveWindows, hand: int) -> _Shown:
-    """Fit displacements and turns for one handedness, with hardly any prior."""
-    track = windows.track
-    v, u = track.mean_speed, track.half_difference
-    nose = track.nose if hand > 0 else track.nose.conj()
-    spans = [windows.over(track.at_places(rate * nose)) / windows.length_m for rate in (v, u)]
-    seen = windows.over(track.place) / windows.length_m
-    columns = np.column_stack([spans[0], 1j * spans[0], spans[1], 1j * spans[1]])
+def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -> _Shown:
+    """Fit displacements and turns for one handedness, with hardly any prior.
+
+    Parameters
+    ----------
+    laid : (w,) mean of the sides' distances, and half their difference, along the heading of that handedness [m]
+    """
+    track, seen = windows.track, windows.seen / windows.length_m
+    v, u = (one / windows.length_m for one in laid)
+    columns = np.column_stack([v, 1j * v, u, 1j * u])
     first, last = windows.turn_begin, windows.turn_end
-    by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in map(track.cumulate, (u, v))]
+    turns = [track.cumulate(one) for one in (track.half_difference, track.mean_speed)]
+    by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in turns]
     place, turn = (
         robust_regression(design, target, np.full(design.shape[1], PRIOR_STD), float(STARTS_A_WINDOW))
         for design, target in (
             (np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])),
-            (np.column_stack(by), hand * windows.turned),
+            (np.column_stack(by), hand * windows.heading_changes),
         )
     )
     of_place = sandwich_covariance(place, np.tile(windows.group, 2))

@@ -155,7 +155,7 @@ class AlignmentFit(NamedTuple):
         """Robust scatter of the displacements along and across the heading beyond the fixes' noise, over the length."""
         noise2 = 2.0 * self.windows.track.place_std_m**2
         beyond = np.maximum(self.fit.scale[[0, len(self.windows.begin)]] ** 2 - noise2, 0.0)
-        along, across = (np.sqrt(beyond) / self.windows.length_m).tolist()
+        along, across = (np.sqrt(beyond) / self.windows.length_m[0]).tolist()
         return along, across
 
     @property
@@ -168,7 +168,7 @@ class AlignmentFit(NamedTuple):
     @property
     def turn_slip(self) -> float:
         """Robust scatter of the turns within a second about those of the wheels, in parts of the usual turn."""
-        usual = math.sqrt(float(np.mean(self.windows.turned**2)))
+        usual = math.sqrt(float(np.mean(self.windows.heading_changes**2)))
         return float(self.fit.scale[-1]) / max(usual, LEAST_TURN_RAD)
 
     @property
@@ -199,7 +199,7 @@ def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     before, after = (found.model.evaluate(x)[0] for x in (neutral, found.fit.x))
     return ResidualsByEstimate(
         before[: 2 * w].reshape(2, w), after[: 2 * w].reshape(2, w), before[2 * w :], after[2 * w :],
-        found.windows.turned,
+        found.windows.heading_changes,
     )  # fmt: skip
 
 
@@ -226,8 +226,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     track, model = windows.track, MotionOfWindows(windows, width_m)
     start = PRIOR_MEAN.copy()
     # the direction of the displacements from wheels laid along the heading
-    laid = windows.over(track.laid)
-    unit = (model.seen * np.conj(laid))[np.abs(laid) > windows.length_m / 3]
+    unit = (windows.seen * np.conj(windows.laid))[np.abs(windows.laid) > windows.length_m / 3]
     spins = len(unit) < FEWEST_OVERLAPPING
     if not spins:
         start[D] = np.angle(np.sum(unit / np.maximum(np.abs(unit), 1e-12)))
@@ -269,7 +268,6 @@ class MotionOfWindows:
         self.v, self.u = track.mean_speed, track.half_difference
         # places are needed where a window begins or ends: at few of the fixes of a long drive
         self.edge_t = track.place_t[np.stack([windows.begin, windows.end])]
-        self.seen = windows.over(track.place)
         self.level = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
         self.turn_v, self.turn_w = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
         # the mean of the heading over `SMOOTH_S` to either side: noise is no turn
@@ -292,7 +290,7 @@ class MotionOfWindows:
             begin, end = total[row] + part * (total[row + 1] - total[row])
             return np.asarray(end - begin)
 
-        by = np.zeros((len(x), len(self.seen)), np.complex128)
+        by = np.zeros((len(x), len(self.windows.begin)), np.complex128)
         by[A], by[M], by[N], by[C], by[L] = laid(v), laid(u), laid(drag), 1j * laid(rate), 1j * laid(v * rate)
         predicted = x @ by
         by[D] = 1j * predicted
@@ -305,7 +303,7 @@ class MotionOfWindows:
         begin, end = np.interp(t, track.t + track.held / 2, aside) * turning
         by[TH] = by[TP] + 1j * laid(rate * ahead) + end - begin
         level = self.level * np.exp(-1j * x[D])
-        place, by = (predicted - self.seen) * level, by * level
+        place, by = (predicted - self.windows.seen) * level, by * level
         turn, turn_by = self._turns(x)
         return (
             np.concatenate([place.real, place.imag, turn]),
@@ -349,4 +347,4 @@ class MotionOfWindows:
         by[K], by[Q], by[G] = over(self.turn_w), over(self.turn_v) / self.b, edges[1] - edges[0]
         predicted = x @ by
         by[TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
-        return predicted - self.windows.turned, by
+        return predicted - self.windows.heading_changes, by

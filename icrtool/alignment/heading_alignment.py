@@ -150,15 +150,13 @@ NOT_COMPARED = CourseComparison(0, math.nan, math.nan, False, 0.0)
 def compare_with_course(windows: DriveWindows) -> CourseComparison:
     """Compare the heading of a drive with its course over ground, in windows that hardly overlap."""
     track, apart = windows.track, slice(None, None, STARTS_A_WINDOW)
-    v, nose = track.mean_speed, track.nose
-    seen, laid, other = (
-        windows.over(at)[apart] for at in (track.place, track.at_places(v * nose), track.at_places(v * nose.conj()))
-    )
-    gone, lasted_s = windows.over(track.at_places(v))[apart], windows.over(track.place_t)[apart]
-    moved = (np.abs(seen) > windows.length_m / 3) & (np.abs(laid) > windows.length_m / 3)
+    seen, laid, third_m = windows.seen[apart], windows.laid[apart], windows.length_m[apart] / 3
+    gone, lasted_s = windows.over(track.at_places(track.mean_speed))[apart], windows.over(track.place_t)[apart]
+    moved = (np.abs(seen) > third_m) & (np.abs(laid) > third_m)
     if not moved.any():
         return NOT_COMPARED
-    angle, turned_over = (np.exp(1j * np.angle(one * np.conj(seen)))[moved] for one in (laid, other))
+    # a heading of the other handedness lays the same distance on the other side of north
+    angle, turned_over = (np.exp(1j * np.angle(one * np.conj(seen)))[moved] for one in (laid, np.conj(laid)))
     backwards = (gone < 0.0)[moved]
     ahead, back = angle[~backwards], angle[backwards]
     turns_about = False

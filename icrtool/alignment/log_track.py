@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from icrtool.alignment.sensor_noise import (
 )
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
-from icrtool.kernels.track import Rate, Track, cut
+from icrtool.kernels.track import Track, Windows, cut
 from icrtool.records.measurements import TURNING_MPS, Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
@@ -51,33 +52,28 @@ MOST_WHEEL_SAMPLES = 25_000
 """The samples of a longer drive are joined to about so many: 1 h at 7 Hz, where windows last seconds."""
 
 
-class DriveWindows(NamedTuple):
-    """Windows of a drive.
+@dataclass(frozen=True)
+class DriveWindows(Windows):
+    """Windows of distance, all of one length, and windows of time in which the heading changes.
 
     Attributes
     ----------
-    track : that they are cut from
-    begin, end : (w,) rows of its positions, first and last of a window
-    length_m : wheel distance of a window
     turn_begin, turn_end : (u,) [s] windows of heading changes
     group, turn_group : (w,), (u,) stretches of distance that are independent of one another
     """
 
-    track: Track
-    begin: Ints
-    end: Ints
-    length_m: float
     turn_begin: Floats
     turn_end: Floats
     group: Ints
     turn_group: Ints
 
-    def over(self, at_places: Rate) -> Rate:
-        """Return the change in each window (w,) of what is known at the positions (m,)."""
-        return at_places[self.end] - at_places[self.begin]
+    @cached_property
+    def laid(self) -> Complexes:
+        """Mean distance of the sides laid along the heading (w,), north + j east [m]."""
+        return self.over(self.track.at_places(np.asarray(self.track.mean_speed * self.track.nose)))
 
-    @property
-    def turned(self) -> Floats:
+    @cached_property
+    def heading_changes(self) -> Floats:
         """Turn of the heading in each window of time (u,) [rad]."""
         begin, end = self.track.heading_at(np.stack([self.turn_begin, self.turn_end]))
         return np.asarray(end - begin)
@@ -177,13 +173,14 @@ def cut_windows(track: Track, least_m: float = WINDOW_M, *, length_m: float = 0.
     changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
     lasts_m = float(travel[-1]) / max(sum(changes) / 2, 1.0)
     length = length_m or max(least_m, noise, min(WINDOW_IN_VALUES * lasts_m, LONGEST_WINDOW_M))
-    begin, end, _ = cut(track, [length], length / STARTS_A_WINDOW)
+    windows = cut(track, [length], length / STARTS_A_WINDOW)
+    begin, end = windows.begin, windows.end
     covers = [track.t, track.heading_t] if len(track.heading_t) else [track.t]
     first, last = max(t[0] for t in covers), min(t[-1] for t in covers)
     t, at = track.place_t, track.distance
     whole = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_WINDOW_S)
     whole &= at[end] - at[begin] < 2.0 * length
-    begin, end = begin[whole], end[whole]
+    begin, end, lengths = begin[whole], end[whole], windows.length_m[whole]
     # windows of time in which wheels and heading were sampled and the wheels turned
     turn_begin = turn_end = np.empty(0)
     sampled = track.heading_t
@@ -199,7 +196,7 @@ def cut_windows(track: Track, least_m: float = WINDOW_M, *, length_m: float = 0.
     size = min(max(float(travel[-1]) / 40.0, 2.0 * length), 10.0 * length)
     turn_travel = np.interp(turn_begin, track.t, travel)
     return DriveWindows(
-        track, begin, end, length, turn_begin, turn_end,
+        track, begin, end, lengths, turn_begin, turn_end,
         np.floor(at[begin] / size).astype(np.int64), np.floor(turn_travel / size).astype(np.int64),
     )  # fmt: skip
 

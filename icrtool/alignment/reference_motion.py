@@ -12,6 +12,7 @@ shows stays undecided, and is the robot's.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -238,8 +239,9 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
         (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])
         for begin, end in ((windows.begin, windows.end), turns)
     )
-    windows = windows._replace(
-        begin=windows.begin[kept], end=windows.end[kept], group=windows.group[kept],
+    windows = replace(
+        windows,
+        begin=windows.begin[kept], end=windows.end[kept], length_m=windows.length_m[kept], group=windows.group[kept],
         turn_begin=windows.turn_begin[turns_kept], turn_end=windows.turn_end[turns_kept],
         turn_group=windows.turn_group[turns_kept],
     )  # fmt: skip

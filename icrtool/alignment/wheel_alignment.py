@@ -167,7 +167,7 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
     """
     if fit.slips:
         apart = f"their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
-        slip = f"over {fit.windows.length_m:.0f} m {apart}, their turns by {100 * fit.turn_slip:.0f} %"
+        slip = f"over {fit.windows.length_m[0]:.0f} m {apart}, their turns by {100 * fit.turn_slip:.0f} %"
         return (1.0, 1.0), [f"the wheels slip: {slip}; no scale and no delay is corrected"]
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     may = config.filter.preset == "field" and sound and not given

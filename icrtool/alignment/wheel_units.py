@@ -125,9 +125,9 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
         track = windows.track
         if len(windows.begin) < FEWEST_WINDOWS:
             return
-        turned = np.abs(windows.over(track.heading_at(track.place_t)))
+        turned = np.abs(windows.turned)
         apart = np.abs(windows.over(track.at_places(track.half_difference)))
-        laid, went = np.abs(windows.over(track.laid)), np.abs(windows.over(track.place))
+        laid, went = np.abs(windows.laid), np.abs(windows.seen)
         moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
         clear = np.maximum(laid, apart) > windows.length_m / 4
         if np.count_nonzero(clear) < FEWEST_WINDOWS or float((~moved)[clear].mean()) <= STANDS_SHARE:

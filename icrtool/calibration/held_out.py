@@ -22,14 +22,13 @@ from icrtool.calibration import error_growth
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints
 from icrtool.kernels.error_statistics import Summary, error_summary, within_budget
-from icrtool.kernels.track import OpenLoopPath, Track
+from icrtool.kernels.track import OpenLoopPath, Track, Windows
 from icrtool.motion.models import CONTROLLER, FIVE, MODELS, NO_SLIP, RECOMMENDED, controller_model
 from icrtool.motion.recording import (
     NO_CONSTANTS,
     Recording,
     TrialErrors,
     Trials,
-    Windows,
     cut_trials,
     cut_windows,
     predicted_path,
@@ -174,7 +173,7 @@ class HeldOut:
 
     def errors(self, name: str, i: int, trials: Trials) -> TrialErrors:
         """Return the errors of a row in trials of recording i, each predicted without what it touches."""
-        steps = self.fits[RECOMMENDED].pool.windows[i].steps
+        steps = self.fits[RECOMMENDED].pool.windows[i].track
         return errors_without(self.recordings[i], trials, self.folds, i, partial(self.without, name), steps)
 
     def path(self, name: str, i: int, start: int, end: int) -> OpenLoopPath | None:
@@ -185,7 +184,7 @@ class HeldOut:
         ((fold, _),) = left_out(self.folds, i, *ends)
         if (found := self.without(name, fold)) is None:
             return None
-        steps = self.fits[RECOMMENDED].pool.windows[i].steps.around(t[start], t[end])
+        steps = self.fits[RECOMMENDED].pool.windows[i].track.around(t[start], t[end])
         turned, place = predicted_path(recording, *found, steps)(t[rows])
         turn = track.heading[start] - turned[0]
         moved = np.exp(1j * turn) * (place - place[0])
@@ -312,11 +311,12 @@ def _left_out_windows(
     """Yield recording, rows (w,) of windows, their times, what is predicted without them, and the steps around them."""
     for i, windows in table.error_windows:
         these = np.flatnonzero(np.isin(windows.length_m, lengths_m))
-        for fold, some in left_out(table.folds, i, windows.start_m[these], windows.end_m[these]):
+        start_m, end_m = (windows.track.distance[rows[these]] for rows in (windows.begin, windows.end))
+        for fold, some in left_out(table.folds, i, start_m, end_m):
             if (predicted := table.without(name, fold)) is not None:
                 rows = these[some]
-                begin, end = windows.knot_t[windows.start[rows]], windows.knot_t[windows.end[rows]]
-                yield i, windows, rows, (begin, end), predicted, windows.steps.around(begin.min(), end.max())
+                begin, end = (windows.track.place_t[one[rows]] for one in (windows.begin, windows.end))
+                yield i, windows, rows, (begin, end), predicted, windows.track.around(begin.min(), end.max())
 
 
 def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
@@ -336,10 +336,10 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     tested = [np.empty((0, 3))]
     for i, windows, some, (begin, end), (fitted, own), steps in _left_out_windows(table, name, LENGTHS_M):
         errors = error_growth.path_errors(steps, begin, end, fitted, table.recordings[i].width_m, own)
-        reference = np.exp(-1j * own.heading_offset_rad) * windows.reference[some]
+        reference = np.exp(-1j * own.heading_offset_rad) * windows.moved[some]
         length_m = windows.length_m[some]
         found.append((length_m, errors, errors.turned - windows.turned[some], errors.moved - reference))
-        stretch = np.floor(windows.start_m[some] / length_m)
+        stretch = np.floor(windows.track.distance[windows.begin[some]] / length_m)
         tested.append(np.column_stack([np.full(len(some), i), length_m, stretch]))
     stretches = Counter(np.unique(np.concatenate(tested), axis=0)[:, 1].tolist())
     measured_to_m = max(one for one in LENGTHS_M if one <= ALWAYS_TO_M or stretches[one] >= FEWEST_STRETCHES)
@@ -405,7 +405,7 @@ def _controller_window_errors(table: HeldOut, length_m: float) -> Floats:
     for i, windows, some, (begin, end), predicted, steps in _left_out_windows(table, CONTROLLER, [length_m]):
         path = predicted_path(table.recordings[i], *predicted, steps)
         (theta, turned), (place, moved) = (np.split(one, 2) for one in path(np.append(begin, end)))
-        error = np.exp(-1j * theta) * (moved - place) - windows.reference[some]
+        error = np.exp(-1j * theta) * (moved - place) - windows.moved[some]
         turn = windows.turned[some]
         off = turned - theta - turn
         rows.append(np.column_stack([error.real, error.imag, off, end - begin, turn, windows.length_m[some]]))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -169,24 +171,60 @@ class Track(NamedTuple):
         return np.divide(risen, apart, out=np.zeros(len(rows)), where=apart > 0.0)
 
 
-def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> tuple[Ints, Ints, Floats]:
+@dataclass(frozen=True)
+class Windows:
+    """Windows of driven distance.
+
+    Attributes
+    ----------
+    track : that they are cut from; its wheel samples may have been joined since
+    begin, end : (w,) rows of its positions, first and last of a window
+    length_m : (w,) distance [m], nominal
+    """
+
+    track: Track
+    begin: Ints
+    end: Ints
+    length_m: Floats
+
+    def over(self, at_places: Rate) -> Rate:
+        """Return the change in each window (w,) of what is known at the positions (m,)."""
+        return at_places[self.end] - at_places[self.begin]
+
+    @cached_property
+    def seen(self) -> Complexes:
+        """Displacement of the reference (w,), north + j east [m]."""
+        begin, end = (self.track.north[rows] + 1j * self.track.east[rows] for rows in (self.begin, self.end))
+        return np.asarray(end - begin)
+
+    @cached_property
+    def moved(self) -> Complexes:
+        """Displacement of the reference (w,), forward + j right in the body frame of the begin [m]."""
+        return np.asarray(np.exp(-1j * self.track.heading_at(self.track.place_t[self.begin])) * self.seen)
+
+    @cached_property
+    def turned(self) -> Floats:
+        """Turn of the reference (w,) [rad]."""
+        begin, end = self.track.heading_at(self.track.place_t[np.stack([self.begin, self.end])])
+        return np.asarray(end - begin)
+
+
+def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Windows:
     """Cut a drive into windows of driven distance; none crosses a gap, a jump or a slip event, or ends in an outage.
 
     Parameters
     ----------
     every_m : a window of each length starts every so much distance
-
-    Returns
-    -------
-    rows of the positions at begin and end (w,), and nominal length (w,) [m] of the windows
     """
     lengths, begins = np.asarray(lengths_m, np.float64), rows_at_steps(track.distance, every_m)
     begins = begins[~track.in_outage[begins]]
     ends = ends_from(track, lengths, begins)
     column, row = np.nonzero(ends.T >= 0)
     begin, end = begins[row], ends[row, column]
-    quiet = _before(track.slipping, begin) == _before(track.slipping, end)
-    return begin[quiet], end[quiet], lengths[column][quiet]
+    # as many flags are set before one end as before the other
+    slips = np.flatnonzero(track.slipping)
+    quiet = np.searchsorted(slips, begin) == np.searchsorted(slips, end)
+    return Windows(track, begin[quiet], end[quiet], lengths[column][quiet])
 
 
 def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Ints:
@@ -229,11 +267,6 @@ def ends_finder(track: Track) -> Callable[[Floats, Ints], Ints]:
         return ends.T
 
     return find
-
-
-def _before(flags: Bools, rows: Ints) -> Ints:
-    """Return how many of the flags (m,) are set before each row."""
-    return np.searchsorted(np.flatnonzero(flags), rows)
 
 
 class FrozenIcrs(NamedTuple):

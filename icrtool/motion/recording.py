@@ -6,7 +6,7 @@ The gyro is compared with the heading by one line, which alignment uses too.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints, rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
-from icrtool.kernels.track import Track, cut, ends_from
+from icrtool.kernels.track import Track, Windows, cut, ends_from
 from icrtool.kernels.window_residuals import OMEGA, path_at
 from icrtool.motion.models import NO_LEVER, FittedModel, Lever, wheel_motion
 from icrtool.records.measurements import TURNING_MPS
@@ -90,30 +90,6 @@ class LogConstants(NamedTuple):
 NO_CONSTANTS = LogConstants()
 
 
-class Windows(NamedTuple):
-    """Overlapping windows of driven distance of one recording, ready to be fitted.
-
-    Attributes
-    ----------
-    steps : the track, its wheel samples joined
-    knot_t : (m,) times at which windows start or end [s], ascending
-    start, end : (w,) rows of `knot_t`
-    start_m, end_m, length_m : (w,) path length at start and end, and nominal length [m]
-    reference : complex (w,), displacement forward + j right in the body frame of the start [m]
-    turned : (w,) turn of the reference [rad]
-    """
-
-    steps: Track
-    knot_t: Floats
-    start: Ints
-    end: Ints
-    start_m: Floats
-    end_m: Floats
-    length_m: Floats
-    reference: Complexes
-    turned: Floats
-
-
 class Totals(NamedTuple):
     """Distance [m] and time [s] of all recordings that are fitted together."""
 
@@ -137,7 +113,7 @@ def size_of(width_m: float) -> float:
 def cut_windows(
     recording: Recording, lengths_m: Sequence[float] | None = None, pooled: Totals | None = None
 ) -> Windows:
-    """Cut a recording into windows of driven distance; none crosses a gap or a slip event, or ends in an outage.
+    """Cut a recording into windows of driven distance, ready to be fitted: the wheel samples of their track are joined.
 
     Parameters
     ----------
@@ -152,23 +128,11 @@ def cut_windows(
     track, pooled, size = recording.track, pooled or totals_of(recording), size_of(recording.width_m)
     lengths_m = [size * one for one in WINDOWS_M] if lengths_m is None else lengths_m
     every = min(max(size * EVERY_M, pooled.metres / MOST_STARTS), size * LEAST_OFTEN_M)
-    start, end, length = cut(track, lengths_m, every)
-    if len(start) < FEWEST_WINDOWS:
-        why = f"only {len(start)} windows of {min(lengths_m):g} m of driven distance"
+    windows = cut(track, lengths_m, every)
+    if len(windows.begin) < FEWEST_WINDOWS:
+        why = f"only {len(windows.begin)} windows of {min(lengths_m):g} m of driven distance"
         raise DataError(recording.name, why, "a calibration needs a longer drive")
-    begin_place, end_place = (track.north[rows] + 1j * track.east[rows] for rows in (start, end))
-    knots, rows = np.unique(np.concatenate([start, end]), return_inverse=True)
-    return Windows(
-        steps_of(recording, pooled.seconds),
-        knot_t=track.t[knots],
-        start=rows[: len(start)],
-        end=rows[len(start) :],
-        start_m=track.distance[start],
-        end_m=track.distance[end],
-        length_m=length,
-        reference=np.exp(-1j * track.heading[start]) * (end_place - begin_place),
-        turned=track.heading[end] - track.heading[start],
-    )
+    return replace(windows, track=steps_of(recording, pooled.seconds))
 
 
 def samples_a_step(track: Track, pooled_s: float | None = None) -> int:

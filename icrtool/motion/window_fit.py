@@ -30,9 +30,10 @@ from icrtool.kernels.robust import (
     soft_l1_weights,
     student_covariance,
 )
+from icrtool.kernels.track import Windows
 from icrtool.kernels.window_residuals import OMEGA, path_at, turn_residuals, window_residuals
 from icrtool.motion.models import FittedModel, MotionModel, model_columns, wheel_motion
-from icrtool.motion.recording import STRETCH_M, LogConstants, Windows, size_of
+from icrtool.motion.recording import STRETCH_M, LogConstants, size_of
 
 SETTLED = 0.1
 """Delays have kinks, where a shorter last step is not found."""
@@ -101,7 +102,10 @@ def residuals_of(
     A function of parameters (k,) and constants (c,), `LogConstants`, those of a gyro only for a model with one. It
     returns residuals (3 w,), forward, right [m^0.5], then turn [rad/m^0.5], and their derivatives (3 w, k + c).
     """
-    steps, start, end, root = windows.steps, windows.start, windows.end, np.sqrt(windows.length_m)
+    steps, root = windows.track, np.sqrt(windows.length_m)
+    seen, seen_turned = windows.moved, windows.turned
+    knots, rows = np.unique([windows.begin, windows.end], return_inverse=True)
+    knot_t, (start, end) = steps.place_t[knots], rows.reshape(2, -1)
     motion = wheel_motion(steps.v_left, steps.v_right, width_m, steps.gyro)
     if wheels is not None:
         motion = motion._replace(turn=wheels.twist(motion)[OMEGA])
@@ -124,11 +128,10 @@ def residuals_of(
             fixed[OMEGA] += shift
             columns[:k] += gains[:, None] * shift
             columns[-1] = (1.0 + parameters @ gains) * gyro_change
-        at = windows.knot_t + delay
-        path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, at)
-        turned, turned_by = turn_residuals(path, start, end, windows.turned, root)
+        path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, knot_t + delay)
+        turned, turned_by = turn_residuals(path, start, end, seen_turned, root)
         share = shortening(turned * root, windows.length_m)
-        moved, moved_by = window_residuals(path, start, end, windows.reference, offset, root, share)
+        moved, moved_by = window_residuals(path, start, end, seen, offset, root, share)
         # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
         terms = len(axes)
         jacobian = np.concatenate([moved_by, turned_by])[:, [*range(k), terms, terms + 1, *range(k, terms)]]
@@ -323,8 +326,8 @@ def own_constants(windows: Windows, fitted: FittedModel, width_m: float) -> LogC
         residuals, by = of_both(fitted.parameters, constants)
         return residuals, by[:, len(fitted.parameters) :]
 
-    zero, kind = np.zeros(len(std)), np.repeat(KINDS, len(windows.start))
-    overlap = len(windows.start) / 5.0
+    zero, kind = np.zeros(len(std)), np.repeat(KINDS, len(windows.begin))
+    overlap = len(windows.begin) / 5.0
     return LogConstants(*robust_least_squares(evaluate, zero, zero, std, kind=kind, overlap=overlap).x.tolist())
 
 
@@ -346,9 +349,9 @@ class Pool:
 
     def __init__(self, windows: Sequence[Windows], widths_m: Sequence[float]) -> None:
         self.windows, self.widths_m = windows, widths_m
-        by_window = [np.tile([w.start_m, w.end_m, w.length_m], len(KINDS)) for w in windows]
+        by_window = [np.tile([*w.track.distance[[w.begin, w.end]], w.length_m], len(KINDS)) for w in windows]
         self.start_m, self.end_m, self.length_m = np.concatenate(by_window, axis=1)
-        self.kind = np.concatenate([np.repeat(KINDS, len(w.start)) for w in windows])
+        self.kind = np.concatenate([np.repeat(KINDS, len(w.begin)) for w in windows])
         sizes = [one.shape[1] for one in by_window]
         self.first = np.cumsum([0, *sizes])
         self.recording = np.repeat(np.arange(len(windows)), sizes)

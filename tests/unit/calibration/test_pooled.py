@@ -24,8 +24,9 @@ from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Bools
+from icrtool.kernels.track import Windows
 from icrtool.motion.models import FAMILY, MODELS
-from icrtool.motion.recording import Recording, Trials, Windows, cut_trials, cut_windows, predicted_path
+from icrtool.motion.recording import Recording, Trials, cut_trials, cut_windows, predicted_path
 from icrtool.motion.window_fit import Pool, own_constants
 from icrtool.output.files.formats import open_calibration, write_calibration
 from icrtool.output.tables.calibration import calibration_blocks
@@ -169,8 +170,7 @@ def test_a_calibration_is_tested_in_the_trials_of_other_models(result: Calibrati
 
 
 def kept_of(windows: Windows, kept: Bools) -> Windows:
-    columns = ("start", "end", "start_m", "end_m", "length_m", "reference", "turned")
-    return windows._replace(**{name: getattr(windows, name)[kept] for name in columns})
+    return replace(windows, begin=windows.begin[kept], end=windows.end[kept], length_m=windows.length_m[kept])
 
 
 @pytest.mark.parametrize("horizon_m", [5.0, 20.0])
@@ -188,7 +188,7 @@ def test_a_trial_is_predicted_without_what_is_near_it(horizon_m: float) -> None:
         ((fold, _),) = left_out(table.folds, 0, np.array([begin]), np.array([end]))
         assert fold.begin_m <= begin
         assert end <= fold.end_m
-        clear = (windows.end_m <= fold.begin_m) | (windows.start_m >= fold.end_m)
+        clear = (distance[windows.end] <= fold.begin_m) | (distance[windows.begin] >= fold.end_m)
         apart, whole = (Pool([kept_of(windows, kept)], [WIDTH_M]).fit(WHOLE) for kept in (clear, clear | True))
         expected, in_sample = (
             table_errors(recording, one, predicted_path(recording, fitted, fitted.constants(0)))[0, 0]

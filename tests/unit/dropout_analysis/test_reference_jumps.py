@@ -64,7 +64,7 @@ def test_no_trial_of_any_row_crosses_it(jumping: Run, report: DropoutReport) -> 
     starts, horizons = np.nonzero(held_out.ends >= 0)
     assert not ((t[held_out.starts[starts]] < begin) & (t[held_out.ends[starts, horizons]] > end)).any()
     windows = cut_windows(recording)
-    first, last = windows.knot_t[windows.start], windows.knot_t[windows.end]
+    first, last = (windows.track.place_t[rows] for rows in (windows.begin, windows.end))
     assert not ((first < begin) & (last > end)).any()
     assert {one.name for one in report.results} >= {"icr", "no_slip", "icr_final", "recommended"}
     for one in report.results:

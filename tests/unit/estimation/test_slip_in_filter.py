@@ -110,11 +110,11 @@ def test_an_event_is_left_out_of_the_calibration() -> None:
     (event,) = run.sensors.events
     recording = recording_of(run)
     windows = cut_windows(recording)
-    begin, end = (recording.begin_ns + 1e9 * windows.knot_t[one] for one in (windows.start, windows.end))
+    begin, end = (recording.begin_ns + 1e9 * windows.track.place_t[one] for one in (windows.begin, windows.end))
     assert not ((begin < event.end_ns) & (end > event.begin_ns)).any()
     assert ((begin < event.end_ns) & (end > event.begin_ns - 2e9)).any()
     track = recording.track._replace(slipping=np.zeros_like(recording.track.slipping))
-    assert len(cut_windows(replace(recording, track=track)).start) > len(windows.start)
+    assert len(cut_windows(replace(recording, track=track)).begin) > len(windows.begin)
 
 
 def test_an_event_is_left_out_of_the_alignment(monkeypatch: pytest.MonkeyPatch) -> None:
