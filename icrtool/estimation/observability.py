@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from msgspec.structs import asdict, replace
@@ -12,7 +13,7 @@ from icrtool.kernels.arrays import Floats, Ints, rows_at_steps
 from icrtool.kernels.filter_records import REFERENCE_STEP_S
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
-from icrtool.kernels.track import Track
+from icrtool.kernels.track import Track, Windows
 from icrtool.kernels.window_residuals import path_at, window_residuals
 from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs, wheel_motion
 from icrtool.records.plain_data import known
@@ -46,27 +47,27 @@ SLIPS, LEAST_SLIP = 0.4, 0.25
 roll has less slip to vary; at least this part of it."""
 
 
-class StateWindows(NamedTuple):
-    """Displacement and turn over windows of distance, linear in what may be unknown.
+@dataclass(frozen=True)
+class StateWindows(Windows):
+    """Displacement and turn over windows of the wheels' distance, linear in what may be unknown.
 
     Attributes
     ----------
     residuals : (3 w,) forward, right [m] and turn [rad] of the wheels' motion less that of the states
     jacobian : (3 w, 6) by y_icr_right, y_icr_left, x_icr [m], heading offset [rad], scale of both wheels, difference
-    length_m : (w,) distance of the wheels; turned_rad : (w,) turn by the wheels
-    end_s, end_m : (w,) time and distance of the wheels at the end; stretch : (w,) number of its stretch
+    turned_rad : (w,) turn by the wheels; end_m : (w,) their distance at the end; stretch : (w,) number of its stretch
     distance_m : of the wheels, whole drive
+    separation_m : y right - y left of the ICRs that the wheels' motion is by
     place_std_m, heading_std_rad : median standard deviation of the states that the motion is compared with
     """
 
     residuals: Floats
     jacobian: Floats
-    length_m: Floats
     turned_rad: Floats
-    end_s: Floats
     end_m: Floats
     stretch: Ints
     distance_m: float
+    separation_m: float
     place_std_m: float
     heading_std_rad: float
 
@@ -77,13 +78,26 @@ class StateWindows(NamedTuple):
         return np.array([place, place, math.sqrt(2.0) * self.heading_std_rad])
 
 
-def cut_states(table: States, track: Track, icrs_m: Floats) -> StateWindows:
-    """Return windows of states, with the motion by constant ICRs (3,) [m]: y right, y left, x."""
-    distance = track.travel
-    window_m = min(WINDOW_M, WINDOW_IN_SEPARATIONS * float(icrs_m[0] - icrs_m[1]))
+def cut_states(table: States, track: Track, track_width_m: float | None) -> StateWindows:
+    """Return windows of states that follow one another, with the motion by constant ICRs.
+
+    Those are the run's final ones where they can be, else those of the track width.
+
+    Parameters
+    ----------
+    table : the recorded states
+    track : the same as a track
+    track_width_m : b, None where not known
+    """
+    right, left, x = table.icrs_at(-1)
+    half = width_or_usual_m(track_width_m) / 2
+    if right - left < half or right <= 0.0 or left >= 0.0:
+        right, left, x = 1.4 * half, -1.4 * half, 0.0
+    distance, separation_m = track.travel, float(right - left)
+    window_m = min(WINDOW_M, WINDOW_IN_SEPARATIONS * separation_m)
     rows = rows_at_steps(distance, window_m)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
-    parameters, by_icrs = parameters_of_icrs(icrs_m, WIDTH_M)
+    parameters, by_icrs = parameters_of_icrs(np.array([right, left, x]), WIDTH_M)
     terms, whole_m, distance = len(parameters), float(distance[-1]), distance[rows]
     give_back_freed()
 
@@ -91,21 +105,23 @@ def cut_states(table: States, track: Track, icrs_m: Floats) -> StateWindows:
         return model_columns(FULL_LINEAR, wheel_motion(track.v_left[some], track.v_right[some], WIDTH_M))
 
     path = path_at(track, twists, parameters, track.t[rows])
-    place, heading = table.north_m[rows] + 1j * table.east_m[rows], table.heading_rad[rows]
-    moved = np.exp(-1j * heading[start]) * (place[end] - place[start])
-    missed, jacobian = window_residuals(path, start, end, moved, 0.0, np.ones(len(start)))
+    windows = Windows(track, rows[:-1], rows[1:], np.diff(distance))
+    missed, jacobian = window_residuals(path, start, end, windows.moved, 0.0, np.ones(len(start)))
     turned = np.diff(path.heading)
     by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
     by_terms = np.concatenate([jacobian[:, :terms], np.diff(path.heading_by).T]) @ by_icrs
     return StateWindows(
-        residuals=np.concatenate([missed, turned - np.diff(heading)]),
+        track,
+        windows.begin,
+        windows.end,
+        windows.length_m,
+        residuals=np.concatenate([missed, turned - windows.turned]),
         jacobian=np.column_stack([by_terms[:, :3], by_offset, by_terms[:, 3:]]),
-        length_m=np.diff(distance),
         turned_rad=turned,
-        end_s=table.t_s[rows[1:]],
         end_m=distance[1:],
         stretch=(distance[:-1] // (STRETCH_IN_WINDOWS * window_m)).astype(np.int64),
         distance_m=whole_m,
+        separation_m=separation_m,
         place_std_m=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
         heading_std_rad=float(np.median(table.std_heading_rad)),
     )
@@ -120,7 +136,6 @@ def final_covariance(
     windows: StateWindows,
     filter_covariance: Floats,
     *,
-    width_m: float,
     process_icr_mps: float,
     track_width_m: float | None = None,
 ) -> Floats:
@@ -128,10 +143,9 @@ def final_covariance(
 
     Parameters
     ----------
-    windows : with the final ICRs
+    windows : with the final ICRs; y right - y left is the prior's standard deviation, too
     filter_covariance : (3, 3) of the ICRs at the end, and
     process_icr_mps : process noise of the filter: both give how fast it forgets
-    width_m : y right - y left, the prior's standard deviation
     track_width_m : b; None: not known
 
     Notes
@@ -152,6 +166,7 @@ def final_covariance(
     x 98 %; that truth has the drive's own slip, and is nearer than another drive. Halves of recorded drives, which
     hold other turns at other speeds, are the least certain, x_icr above all.
     """
+    width_m = windows.separation_m
     if len(windows.length_m) < 2:
         return filter_covariance + np.eye(3) * width_m**2
     forgets = process_icr_mps**2 * REFERENCE_STEP_S
@@ -195,17 +210,12 @@ SPIN_RATIO = 3.0
 """A turn counts as a spin where the sides differ by this many times their mean."""
 
 
-def find_excitation(
-    table: States, track: Track, track_width_m: float | None, windows: StateWindows
-) -> ExcitationDocument:
+def find_excitation(windows: StateWindows) -> ExcitationDocument:
     """Return which ICRs a drive could show.
 
     Parameters
     ----------
-    table : the recorded states
-    track : the same as a track
-    track_width_m : b, None where not known
-    windows : of the drive, with `nominal_icrs`
+    windows : of the recorded states
 
     Notes
     -----
@@ -213,8 +223,7 @@ def find_excitation(
     filter's own uncertainties and some slip as noise, after the heading's offset and the wheels' scales are
     marginalised. It is what a drive could show at best, not what the filter learned.
     """
-    p = nominal_icrs(table, track_width_m)
-    width = float(p[0] - p[1])
+    track, width = windows.track, windows.separation_m
     slip = SLIP_SHARE * np.abs([windows.length_m, windows.length_m, windows.turned_rad])
     rows = windows.jacobian / np.hypot(slip, np.maximum(windows.noise, 1e-6)[:, None]).ravel()[:, None]
     information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
@@ -227,8 +236,11 @@ def find_excitation(
         float(np.maximum(side * some, 0.0).sum()) for some in (turns, turns[spins]) for side in (1.0, -1.0)
     )
     stds: dict[str, float] = dict(zip(ICR_COLUMNS, std.tolist(), strict=True))
-    verdicts: dict[str, Excited] = {name: _verdict(value / width) for name, value in stds.items()}
-    sentences = _sentences(stds, verdicts, right, left, table, windows)
+    verdicts: dict[str, Excited] = {
+        name: "shown" if value / width <= SHOWN_SHARE else "weak" if value / width <= WEAK_SHARE else "not shown"
+        for name, value in stds.items()
+    }
+    sentences = _sentences(stds, verdicts, right, left, windows)
     return ExcitationDocument(
         NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(right),
         math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), sentences,
@@ -267,32 +279,16 @@ def withhold_unlearned(
     return replace(found, verdict=VerdictByIcr(**verdicts), sentences=tuple(sentences))
 
 
-def nominal_icrs(table: States, track_width_m: float | None) -> Floats:
-    """Return ICRs (3,) [m] near which to ask: the run's final ones where they can be, else those of the width."""
-    right, left, x = table.icrs_at(-1)
-    half = width_or_usual_m(track_width_m) / 2
-    if right - left < half or right <= 0.0 or left >= 0.0:
-        right, left, x = 1.4 * half, -1.4 * half, 0.0
-    return np.array([right, left, x])
-
-
-def _verdict(share: float) -> Excited:
-    if share <= SHOWN_SHARE:
-        return "shown"
-    return "weak" if share <= WEAK_SHARE else "not shown"
-
-
 def _sentences(
-    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, table: States,
-    windows: StateWindows,
-) -> tuple[str, ...]:  # fmt: skip
+    stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, windows: StateWindows
+) -> tuple[str, ...]:
     """Return sentences: what is not shown, why, and what to drive."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return ()
     unshown = ", ".join(f"{ICR_WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
     first = f"this drive could not show the ICRs well: {unshown}"
-    turned = np.abs(np.diff(np.interp(windows.end_s, table.t_s, table.heading_rad)))
+    turned = np.abs(windows.turned[1:])
     steered = float(turned[turned > SURELY_TURNED_RAD].sum())
     if steered > TURNS_NEEDED_RAD and right + left < STEERS * steered:
         angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(right + left):.0f}°"

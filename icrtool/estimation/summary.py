@@ -16,7 +16,6 @@ from icrtool.estimation.observability import (
     final_covariance,
     find_excitation,
     multiplier_std,
-    nominal_icrs,
     withhold_unlearned,
 )
 from icrtool.estimation.odometry import drive_summary, odometry_end_error
@@ -225,15 +224,13 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     """
     table, width = filtered.table, config.robot.track_width_m
     track = track_of_states(table, filtered.in_gap, filtered.outages_ns)
-    p = nominal_icrs(table, width)
-    windows, own = cut_states(table, track, p), filtered.covariance[3:, 3:]
-    excitation = find_excitation(table, track, width, windows)
+    windows, own = cut_states(table, track, width), filtered.covariance[3:, 3:]
+    excitation = find_excitation(windows)
     if config.filter.preset == "paper":
         return own, excitation, 0.0
     covariance = final_covariance(
         windows,
         own,
-        width_m=float(p[0] - p[1]),
         process_icr_mps=config.filter.process_icr_mps,
         track_width_m=width,
     )

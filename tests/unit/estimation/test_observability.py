@@ -6,16 +6,14 @@ import pytest
 from msgspec.structs import astuple
 
 from icrtool.estimation.fit import fit
-from icrtool.estimation.observability import cut_states, find_excitation, nominal_icrs
+from icrtool.estimation.observability import cut_states, find_excitation
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 from icrtool.records.run_document import ExcitationDocument
 from support.exact_drives import CONFIG, simulate
 
 
 def excitation_of(run: Run) -> ExcitationDocument:
-    drive = track_of(run)
-    windows = cut_states(run.table, drive, nominal_icrs(run.table, run.track_width_m))
-    return find_excitation(run.table, drive, run.track_width_m, windows)
+    return find_excitation(cut_states(run.table, track_of(run), run.track_width_m))
 
 
 @pytest.fixture(scope="module")
