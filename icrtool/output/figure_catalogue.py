@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from icrtool.output.text_blocks import Chart
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import FigureSet
 
@@ -136,6 +137,36 @@ FIGURES = {
     ),
 }  # fmt: skip
 """By the name of the file; a name that ends in ``_`` goes on with a distance."""
+
+
+def drive_charts(position_word: str) -> tuple[Chart, ...]:
+    """Return what the script of a run's page draws of the drive, its map first; captions go on from the pictures'."""
+    icrs, differences = FIGURES["icr_estimates"], FIGURES["gnss_difference"]
+    return (
+        Chart(
+            "map",
+            "Map",
+            "Point at the drive: the same moment is marked in the charts. Click on it: the path that each model drives "
+            "from there, by wheel speeds alone for 20 m; the black line is the filter, which had the "
+            f"{position_word}. The closer a coloured end lies to the black one, the better the model.",
+        ),
+        Chart("speeds", "Wheel speeds", "Where left and right differ the robot turns: there slip shows."),
+        Chart(
+            "icrs",
+            icrs.title,
+            f"{icrs.caption} Bands: ±2σ. The dotted lines are half the track width: no slip.",
+        ),
+        Chart(
+            "differences",
+            f"Distance from filter to {position_word}",
+            f"{differences.caption} Crosses are rejected fixes; those at the upper edge lie beyond it.",
+        ),
+        Chart(
+            "headings",
+            "Heading: measured minus filter",
+            "Good: noise about zero. A long deviation is a compass that is disturbed, or a clock that lags.",
+        ),
+    )
 
 
 def figures_of(of: Subject, subject: object, figures: FigureSet = "default") -> Iterator[tuple[str, Figure]]:

@@ -139,6 +139,14 @@ class Items(NamedTuple):
     texts: Sequence[str]
 
 
+class Chart(NamedTuple):
+    """What a page's script draws in its element `name`, its title, and what to see there."""
+
+    name: str
+    title: str
+    caption: str
+
+
 class Figure(NamedTuple):
     """Figures of `icrtool.output.figure_catalogue`.
 
@@ -146,11 +154,13 @@ class Figure(NamedTuple):
     ----------
     names : begin the names of its pictures
     drawing : template of what a page's scripts draw in place of them; empty: nothing
+    charts : what is drawn there
     folded : a page shows the titles of its pictures first
     """
 
     names: tuple[str, ...]
     drawing: str = ""
+    charts: tuple[Chart, ...] = ()
     folded: bool = True
 
 

@@ -20,6 +20,23 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 MODEL_WORDS = {"recommended": "whole model", "controller": "controller numbers", "icr": "ICR", "no_slip": "no slip"}
 
+WORDS = {
+    "ICR": "Instantaneous centre of rotation of a track: the point of the ground, seen from the robot, about which it "
+    "turns. A robot that slips turns about points further out than its tracks.",
+    "momentary, final": "The estimate at the start of a trial; the estimate at the end of the log.",
+    "no slip": "The model of a robot whose wheels never slide sideways: what odometry uses where nothing was "
+    "calibrated.",
+    "whole model": "The recommended one: constant parameters, fitted to many windows of the drive, each trial "
+    "predicted without the distance that it drives.",
+    "controller numbers": "What a differential-drive controller makes of the multiplier and the radius factors above, "
+    "tested like the others.",
+    "trial": "From one recorded state, drive on with wheel speeds alone. The error is the distance to the reference "
+    "at the end.",
+    "95 %, expected": "19 of 20 trials end nearer than the first; the second is the mean over all trials.",
+    "σ": "One standard deviation.",
+}
+"""What the words of a run's page mean."""
+
 MOST_LINES = 50
 """Jumps of the reference that are printed, the largest decided ones first."""
 

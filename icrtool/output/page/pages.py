@@ -20,6 +20,7 @@ from icrtool.dropout_analysis.starts import with_smoothed_reference
 from icrtool.errors import RunError
 from icrtool.motion.models import FAMILY
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
+from icrtool.output.figure_catalogue import drive_charts
 from icrtool.output.files.atomic import is_page, write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS, drive_data
@@ -32,6 +33,7 @@ from icrtool.output.tables.run import advice_blocks, log_sections, unusable_line
 from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Section, Table, Title
 from icrtool.output.text_format import (
     MODEL_WORDS,
+    WORDS,
     driven_text,
     duration_text,
     error_text,
@@ -110,23 +112,25 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
         "From this drive icrtool learned how the robot slips when it turns, and then tested how far wheel speeds alone "
         "keep its position."
     )
+    words = Section("ICR, no slip, whole model, trial, σ …", [Facts(list(WORDS.items()))], PAGE)
     blocks = [
         Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {about}"),
         *page_blocks(summary, report),
         Section("Log and settings", [*log_sections(summary), made_from], name="log"),
-        Section("Words on this page", [Figure((), "words")], name="words"),
+        Section("Words on this page", [words], name="words"),
     ]
     return render(
         SCRIPTS, drive_data(compared, report, coordinates=coordinates), title=summary.log,
         kind="Drive without GNSS: report of one log", blocks=blocks, pictures=pictures,
-        position_word=position_word(summary), duration_s=summary.drive.duration_s,
-        folded_models=len(report.models) - len(main_rows(report)),
+        duration_s=summary.drive.duration_s, groups=(), folded_models=len(report.models) - len(main_rows(report)),
     )  # fmt: skip
 
 
 def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
-    drive: list[Block] = [Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive")]
+    drive: list[Block] = [
+        Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive", drive_charts(position_word(summary)))
+    ]
     if events := summary.events:
         rows = []
         for one in events:
@@ -361,7 +365,7 @@ def comparison_page(found: GroupComparison, title: str) -> str:
         (*VENDOR, "columns.js", "charts.js", "comparison.js"), {"by_group": by_group}, title=title,
         kind="Drive without GNSS: groups of runs compared",
         blocks=[Title(f"{', '.join(names)} ({title})", groups), *transfer_blocks(found)],
-        names=names, pictures=drawn_pictures([("transfer", transfer(found))]),
+        groups=names, folded_models=0, pictures=drawn_pictures([("transfer", transfer(found))]),
     )  # fmt: skip
 
 

@@ -61,8 +61,6 @@ def render(
     """
     from markupsafe import Markup
 
-    from icrtool.output.figure_catalogue import FIGURES
-
     style = "\n".join(_static(name) for name in STYLES)
     code = [BEGIN, *(_static(name) for name in scripts)]
     # As a content security policy names a style or a script.
@@ -79,7 +77,7 @@ def render(
         # Ours, not of a log: they stand in the page as they are.
         policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(one) for one in code[1:]],  # noqa: S704
         data=None if data is None else Markup(written),  # noqa: S704 - escaped for a script element
-        tool_version=__version__, title=title, kind=kind, blocks=blocks, figures=FIGURES,
+        tool_version=__version__, title=title, kind=kind, blocks=blocks,
         **{"pictures": {}, **content},
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ from icrtool.motion.models import TERMS
 from icrtool.output.files.formats import csv_bytes
 from icrtool.output.tables.dropout import REACH_ROWS, parameter_table, reach_row
 from icrtool.output.tables.run import numbers_of
-from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Facts, Figure, Items, Line, Section, Table, Title
+from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import model_text
 from icrtool.records import calibration_document as documents
 from icrtool.records.dropout import CHOICE_HORIZON_M
@@ -221,8 +221,13 @@ def transfer_blocks(found: documents.GroupComparison) -> list[Block]:
             cells[one.calibrated_on, one.tested_on] = f"{one.p95_m:.2f} / {one.expected_m:.2f}"
     matrix = [(row, *(cells[row, column] for column in names)) for row in names]
     caption = f"95 % / expected error [m] after {CHOICE_HORIZON_M:g} m, calibrated on row, tested on column"
+    chart = (
+        "A curve for each calibration, tested in the runs of one group. A calibration of the same group is tested on "
+        "what it was not fitted to. Where the bands (95 % interval) of two curves lie apart, the calibrations differ "
+        "in use."
+    )
     cost: list[Block] = [
-        Figure((), "comparison"),
+        Figure((), "errors", (Chart("error-chart", "Error over distance", chart),)),
         Figure(("transfer",), folded=False),
         Table("lr", matrix, ("", *names), caption),
         "on the diagonal each trial is predicted by a fit that does not contain it",

@@ -11,7 +11,8 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import difference_half_width
-from icrtool.output.text_blocks import VERBOSE, Block, Cell, Figure, Items, Section, Table
+from icrtool.output.figure_catalogue import FIGURES
+from icrtool.output.text_blocks import VERBOSE, Block, Cell, Chart, Figure, Items, Section, Table
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text
 from icrtool.records.dropout import CHOICE_HORIZON_M, METRICS
 from icrtool.records.dropout_document import DropoutDocument, ModelDocument, column_of
@@ -94,10 +95,13 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
         kind = "straight" if split.straight else "turning"
         errors = ", ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in split.expected_m.items())
         rests.append(f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)")
+    caption = (
+        f"{FIGURES['summary'].caption} The budget is the dashed red line. Bands: 95 % interval of the number itself."
+    )
     return Section(
         "Error over distance without GNSS",
         [
-            Figure(("summary",), "errors"),
+            Figure(("summary",), "errors", (Chart("error-chart", FIGURES["summary"].title, caption),)),
             Table("llr", rows, head),
             *further,
             Section("What the errors rest on", rests, VERBOSE),
