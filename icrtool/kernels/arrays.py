@@ -1,4 +1,4 @@
-"""Types of arrays, the integral of one, and rows at equal steps of a quantity that never decreases."""
+"""Types of arrays; the integral of one, rows at steps of a quantity that never decreases, turns by quaternions."""
 
 from __future__ import annotations
 
@@ -48,3 +48,18 @@ def rows_of_cells(progress: Floats, cells_of: Callable[[Floats], Floats]) -> Int
         found.append(lo + np.flatnonzero(cell > np.append(last, cell[:-1])))
         last = cell[-1]
     return np.concatenate(found)
+
+
+def quaternion_product(a: Floats, b: Floats) -> Floats:
+    """Return the products (n, 4) of quaternions x, y, z, w: turned by b, then by a."""
+    vector = a[:, 3:] * b[:, :3] + b[:, 3:] * a[:, :3] + np.cross(a[:, :3], b[:, :3])
+    return np.column_stack([vector, a[:, 3] * b[:, 3] - np.sum(a[:, :3] * b[:, :3], axis=1)])
+
+
+def turned_axis(axis: int, x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return x, y, z (n,) of an axis (0, 1, 2) of frames turned by unit quaternions, in the frame around."""
+    if axis == 0:
+        return 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
+    if axis == 1:
+        return 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
+    return 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, turned_axis
 from icrtool.logs.messages.topic_table import FRAME, TopicTable
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
 from icrtool.logs.streams.sources import (
@@ -243,14 +243,14 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     ordered = [q[place] for place in places]
 
     def tilt(axis: int) -> float:
-        upward = _of_rows(lambda *unit: _vertical(*unit)[axis], ordered, norm)[usable]
+        upward = _of_rows(lambda *unit: turned_axis(axis, *unit)[2], ordered, norm)[usable]
         return float(np.median(np.abs(upward))) if len(upward) else 1.0
 
-    if tilt(2) >= UPRIGHT_COSINE:
-        return _of_rows(partial(_bearing, 0), ordered, norm), usable, note
-    level = min(range(3), key=tilt)
-    used = "is level and is used as heading, with an offset to be estimated"
-    note = f"mounted on its side: its {'xyz'[level]} axis {used}"
+    level = 0
+    if tilt(2) < UPRIGHT_COSINE:
+        level = min(range(3), key=tilt)
+        used = "is level and is used as heading, with an offset to be estimated"
+        note = f"mounted on its side: its {'xyz'[level]} axis {used}"
     return _of_rows(partial(_bearing, level), ordered, norm), usable, note
 
 
@@ -265,11 +265,7 @@ def _of_rows(make: Callable[..., Floats], q: Sequence[Floats], norm: Floats | fl
 
 def _bearing(axis: int, x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
     """Return the direction in which an axis of the sensor points, seen from above [rad] (n,)."""
-    east, north = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x)),
-    )[axis]
+    east, north, _ = turned_axis(axis, x, y, z, w)
     return np.arctan2(north, east)
 
 
@@ -288,19 +284,15 @@ def _written_order(
 
     as_named, some = (0, 1, 2, 3), unit(rows[:: max(1, len(rows) // MOST_LOOKED_AT)])
     # Of each axis of the sensor, the share of the time in which it is not upright.
-    if len(some) < 2 or ((np.abs(_vertical(*some.T)) < UPRIGHT_COSINE).mean(axis=1) < TILTED_SHARE).any():
+    upward = np.array([turned_axis(axis, *some.T)[2] for axis in range(3)])
+    if len(some) < 2 or ((np.abs(upward) < UPRIGHT_COSINE).mean(axis=1) < TILTED_SHARE).any():
         return as_named, ""
     rate = None if yaw_rate_radps is None else yaw_rate_radps[rows]
     for order, note in ORDERS:
-        tilted = (np.abs(_vertical(*some[:, order].T)[2]) < LEVEL_COSINE).mean()
+        tilted = (np.abs(turned_axis(2, *some[:, order].T)[2]) < LEVEL_COSINE).mean()
         if tilted < TILTED_SHARE and _turns_with(unit(rows)[:, order], rate):
             return order, note
     return as_named, ""
-
-
-def _vertical(x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
-    """Return the vertical component of the sensor's axes (3, n)."""
-    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
 
 
 def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints, quaternion_product, turned_axis
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import FRAME, STAMPS, TopicTable
 from icrtool.logs.streams.sources import NEVER_MOVES, PositionSource, all_valid, fields_in, number, of_topic
@@ -295,8 +295,8 @@ def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[flo
     if not frame or frame not in links:
         return None
     # of several messages for one child frame, the last
-    turns = np.array([one.turn[-1] for one in links.values()])
-    axes = _rotated(np.repeat(turns, 3, axis=0), np.tile(np.eye(3), (len(links), 1))).reshape(-1, 3, 3)
+    turns = np.array([one.turn[-1] for one in links.values()]).T
+    axes = np.array([turned_axis(axis, *turns) for axis in range(3)]).transpose(2, 0, 1)
     placed = _in_roots(
         {name: (one.parent, one.place[-1], of) for (name, one), of in zip(links.items(), axes, strict=True)}
     )
@@ -368,8 +368,10 @@ def transform_pose(table: TopicTable) -> TopicTable:
         changed = np.diff(above.place, axis=0).any(axis=1) | np.diff(above.turn, axis=0).any(axis=1)
         version = np.append(0, np.cumsum(changed))[held]
         step[1:] |= version[1:] != version[:-1]
-        place = above.place[held] + _rotated(above.turn[held], place[known])
-        turn = _product(above.turn[held], turn[known])
+        outer, place = above.turn[held], place[known]
+        axes = (np.column_stack(turned_axis(axis, *outer.T)) for axis in range(3))
+        place = above.place[held] + sum(along[:, None] * axis for along, axis in zip(place.T, axes, strict=True))
+        turn = quaternion_product(outer, turn[known])
         root, lowest = above.parent, False
     if not (REFERENCE_WORDS.search(root) or root in REFERENCE_FRAMES):
         why = f"its root, {root}, does not show a position reference: it may be the wheels' dead reckoning"
@@ -406,15 +408,3 @@ def _links(table: TopicTable) -> dict[str, _Link]:
             turn = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1)[:, None]
             found[name.strip("/")] = _Link(parent, rows, places, pose[:, :3], turn)
     return found
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    """Return the products (n, 4) of quaternions x, y, z, w."""
-    vector = a[:, 3:] * b[:, :3] + b[:, 3:] * a[:, :3] + np.cross(a[:, :3], b[:, :3])
-    return np.column_stack([vector, a[:, 3] * b[:, 3] - np.sum(a[:, :3] * b[:, :3], axis=1)])
-
-
-def _rotated(q: Floats, places: Floats) -> Floats:
-    """Return places (n, 3) rotated by quaternions (n, 4)."""
-    twice = 2.0 * np.cross(q[:, :3], places)
-    return places + q[:, 3:] * twice + np.cross(q[:, :3], twice)
