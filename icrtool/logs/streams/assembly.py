@@ -20,7 +20,6 @@ from icrtool.logs.streams.select import Candidates, Choice, choose_streams, igno
 from icrtool.logs.streams.sources import (
     Convention,
     HeadingSource,
-    Pair,
     PositionSource,
     Source,
     StampedRows,
@@ -100,8 +99,8 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         far = "one stream has no header stamps, and the header stamps of another are far from log time"
         notes.append(f"{far}; log time is used for all streams")
     notes += clock_notes([(role, one.stamps) for role, one in chosen.items()], name)
-    gnss, datum = _fixes(position, config, clock, name)
-    heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock, name)
+    gnss, datum = _fixes(position, config, clock)
+    heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock)
     wheels, wheel_notes = wheel_samples(motion, motion.stamps.on(clock), config, name)
     notes += wheel_notes + ignored_joints(motion, config)
     notes += [f"{one.topic}: {one.note}" for one in chosen.values() if one.note]
@@ -128,11 +127,8 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         rate, jitter = rate_and_jitter(samples.stamp_ns)
         streams.append(StreamChoice(role, one.topic, one.message_type, count, rate, used, jitter, one.why + detail))
     # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
-    receivers = []
-    for other in found.gnss:
-        usable = other.geodetic is not None and not other.is_empty and not other.problem
-        if datum is not None and usable and other.topic != position.topic:
-            receivers.append(OtherReceiver(other.topic, _fixes(other, config, clock, name, datum)[0]))
+    others = [one for one in found.gnss if one.geodetic is not None and not one.problem and one.topic != position.topic]
+    receivers = [OtherReceiver(one.topic, _fixes(one, config, clock, datum)[0]) for one in others if datum is not None]
     known: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
     units = inertial_units(survey.tables, GYRO_AXES, clock, known)
     log = RobotLog(
@@ -195,11 +191,9 @@ def common_clock(streams: Sequence[StampedRows]) -> Literal["header", "log"]:
 
 
 def _fixes(
-    source: PositionSource, config: Config, clock: Clock, name: str, given: Datum | None = None
+    source: PositionSource, config: Config, clock: Clock, given: Datum | None = None
 ) -> tuple[PositionFixes, Datum | None]:
     """Return positions in the local plane about the datum: `given`, else the configured one, else the first fix."""
-    if source.is_empty:
-        raise DataError(name, f"{source.topic}: {source.problem}", "name another position in topics.gnss")
     stamps = source.stamps.on(clock)
     rows = np.flatnonzero(source.usable)
     rows = rows[np.argsort(stamps[rows], kind="stable")]
@@ -222,11 +216,8 @@ def _fixes(
     return PositionFixes(stamps[rows], north, east, var_north, var_east, covariance, stated), datum
 
 
-def _headings(source: HeadingSource, config: Config, clock: Clock, name: str) -> tuple[HeadingSamples, str]:
+def _headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[HeadingSamples, str]:
     """Return headings clockwise from north, and a text on how the convention is known."""
-    if source.is_empty:
-        why = source.problem or "no usable heading"
-        raise DataError(name, f"{source.topic}: {why}", "choose another with topics.heading")
     convention: Convention = source.convention
     why = source.convention_why
     if config.frames.heading != "auto":
@@ -297,22 +288,19 @@ def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bo
     wanted, positions, speeds = config.wheels.quantity, motion.position, motion.speed
     if wanted in ("position", "counts") and positions is None:
         raise ConfigError("wheels.quantity", f"{motion.topic} has no {wanted}", "leave it on auto")
-    usable = speeds is None or wanted != "auto" or positions is None or _alive(positions, speeds)
-    if positions is not None and wanted != "velocity" and usable:
+    stuck = False
+    if wanted == "auto" and positions is not None and speeds is not None:
+        # Some drivers leave the position at zero.
+        finite = np.isfinite(positions[0]) & np.isfinite(positions[1])
+        stuck = int(np.count_nonzero(finite)) < len(finite) / 2 or any(
+            np.ptp(travelled[finite]) == 0.0 and np.nanmax(np.abs(speed)) > 0.0
+            for travelled, speed in zip(positions, speeds, strict=True)
+        )
+    if positions is not None and wanted != "velocity" and not stuck:
         return *positions, "counts" if wanted == "counts" else motion.unit, True
     if speeds is None:
         raise ConfigError("wheels.quantity", f"{motion.topic} has no velocity of both sides", "leave it on auto")
     return *speeds, motion.unit, False
-
-
-def _alive(positions: Pair, speeds: Pair) -> bool:
-    """Return whether the positions change where the speeds do: some drivers leave the position at zero."""
-    finite = np.isfinite(positions[0]) & np.isfinite(positions[1])
-    if np.count_nonzero(finite) < len(finite) / 2:
-        return False
-    still = [float(np.ptp(side[finite])) == 0.0 for side in positions]
-    moving = [float(np.nanmax(np.abs(side))) > 0.0 for side in speeds]
-    return not any(stuck and moves for stuck, moves in zip(still, moving, strict=True))
 
 
 PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0
