@@ -129,8 +129,7 @@ class Joints:
             problem = f"lists {lefts} left and {len(right)} right wheels; at most {MOST_WHEELS} of a side are read"
         else:
             # All messages list the same joints in the same order: one row stands for them.
-            places = _places_of(left + right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
-            alike = _rows_alike(places >= 0, lefts)
+            places, alike = _places_of(left, right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
             problem = "" if alike.any() else "left and right wheels come in different messages"
         if problem:
             return WheelMotion(**of_topic(table), joints=tuple(texts), problem=problem)
@@ -144,27 +143,25 @@ class Joints:
         )  # fmt: skip
 
 
-def _places_of(wheels: Sequence[int], codes: Ints, joints: int) -> Ints:
-    """Return the place of each wheel in the list of each message (n, k), -1 where it is not listed."""
+def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: int) -> tuple[Ints, Bools]:
+    """Return the place of each wheel in the list of each message (n, k), and which messages (n,) are used.
+
+    A wheel that a message does not list is at -1. Those messages are used that list the set of wheels most do, of those
+    sets with both sides: a mean over wheels that changes its members would jump.
+    """
+    wheels = [*left, *right]
     wheel = np.full(joints + 1, -1)
     wheel[wheels] = np.arange(len(wheels))
-    rows, listed = np.nonzero(wheel[codes] >= 0)
+    rows, at = np.nonzero(wheel[codes] >= 0)
     places = np.full((len(wheels), len(codes)), -1).T
-    places[rows, wheel[codes[rows, listed]]] = listed
-    return places
-
-
-def _rows_alike(listed: Bools, lefts: int) -> Bools:
-    """Return the rows (n,) that list the set of wheels (n, k) most rows list, of those sets with both sides.
-
-    A mean over wheels that changes its members would jump.
-    """
-    both: Bools = np.logical_and(listed[:, :lefts].any(axis=1), listed[:, lefts:].any(axis=1))
+    places[rows, wheel[codes[rows, at]]] = at
+    listed = places >= 0
+    both: Bools = np.logical_and(listed[:, : len(left)].any(axis=1), listed[:, len(left) :].any(axis=1))
     sets = listed[both]
     if len(sets) and np.any(sets != sets[0]):
         _, which, count = np.unique(sets, axis=0, return_inverse=True, return_counts=True)
         both[both] = which.reshape(-1) == int(np.argmax(count))
-    return both
+    return places, both
 
 
 def _by_wheel(values: NDArray[Any] | None, places: Ints) -> list[Floats]:
@@ -346,31 +343,25 @@ _LEFT_TOKENS = {"l", "left", "fl", "rl", "bl", "ml", "lf", "lb", "lr", "lm", "lh
 _RIGHT_TOKENS = {"r", "right", "fr", "rr", "br", "mr", "rf", "rb", "rm", "rh", "rwheel", "wr"}
 
 
-def side_of(name: str) -> str:
-    """Return ``left``, ``right`` or an empty string for a joint's name."""
-    lowered = name.lower()
-    left, right = "left" in lowered, "right" in lowered
-    if left == right:
-        tokens = words_of(name)
-        left, right = bool(tokens & _LEFT_TOKENS), bool(tokens & _RIGHT_TOKENS)
-    return "" if left == right else "left" if left else "right"
-
-
-def words_of(name: str) -> set[str]:
-    """Return the words of a name, lower case: ``wheel_FL_joint``, ``frontLeftWheel``, ``panther/rl_wheel_joint``."""
-    return {word.lower() for word in _TOKENS.findall(name.replace("_", " "))}
-
-
 def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
     """Return the positions of the left and of the right wheel joints among the names of a message."""
-    sides = [(i, *_side_of_wheel(name)) for i, name in enumerate(names)]
+    sides = [(i, *side_of(name)) for i, name in enumerate(names)]
     any_named = any(named for _, side, named in sides if side)
     left, right = ([i for i, side, named in sides if side == one and named >= any_named] for one in ("left", "right"))
     return left, right
 
 
 @lru_cache(4096)
-def _side_of_wheel(name: str) -> tuple[str, bool]:
-    """Return the side of a joint that may be a wheel, empty for others, and whether its name is that of a wheel."""
-    elsewhere = any(_OTHER_JOINTS.fullmatch(word) for word in words_of(name))
-    return "" if elsewhere else side_of(name), bool(WHEEL_WORDS.search(name))
+def side_of(name: str) -> tuple[Literal["left", "right", ""], bool]:
+    """Return the side of a joint that may be a wheel, empty for others, and whether its name is that of a wheel.
+
+    The words of a name are found in ``wheel_FL_joint``, ``frontLeftWheel`` and ``panther/rl_wheel_joint``.
+    """
+    words = {word.lower() for word in _TOKENS.findall(name.replace("_", " "))}
+    left, right = "left" in name.lower(), "right" in name.lower()
+    if left == right:
+        left, right = bool(words & _LEFT_TOKENS), bool(words & _RIGHT_TOKENS)
+    named = bool(WHEEL_WORDS.search(name))
+    if left == right or any(_OTHER_JOINTS.fullmatch(word) for word in words):
+        return "", named
+    return ("left" if left else "right"), named

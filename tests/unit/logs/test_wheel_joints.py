@@ -38,7 +38,7 @@ from icrtool.logs.streams.wheels import side_of, wheel_joints
     ],
 )
 def test_the_side_of_a_joint_is_in_its_name(name: str, side: str) -> None:
-    assert side_of(name) == side
+    assert side_of(name)[0] == side
 
 
 def test_wheels_are_picked_from_among_other_joints() -> None:
