@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
@@ -46,10 +45,6 @@ Of a chunk with images that is a few percent, and most recorders close a chunk b
 
 class NotByRangesError(Exception):
     """A distant file that cannot be read by ranges."""
-
-
-class _PartError(DecompressionError):
-    """Damaged records, read without their checksum: those of the chunks beside them are computed, too."""
 
 
 class Part(NamedTuple):
@@ -191,7 +186,15 @@ class ChunkedFile(Container):
         groups = zip(_groups(parts), reused_spaces(), strict=False)
         for (group, spaces), made in ahead(lambda one: self._joined(*one), groups, THREADS, BLOCKS_AHEAD):
             self._at = group[-1].chunk.at
-            yield from self._sound(group, spaces, made)
+            try:
+                block, inflation = made()
+            except (DecompressionError, MemoryError):
+                # what is sound of each, all of it checked
+                for part in group:
+                    yield from self._read_chunk(part, spaces)
+            else:
+                self._inflation.left += inflation.left
+                yield self._with_possible_times(block)
 
     def _read_ahead(self, remote: RemoteFile, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Part]:
         """Yield parts of a distant file as `_located` does, with what is wanted of the next ones read meanwhile."""
@@ -239,22 +242,6 @@ class ChunkedFile(Container):
             records = self._remote.gather(behind - chunk.size, ranges)
         return Part(chunk, np.cumsum(sizes) - sizes, ranges, held, records)
 
-    def _sound(
-        self, group: Sequence[Part], spaces: Spaces, made: Callable[[], tuple[Block, Inflation]]
-    ) -> Iterator[Block]:
-        """Yield the block that is made of some chunks; where anything is damaged, one for each, or what is sound."""
-        try:
-            block, inflation = made()
-        except (DecompressionError, MemoryError) as err:
-            for part in group:
-                if len(group) == 1 or isinstance(err, _PartError):
-                    yield from self._read_chunk(part, spaces)
-                else:
-                    yield from self._sound([part], spaces, partial(self._joined, [part], spaces))
-        else:
-            self._inflation.left += inflation.left
-            yield self._with_possible_times(block)
-
     def _joined(self, group: Sequence[Part], spaces: Spaces) -> tuple[Block, Inflation]:
         """Return the messages of some chunks, and how much less than allowed these inflate.
 
@@ -276,7 +263,7 @@ class ChunkedFile(Container):
             hint = None if part.messages is None else part.messages + begin
             found, _, stop = self._scan(data, begin, hint)
             if stop < len(data):
-                raise DecompressionError if part.ranges is None else _PartError
+                raise DecompressionError
             messages.append(found)
         return Block(data, *np.concatenate(messages, axis=1)), inflation
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -136,7 +136,6 @@ class McapFile(ChunkedFile):
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, McapChannel] = {}
         self._counts: dict[int, int] = {}
-        self._listed: list[int] = []
         super().__init__(path, message_compression, source)
 
     def _described_channels(self) -> list[Channel]:
@@ -162,13 +161,19 @@ class McapFile(ChunkedFile):
     def _read_index(self) -> list[Chunk] | None:
         if self._source.read_at(0, len(MAGIC)) != MAGIC:
             raise LogError(self.path, "not an MCAP file", "its first bytes are not those of MCAP")
+        start, summary = self._summary()
         chunks: list[Chunk] = []
         schemas: dict[int, Schema] = {}
         channels: dict[int, McapChannel] = {}
         statistics: Statistics | None = None
-        for opcode, content in self._summary_records():
-            record = _parse(opcode, content)
-            if record is None:
+        at = 0
+        while at + _HEAD_BYTES <= len(summary):
+            opcode, length = _HEAD.unpack_from(summary, at)
+            content = summary[at + _HEAD_BYTES : at + _HEAD_BYTES + length]
+            at += _HEAD_BYTES + length
+            if opcode not in (_SCHEMA, _CHANNEL, _CHUNK_INDEX, _STATISTICS):
+                continue
+            if (record := _parse(opcode, content)) is None:
                 return None
             if opcode == _CHUNK_INDEX:
                 chunks.append(record)
@@ -181,15 +186,14 @@ class McapFile(ChunkedFile):
         if len(schemas) < statistics.schema_count or len(channels) < statistics.channel_count:
             return None
         chunks.sort(key=lambda chunk: chunk.at)
-        self._listed = [chunk.at - _HEAD_BYTES for chunk in chunks]
-        if not self._fits(dict(zip(self._listed, chunks, strict=True))):
+        if not self._holds_all(chunks, start):
             return None
         self._schemas, self._channels = schemas, channels
         self._counts = dict(statistics.channel_message_counts)
         return chunks
 
-    def _summary_records(self) -> Iterator[tuple[int, bytes]]:
-        """Yield opcode and content of the records of the summary that reading needs; none where it is damaged."""
+    def _summary(self) -> tuple[int, bytes]:
+        """Return where the summary begins, and its records; none where it is damaged."""
         end = self._size - len(MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
         footer = self._source.read_at(max(end, 0), _HEAD_BYTES + _FOOTER_BYTES)
         start = int.from_bytes(footer[9:17], "little")
@@ -197,44 +201,34 @@ class McapFile(ChunkedFile):
             footer[:1] != bytes([_FOOTER])
             or self._source.read_at(self._size - len(MAGIC), len(MAGIC)) != MAGIC
             or not 0 < start <= end
+            or end - start > LARGEST_CHUNK_BYTES
         ):
-            return
-        if end - start > LARGEST_CHUNK_BYTES:
-            return
+            return 0, b""
         summary = self._source.read_at(start, end - start)
         checksum = int.from_bytes(footer[-_CHECKSUM_BYTES:], "little")
         if checksum and zlib.crc32(footer[:-_CHECKSUM_BYTES], zlib.crc32(summary)) != checksum:
-            return
-        at = 0
-        while at + _HEAD_BYTES <= len(summary):
-            opcode, length = struct.unpack_from("<BQ", summary, at)
-            at += _HEAD_BYTES
-            if opcode in (_SCHEMA, _CHANNEL, _CHUNK_INDEX, _STATISTICS):
-                yield opcode, summary[at : at + length]
-            at += length
+            return 0, b""
+        return start, summary
 
-    def _fits(self, listed: dict[int, Chunk]) -> bool:
-        """Return whether the index lists what is in the file: all its chunks, and no message is outside them.
-
-        Parameters
-        ----------
-        listed : chunks of the index by the file offset of their record
-        """
-        if len(listed) < len(self._listed):
-            return False
-        at = len(MAGIC)
-        while True:
-            chunk = listed.pop(at, None)
-            # What the index lists there, reading the chunk shows too; asking for each head alone takes minutes.
-            is_known = chunk is not None and self._remote is not None
-            opcode, length = (_CHUNK, chunk.length) if chunk is not None and is_known else self._head(at)
-            if opcode in (_FOOTER, _DATA_END):
-                return not listed and chunk is None
-            if opcode in (0, _MESSAGE) or length > self._size - at - _HEAD_BYTES:
+    def _holds_all(self, chunks: Sequence[Chunk], end: int) -> bool:
+        """Return whether the chunks of the index lie one behind the other, and no message outside them before `end`."""
+        at, damaged = len(MAGIC), []
+        ranges = [(chunk.at - _HEAD_BYTES, chunk.at + chunk.length + chunk.index_length) for chunk in chunks]
+        for begin, behind in [*ranges, (end, end)]:
+            if at > begin:
                 return False
-            if (opcode == _CHUNK) != (chunk is not None) or (chunk is not None and chunk.length != length):
-                return False
-            at += _HEAD_BYTES + length + (chunk.index_length if chunk is not None else 0)
+            while at < begin:
+                opcode, length = self._head(at)
+                if opcode in (_MESSAGE, _CHUNK):
+                    return False
+                if opcode == 0 or length > begin - at - _HEAD_BYTES:
+                    damaged.append(f"damaged at byte {at}; reading goes on at byte {begin}")
+                    break
+                at += _HEAD_BYTES + length
+            at = behind
+        for one in damaged:
+            self.report(one)
+        return True
 
     def _head(self, at: int) -> tuple[int, int]:
         """Return opcode and length of the record at a file offset; opcode 0 where there is none."""
@@ -242,9 +236,8 @@ class McapFile(ChunkedFile):
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
     def _read_in_order(self) -> Iterator[Block]:
-        """Yield the messages record by record; behind damage it goes on at the next chunk that the index lists."""
-        begin = at = len(MAGIC)
-        spaces = reused_spaces()
+        """Yield the messages record by record, up to the first place that holds none."""
+        at, spaces = len(MAGIC), reused_spaces()
         while True:
             opcode, length = self._head(at)
             left = self._size - at - _HEAD_BYTES
@@ -257,14 +250,9 @@ class McapFile(ChunkedFile):
                 block, length = self._read_loose(at, length)
                 if block is not None:
                     yield block
-            if opcode != 0 and length <= left:
-                begin, at = at, at + _HEAD_BYTES + length
-                continue
-            further = next((place for place in self._listed if place > begin and self._head(place)[0] == _CHUNK), None)
-            if further is None:
+            if opcode == 0 or length > left:
                 break
-            self.report(f"damaged at byte {at}; reading goes on at byte {further}")
-            begin = at = further
+            at += _HEAD_BYTES + length
         self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_loose(self, at: int, length: int) -> tuple[Block | None, int]:
@@ -294,9 +282,11 @@ class McapFile(ChunkedFile):
         data = content[name_end + 8 : name_end + 8 + packed]
         if part.chunk.is_cut or needed:
             return Packed(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
-        if len(data) < packed:
+        chunk = Packed(data, compression, size, checksum=checksum)
+        # a header of zeros is that of an empty chunk
+        if len(data) < packed or (not checksum and chunk.claimed < part.chunk.size):
             raise DecompressionError("its header is damaged")
-        return Packed(data, compression, size, checksum=checksum)
+        return chunk
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         code, _, start, end = record

@@ -198,7 +198,32 @@ def test_mcap_chunk_whose_place_was_overwritten_is_said_and_the_index_finds_the_
     assert len(messages) - 60 < len(found) < len(messages)
     assert [message for message in messages if message in found] == found
     (problem,) = problems
-    assert re.fullmatch(rf"log\.mcap: damaged at byte \d+; reading goes on at byte {chunk_places(whole)[3]}", problem)
+    assert problem.startswith(f"log.mcap: chunk at byte {third} left out: ")
+
+
+@pytest.mark.parametrize("checksum", [True, False], ids=["checksum", "no checksum"])
+def test_mcap_whose_records_between_chunks_are_damaged_loses_no_message(tmp_path, checksum):
+    messages = make_messages()
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=4000, compression=CompressionType.NONE, enable_crcs=checksum)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"float64 data")
+        channel = writer.register_channel("/a", "cdr", schema)
+        for row, (_, stamp, data) in enumerate(messages):
+            writer.add_message(channel, stamp, data, stamp)
+            if row % 50 == 49:
+                writer.add_attachment(stamp, stamp, "notes", "text", b"attachment" * 30)
+        writer.finish()
+    whole = path.read_bytes()
+    # behind the chunk that was written last, before the one that is open
+    begin = whole.index(b"attachment")
+    record = whole.rindex(b"\x09", 0, begin - 40)
+    path.write_bytes(patched(whole, record, bytes(12)))
+    found, problems = read_log(path)
+    assert [message[1:] for message in found] == [message[1:] for message in messages]
+    (problem,) = problems
+    assert re.fullmatch(rf"log\.mcap: damaged at byte {record}; reading goes on at byte \d+", problem)
 
 
 @pytest.mark.parametrize("index", [IndexType.ALL, IndexType.NONE], ids=["index", "no index"])
@@ -241,6 +266,10 @@ def test_mcap_chunk_that_claims_what_it_does_not_hold_costs_nothing_but_itself(t
     assert peak < LITTLE_MEMORY
     if compression == "none" and claim.startswith("uncompressed size"):
         # A chunk that is not compressed is as large as it is, and its checksum confirms it.
+        assert (found, problems) == (messages, [])
+        return
+    if index == IndexType.ALL and "record" in claim:
+        # How long it is, its index states, too.
         assert (found, problems) == (messages, [])
         return
     assert problems
