@@ -91,6 +91,7 @@ class AbsoluteHeading(NamedTuple):
     t : (m,) [s]; heading : (m,) [rad]; std : (m,) of their white noise [rad]
     rate : (m,) turn rate, which a delay of the heading multiplies [rad/s]
     offset_std : of the offset, about zero [rad]; aligned_std : the same where no offset is significant
+    topic : where it was read; part : what it is, for the user
     """
 
     t: Floats
@@ -99,6 +100,8 @@ class AbsoluteHeading(NamedTuple):
     rate: Floats
     offset_std: float = math.inf
     aligned_std: float = math.inf
+    topic: str = ""
+    part: str = ""
 
 
 @dataclass(frozen=True, slots=True)

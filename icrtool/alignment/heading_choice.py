@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +18,11 @@ from icrtool.alignment.gyro_heading import (
 )
 from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensor_noise import is_hole
-from icrtool.alignment.turn_rates import TurnRate, gyro_rate, wheel_rate
+from icrtool.alignment.turn_rates import TurnRate, course_changes, gyro_rate, wheel_rate
 from icrtool.alignment.wheel_alignment import compare_turns
 from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats, trapezoids
+from icrtool.kernels.arrays import Floats, trapezoids, wrapped
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
 from icrtool.records.samples import (
@@ -43,18 +42,10 @@ SHORTEST_BASELINE_M = 0.2
 LEAST_ATTITUDE_STD_RAD = math.radians(0.01)
 
 
-class AntennaPair(NamedTuple):
-    """Bearing from the chosen antenna to another one, the topic of that, and how far it is [m]."""
-
-    bearing: AbsoluteHeading
-    topic: str
-    baseline_m: float
-
-
-def antenna_pair(log: RobotLog, turn: TurnRate) -> AntennaPair | None:
-    """Return the bearing to the furthest other antenna; None where none shows one."""
+def antenna_bearing(log: RobotLog, turn: TurnRate) -> AbsoluteHeading | None:
+    """Return the bearing from the chosen antenna to the furthest other one; None where none shows one."""
     mine, epoch = log.gnss, int(log.wheels.stamp_ns[0])
-    best: AntennaPair | None = None
+    best, baseline_m = None, 0.0
     for topic, other in ((receiver.topic, receiver.fixes) for receiver in log.other_receivers):
         if min(len(mine.stamp_ns), len(other.stamp_ns)) < 2:
             continue
@@ -66,10 +57,11 @@ def antenna_pair(log: RobotLog, turn: TurnRate) -> AntennaPair | None:
         length = float(np.median(np.abs(line))) if len(line) > 1 else 0.0
         noise = math.hypot(fix_std_m(mine), fix_std_m(other))
         good = np.abs(np.abs(line) - length) < max(5.0 * noise, 0.05 * length)
-        short = length < max(SHORTEST_BASELINE_M, 4.0 * noise) or (best is not None and length <= best.baseline_m)
+        short = length < max(SHORTEST_BASELINE_M, 4.0 * noise) or length <= baseline_m
         if not short and np.count_nonzero(good) >= len(good) / 2:
             found = _averaged(t[near][good], np.angle(line[good]), turn, PAIR_CELL_S)
-            best = AntennaPair(found._replace(std=noise / length * found.std), topic, length)
+            part = f"two antennas {length:.2f} m apart"
+            best, baseline_m = found._replace(std=noise / length * found.std, topic=topic, part=part), length
     return best
 
 
@@ -156,16 +148,14 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
     alive = found is not None and found.estimate.noises["angle"] < LARGEST_DRIFT
     if found is not None and (alive or _follows_wheels(found, track, width_m, log)):
         return found
-    turn = wheel_rate(track, width_m)
-    pair = antenna_pair(log, turn)
-    estimate = estimate_heading(track, turn, [pair.bearing] if pair is not None else [], stands=False)
-    if estimate is not None and (found is None or estimate.median_std < found.estimate.median_std):
-        why = "no turn rate in the log"
-        if found is not None:
-            why = "the turn rate drifts more"
-        elif log.gyros:
-            why = "the turn rate does not cover enough of the drive"
-        return _derived(log, estimate, turn, None, pair, None, instead=why)
+    why = "no turn rate in the log"
+    if found is not None:
+        why = "the turn rate drifts more"
+    elif log.gyros:
+        why = "the turn rate does not cover enough of the drive"
+    by_wheels = _derived(log, track, wheel_rate(track, width_m), None, None, instead=why)
+    if by_wheels is not None and (found is None or by_wheels.estimate.median_std < found.estimate.median_std):
+        return by_wheels
     if found is None:
         refuse_standing(log)
         raise DataError(
@@ -208,57 +198,60 @@ def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: 
 
 def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> DerivedHeading | None:
     """Return the estimate with the gyro that follows the courses over ground best; None where none covers them."""
-    best: DerivedHeading | None = None
-    epoch = int(log.wheels.stamp_ns[0])
+    if not log.gyros:
+        return None
+    best, changes = None, course_changes(track)
     for gyro in log.gyros:
-        found = gyro_rate(track, gyro, epoch)
-        if found is None:
+        measured = gyro_rate(track, changes, gyro, int(log.wheels.stamp_ns[0]))
+        if measured is None:
             continue
-        turn, axis = found
-        absolute: list[AbsoluteHeading] = []
-        if stated is not None:
-            # with the white noise that it shows beside the turn rate
-            one = _averaged(track.heading_t, track.heading, turn, ATTITUDE_CELL_S)
-            step = np.diff(one.heading - np.interp(one.t, turn.t, turn.integrated()))
-            noise = mad_std(np.angle(np.exp(1j * (step - np.median(step))))) / math.sqrt(2.0) if len(step) else 0.0
-            std = np.full(len(one.t), max(noise, LEAST_ATTITUDE_STD_RAD))
-            absolute.append(one._replace(std=std, aligned_std=ATTITUDE_STD_RAD))
-        pair = antenna_pair(log, turn)
-        absolute += [pair.bearing] if pair is not None else []
-        estimate = estimate_heading(track, turn, absolute)
-        if estimate is None:
-            continue
-        topic = gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})"
-        if best is None or estimate.median_std < best.estimate.median_std:
-            best = _derived(log, estimate, turn, topic, pair, stated)
+        turn, axis = measured
+        found = _derived(log, track, turn, gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})", stated)
+        if found is not None and (best is None or found.estimate.median_std < best.estimate.median_std):
+            best = found
     return best
 
 
 def _derived(
-    log: RobotLog, estimate: HeadingEstimate, turn: TurnRate, gyro_topic: str | None,
-    pair: AntennaPair | None, stated: HeadingSamples | None, instead: str = "",
-) -> DerivedHeading:  # fmt: skip
-    """Return the record of an estimate; `instead` is why the wheels' turn is used and no gyro's."""
-    epoch = int(log.wheels.stamp_ns[0])
+    log: RobotLog, track: Track, turn: TurnRate, gyro_topic: str | None, stated: HeadingSamples | None,
+    instead: str = "",
+) -> DerivedHeading | None:  # fmt: skip
+    """Return the estimate with a turn rate, a stated heading and other antennas; None with too few courses.
+
+    Parameters
+    ----------
+    gyro_topic : of the turn rate; None: it is the wheels', for the reason `instead`
+    """
+    epoch, absolute = int(log.wheels.stamp_ns[0]), list[AbsoluteHeading]()
+    if stated is not None:
+        # with the white noise that it shows beside the turn rate
+        one = _averaged(track.heading_t, track.heading, turn, ATTITUDE_CELL_S)
+        step = np.diff(one.heading - np.interp(one.t, turn.t, turn.integrated()))
+        noise = mad_std(wrapped(step - np.median(step))) / math.sqrt(2.0) if len(step) else 0.0
+        std = np.full(len(one.t), max(noise, LEAST_ATTITUDE_STD_RAD))
+        topic = log.topic("heading", "orientation")
+        absolute.append(one._replace(std=std, aligned_std=ATTITUDE_STD_RAD, topic=topic, part="orientation"))
+    bearing = antenna_bearing(log, turn)
+    absolute += [bearing] if bearing is not None else []
+    estimate = estimate_heading(track, turn, absolute, stands=gyro_topic is not None)
+    if estimate is None:
+        return None
     bias = f"turn rate (bias {math.degrees(estimate.constants[1]):+.2f} deg/s at the end)"
-    parts = [bias if gyro_topic else f"wheels ({instead})", "course over ground"]
-    names = [gyro_topic or "wheels", log.topic("gnss", "positions")]
+    parts = [*(one.part for one in absolute), bias if gyro_topic else f"wheels ({instead})", "course over ground"]
+    names = [*(one.topic for one in absolute), gyro_topic or "wheels", log.topic("gnss", "positions")]
     source = "gyro_course" if gyro_topic else "wheels_course"
-    if pair is not None:
+    if bearing is not None:
         source = "antenna_pair"
-        parts.insert(0, f"two antennas {pair.baseline_m:.2f} m apart")
-        names.insert(0, pair.topic)
     attitude, attitude_offset = None, None
     if stated is not None:
         source = "fused"
-        parts.insert(0, f"orientation (error {math.degrees(estimate.noises[WANDERS]):.1f}°)")
-        names.insert(0, log.topic("heading", "orientation"))
+        parts[0] += f" (error {math.degrees(estimate.noises[WANDERS]):.1f}°)"
         offset = math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
         attitude_offset = offset, float(estimate.constants_std[OFFSET])
         lag = round(float(estimate.constants[LAG]) * 1e9)
         attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - attitude_offset[0], thin(stated.var_rad2))
     stamps, turn_stamps = (epoch + np.round(t * 1e9).astype(np.int64) for t in (estimate.t, turn.t))
-    causal, smoothed = (np.angle(np.exp(1j * psi)) for psi in (estimate.causal, estimate.smoothed))
+    causal, smoothed = wrapped(estimate.causal), wrapped(estimate.smoothed)
     # the causal one from where it is known
     std = estimate.causal_std
     known = slice(int(np.argmax(std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(std))))), None)

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.sensor_noise import JUMP_SIGMAS, is_hole
-from icrtool.kernels.arrays import Complexes, Floats, trapezoids
+from icrtool.kernels.arrays import Complexes, Floats, trapezoids, wrapped
 from icrtool.kernels.robust import mad_std, robust_regression, soft_l1_weights
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S
@@ -266,13 +266,15 @@ def wheel_rate(track: Track, width_m: float) -> TurnRate:
     return TurnRate(track.t, rate, holes, scale_std=WHEEL_SCALE_STD, bias_std=math.radians(0.5), delay_std_s=RESPONSE_S)
 
 
-def gyro_rate(track: Track, gyro: GyroAxes, epoch_ns: int) -> tuple[TurnRate, str] | None:
+def gyro_rate(
+    track: Track, changes: tuple[Floats, Floats, Floats], gyro: GyroAxes, epoch_ns: int
+) -> tuple[TurnRate, str] | None:
     """Return the turn rate of a gyro about the vertical, and how it is mounted; None where it does not cover courses.
 
-    Changes of the course over ground are regressed on the turns about all three axes of the sensor.
+    Changes of the course over ground (`course_changes`) are regressed on the turns about all three axes of the sensor.
     """
     t = (gyro.stamp_ns - epoch_ns) / 1e9
-    begin, end, change = course_changes(track)
+    begin, end, change = changes
     inside = (begin >= t[0]) & (end <= t[-1])
     begin, end, change = begin[inside], end[inside], change[inside]
     if len(change) < 3:
@@ -305,7 +307,7 @@ def _vertical_axis(turned: Floats, seconds: Floats, change: Floats, up: Floats) 
         axis = np.sign(axis[main]) * np.eye(3)[main]
         name = f"{'xyz'[main]} {'down' if axis[main] > 0 else 'up'}"
     left = change[:, None] - found[3] * seconds[:, None] - turned @ np.column_stack([axis, up])
-    scatter = np.abs(np.angle(np.exp(1j * left))).mean(axis=0)
+    scatter = np.abs(wrapped(left)).mean(axis=0)
     return (axis, name) if scatter[0] < BETTER * scatter[1] else (up, "z up")
 
 

@@ -24,7 +24,7 @@ from icrtool.estimation.filter_setup import (
     set_up_filter,
     wheel_gap_s,
 )
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, wrapped
 from icrtool.kernels.ekf import run_ekf, run_smoother
 from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutput
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
@@ -348,7 +348,7 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
         recent = (last >= 0) & (age < LONGEST_CARRY_S)
         std = np.sqrt(headings.var_rad2[row] + TURN_WANDER_RAD**2 * np.abs(age))
         clear = recent & (CLEARLY * std < table.std_heading_rad[some])
-        off = np.angle(np.exp(1j * (headings.heading_rad[row] - np.interp(seen_s, table.t_s, psi))))
+        off = wrapped(headings.heading_rad[row] - np.interp(seen_s, table.t_s, psi))
         np.add(psi[some], off, out=psi[some], where=clear)
         np.copyto(table.std_heading_rad[some], std, where=clear)
 

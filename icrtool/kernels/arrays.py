@@ -1,4 +1,4 @@
-"""Types of arrays; the integral of one, rows at steps of a quantity that never decreases, turns by quaternions."""
+"""Types of arrays; integrals, rows at steps of what never decreases, wrapped angles, turns by quaternions."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ Bytes = NDArray[np.uint8]
 def trapezoids(t: Floats, rate: Floats) -> Floats:
     """Return the integral of a rate (n,) from the first of its times (n,) until each, by trapezoids."""
     return np.concatenate([[0.0], np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2)])
+
+
+def wrapped(angle: Floats) -> Floats:
+    """Return angles within a half turn to either side [rad]."""
+    return np.asarray(np.angle(np.exp(1j * angle)))
 
 
 ROWS_AT_ONCE = 1 << 16

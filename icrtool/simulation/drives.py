@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from icrtool.errors import ConfigError
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints, wrapped
 from icrtool.kernels.kinematics import drive, follow, poses_at
 from icrtool.records.samples import SensorColumns
 from icrtool.records.tables import Icrs
@@ -410,7 +410,7 @@ def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> Se
         gnss_std_m=np.full(fixes, sensors.gnss_std_m),
         gnss_status=np.full(fixes, status, np.int64),
         heading_stamp_ns=stamps(readings.heading_t + sensors.heading_delay_s),
-        heading_rad=np.angle(np.exp(1j * readings.heading_rad)),
+        heading_rad=wrapped(readings.heading_rad),
         yaw_rate_radps=readings.yaw_rate_radps,
     )
 

@@ -17,7 +17,7 @@ import numpy as np
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
 from icrtool.estimation.filter_setup import configured_noise, process_variance, rate_invariant, set_up_filter
-from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.arrays import Floats, Ints, wrapped
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GUARDED
 from icrtool.kernels.kinematics import drive, model_states
@@ -398,7 +398,7 @@ def errors_over_std(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     The heading error is wrapped. The covariance is scaled to correlations first: metres and radians differ by orders.
     """
     error = error.copy()
-    error[..., 2] = np.angle(np.exp(1j * error[..., 2]))
+    error[..., 2] = wrapped(error[..., 2])
     std = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), LEAST_STD**2))
     ratio = error / std
     correlation = covariance / (std[..., :, None] * std[..., None, :])

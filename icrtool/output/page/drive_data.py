@@ -22,7 +22,7 @@ from icrtool.calibration.pooled import calibrated, turning_recording_of
 from icrtool.calibration.record import stored_calibration
 from icrtool.errors import DataError
 from icrtool.estimation.odometry import drive_wheels, odometry_icrs
-from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, wrapped
 from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
 from icrtool.motion.recording import Recording, cut_windows, predicted_path
 from icrtool.motion.window_fit import own_constants
@@ -123,7 +123,7 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
     return {
         "step": packed_sums(rows, unit=1),
         "t": packed_sums(table.t_s[state]),
-        "heading": packed(np.angle(np.exp(1j * table.heading_rad[state]))),
+        "heading": packed(wrapped(table.heading_rad[state])),
         **{name: packed(column[rows]) for name, column in values.items()},
         **{name: packed_levels(column[state]) for name, column in (speeds | spreads).items()},
     }
