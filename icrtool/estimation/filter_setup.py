@@ -140,14 +140,17 @@ def set_up_filter(
     fix, sample = _kept(fixes.stamp_ns, outages_ns), _kept(headings.stamp_ns, outages_ns)
     margin = round(EVENT_MARGIN_S * 1e9)
     events = ((event.begin_ns - margin, event.end_ns + margin) for event in sensors.events)
+    wheel_t, gnss_t, heading_t = (
+        (stamps - epoch) / 1e9 for stamps in (wheels.stamp_ns, fixes.stamp_ns[fix], headings.stamp_ns[sample])
+    )
     data = FilterInputs(
-        wheel_t=_seconds(wheels.stamp_ns, epoch),
+        wheel_t=wheel_t,
         v_left=wheels.v_left_mps,
         v_right=wheels.v_right_mps,
-        gnss_t=_seconds(fixes.stamp_ns[fix], epoch),
+        gnss_t=gnss_t,
         gnss_z=np.column_stack([fixes.north_m, fixes.east_m])[fix],
         gnss_r=np.column_stack([fixes.var_north_m2, fixes.var_east_m2])[fix],
-        heading_t=_seconds(headings.stamp_ns[sample], epoch),
+        heading_t=heading_t,
         heading_z=headings.heading_rad[sample],
         heading_r=headings.var_rad2[sample],
         change_t=np.empty(0),
@@ -157,8 +160,14 @@ def set_up_filter(
     icrs, icr_std = _initial_icrs(config, sensors.icr_start)
     if sensors.headings_are_precise:
         data = data._replace(turn_variance=_response_variance(data, float(icrs[0] - icrs[1])) + TURN_WANDER_RAD**2)
-    t0 = _start_time(sensors.name, data)
-    first_state = float(data.wheel_t[np.searchsorted(data.wheel_t, t0)])
+    if not (len(gnss_t) and len(heading_t)):
+        raise DataError(sensors.name, "the outages leave no fix or no heading", "shorten them")
+    # the first stamp by which wheel, GNSS and heading have each been seen
+    t0 = max(float(wheel_t[0]), float(gnss_t[0]), float(heading_t[0]))
+    if t0 >= wheel_t[-1]:
+        why = "no wheel sample after the first fix and the first heading"
+        raise DataError(sensors.name, why, "check the streams' clocks")
+    first_state = float(wheel_t[np.searchsorted(wheel_t, t0)])
     data = data._replace(change_t=np.array(sorted(changes_s), np.float64) + first_state)
     parameters = _parameters(config, data, sensors, noise or configured_noise(config))
     x0, P0 = _start_state(data, t0, (icrs, icr_std), parameters, warm_start)
@@ -172,10 +181,6 @@ def chi2_gate(probability: float, degrees: int) -> float:
     return NormalDist().inv_cdf((1.0 + probability) / 2.0) ** 2
 
 
-def _seconds(stamps_ns: Ints, epoch_ns: int) -> Floats:
-    return (stamps_ns - epoch_ns) / 1e9
-
-
 def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints | slice:
     """Return the rows outside the outages; without one a slice, which copies nothing."""
     if not outages_ns:
@@ -184,16 +189,6 @@ def _kept(stamps_ns: Ints, outages_ns: tuple[tuple[int, int], ...]) -> Ints | sl
     for begin, end in outages_ns:
         kept &= (stamps_ns < begin) | (stamps_ns >= end)
     return np.flatnonzero(kept)
-
-
-def _start_time(name: str, data: FilterInputs) -> float:
-    """Return the first stamp by which wheel, GNSS and heading have each been seen."""
-    if not (len(data.gnss_t) and len(data.heading_t)):
-        raise DataError(name, "the outages leave no fix or no heading", "shorten them")
-    t0 = max(float(data.wheel_t[0]), float(data.gnss_t[0]), float(data.heading_t[0]))
-    if t0 >= data.wheel_t[-1]:
-        raise DataError(name, "no wheel sample after the first fix and the first heading", "check the streams' clocks")
-    return t0
 
 
 def _start_state(

@@ -58,7 +58,7 @@ class StateWindows(Windows):
     turned_rad : (w,) turn by the wheels; end_m : (w,) their distance at the end; stretch : (w,) number of its stretch
     distance_m : of the wheels, whole drive
     separation_m : y right - y left of the ICRs that the wheels' motion is by
-    place_std_m, heading_std_rad : median standard deviation of the states that the motion is compared with
+    noise : (3,) standard deviation that the states give to each kind of residual
     """
 
     residuals: Floats
@@ -68,14 +68,7 @@ class StateWindows(Windows):
     stretch: Ints
     distance_m: float
     separation_m: float
-    place_std_m: float
-    heading_std_rad: float
-
-    @property
-    def noise(self) -> Floats:
-        """Standard deviation that the states give to each kind of residual (3,)."""
-        place = math.sqrt(2.0) * self.place_std_m
-        return np.array([place, place, math.sqrt(2.0) * self.heading_std_rad])
+    noise: Floats
 
 
 def cut_states(table: States, track: Track, track_width_m: float | None) -> StateWindows:
@@ -110,6 +103,7 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
     turned = np.diff(path.heading)
     by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
     by_terms = np.concatenate([jacobian[:, :terms], np.diff(path.heading_by).T]) @ by_icrs
+    place_std_m = float(np.median(np.hypot(table.std_north_m, table.std_east_m)))
     return StateWindows(
         track,
         windows.begin,
@@ -122,8 +116,7 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
         stretch=(distance[:-1] // (STRETCH_IN_WINDOWS * window_m)).astype(np.int64),
         distance_m=whole_m,
         separation_m=separation_m,
-        place_std_m=float(np.median(np.hypot(table.std_north_m, table.std_east_m))),
-        heading_std_rad=float(np.median(table.std_heading_rad)),
+        noise=math.sqrt(2.0) * np.array([place_std_m, place_std_m, float(np.median(table.std_heading_rad))]),
     )
 
 

@@ -207,7 +207,15 @@ def run_adaptively(
 
     noise, settings = configured_noise(config), config.filter
     setup, output = run(sensors, noise)
-    if settings.preset != "field" or max(_capped_nis(setup, output, _moving(sensors))) <= TOLERATED_NIS:
+    if settings.preset != "field":
+        return setup, output, noise
+    moving, limits = _moving(sensors), setup.parameters
+    # mean NIS per degree of freedom, each counted up to its gate
+    nis = (
+        np.minimum(output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]], limits.gnss_gate) / 2.0,
+        np.minimum(output.heading_nis[(output.heading_code > UNSEEN) & moving[1]], limits.heading_gate),
+    )
+    if all(not len(one) or one.mean() <= TOLERATED_NIS for one in nis):
         return setup, output, noise
     del setup, output  # of a long log, as large as all that the next run makes
     largest = min(LARGEST_HEADING_DEGPS, STEP * math.degrees(sensors.turn_wander_rad) / math.sqrt(REFERENCE_STEP_S))
@@ -300,16 +308,6 @@ def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float
         float(np.mean((TAIL_DEGREES + degrees) * np.log1p(nis / TAIL_DEGREES) + np.log(det)))
         for degrees, nis, det in streams
         if len(nis)
-    )
-
-
-def _capped_nis(setup: FilterSetup, output: FilterOutput, moving: Moving) -> tuple[float, float]:
-    """Return mean NIS of fixes and of headings per degree of freedom, each counted up to its gate; 0 for none."""
-    fixes = output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]]
-    headings = output.heading_nis[(output.heading_code > UNSEEN) & moving[1]]
-    return (
-        float(np.minimum(fixes, setup.parameters.gnss_gate).mean()) / 2.0 if len(fixes) else 0.0,
-        float(np.minimum(headings, setup.parameters.heading_gate).mean()) if len(headings) else 0.0,
     )
 
 

@@ -145,11 +145,12 @@ def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
 
 def run_warnings(
     name: str,
-    table: States,
     rejected: Mapping[str, float],
     multiplier: tuple[float, float] | None,
     excitation: ExcitationDocument,
     findings: Mapping[str, Finding],
+    *,
+    inverted: bool,
 ) -> list[str]:
     """Return what a user should know before trusting the numbers.
 
@@ -158,11 +159,18 @@ def run_warnings(
     rejected : `rejected_share` of the fixes, and of the headings
     multiplier : (y_r - y_l) / b and its standard deviation; None where b is not known, or the run is not usable
     findings : of the alignment
+    inverted : the right ICR ended left of the left one
     """
     found = []
     if multiplier is not None and excitation.verdict.shows_sides:
-        found += _multiplier_warnings(*multiplier)
-    if table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]:
+        value, std = multiplier
+        if abs(value - 1.0) <= max(ROLLS, 2.0 * std) and std <= ROLLS_STD:
+            rolls = f"this robot turns as a differential drive (multiplier {value:.3f} ± {std:.3f})"
+            found.append(f"{rolls}: ICRs improve nothing")
+        elif value < SMALLEST_MULTIPLIER:
+            cause = "slip makes it more than 1: check robot.track_width_m, wheel radius and sides"
+            found.append(f"the ICRs are {value:.2f} of the track width apart; {cause}")
+    if inverted:
         found.append(
             "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
         )
@@ -183,16 +191,6 @@ def _cause_of_rejection(delay: Finding | None) -> str:
     if abs(left) > DELAY_SIGMAS * delay.std:
         return f"they {'lag' if left > 0 else 'lead'} the wheels by {abs(left):.2f} ± {delay.std:.2f} s, or {scatter}"
     return f"{scatter} (their clock agrees with the wheels to {max(delay.std, abs(left)):.2f} s)"
-
-
-def _multiplier_warnings(multiplier: float, std: float) -> list[str]:
-    if abs(multiplier - 1.0) <= max(ROLLS, 2.0 * std) and std <= ROLLS_STD:
-        value = f"multiplier {multiplier:.3f} ± {std:.3f}"
-        return [f"this robot turns as a differential drive ({value}): ICRs improve nothing"]
-    if multiplier < SMALLEST_MULTIPLIER:
-        cause = "slip makes it more than 1: check robot.track_width_m, wheel radius and sides"
-        return [f"the ICRs are {multiplier:.2f} of the track width apart; {cause}"]
-    return []
 
 
 def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:

@@ -31,7 +31,7 @@ from icrtool.estimation.run_warnings import (
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.records.measurements import Fixes, FixStatistics, Measurements, ReferenceJump, SlipEvent
+from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
 from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, no_slip_icrs, track_of_states
 from icrtool.records.run_document import (
@@ -88,7 +88,8 @@ def summarise(
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation, x_clock_std_m = learned(filtered, config, measurements.clock_std_s)
-    multiplier = separation_multiplier(table, width) if width is not None else None
+    multiplier = None if width is None else (separation_multiplier(table, width), multiplier_std(covariance, width))
+    inverted = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1])
     field = config.filter.preset == "field"
     scale = measurements.findings["wheel_scale"] if field else None
     of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
@@ -96,10 +97,10 @@ def summarise(
     # while the robot was in use
     rejected = {word: rejected_share(one.code[sensors.moving(one.stamp_ns)]) for word, one in measured.items()}
     unusable = unusable_reasons(
-        excitation, rejected, filtered.noise, scale, multiplier if of_twist else None,
+        excitation, rejected, filtered.noise, scale, multiplier[0] if of_twist and multiplier is not None else None,
         contradicts_windows(table, covariance, measurements.findings) if field and not changes_s else "",
         measurements.wheels.filtered or "" if field else "",
-        inverted=bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1]),
+        inverted=inverted,
     )  # fmt: skip
     hidden = () if config.filter.preset == "paper" else excitation.verdict.not_shown
     lag = measurements.findings["heading_delay_s"]
@@ -113,13 +114,13 @@ def summarise(
         streams=measurements.streams,
         warnings=_warnings(
             measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance,
-            rejected,
+            rejected, inverted=inverted,
         ),
         alignment=measurements.findings,
         drive=drive_summary(table),
         usable=not unusable,
         unusable_because="; ".join(unusable) if unusable else None,
-        icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, width, hidden),
+        icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, multiplier, hidden),
         odometry=OdometryDocument(
             EndErrorDocument(odometry_end_error(table, filtered.in_gap, table.icrs_at(-1))),
             None
@@ -147,17 +148,16 @@ def summarise(
 
 
 def _warnings(
-    measurements: Measurements, filtered: Filtered, config: Config, multiplier: float | None,
+    measurements: Measurements, filtered: Filtered, config: Config, multiplier: tuple[float, float] | None,
     excitation: ExcitationDocument, changes_s: Sequence[float], covariance: Floats,
-    rejected: dict[str, float],
+    rejected: dict[str, float], *, inverted: bool,
 ) -> tuple[str, ...]:  # fmt: skip
     """Return the warnings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
-    name, table, width = filtered.sensors.name, filtered.table, config.robot.track_width_m
-    apart = None if multiplier is None or width is None else (multiplier, multiplier_std(covariance, width))
+    name, table = filtered.sensors.name, filtered.table
     end_s = float(table.t_s[-1])
     return (
         *measurements.warnings,
-        *run_warnings(name, table, rejected, apart, excitation, measurements.findings),
+        *run_warnings(name, rejected, multiplier, excitation, measurements.findings, inverted=inverted),
         *(
             []
             if measurements.antenna_is_known or not excitation.verdict.shows_sides
@@ -253,23 +253,6 @@ def _seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, float]
     return {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
 
 
-def class_summary(fixes: Fixes, statistics: FixStatistics, outcome: MeasurementOutcome) -> dict[str, ClassDocument]:
-    """Return how many fixes of each class there were and how they were used."""
-    return {
-        name: ClassDocument(
-            fixes=_count(rows),
-            used=_count(rows & outcome.used),
-            rejected=_count(rows & outcome.rejected),
-            down_weighted=_count(rows & fixes.down_weighted),
-            sold_as_fixed=_count(rows & fixes.misreported),
-            std_m=known(statistics.std_m[name]),
-            step_std_m=known(statistics.step_std_m[name]),
-        )
-        for code, name in CLASSES.items()
-        if (rows := fixes.fix_class == code).any()
-    }
-
-
 def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:
     """Find when each ICR estimate converged, up to a time where one is given.
 
@@ -306,7 +289,7 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
 
 def icr_summary(
     table: States, convergence: dict[IcrColumn, tuple[float, float] | None], covariance: Floats, of_filter: Floats,
-    x_clock_std_m: float, track_width_m: float | None, hidden: Collection[str],
+    x_clock_std_m: float, multiplier: tuple[float, float] | None, hidden: Collection[str],
 ) -> IcrDocument:  # fmt: skip
     """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did.
 
@@ -314,6 +297,7 @@ def icr_summary(
     ----------
     covariance : (3, 3) of the final ICRs [m^2]; of_filter : the filter's own
     x_clock_std_m : part of the clocks in the standard deviation of x
+    multiplier : (y_r - y_l) / b and its standard deviation, None where b is not known
     hidden : ICRs that are not shown, and have no number; nor has a multiplier made of one
     """
     settled = max((span[1] for span in convergence.values() if span is not None), default=0.0)
@@ -324,7 +308,10 @@ def icr_summary(
         return NumberByIcr(*(None if column in hidden else known(value) for column, value in rows))
 
     settled_icrs: list[Floats] = [getattr(table, column)[after] for column in ICR_COLUMNS]
-    width = None if {"y_icr_right_m", "y_icr_left_m"} & set(hidden) else track_width_m
+    if multiplier is None or {"y_icr_right_m", "y_icr_left_m"} & set(hidden):
+        apart, apart_std = None, None
+    else:
+        apart, apart_std = multiplier
     return IcrDocument(
         final=by_icr(table.icrs_at(-1)),
         final_std=by_icr(np.sqrt(np.diag(covariance)).tolist()),
@@ -332,8 +319,8 @@ def icr_summary(
         std=by_icr(float(one.std()) for one in settled_icrs),
         convergence_s=NumberByIcr(*(span[1] - span[0] if span is not None else None for span in convergence.values())),
         convergence_span_s=SpanByIcr(*convergence.values()),
-        separation_multiplier=None if width is None else separation_multiplier(table, width),
-        separation_multiplier_std=None if width is None else multiplier_std(covariance, width),
+        separation_multiplier=apart,
+        separation_multiplier_std=apart_std,
         final_covariance_m2=of_filter.tolist(),
         x_clock_std_m=x_clock_std_m,
     )
@@ -360,9 +347,22 @@ def gnss_summary(
     datum: Datum | None, rejected_fixes: dict[str, int], outcome: MeasurementOutcome, fixes: Fixes,
     measurements: Measurements,
 ) -> GnssDocument:  # fmt: skip
-    """Return how many fixes were used and rejected, and how far the filter stays from those it used and trusted."""
+    """Return how many fixes were used and rejected, by class too, and how far the filter is from those it trusts."""
     delay = measurements.findings["position_delay_s"]
     difference = outcome.difference[outcome.used & ~fixes.down_weighted]
+    classes = {
+        name: ClassDocument(
+            fixes=_count(rows),
+            used=_count(rows & outcome.used),
+            rejected=_count(rows & outcome.rejected),
+            down_weighted=_count(rows & fixes.down_weighted),
+            sold_as_fixed=_count(rows & fixes.misreported),
+            std_m=known(measurements.fix_statistics.std_m[name]),
+            step_std_m=known(measurements.fix_statistics.step_std_m[name]),
+        )
+        for code, name in CLASSES.items()
+        if (rows := fixes.fix_class == code).any()
+    }
     return GnssDocument(
         used=_count(outcome.used),
         rejected=_count(outcome.rejected) + sum(rejected_fixes.values()),
@@ -374,5 +374,5 @@ def gnss_summary(
         datum=(datum.latitude_deg, datum.longitude_deg, datum.height_m) if datum is not None else None,
         delay_s=delay.value,
         delay_std_s=delay.std,
-        classes=class_summary(fixes, measurements.fix_statistics, outcome),
+        classes=classes,
     )
