@@ -12,9 +12,9 @@ import numpy as np
 from icrtool.alignment.conventions import apply_convention, decide_conventions
 from icrtool.alignment.corrections import AlignedStreams, align_streams
 from icrtool.alignment.estimator import estimate_alignment
-from icrtool.alignment.gnss_quality import fixes_of, grade_fixes
+from icrtool.alignment.gnss_quality import grade_fixes
 from icrtool.alignment.log_track import check_streams, cut_windows, track_of_log
-from icrtool.alignment.sensor_noise import heading_variance, reference_noise, without_frozen
+from icrtool.alignment.sensor_noise import fixes_of, heading_variance, reference_noise, without_frozen
 from icrtool.alignment.slip_events import find_disagreements
 from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds

@@ -298,7 +298,7 @@ class MotionOfWindows:
         before, after = (np.interp(t + shift_s, track.t, path) for shift_s in (-STEP_S, STEP_S))
         by[TP] = np.diff(before - after, axis=0) / (2 * STEP_S)
         # the derivative of the heading's unit vector, over `TURN_STEP_S`
-        after, before = self._heading_at(t + TURN_STEP_S, x), self._heading_at(t - TURN_STEP_S, x)
+        after, before = (track.heading_at(t + shift_s + x[TH]) + x[D] for shift_s in (TURN_STEP_S, -TURN_STEP_S))
         turning = 0.5j * (after - before) / TURN_STEP_S * np.exp(0.5j * (after + before))
         begin, end = np.interp(t, track.t + track.held / 2, aside) * turning
         by[TH] = by[TP] + 1j * laid(rate * ahead) + end - begin
@@ -321,15 +321,12 @@ class MotionOfWindows:
             np.asarray(np.interp(t - x[TH], self.track.t, turn), np.float64),
         )
 
-    def _heading_at(self, t: Floats, x: Floats) -> Floats:
-        """Return the heading that a wheel speed of time t acts along: a response delays both alike."""
-        return np.asarray(self.track.heading_at(t + x[TH]) + x[D])
-
     def _motion(self, x: Floats) -> tuple[Complexes, Floats, Floats, Floats]:
         """Return the heading as a unit vector, its rate [rad/s], speeds ahead and aside for each of that rate (n,)."""
         track = self.track
         ends = np.append(track.t, track.t[-1] + track.held[-1])
-        heading = self._heading_at(ends, x)
+        # a wheel speed acts along the heading of a later time: a response delays both alike
+        heading = track.heading_at(ends + x[TH]) + x[D]
         smooth = np.interp(ends + x[TH], track.heading_t, self.smooth_heading)
         rate = np.where(track.held > 0.0, np.diff(smooth) / np.maximum(track.held, 1e-9), 0.0)
         ahead = x[A] * self.v + x[M] * self.u + x[N] * np.abs(self.u)

@@ -19,13 +19,13 @@ from icrtool.alignment.sensor_noise import (
     LARGEST_SANE_GNSS_STD_M,
     NOISIER,
     FixSteps,
-    position_variance,
+    fixes_of,
     unstated_position_std_m,
 )
-from icrtool.config import Config, FilterConfig
+from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.measurements import Fixes, FixStatistics
-from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX, PositionFixes
+from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 from icrtool.records.tables import RobotLog
 
 REFERENCE = 0
@@ -66,21 +66,6 @@ class GnssQuality(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def fixes_of(gnss: PositionFixes, settings: FilterConfig, measured_m: float = math.nan) -> Fixes:
-    """Return positions as the filter uses them, all of one class; `measured_m` as in `position_variance`."""
-    variance, none = position_variance(gnss, settings, measured_m), np.zeros(len(gnss.stamp_ns), np.bool_)
-    return Fixes(
-        stamp_ns=gnss.stamp_ns,
-        north_m=gnss.north_m,
-        east_m=gnss.east_m,
-        var_north_m2=np.ascontiguousarray(variance[:, 0]),
-        var_east_m2=np.ascontiguousarray(variance[:, 1]),
-        fix_class=np.zeros(len(none), np.uint8),
-        misreported=none,
-        down_weighted=none,
-    )
-
-
 def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: float = math.nan) -> GnssQuality:
     """Return the classes of the fixes, and the noise of each.
 
@@ -91,7 +76,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
 
     Parameters
     ----------
-    measured_m : as in `position_variance`
+    measured_m : as in `icrtool.alignment.sensor_noise.fixes_of`
     """
     gnss, changes = log.gnss, config.filter.preset != "paper"
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)

@@ -276,15 +276,14 @@ class _Problem:
 
     def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
         """Return the noises with those of the grids that have the largest likelihood, one after the other."""
-
-        def likelihood(tried: dict[str, float]) -> float:
-            return heading_log_likelihood(self.events(tried).cut(MOST_EVENTS), self.model(tried))
-
         noises = {name: float(values[len(values) // 2]) for name, values in grids.items()} | noises
         for _ in range(MOST_SWEEPS):
             before = noises
             for name, values in grids.items():
-                noises = max((noises | {name: float(value)} for value in values), key=likelihood)
+                noises = max(
+                    (noises | {name: float(value)} for value in values),
+                    key=lambda tried: heading_log_likelihood(self.events(tried).cut(MOST_EVENTS), self.model(tried)),
+                )
             if noises == before:
                 break
         return noises

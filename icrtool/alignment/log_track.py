@@ -70,7 +70,7 @@ class DriveWindows(Windows):
     @cached_property
     def laid(self) -> Complexes:
         """Mean distance of the sides laid along the heading (w,), north + j east [m]."""
-        return self.over(self.track.at_places(np.asarray(self.track.mean_speed * self.track.nose)))
+        return self.over(self.track.laid)
 
     @cached_property
     def heading_changes(self) -> Floats:

@@ -11,6 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.config import FilterConfig
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.records.measurements import Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog
 
@@ -181,24 +182,37 @@ def unstated_position_std_m(settings: FilterConfig) -> float:
     return USUAL_POSITION_STD_M if settings.gnss_std_m == "auto" else settings.gnss_std_m
 
 
-def position_variance(fixes: PositionFixes, settings: FilterConfig, measured_m: float = math.nan) -> Floats:
-    """Return the variances of north and east (m, 2) [m^2]; preset ``paper`` has the configured one throughout.
+def fixes_of(gnss: PositionFixes, settings: FilterConfig, measured_m: float = math.nan) -> Fixes:
+    """Return positions as the filter uses them, of one class; preset ``paper`` has the configured noise throughout.
 
     Parameters
     ----------
     measured_m : of `reference_noise`; a number is used throughout
     """
     # The diagonal plus the covariance's size is never below the full matrix: correlated fixes are not overrated.
-    correlated = np.nan_to_num(np.abs(fixes.cov_north_east_m2))
-    stated = np.column_stack([fixes.var_north_m2 + correlated, fixes.var_east_m2 + correlated])
+    correlated = np.nan_to_num(np.abs(gnss.cov_north_east_m2))
     usual, floor = unstated_position_std_m(settings), settings.gnss_std_floor_m
-    return _variance(stated, settings, usual, LARGEST_SANE_GNSS_STD_M, floor, measured_m, 0.0)
+    north, east = (
+        _variance(stated + correlated, settings, usual, LARGEST_SANE_GNSS_STD_M, floor, measured_m, 0.0)
+        for stated in (gnss.var_north_m2, gnss.var_east_m2)
+    )
+    none = np.zeros(len(gnss.stamp_ns), np.bool_)
+    return Fixes(
+        stamp_ns=gnss.stamp_ns,
+        north_m=gnss.north_m,
+        east_m=gnss.east_m,
+        var_north_m2=north,
+        var_east_m2=east,
+        fix_class=np.zeros(len(none), np.uint8),
+        misreported=none,
+        down_weighted=none,
+    )
 
 
 def heading_variance(
     headings: HeadingSamples, settings: FilterConfig, at_least_rad: float = 0.0, measured_rad: float = math.nan
 ) -> Floats:
-    """Return the variances (h,) [rad^2], nowhere below `at_least_rad` squared; other arguments as above."""
+    """Return the variances (h,) [rad^2], nowhere below `at_least_rad` squared; others as in `fixes_of`."""
     usual_deg = USUAL_HEADING_STD_DEG if settings.heading_std_deg == "auto" else settings.heading_std_deg
     usual, floor = math.radians(usual_deg), math.radians(settings.heading_std_floor_deg)
     largest = LARGEST_SANE_HEADING_STD_RAD

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.sensor_noise import JUMP_SIGMAS, is_hole
-from icrtool.kernels.arrays import Complexes, Floats, trapezoids, wrapped
+from icrtool.kernels.arrays import Complexes, Floats, Ints, trapezoids, wrapped
 from icrtool.kernels.robust import mad_std, robust_regression, soft_l1_weights
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S
@@ -125,22 +125,15 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     psi = np.interp(middle, turn.t, corrected)
     nose = np.exp(1j * psi) * track.held
     step = (v + guess.middle * u) * nose
-    gone = track.cumulate(np.abs(v))
-    length = _course_length(track)
-    t, place = _without_spikes(
-        track._replace(place_t=track.place_t - guess.delay_s),
-        max(track.t[0], turn.t[0]), min(track.t[-1], turn.t[-1]),
-    )  # fmt: skip
-    edge = _edges(np.interp(t, track.t, gone), length)
-    begin, end = edge[:-1], edge[1:] - 1
+    span = max(track.t[0], turn.t[0]), min(track.t[-1], turn.t[-1])
+    length, t, place, begin, end = _cut_courses(track._replace(place_t=track.place_t - guess.delay_s), *span)
     if not len(begin):
         return Courses(*(np.empty(0) for _ in Courses._fields))
-    count = end + 1 - begin
-    used, first = slice(edge[0], edge[-1]), begin - edge[0]
+    count, used = end + 1 - begin, slice(0, end[-1] + 1)
 
     def centred(values: Complexes) -> Complexes:
         """Return values at the fixes about the mean of their window."""
-        mean = np.add.reduceat(values[used], first) / count
+        mean = np.add.reduceat(values[used], begin) / count
         return np.asarray(values[used] - np.repeat(mean, count), np.complex128)
 
     def laid(rate: Complexes) -> Complexes:
@@ -148,7 +141,7 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
         return np.asarray(np.interp(t, track.t, along), np.complex128)
 
     def product(values: Complexes) -> Complexes:
-        return np.asarray(np.add.reduceat(values * np.conj(path), first), np.complex128)
+        return np.asarray(np.add.reduceat(values * np.conj(path), begin), np.complex128)
 
     turned = np.interp(t, turn.t, corrected)
     swing = np.exp(1j * turned)
@@ -193,11 +186,8 @@ def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
 
     Only displacements and the sense of the wheels' turning: nothing is known of the heading yet.
     """
-    along, gone = (track.cumulate(one) for one in (track.mean_speed, np.abs(track.mean_speed)))
-    t, place = _without_spikes(track, float(track.t[0]), float(track.t[-1]))
-    length = _course_length(track)
-    edge = _edges(np.interp(t, track.t, gone), length)
-    begin, end = edge[:-1], edge[1:] - 1
+    along = track.cumulate(track.mean_speed)
+    length, t, place, begin, end = _cut_courses(track, float(track.t[0]), float(track.t[-1]))
     went = np.interp(t[end], track.t, along) - np.interp(t[begin], track.t, along)
     seen = (place[end] - place[begin]) * np.sign(went)
     kept = (np.abs(went) > 0.3 * length) & (np.abs(seen) > 0.3 * np.abs(went))
@@ -207,35 +197,32 @@ def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
     return middle[:-1][near], middle[1:][near], np.angle(seen[1:] * np.conj(seen[:-1]))[near]
 
 
-def _course_length(track: Track) -> float:
+def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Floats, Complexes, Ints, Ints]:
+    """Cut a span of a drive into windows of driven distance that follow one another, and share no fix.
+
+    Returns
+    -------
+    length of the windows [m]; times and places of the fixes, without those that lie far from both neighbours; rows of
+    these (w,), first and last of each window
+    """
     std = min(track.place_std_m, 10.0)
     short = max(float(track.travel[-1]) / ENOUGH_COURSES, SHORTEST_IN_POSITION_STD * std)
-    return max(COURSE_WINDOW_M, min(COURSE_IN_POSITION_STD * std, short))
-
-
-def _edges(gone: Floats, length: float) -> np.ndarray:
-    """Return the first fixes of windows: a new one after so much distance and so many fixes."""
-    edges, last = [0], 0
-    cell = np.floor(gone / length)
-    for one in np.flatnonzero(np.diff(cell) > 0) + 1:
-        if one - last >= FIXES_A_WINDOW:
-            edges.append(int(one))
-            last = int(one)
-    return np.array(edges)
-
-
-def _without_spikes(track: Track, first: float, last: float) -> tuple[Floats, Complexes]:
-    """Return times and places of the fixes in a span, without those that lie far from both neighbours."""
-    rows = np.flatnonzero((track.place_t >= first) & (track.place_t <= last))
+    length = max(COURSE_WINDOW_M, min(COURSE_IN_POSITION_STD * std, short))
+    rows = np.flatnonzero((track.place_t >= first_s) & (track.place_t <= last_s))
     t, place = track.place_t[rows], track.place[rows]
-    if len(rows) < 3:
-        return t, place
-    bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
-    far = bend > JUMP_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
-    # the neighbours of a spike bend by half as much
-    spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
-    kept = np.concatenate([[True], ~spike, [True]])
-    return t[kept], place[kept]
+    if len(rows) > 2:
+        bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
+        far = bend > JUMP_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
+        # the neighbours of a spike bend by half as much
+        spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
+        kept = np.concatenate([[True], ~spike, [True]])
+        t, place = t[kept], place[kept]
+    cell = np.floor(np.interp(t, track.t, track.cumulate(np.abs(track.mean_speed))) / length)
+    edges = [0]
+    for row in (np.flatnonzero(np.diff(cell) > 0) + 1).tolist():
+        if row - edges[-1] >= FIXES_A_WINDOW:
+            edges.append(row)
+    return length, t, place, np.array(edges[:-1], np.int64), np.array(edges[1:], np.int64) - 1
 
 
 WHEEL_TURN, WHEEL_SCALE_STD = 0.6, 0.5
@@ -271,7 +258,7 @@ def gyro_rate(
 ) -> tuple[TurnRate, str] | None:
     """Return the turn rate of a gyro about the vertical, and how it is mounted; None where it does not cover courses.
 
-    Changes of the course over ground (`course_changes`) are regressed on the turns about all three axes of the sensor.
+    Changes of the course over ground are regressed on the turns about all three axes of the sensor.
     """
     t = (gyro.stamp_ns - epoch_ns) / 1e9
     begin, end, change = changes
