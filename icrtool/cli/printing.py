@@ -17,7 +17,7 @@ import click
 
 from icrtool import __version__
 from icrtool.cli import when_used
-from icrtool.output.text_blocks import Block, Line, Table, format_blocks, narrowed, printed
+from icrtool.output.text_blocks import Block, Line, Table, fitted, format_blocks, printed
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
 
@@ -69,7 +69,7 @@ def _print_table(block: Table, console: Console) -> None:
     from rich.table import Table as RichTable
     from rich.text import Text as RichText
 
-    table, left_out = _fitting(narrowed(block, console.width), console.width)
+    table, left_out = fitted(block, console.width, FEWEST_COLUMNS)
     shown = RichTable(box=None, pad_edge=False, show_header=bool(table.head))
     sides = table.sides()
     for number, side in enumerate(sides):
@@ -86,26 +86,6 @@ def _print_table(block: Table, console: Console) -> None:
     if left_out:
         why = f"the terminal has {console.width} columns"
         console.print(RichText(f"  ({', '.join(left_out)} left out: {why})", "dim"))
-
-
-def _fitting(table: Table, width: int) -> tuple[Table, list[str]]:
-    """Return a table of numbers without the columns that a terminal has no place for, and their names.
-
-    The first and the last one stay; a last column of text is wrapped and needs no more than a few words.
-    """
-    sides, rows = table.sides(), [[str(cell) for cell in row] for row in (table.head, *table.rows) if row]
-    sizes = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
-    if sides[-1] == "l":
-        sizes[-1] = min(sizes[-1], width // 4)
-    kept, left_out = list(range(len(sides))), []
-    while sum(sizes[column] for column in kept) - 2 > width and len(kept) > FEWEST_COLUMNS:
-        out = kept.pop(len(kept) // 2)
-        left_out.append(str(table.head[out]) if table.head else f"column {out + 1}")
-    if not left_out:
-        return table, []
-    chosen = [[row[column] for column in kept] for row in table.rows]
-    head = [table.head[column] for column in kept] if table.head else ()
-    return Table("".join(sides[column] for column in kept), chosen, head), left_out
 
 
 def write_or_print(text: str, output: Path | None) -> None:

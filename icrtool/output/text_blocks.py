@@ -264,32 +264,37 @@ def _sentence(first: str, text: str, most: int, look: Look = "as is", *, verbose
     return Line("\n".join(_wrap(text, first, " " * len(first), BRIEF_WIDTH, most)) or first.rstrip(), look)
 
 
-def narrowed(table: Table, width: int) -> Table:
-    """Return a table with one line a row, whose widest cells of text are shortened until it fits, where that helps."""
-    sides = table.sides()
-    rows = [list(map(str, table.head)), *table.lines()] if table.head else table.lines()
+def fitted(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
+    """Return a table with one line a row that fits a width as far as it can, and the columns that are left out for it.
+
+    The widest cells of text are shortened first; then columns are left out, from the middle, until `fewest` are left. A
+    last column of text is wrapped, and needs no more than a few words.
+    """
+    sides, head = table.sides(), [list(map(str, table.head))] if table.head else []
+    rows = [*head, *table.lines()]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    last = len(widths) - 1
-    # a last column of text is wrapped
+    if sides.endswith("l"):
+        widths[-1] = min(widths[-1], NARROWEST_LAST)
     texts = [column for column, side in enumerate(sides[:-1]) if side == "l" and column]
-    widths[last] = min(widths[last], NARROWEST_LAST) if sides[last] == "l" else widths[last]
     while texts and sum(widths) + 2 * (len(widths) - 1) > width:
         widest = max(texts, key=lambda column: widths[column])
         if widths[widest] <= NARROWEST:
             break
         widths[widest] -= 1
-    rows = [
-        [shortened(cell, widths[column]) if column in texts else cell for column, cell in enumerate(row)]
-        for row in rows
-    ]  # fmt: skip
-    return table._replace(rows=rows[1:] if table.head else rows)
+    kept, left_out = list(range(len(widths))), []
+    while len(kept) > fewest and sum(widths[column] for column in kept) + 2 * (len(kept) - 1) > width:
+        out = kept.pop(len(kept) // 2)
+        left_out.append(head[0][out] if head else f"column {out + 1}")
+    rows = [[shortened(row[one], widths[one]) if one in texts else row[one] for one in kept] for row in rows]
+    align = "".join(sides[column] for column in kept)
+    return table._replace(align=align, rows=rows[len(head) :], head=rows[0] if head else ()), left_out
 
 
 def _table_lines(table: Table) -> Iterator[str]:
-    table = narrowed(table, TEXT_WIDTH)
+    sides = table.sides()
+    table, _ = fitted(table, TEXT_WIDTH, len(sides))
     rows = [[str(cell) for cell in row] for row in ((table.head, *table.rows) if table.head else table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    sides = table.sides()
     for row in rows:
         *first, last = (
             cell.ljust(width) if side == "l" else cell.rjust(width)

@@ -108,7 +108,7 @@ def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
             std = f" ± {one.std:{form.lstrip('+')}}" if one.verdict != "given" else ""
             value = f"{one.value:{form}}{std} {unit}".rstrip()
         rows.append((LABELS[key], value, one.verdict + (f": {one.note}" if one.note else "")))
-    table = Table("l", rows, ("parameter", "value ± std", "verdict"))
+    table = Table("lrl", rows, ("parameter", "value ± std", "verdict"))
     estimates = Section(calibration.log, [Facts(head), table, MEANINGS, ""], VERBOSE)
     if not calibration.settings:
         shown = any(one.verdict == "shown" for one in calibration.parameters.values())

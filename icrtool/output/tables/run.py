@@ -349,7 +349,7 @@ def _icr_tables(summary: RunDocument) -> Iterator[Table]:
         final = icr_text(icr.final[column], icr.final_std[column])
         verdict = NOT_SHOWN_WORDS.get(summary.excitation.verdict[column], "")
         rows.append((ICR_WORDS[column], found, final, convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
-    yield Table("l", rows, ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", ""))
+    yield Table("lrrrrl", rows, ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", ""))
     segments = []
     for number, segment in enumerate(summary.segments, start=1):
         icrs = [(segment.mean[column], segment.std[column]) for column in ICR_COLUMNS]
@@ -357,4 +357,4 @@ def _icr_tables(summary: RunDocument) -> Iterator[Table]:
         segments.append((f"  {number}", f"{segment.begin_s:.1f} s", *texts))
     if segments:
         head = ("segment", "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
-        yield Table("lrl", segments, head)
+        yield Table("lr", segments, head)
