@@ -239,7 +239,7 @@ def format_fleet_markdown(rows: Sequence[FleetLog], missing: Sequence[str] = ())
     ----------
     missing : logs of the baseline that the batch does not have
     """
-    from icrtool.output.exports.acceptance import escaped_markdown, markdown_table
+    from icrtool.output.text_blocks import escaped_markdown, markdown_table
 
     lines = [f"## {len(rows)} logs", ""]
     lines += [counts_text(rows), ""]

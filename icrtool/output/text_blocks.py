@@ -1,12 +1,13 @@
-"""Blocks: what a document states, once; printed here, by `icrtool.cli.printing` on a terminal, and on a page.
+"""Blocks: what a document states, once; laid out here as text and Markdown, by `icrtool.cli.printing`, and on a page.
 
 A document (a run, a report, a comparison) is a list of blocks. Whatever lays them out knows nothing of runs or reports.
 """
 
 from __future__ import annotations
 
+import re
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from icrtool.records.text import shortened
@@ -312,3 +313,29 @@ def _wrap(text: str, first: str, later: str, width: int = TEXT_WIDTH, most: int 
         text, width, initial_indent=first, subsequent_indent=later, break_long_words=False, break_on_hyphens=False,
         max_lines=most, placeholder=" …",
     )  # fmt: skip
+
+
+def markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
+    """Yield all of a document as lines of Markdown: a heading each section, an item each sentence."""
+    for block in blocks:
+        for one in printed([block], verbose=True):
+            if isinstance(one, Table):
+                rows = [[escaped_markdown(cell.strip()) for cell in row] for row in one.lines()]
+                texts = [column for column, side in enumerate(one.sides()) if side == "l"]
+                table = ["", *markdown_table(one.head, rows, texts), ""]
+                yield from table if one.head else (f"- {' '.join(filter(None, row))}" for row in rows)
+            elif isinstance(one, Line) and one.look == "title" and not isinstance(block, Title):
+                yield from ("", f"### {escaped_markdown(one.text)}", "")
+            elif text := one.text if isinstance(one, Line) else one:
+                yield f"- {escaped_markdown(text)}"
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], texts: Collection[int] = (0,)) -> list[str]:
+    """Return a table as lines; columns but those in `texts` are aligned to the right."""
+    rule = ["---" if column in texts else "---:" for column in range(len(head))]
+    return [f"| {' | '.join(row)} |" for row in (head, rule, *rows)]
+
+
+def escaped_markdown(text: str) -> str:
+    """Return text with what Markdown would take for markup escaped."""
+    return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)

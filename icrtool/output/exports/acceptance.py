@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
@@ -11,7 +10,7 @@ from xml.etree import ElementTree as ET
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.files.atomic import write_file
-from icrtool.output.text_blocks import Line, Table, printed
+from icrtool.output.text_blocks import escaped_markdown, markdown_lines
 from icrtool.output.text_format import run_title, xml_text
 from icrtool.records.fleet_document import FleetVerdict, fleet_verdict
 
@@ -72,21 +71,13 @@ def format_markdown(report: DropoutReport) -> str:
     # Not at import: a batch needs the verdicts alone.
     from icrtool.output.tables.dropout import dropout_blocks
 
-    title, verdicts = run_title(report.run_document), [one.verdict for one in report.document.gates]
-    lines = [f"## {escaped_markdown(title)}", ""]
+    verdicts = [one.verdict for one in report.document.gates]
+    lines = [f"## {escaped_markdown(run_title(report.run_document))}", ""]
     if verdicts:
         word = "All acceptance limits are met." if report.passed else "**An acceptance limit is not met.**"
         lines += [word, "", *(f"- {escaped_markdown(line)}" for line in verdicts), ""]
-    for block in printed(dropout_blocks(report), verbose=True):
-        if isinstance(block, Table):
-            rows = [[escaped_markdown(cell.strip()) for cell in row] for row in block.lines()]
-            texts = [column for column, side in enumerate(block.sides()) if side == "l"]
-            table = ["", *markdown_table(block.head, rows, texts), ""]
-            lines += table if block.head else [f"- {' '.join(filter(None, row))}" for row in rows]
-        elif (text := block.text if isinstance(block, Line) else block) and text not in verdicts:
-            heading = isinstance(block, Line) and block.look == "title" and not text.startswith(title)
-            lines += ["", f"### {escaped_markdown(text)}", ""] if heading else [f"- {escaped_markdown(text)}"]
-    return "\n".join(lines) + "\n"
+    *blocks, _ = dropout_blocks(report)
+    return "\n".join([*lines, *markdown_lines(blocks)]) + "\n"
 
 
 def _suite(one: Suite, command: str) -> ET.Element:
@@ -111,14 +102,3 @@ def _suite(one: Suite, command: str) -> ET.Element:
         element = ET.SubElement(suite, "testcase", classname=name, name=command)
         ET.SubElement(element, "error", type="IcrToolError", message=xml_text(one.error))
     return suite
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], texts: Collection[int] = (0,)) -> list[str]:
-    """Return a table as lines; columns but those in `texts` are aligned to the right."""
-    rule = ["---" if column in texts else "---:" for column in range(len(head))]
-    return [f"| {' | '.join(row)} |" for row in (head, rule, *rows)]
-
-
-def escaped_markdown(text: str) -> str:
-    """Return text with what Markdown would take for markup escaped."""
-    return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)
