@@ -324,33 +324,25 @@ def write_mcap(
         writer.finish()
 
 
-def write_rosbag(
-    path: Path,
-    topics: Sequence[TopicMessages],
-    store: Typestore,
-    *,
-    ros1: bool,
-    compression: Compression,
-    definitions: bool,
-) -> None:
-    """Write one ROS 1 bag, which always carries definitions, or a ROS 2 bag directory with sqlite3 storage."""
+def write_rosbag(path: Path, topics: Sequence[TopicMessages], store: Typestore, options: WriteOptions) -> None:
+    """Write one ROS 1 bag, or a ROS 2 bag directory with sqlite3 storage, as the container of the options states."""
     from rosbags import rosbag1, rosbag2
 
     bag: Any
-    if ros1:
+    if options.container == "bag":
         bag = rosbag1.Writer(path)
-        if compression != "none":
-            bag.set_compression(rosbag1.Writer.CompressionFormat[compression.upper()])
+        if options.compression != "none":
+            bag.set_compression(rosbag1.Writer.CompressionFormat[options.compression.upper()])
     else:
         bag = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
-        if compression != "none":
-            mode = rosbag2.CompressionMode.MESSAGE if compression == "zstd" else rosbag2.CompressionMode.FILE
+        if options.compression != "none":
+            mode = rosbag2.CompressionMode.MESSAGE if options.compression == "zstd" else rosbag2.CompressionMode.FILE
             bag.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
     with bag:
         connections = [bag.add_connection(topic.topic, topic.message_type, typestore=store) for topic in topics]
         for index, stamp_ns, data in _in_time_order(topics):
             bag.write(connections[index], stamp_ns, data)
-    if not (ros1 or definitions):
+    if not options.definitions:
         with closing(sqlite3.connect(path / f"{path.name}.db3")) as database:
             database.executescript(_TO_SCHEMA_3)
 
@@ -406,11 +398,11 @@ def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -
             tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch,
             unfinished(Path(scratch)),
         ):
-            partial, compression, definitions = Path(scratch) / path.name, options.compression, options.definitions
+            partial, compression = Path(scratch) / path.name, options.compression
             if options.container == "mcap":
-                write_mcap(partial, topics, store, compression=compression, definitions=definitions)
+                write_mcap(partial, topics, store, compression=compression, definitions=options.definitions)
             else:
-                write_rosbag(partial, topics, store, ros1=ros1, compression=compression, definitions=definitions)
+                write_rosbag(partial, topics, store, options)
             partial.rename(path)
     except (OSError, sqlite3.Error) as err:
         reason = err.strerror if isinstance(err, OSError) and err.strerror else str(err)

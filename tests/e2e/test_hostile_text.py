@@ -75,17 +75,13 @@ def mcap(folder: Path) -> Path:
 
 def bag(folder: Path) -> Path:
     path = folder / "\x1b[2J\n\u202e$^{<script>.bag"
-    write_rosbag(
-        path, messages(OPTIONS, "bag"), load_typestore(ros1=True), ros1=True, compression="none", definitions=True
-    )
+    write_rosbag(path, messages(OPTIONS, "bag"), load_typestore(ros1=True), replace(OPTIONS, container="bag"))
     return path
 
 
 def db3(folder: Path) -> Path:
     path = folder / "log"
-    write_rosbag(
-        path, messages(OPTIONS, "db3"), load_typestore(ros1=False), ros1=False, compression="none", definitions=True
-    )
+    write_rosbag(path, messages(OPTIONS, "db3"), load_typestore(ros1=False), replace(OPTIONS, container="db3"))
     with sqlite3.connect(path / "log.db3") as database:
         database.execute("INSERT INTO topics SELECT 99, name || ?, ?, ?, '', '' FROM topics LIMIT 1", (HOSTILE,) * 3)
     database.close()

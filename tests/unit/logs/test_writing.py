@@ -287,14 +287,6 @@ def test_an_sqlite3_log_without_definitions_looks_like_humble(tmp_path):
     check_position(read_back(path, default_types=True), columns)
 
 
-def test_a_ros_1_bag_is_written_whatever_is_asked_about_definitions(tmp_path):
-    store = load_typestore(ros1=True)
-    plan = topic_plans(make_columns(), replace(OPTIONS, container="bag"))[0]
-    path, topics = tmp_path / "drive.bag", [writing_log.serialise_topic(plan, store, ros1=True)]
-    writing_log.write_rosbag(path, topics, store, ros1=True, compression="none", definitions=False)
-    assert stamps_of(read_back(path), plan.topic) == plan.stamp_ns.tolist()
-
-
 def test_an_mcap_without_definitions_has_empty_schemas(tmp_path):
     from mcap.reader import make_reader
 
