@@ -7,8 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from icrtool.config import Config
 from icrtool.logs.containers.container import Block, Channel
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
+from icrtool.logs.streams.sources import Source
+from icrtool.records.samples import Role
 from icrtool.records.text import LogText
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 50_000_000
@@ -46,3 +50,14 @@ def table_of(message_type: str, columns: Mapping[str, Any], topic: str = "/topic
             arrays[path] = np.asarray(values)
     length = len(next(iter(arrays.values())))
     return TopicTable(topic, message_type, START_NS + STEP_NS * np.arange(length), arrays, texts, 0)
+
+
+def fields_of(role: Role, message_type: str) -> tuple[str, ...]:
+    """Return the fields that a role reads of a message type."""
+    row = MESSAGE_TYPES[role].get(message_type)
+    return tuple(filter(None, row.fields)) if row is not None else ()
+
+
+def read_source(role: Role, table: TopicTable, config: Config) -> Source:
+    """Return what a topic, of one of the types of a role, has for it."""
+    return MESSAGE_TYPES[role][table.message_type].read(table, config)

@@ -319,19 +319,5 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
 """By role and type. A number is read as ``lat|latitude * 1e-7 + lat_hp * 1e-9`` states (`sources.terms_of`), a check as
 ``flags & 1 == 1`` (`sources.check_of`)."""
 
-
-def fields_of(role: Role, message_type: str) -> tuple[str, ...]:
-    """Return the fields of a message type that a role is read from, none where it carries nothing for it."""
-    row = MESSAGE_TYPES[role].get(message_type)
-    return tuple(filter(None, row.fields)) if row is not None else ()
-
-
-def read_source(role: Role, table: TopicTable, config: Config) -> Source:
-    """Return what a topic, of one of the types of a role, has for it.
-
-    Raises
-    ------
-    DefinitionError
-        The type, as the log defines it, lacks a field that is needed.
-    """
-    return MESSAGE_TYPES[role][table.message_type].read(table, config)
+KNOWN_TYPES = frozenset[str]().union(*MESSAGE_TYPES.values())
+"""Types with a row of their own: nothing is looked for by the names of their fields."""

@@ -12,7 +12,7 @@ from icrtool.errors import ConfigError, DefinitionError, MissingStreamError
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import HEADER, READ_ENCODINGS, TopicTable
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE
-from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.positions import (
     REFERENCE_WORDS,
     TRANSFORM_FIELDS,
@@ -92,12 +92,13 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
     for channel in channels:
         paths = sorted(sides[channel.id])
         for role in ROLE_WORDS:
-            if (role != "wheels" or topics.wheel_left is None) and getattr(topics, role) in (None, channel.topic):
-                paths += fields_of(role, channel.message_type)
+            row = MESSAGE_TYPES[role].get(channel.message_type)
+            is_open = getattr(topics, role) in (None, channel.topic) and (role != "wheels" or topics.wheel_left is None)
+            paths += row.fields if row is not None and is_open else ()
         if channel.message_type == GYRO_TYPE:
             paths += GYRO_AXES
         if paths:
-            wanted[channel.id] = tuple(dict.fromkeys([*HEADER, *paths]))
+            wanted[channel.id] = tuple(dict.fromkeys([*HEADER, *filter(None, paths)]))
         if is_static(channel):
             static[channel.id] = TRANSFORM_FIELDS
         elif channel.message_type in TRANSFORM_TYPES and (
@@ -147,13 +148,10 @@ def _read_all(tables: Sequence[TopicTable], role: Role, config: Config, kind: ty
     """Return the topics of one role as sources; a topic whose type lacks a needed field in this log is not usable."""
     sources = []
     for table in tables:
-        if (
-            table.message_type in MESSAGE_TYPES[role]
-            and getattr(config.topics, role) in (None, table.topic)
-            and len(table)
-        ):
+        row = MESSAGE_TYPES[role].get(table.message_type)
+        if row is not None and getattr(config.topics, role) in (None, table.topic) and len(table):
             try:
-                sources.append(cast("Kind", read_source(role, table, config)))
+                sources.append(cast("Kind", row.read(table, config)))
             except DefinitionError as err:
                 sources.append(kind(**of_topic(table), problem=err.why))
     return sources

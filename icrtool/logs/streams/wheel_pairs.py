@@ -17,7 +17,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import number_fields
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.message_types import MESSAGE_TYPES
+from icrtool.logs.streams.message_types import KNOWN_TYPES
 from icrtool.logs.streams.sources import StampedRows, Unit, WheelMotion, motion_of, of_topic, stamp_rows
 from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTE, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
 from icrtool.records.text import LogText
@@ -140,7 +140,7 @@ def _fields_of(channel: Channel, searched: set[tuple[str, str]]) -> list[str]:
     if message_type in ARRAY_TYPES:
         return ["data[*]"] if _OF_WHEELS.search(topic) and not _OTHER_WORDS.search(topic) else []
     words = f"{topic} {message_type} {channel.definition}"
-    if _is_known(message_type) or not (_SIDE_WORDS.search(words) and _OF_WHEELS.search(words)):
+    if message_type in KNOWN_TYPES or not (_SIDE_WORDS.search(words) and _OF_WHEELS.search(words)):
         return []
     one = (message_type, channel.definition)
     if sum(len(text) for _, text in searched | {one}) > MOST_SEARCHED:
@@ -160,11 +160,6 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
     return only_side or any(words.search(path) for words in (_SPEED_WORDS, _PLACE_WORDS))
 
 
-def _is_known(message_type: str) -> bool:
-    """Return whether a type has a row of its own: nothing is looked for by the names of its fields."""
-    return any(message_type in types for types in MESSAGE_TYPES.values())
-
-
 def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
     """Return the wheels made of two sides: the configured ones, or all that the names of topics and fields show."""
     topics = config.topics
@@ -175,7 +170,9 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelM
         return [pair_motion(sides[0], sides[1], config)] if len(sides) == 2 else []
     found: dict[str, dict[str, Side]] = {}
     for table in tables:
-        for path in table.columns if not _is_known(table.message_type) and topics.wheels in (None, table.topic) else ():
+        if table.message_type in KNOWN_TYPES or topics.wheels not in (None, table.topic):
+            continue
+        for path in table.columns:
             if _may_be_side(table.topic, table.message_type, path):
                 side = Side(table, path)
                 found.setdefault(table.message_type, {})[side.name] = side

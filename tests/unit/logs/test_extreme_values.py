@@ -11,10 +11,11 @@ from icrtool.config import load_config
 from icrtool.errors import IcrToolError
 from icrtool.kernels.arrays import Floats
 from icrtool.logs.messages.topic_table import LARGEST, GrowingColumn, TopicTable
-from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of, read_source
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.sources import HeadingSource, PositionSource
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import LogText
+from support.tables import fields_of, read_source
 
 CONFIG = load_config(sets=["robot.track_width_m=0.55"])
 EXTREME = [0.0, -1.0, 1.0, np.nan, np.inf, -np.inf, LARGEST, -LARGEST, 1.7e308, -1.7e308, 1e155, 5e-324, 1e-310]

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from icrtool.config import Config
-from icrtool.logs.streams.message_types import read_source
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
-from support.tables import table_of
+from support.tables import read_source, table_of
 
 WORD, NUMBER = "novatel_gps_msgs/NovatelPosition", "novatel_oem7_msgs/BESTPOS"
 

@@ -24,11 +24,10 @@ from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.definitions import ARRAY, BASE, NAME, SEQUENCE, compile_layout
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.logs.read_log import LONGEST_HEAD_BYTES, moment, read_log, survey_log
-from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.sources import stamp_rows
 from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
 from icrtool.records.text import LogText
-from support.tables import block_of, channel_of, collected
+from support.tables import block_of, channel_of, collected, read_source
 
 SEPARATOR = "=" * 80 + "\n"
 START_NS = 1_760_000_000_000_000_000

@@ -31,9 +31,10 @@ from icrtool.logs.messages.decoded_values import NMEA_SENTENCE
 from icrtool.logs.messages.topic_table import DYNAMIC_JOINT_STATE, HEADER, TopicTable
 from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.assembly import Survey
-from icrtool.logs.streams.message_types import MESSAGE_TYPES, fields_of
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
 from icrtool.records.samples import ROLE_WORDS, Role
+from support.tables import fields_of
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 10_000_000

@@ -11,9 +11,8 @@ import pytest
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, increasing, stamp_rows
-from support.tables import START_NS, STEP_NS, table_of
+from support.tables import START_NS, STEP_NS, read_source, table_of
 
 ROUNDING_DEG = 1e-12
 """A degree near 180 is rounded at 3e-14; a few operations follow."""

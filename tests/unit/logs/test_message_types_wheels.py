@@ -17,12 +17,12 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError, DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import survey_log
-from icrtool.logs.streams.message_types import MESSAGE_TYPES, read_source
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.sources import WheelMotion
 from icrtool.logs.streams.wheel_pairs import Side, pair_motion
 from icrtool.logs.streams.wheels import Twist
 from icrtool.records.samples import TWIST_TYPES, StreamChoice
-from support.tables import table_of
+from support.tables import read_source, table_of
 
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 20_000_000
 CONFIG = load_config()

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from icrtool.config import Config
 from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC, parse_sentence
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.message_types import read_source
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
-from support.tables import channel_of, collected
+from support.tables import channel_of, collected, read_source
 
 ROUNDING_DEG = 1e-12
 STEP_NS = 100_000_000

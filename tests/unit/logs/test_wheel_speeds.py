@@ -10,10 +10,10 @@ from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.assembly import wheel_samples
-from icrtool.logs.streams.message_types import read_source
 from icrtool.logs.streams.sources import StampedRows, WheelMotion, motion_of
 from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog
+from support.tables import read_source
 
 RADIUS_M, STEP_NS = 0.1, 20_000_000
 CONFIG = load_config(sets=[f"robot.wheel_radius_m={RADIUS_M}"])
