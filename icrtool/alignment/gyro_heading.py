@@ -189,7 +189,7 @@ def _standing(track: Track, turn: TurnRate) -> tuple[Floats, Floats]:
     gone = track.cumulate(np.abs(track.v_left) + np.abs(track.v_right))
     still = np.interp(end, track.t, gone) - np.interp(begin - STANDING_S, track.t, gone) < 1e-3
     still &= (end - begin < 1.5 * STANDING_S) & (begin >= turn.t[0]) & (end <= turn.t[-1])
-    G = turn.integrated()
+    G = turn.integrated
     rate = (np.interp(end, turn.t, G) - np.interp(begin, turn.t, G)) / (end - begin)
     return end[still], rate[still]
 
@@ -200,7 +200,7 @@ class _Problem:
     def __init__(
         self, courses: Courses, still: tuple[Floats, Floats], turn: TurnRate, absolute: Sequence[AbsoluteHeading]
     ) -> None:
-        self.turn, self.absolute, self.G = turn, absolute, turn.integrated()
+        self.turn, self.absolute, self.G = turn, absolute, turn.integrated
         still_t, still_rate = still
         t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
         # steps that measure nothing, between events far apart

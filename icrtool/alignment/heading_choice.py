@@ -74,7 +74,7 @@ def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> Absolu
     t, angle = t[inside], angle[inside]
     if not len(t):
         return AbsoluteHeading(t, angle, angle, angle)
-    turned = np.interp(t, turn.t, turn.integrated())
+    turned = np.interp(t, turn.t, turn.integrated)
     first = np.flatnonzero(np.diff(np.floor(t / cell_s), prepend=-1.0) > 0)
     count = np.diff(first, append=len(t))
     last = first + count - 1
@@ -226,7 +226,7 @@ def _derived(
     if stated is not None:
         # with the white noise that it shows beside the turn rate
         one = _averaged(track.heading_t, track.heading, turn, ATTITUDE_CELL_S)
-        step = np.diff(one.heading - np.interp(one.t, turn.t, turn.integrated()))
+        step = np.diff(one.heading - np.interp(one.t, turn.t, turn.integrated))
         noise = mad_std(wrapped(step - np.median(step))) / math.sqrt(2.0) if len(step) else 0.0
         std = np.full(len(one.t), max(noise, LEAST_ATTITUDE_STD_RAD))
         topic = log.topic("heading", "orientation")

@@ -15,6 +15,8 @@ Wheels that run backwards turn S round.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +45,8 @@ LONGEST_STRETCH_S = 60.0
 """Displacements that take longer, or are further apart, are not compared without a turn rate."""
 
 
-class TurnRate(NamedTuple):
+@dataclass(frozen=True)
+class TurnRate:
     """A turn rate, clockwise.
 
     Attributes
@@ -56,14 +59,15 @@ class TurnRate(NamedTuple):
 
     t: Floats
     rate: Floats
-    holes: Floats = np.empty((0, 2))
+    holes: Floats = field(default_factory=lambda: np.empty((0, 2)))
     scale_std: float = 0.02
     bias_std: float = math.radians(2.0)
     hole_std: float = math.radians(10.0)
     delay_std_s: float | None = None
 
+    @cached_property
     def integrated(self) -> Floats:
-        """Return the turn since the first sample (n,) [rad], by trapezoids."""
+        """Turn since the first sample (n,) [rad], by trapezoids."""
         return trapezoids(self.t, self.rate)
 
     def hole_variance(self, t: Floats) -> Floats:
@@ -119,7 +123,7 @@ class Courses(NamedTuple):
 
 def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     """Cut the drive into windows of distance that follow one another, and measure the course over ground in each."""
-    corrected = turn._replace(rate=turn.rate - guess.bias).integrated()
+    corrected = trapezoids(turn.t, turn.rate - guess.bias)
     v, u = track.mean_speed, track.half_difference
     middle = track.t + track.held / 2
     psi = np.interp(middle, turn.t, corrected)
