@@ -209,7 +209,7 @@ def run_adaptively(
     setup, output = run(sensors, noise)
     if settings.preset != "field":
         return setup, output, noise
-    moving, limits = _moving(sensors), setup.parameters
+    moving, limits = sensors.moving(), setup.parameters
     # mean NIS per degree of freedom, each counted up to its gate
     nis = (
         np.minimum(output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]], limits.gnss_gate) / 2.0,
@@ -220,7 +220,7 @@ def run_adaptively(
     del setup, output  # of a long log, as large as all that the next run makes
     largest = min(LARGEST_HEADING_DEGPS, STEP * math.degrees(sensors.turn_wander_rad) / math.sqrt(REFERENCE_STEP_S))
     part = _busiest_part(sensors)
-    moving = _moving(part)
+    moving = part.moving()
     best = find_noise(
         lambda tried: innovation_cost(run(part, tried)[1], moving),
         noise,
@@ -278,10 +278,6 @@ def find_noise(
         if best == before:
             break
     return best
-
-
-def _moving(sensors: SensorData) -> Moving:
-    return sensors.moving(sensors.fixes.stamp_ns), sensors.moving(sensors.headings.stamp_ns)
 
 
 def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float:

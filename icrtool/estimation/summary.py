@@ -93,9 +93,12 @@ def summarise(
     field = config.filter.preset == "field"
     scale = measurements.findings["wheel_scale"] if field else None
     of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
-    measured = {"fixes": filtered.gnss, "headings": filtered.heading}
     # while the robot was in use
-    rejected = {word: rejected_share(one.code[sensors.moving(one.stamp_ns)]) for word, one in measured.items()}
+    of_fixes, of_headings = sensors.moving()
+    rejected = {
+        "fixes": rejected_share(filtered.gnss.code[of_fixes]),
+        "headings": rejected_share(filtered.heading.code[of_headings]),
+    }
     unusable = unusable_reasons(
         excitation, rejected, filtered.noise, scale, multiplier[0] if of_twist and multiplier is not None else None,
         contradicts_windows(table, covariance, measurements.findings) if field and not changes_s else "",

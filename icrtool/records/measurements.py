@@ -115,8 +115,8 @@ class SensorData:
         """Whether the variance of a heading is its own, and not that of an error which lasts."""
         return self.heading_is_estimated or self.heading_is_measured
 
-    def moving(self, stamp_ns: Ints) -> Bools:
-        """Return at which stamps (m,) the wheels turn, or do within `MOVING_S`; all where they never do.
+    def moving(self) -> tuple[Bools, Bools]:
+        """Return at which fixes (m,) and headings (h,) the wheels turn, or do within `MOVING_S`; all where at none.
 
         What a robot measures while it stands shows neither delays nor contradictions, however long it stands.
         """
@@ -124,14 +124,18 @@ class SensorData:
         turning = np.abs(self.wheels.v_left_mps) + np.abs(self.wheels.v_right_mps) > 2.0 * TURNING_MPS
         so_far = np.concatenate([[0], np.cumsum(turning)])
         near = max(round(MOVING_S * 1e9), 2 * int(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0
-        moving = np.empty(len(stamp_ns), np.bool_)
-        for lo in range(0, len(stamp_ns), ROWS_AT_ONCE):
-            some = slice(lo, lo + ROWS_AT_ONCE)
-            # the value before holds, too
-            first = np.maximum(np.searchsorted(stamps, stamp_ns[some] - near) - 1, 0)
-            last = np.searchsorted(stamps, stamp_ns[some] + near, side="right")
-            moving[some] = so_far[last] > so_far[first]
-        return moving if moving.any() else np.ones(len(stamp_ns), np.bool_)
+
+        def of(stamp_ns: Ints) -> Bools:
+            moving = np.empty(len(stamp_ns), np.bool_)
+            for lo in range(0, len(stamp_ns), ROWS_AT_ONCE):
+                some = slice(lo, lo + ROWS_AT_ONCE)
+                # the value before holds, too
+                first = np.maximum(np.searchsorted(stamps, stamp_ns[some] - near) - 1, 0)
+                last = np.searchsorted(stamps, stamp_ns[some] + near, side="right")
+                moving[some] = so_far[last] > so_far[first]
+            return moving if moving.any() else np.ones(len(stamp_ns), np.bool_)
+
+        return of(self.fixes.stamp_ns), of(self.headings.stamp_ns)
 
     def part(self, rows: slice) -> SensorData:
         """Return the part of some wheel samples, with the fixes and headings of that time."""
