@@ -245,7 +245,7 @@ class TopicCollector:
         # of each publisher by itself: one may be recorded later than another
         stored = [times] if len(self.decoders) == 1 else [times[numbers == one] for one in self.decoders]
         back = max(map(set_back_of, stored), default=NOT_SET_BACK)
-        order = None if (np.diff(times) >= 0).all() else np.argsort(times, kind="stable")
+        order = None if (times[1:] >= times[:-1]).all() else np.argsort(times, kind="stable")
         columns: dict[str, NDArray[Any]] = {}
         texts: dict[str, list[LogText]] = {}
         for path, is_text in [*self._columns]:
@@ -262,9 +262,9 @@ class TopicCollector:
 
 def set_back_of(times: Ints) -> SetBack:
     """Return how stored log times (n,) go back, and what sorting does to the stretches between."""
-    steps = np.diff(times)
-    if not (steps < 0).any():
+    if (times[1:] >= times[:-1]).all():
         return NOT_SET_BACK
+    steps = np.diff(times)
     step_ns = int(-steps.min())
     stretch = np.concatenate([[0], np.cumsum(steps < -(NEAR_NS if step_ns > NEAR_NS else OUT_OF_ORDER_NS))])
     pieces = 1 + np.count_nonzero(np.diff(stretch[np.argsort(times, kind="stable")]))

@@ -146,7 +146,7 @@ class Fix:
                 "not finite": ~finite,
                 "not a place on earth": ~possible,
                 "at 0, 0": (first == 0) & (second == 0),
-                "far from the others": _far_away(np.column_stack([first, second]), possible & ~no_fix & finite),
+                "far from the others": _far_away(first, second, possible & ~no_fix & finite),
             }
         usable, rejected = np.ones(len(table), np.bool_), dict[str, int]()
         for reason, bad in reasons.items():
@@ -222,15 +222,15 @@ class Fix:
         return problem
 
 
-def _far_away(places_deg: Floats, known: Bools) -> Bools:
+def _far_away(latitude_deg: Floats, longitude_deg: Floats, known: Bools) -> Bools:
     """Return the known fixes (n,) of another place: a receiver that was switched on may send where it was last."""
-    far, places_deg = np.zeros(len(known), np.bool_), places_deg[known]
-    if len(places_deg):
-        away_deg = places_deg - places_deg[0]
-        away_deg[:, 1] = np.mod(away_deg[:, 1] + 180.0, 360.0) - 180.0  # not across the date line
-        away_deg -= np.median(away_deg, axis=0)
-        away_deg[:, 1] *= math.cos(math.radians(float(np.median(places_deg[:, 0]))))
-        far[known] = (np.abs(away_deg) * METRES_PER_DEGREE > FARTHEST_M).any(axis=1)
+    far, latitude_deg, longitude_deg = np.zeros(len(known), np.bool_), latitude_deg[known], longitude_deg[known]
+    if len(latitude_deg):
+        middle_deg = float(np.median(latitude_deg))
+        east_deg = np.mod(longitude_deg - longitude_deg[0] + 180.0, 360.0) - 180.0  # not across the date line
+        east_deg = (east_deg - np.median(east_deg)) * math.cos(math.radians(middle_deg))
+        away_deg = np.maximum(np.abs(latitude_deg - middle_deg), np.abs(east_deg))
+        far[known] = away_deg * METRES_PER_DEGREE > FARTHEST_M
     return far
 
 
