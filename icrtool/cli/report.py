@@ -56,7 +56,7 @@ def report_command(sources: tuple[Path, ...], output: Path | None, no_coordinate
     for source in sources:
         place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
         # A page in its usual place is beside what a stranger may have put there.
-        inside, ours = (place.parent, atomic.is_page) if output is None else (None, None)
+        inside, ours = (place.parent, run_directory.is_page) if output is None else (None, None)
         atomic.check_place(place, inside, ours)
         page = _page_of(source, coordinates=not no_coordinates)
         atomic.write_file(place, page, inside, ours)

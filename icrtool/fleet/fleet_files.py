@@ -21,8 +21,8 @@ from icrtool.errors import IcrToolError, OutputError
 from icrtool.fleet.recordings import as_text, unique_name
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import formats
-from icrtool.output.files.atomic import atomic_file, check_place, is_page, make_folders, write_file
-from icrtool.output.run_directory import PAGE_FILE
+from icrtool.output.files.atomic import atomic_file, check_place, make_folders, write_file
+from icrtool.output.run_directory import PAGE_FILE, is_page
 from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records import fleet_document as documents
 from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog

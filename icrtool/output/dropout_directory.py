@@ -5,6 +5,7 @@ And the reports that a later one is compared with: a report.json, those of runs,
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -19,9 +20,10 @@ from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
 from icrtool.dropout_analysis.trials import ErrorSink
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.output.files.atomic import atomic_directory, files_in
+from icrtool.output import figure_catalogue
+from icrtool.output.files.atomic import Kind, atomic_directory
 from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, logs_of_fleet, read_document, schema_of
-from icrtool.output.run_directory import is_run_directory
+from icrtool.output.run_directory import REPORT_FILES, is_run_directory
 from icrtool.records.dropout_document import DropoutDocument, EarlierReport, SummaryRow
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
@@ -60,17 +62,15 @@ def write_report(
     Raises
     ------
     OutputError
-        Something that is not a dropout report stands in its place, or the disk does not take it.
+        Something that is not a dropout report stands in its place, or beside its files, or the disk does not take it.
     """
-    with atomic_directory(directory, is_dropout_directory, kind="dropout report", inside=inside) as partial:
+    with atomic_directory(directory, REPORT, inside) as partial:
         with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
             report = analyse(sink)
         if plots:
-            from icrtool.output.figure_catalogue import draw_figures
-
-            draw_figures("report", report, partial / "plots", plots, figures)
+            figure_catalogue.draw_figures("report", report, partial / "plots", plots, figures)
         write_tables(report, partial)
-        names = [name.as_posix() for name in files_in(partial)]
+        names = [path.relative_to(partial).as_posix() for path in sorted(partial.rglob("*")) if path.is_file()]
         if in_run := is_run_directory(directory.parent):
             list_anew(directory.parent, directory.name)
     if in_run:
@@ -81,6 +81,9 @@ def write_report(
 def is_dropout_directory(directory: Path) -> bool:
     """Return whether a directory is a dropout report of ours, of whatever version."""
     return schema_of(directory / REPORT_FILE, directory).startswith(SCHEMA_FAMILY)
+
+
+REPORT = Kind("dropout report", is_dropout_directory, re.compile(REPORT_FILES))
 
 
 def write_tables(report: DropoutReport, directory: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,8 +16,10 @@ import numpy as np
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, OutputError, RunError
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, numbered_file, split_path
+from icrtool.output import figure_catalogue
+from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import formats, run_columns
-from icrtool.output.files.atomic import atomic_directory, check_directory, own_files
+from icrtool.output.files.atomic import Kind, atomic_directory, check_directory
 from icrtool.output.files.remote_place import lies_there, on_disk
 from icrtool.output.files.run_columns import MEASUREMENTS_FILE, StatesFormat
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of, read_regular
@@ -26,7 +29,7 @@ from icrtool.records.run import FigureSet, Run
 from icrtool.records.run_document import EVENT_COLUMNS, RUN_SCHEMA, EventDocument, RunDocument
 from icrtool.records.samples import InputFile
 from icrtool.records.tables import States
-from icrtool.records.text import LONGEST_NAME, escaped_texts, shortened
+from icrtool.records.text import LONGEST_NAME, escaped_texts, listed, shortened
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
@@ -38,6 +41,15 @@ MOST_CSV_STATES = 1_000_000
 """With more states, states.csv would have over 300 MB, and take longer to read than the log."""
 
 SCHEMA_FAMILY = "icrtool/run/"
+
+_FIGURES = "|".join(f"{name}[0-9]+m" if name.endswith("_") else name for name in (*FIGURES, "examples", "ladder"))
+PICTURES = rf"plots/(({_FIGURES})\.(png|svg|pdf))?"
+REPORT_FILES = rf"report\.json|(summary|histogram|worst|ladder)\.csv|trials\.parquet|{PICTURES}"
+RUN_FILES = (
+    r"run\.json|events\.csv|measurements\.npz|(states|smoothed)\.(csv|parquet)|B2SUMS|report\.html"
+    rf"|{PICTURES}|dropout/({REPORT_FILES})?"
+)
+"""All names that any version wrote: what has another is of somebody, and is not replaced."""
 
 
 def check_target(
@@ -59,7 +71,7 @@ def check_target(
     if log is not None and is_run_directory(log):
         path = next((one.path for one in _inputs_of(log)), "data frames")
         raise OutputError(log, "is a run, not a log", f"name its log ({path}), or: icrtool dropout-report {log}")
-    check_directory(directory, is_run_directory, kind="run directory", inside=inside)
+    check_directory(directory, RUN, inside)
     if log is not None and not overwrite and is_run_directory(directory) and not _is_made_from(directory, log):
         other = next((one.path for one in _inputs_of(directory)), "data frames")
         advice = "name another place, or replace it with --overwrite"
@@ -69,7 +81,11 @@ def check_target(
 def _is_made_from(directory: Path, log: Path) -> bool:
     """Return whether a run was made from a log: from a file in the same place, or from files of the same content."""
     files = [file for file in files_of_log(log) if file.is_file()]
-    inputs, sources = _inputs_of(directory), own_files(directory).made_from
+    inputs = _inputs_of(directory)
+    try:
+        sources = formats.read_document(directory / formats.SOURCES_FILE, _Sources, directory, escape=False).made_from
+    except (OSError, ValueError, RecursionError):
+        sources = ()
     if any(os.path.realpath(file) in sources for file in files):
         return True
     if isinstance(log, UrlPath):
@@ -107,13 +123,13 @@ def new_run(
     states : format of the states; default: ``csv``, of more than `MOST_CSV_STATES` ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
     figures : ``all``: those of the paper too
-    note : called with one line where an old run was replaced and files of it were removed or, not icrtool's, kept
+    note : called with one line where an old run was replaced and what the new one does not have was removed
     inside : as in `check_directory`
 
     Raises
     ------
     OutputError
-        A file or a foreign directory is there, or the disk does not take it.
+        A file, a foreign directory or a run with files of others is there, or the disk does not take it.
     """
     if unknown := set(plots) - set(formats.PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {formats.PLOT_FORMATS}")
@@ -121,30 +137,19 @@ def new_run(
         states = "csv" if len(run.table) <= MOST_CSV_STATES else "parquet"
         if states != "csv" and note is not None:
             note(f"{directory}: {len(run.table):,} states: written as states.parquet, not states.csv (--states csv)")
-    sources = [os.path.realpath(file.path) for file in run.document.inputs]
-    with (
-        atomic_directory(
-            directory,
-            is_run_directory,
-            kind="run directory",
-            inside=inside,
-            names=(PAGE_FILE,),
-            made_from=sources,
-            note=note,
-        ) as partial,
-        ThreadPoolExecutor(1) as pool,
-    ):
+    before = set(directory.glob("[!.]*"))
+    with atomic_directory(directory, RUN, inside) as partial, ThreadPoolExecutor(1) as pool:
         states_name = f"states.{states}"
         states_sum = pool.submit(run_columns.write_states, run.table, partial / states_name, states)
         if plots:
-            from icrtool.output.figure_catalogue import draw_figures
-
-            draw_figures("run", run, partial / "plots", plots, figures)
+            figure_catalogue.draw_figures("run", run, partial / "plots", plots, figures)
         sums: dict[str, str] = {}
         if run.smoothed is not None:
             sums[f"smoothed.{states}"] = run_columns.write_states(run.smoothed, partial / f"smoothed.{states}", states)
         run_columns.write_measurements(run, partial / MEASUREMENTS_FILE)
         (partial / RUN_FILE).write_bytes(formats.json_bytes(run.document))
+        sources = _Sources(tuple(os.path.realpath(file.path) for file in run.document.inputs))
+        (partial / formats.SOURCES_FILE).write_bytes(formats.json_bytes(sources))
         (partial / EVENTS_FILE).write_bytes(events_csv(run.document.events))
         pictures = [f"plots/{file.name}" for file in sorted((partial / "plots").glob("*"))]
         others = (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE, *pictures)
@@ -152,6 +157,8 @@ def new_run(
         sums[states_name] = states_sum.result()
         formats.write_sums(partial, sums)
         yield partial
+    if note is not None and (removed := before - set(directory.glob("[!.]*"))):
+        note(f"{directory}: replaced: removed {listed(sorted(path.name for path in removed))}")
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:
@@ -163,6 +170,10 @@ def replaced_log(directory: Path, run: Run) -> str | None:
 
 class _Inputs(Record, frozen=True):
     inputs: tuple[InputFile, ...]
+
+
+class _Sources(Record, frozen=True):
+    made_from: tuple[str, ...] = ()
 
 
 def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
@@ -178,6 +189,14 @@ def is_run_directory(directory: Path) -> bool:
     if isinstance(directory, UrlPath):
         return lies_there(directory, RUN_FILE)
     return formats.schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
+
+
+RUN = Kind("run directory", is_run_directory, re.compile(RUN_FILES))
+
+
+def is_page(first: bytes) -> bool:
+    """Return whether a file is a page of ours, by its first bytes."""
+    return b"icrtool</title>" in first
 
 
 def events_csv(events: Sequence[EventDocument]) -> bytes:

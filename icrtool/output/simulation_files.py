@@ -5,6 +5,7 @@ A study is written whole or not at all: every run as CSV, parameters and statist
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,11 +14,11 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.errors import DataError, OutputError
-from icrtool.output.files import disk
-from icrtool.output.files.atomic import atomic_directory, check_directory, reported, restore
+from icrtool.output.files.atomic import Kind, atomic_directory, beside, check_directory, put, reported, sync_tree
 from icrtool.output.files.formats import csv_bytes, json_bytes, read_numbers, schema_of
 from icrtool.records.process_resources import remove
 from icrtool.simulation.drives import TrackSpeeds, TruthTable
+from icrtool.simulation.studies import STUDIES
 from icrtool.simulation.study_records import StudyResult
 
 SPEED_COLUMNS = ("t_s", "v_left_mps", "v_right_mps")
@@ -43,24 +44,28 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
         Something is there, or the place cannot be written. It then stays as it was.
     """
     truth = truth_path(log)
+    if not log.is_file():
+        check_directory(log, BAG)
     with reported(log):
-        restore(log, _is_bag)
         for place in (log, truth):
             if place.exists() and not force:
                 raise OutputError(place, "exists already", "--force replaces it")
-            if place.is_dir() and (place == truth or not _is_bag(place)):
-                raise OutputError(place, "is a directory and no bag", "it is left alone; choose another name")
-        with disk.beside(log.absolute(), Path.mkdir) as fresh:
+        if truth.is_dir():
+            raise OutputError(truth, "is a directory", "it is left alone; choose another name")
+        with beside(log.absolute(), Path.mkdir) as fresh:
             yield fresh / log.name, fresh / truth.name
-            disk.sync_tree(fresh)
+            sync_tree(fresh)
             # Killed from here on, it leaves a log without its truth, never with that of another log.
             remove(truth)
-            disk.put(fresh / log.name, log.absolute())
-            disk.put(fresh / truth.name, truth.absolute())
+            put(fresh / log.name, log.absolute())
+            put(fresh / truth.name, truth.absolute())
 
 
-def _is_bag(place: Path) -> bool:
-    return (place / "metadata.yaml").is_file()
+BAG = Kind(
+    "bag directory",
+    lambda place: (place / "metadata.yaml").is_file(),
+    re.compile(r"metadata\.yaml|[^/]+\.(db3|mcap)(\.zstd)?"),
+)
 
 
 def write_truth(table: TruthTable, path: Path) -> None:
@@ -96,7 +101,6 @@ def read_speeds(path: Path) -> TrackSpeeds:
 STUDY_SCHEMA = "icrtool/study/1"
 STUDY_FILE = "study.json"
 SCHEMA_FAMILY = "icrtool/study/"
-KIND = "study directory"
 
 
 def check_study_target(directory: Path) -> None:
@@ -105,9 +109,9 @@ def check_study_target(directory: Path) -> None:
     Raises
     ------
     OutputError
-        A file or a directory that is not a study of ours is there.
+        A file, a directory that is not a study of ours, or one with files of others is there.
     """
-    check_directory(directory, is_study_directory, kind=KIND)
+    check_directory(directory, STUDY)
 
 
 def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] = ("png",)) -> None:
@@ -121,7 +125,7 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
     Raises
     ------
     OutputError
-        A file or a foreign directory is there, or the disk does not take it.
+        As `check_study_target`, and the disk does not take it.
     """
     name = result.request.name
     document = {
@@ -134,7 +138,7 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
         "findings": [one._asdict() for one in result.findings],
         "levels": result.records(),
     }
-    with atomic_directory(directory, is_study_directory, kind=KIND) as partial:
+    with atomic_directory(directory, STUDY) as partial:
         (partial / STUDY_FILE).write_bytes(json_bytes(document))
         columns = (column if isinstance(column, list) else column.tolist() for column in result.columns.values())
         rows = zip(*columns, strict=True)
@@ -149,3 +153,8 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
 def is_study_directory(directory: Path) -> bool:
     """Return whether a directory is a study of ours, of whatever version."""
     return schema_of(directory / STUDY_FILE, directory).startswith(SCHEMA_FAMILY)
+
+
+STUDY = Kind(
+    "study directory", is_study_directory, re.compile(rf"study\.json|({'|'.join(STUDIES)})\.(csv|png|svg|pdf)")
+)

@@ -15,7 +15,6 @@ TRIES = 20
 """Another thread may still add files to a directory while it is removed."""
 
 _paths: set[Path] = set()
-_parents: list[Path] = []
 
 
 def begin(path: Path) -> None:
@@ -38,26 +37,6 @@ def unfinished(path: Path) -> Iterator[None]:
         end(path)
 
 
-@contextmanager
-def with_parents(path: Path) -> Iterator[list[Path]]:
-    """Make the directories above a path, and give those that were missing; what is empty at the end is removed again.
-
-    Raises
-    ------
-    OSError
-        One cannot be made.
-    """
-    missing = [parent for parent in path.parents if not parent.exists()]
-    _parents.extend(missing)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield missing
-    finally:
-        _remove_empty(missing)
-        for parent in missing:
-            _parents.remove(parent)
-
-
 def remove_unfinished() -> None:
     """Remove all that is being written; called where no other code of this process will do it any more."""
     for path in list(_paths):
@@ -65,7 +44,6 @@ def remove_unfinished() -> None:
             remove(path)
             if not path.exists():
                 break
-    _remove_empty(list(_parents))
 
 
 def remove(path: Path) -> None:
@@ -75,12 +53,6 @@ def remove(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink(missing_ok=True)
-
-
-def _remove_empty(directories: list[Path]) -> None:
-    for directory in directories:
-        with suppress(OSError):
-            directory.rmdir()
 
 
 LARGE_BYTES = 600 << 20

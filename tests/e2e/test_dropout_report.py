@@ -16,7 +16,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from icrtool.cli import main
-from icrtool.output.files.atomic import OWN_FILES
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = ROOT / "sample_logs" / "wheeled_figure_eight"
@@ -79,7 +78,7 @@ def test_a_log_is_fitted_and_reported_on_in_one_go(fitted: Path) -> None:
     assert "Traceback" not in err
     assert (fitted / RUN / "states.csv").is_file()
     assert (fitted / RUN / "plots" / "trajectory.png").is_file()
-    files = {OWN_FILES, "summary.csv", "histogram.csv", "ladder.csv", "worst.csv", "report.json", "trials.parquet"}
+    files = {"summary.csv", "histogram.csv", "ladder.csv", "worst.csv", "report.json", "trials.parquet"}
     pictures = {f"plots/{name}.png" for name in PICTURES | {"outages"}}
     assert files_in(fitted / RUN / "dropout") == files | pictures
     assert "How far within 0.5 m (95 %)?" in out
@@ -114,13 +113,11 @@ def test_without_an_argument_the_newest_run_is_taken_and_not_filtered_again(fold
     assert done.returncode == 0, done.stderr
     assert {name: (folder / RUN / name).read_bytes() for name in before} == before
     assert files_in(folder / RUN / "dropout") == {
-        OWN_FILES,
         "summary.csv",
         "histogram.csv",
         "ladder.csv",
         "worst.csv",
         "report.json",
-        ".icrtool-files",
     }
     assert pd.read_csv(folder / RUN / "dropout" / "summary.csv").horizon_m.unique().tolist() == [2.0, 10.0]
     full = pd.read_csv(folder / RUN / "dropout" / "summary.csv").set_index(["model", "horizon_m"])

@@ -130,11 +130,16 @@ def test_a_relative_path_from_another_folder_is_another_recording(icrtool, logs:
         check_target(logs / "run", Path("monday/drive.mcap"))
 
 
-def test_a_run_fitted_again_reports_what_it_removes_and_keeps(icrtool, logs: Path) -> None:
+def test_a_run_fitted_again_reports_what_it_removes_and_removes_nothing_of_others(icrtool, logs: Path) -> None:
     assert icrtool("dropout-report", "monday/drive.mcap", *FAST)[0] == 0
     notes = logs / "icrtool-runs" / "drive" / "notes.txt"
     notes.write_text("mine")
-    _, _, err = icrtool("fit", "monday/drive.mcap", *FAST)
-    assert "dropout/" in err.partition("removed ")[2].partition(";")[0]
-    assert "kept notes.txt" in err
-    assert notes.read_text() == "mine"
+    for command in ("fit", "dropout-report"):
+        status, _, err = icrtool(command, "monday/drive.mcap", "--overwrite", *FAST)
+        assert status == 1
+        assert "holds notes.txt" in err
+        assert notes.read_text() == "mine"
+    notes.unlink()
+    status, _, err = icrtool("fit", "monday/drive.mcap", *FAST)
+    assert status == 0
+    assert "removed dropout, report.html" in err

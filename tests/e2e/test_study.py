@@ -37,7 +37,7 @@ def test_a_study_prints_a_table_and_writes_its_directory(tmp_path: Path) -> None
     assert done.stdout.startswith("rate: whether logs of any rate give the same ICRs\n2 runs of 5 s each, seed 0;")
     assert done.stdout.endswith("written to icrtool-runs/study-rate\n")
     made = tmp_path / "icrtool-runs" / "study-rate"
-    assert sorted(path.name for path in made.iterdir()) == [".icrtool-files", "rate.csv", "rate.png", "study.json"]
+    assert sorted(path.name for path in made.iterdir()) == ["rate.csv", "rate.png", "study.json"]
 
 
 def test_the_same_seed_gives_the_same_study(tmp_path: Path) -> None:

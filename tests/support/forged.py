@@ -18,8 +18,11 @@ MOST_FORGED_BYTES = 1 << 24
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
+ASIDE = f".icrtool-{hashlib.blake2b(b'dropout', digest_size=8).hexdigest()}"
+"""How the hidden names beside dropout/ begin."""
+
 HIDDEN = (
-    ".report.html.0123abcd.partial.html", ".dropout.0123abcd.partial", ".dropout.0123abcd.old", "plots/.x.png",
+    ".icrtool-0123456789abcdef-0123abcd.partial", f"{ASIDE}-0123abcd.old", f"{ASIDE}-0123abcd.partial", "plots/.x.png",
     ".icrtool-files", "notes.txt",
 )  # fmt: skip
 

@@ -1,35 +1,32 @@
-"""Files and directories that appear whole or not at all, and replace nothing that somebody else put there.
+"""Files and directories that appear whole or not at all, and replace nothing that icrtool did not write.
 
-Each is written and synced under a hidden name beside its place, then put there (`icrtool.output.files.disk`).
-``.icrtool-files`` in a directory lists what was written there with it: all else is kept where that is replaced.
+Each is written and synced under a hidden name beside its place (``.icrtool-…``), then renamed. A directory exchanges
+its name with the old one; where that is not possible, the old one is renamed aside before, and where a process is
+killed between both renames, the next one that writes there renames it back.
 """
 
 from __future__ import annotations
 
-import json
+import ctypes
+import errno
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
-from typing import Literal
-
-import msgspec
+import re
+import secrets
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from hashlib import blake2b
+from pathlib import Path
+from typing import NamedTuple
 
 from icrtool.errors import OutputError
-from icrtool.output.files import disk
-from icrtool.records.places import check_links, open_regular, read_regular
-from icrtool.records.plain_data import Record
-from icrtool.records.process_resources import with_parents
-from icrtool.records.text import escaped, listed
-
-IsOurs = Callable[[Path], bool]
-"""Whether a directory is one that we wrote and may replace."""
+from icrtool.records.places import check_links, open_regular
+from icrtool.records.process_resources import begin, end, remove, unfinished
 
 IsOurFile = Callable[[bytes], bool]
 """Whether a file, of which the first bytes are given, is one that we wrote and may replace."""
-
-OWN_FILES = ".icrtool-files"
-"""List of the files that were written with a directory: `OwnFiles` as JSON."""
 
 EXPORTED_MCAP = b"icrtool export"
 """Library in the header of an MCAP file that `icrtool export` wrote: it is no log of somebody's."""
@@ -38,6 +35,41 @@ PACKED = (b"\x28\xb5\x2f\xfd", b"\x1f\x8b", b"BZh", b"\x04\x22\x4d\x18")
 """How files packed with zstd, gzip, bzip2 and lz4 begin: nothing that icrtool writes, and perhaps a log."""
 
 FIRST_BYTES = 4096
+
+HIDDEN = ".icrtool-"
+"""How the names of all files begin that are icrtool's and no results."""
+
+OF_NOBODY = {".DS_Store", "Thumbs.db", "desktop.ini"}
+"""What file managers leave in a folder that they show."""
+
+PARTIAL, ASIDE = ".partial", ".old"
+"""Suffixes of those that are being written, and of old directories that were renamed aside."""
+
+ABANDONED_S = 3600.0
+"""What was not changed for so long is written by no process any more: a report takes minutes."""
+
+NO_SYNC = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
+
+SYNC_THREADS = 8
+"""A journal commits what is asked for together: eight threads sync 16 files in a fifth of the time of one."""
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+"""Of Linux: <fcntl.h>, <linux/fs.h>."""
+
+
+class Kind(NamedTuple):
+    """A kind of directory that icrtool writes.
+
+    Attributes
+    ----------
+    name : for messages ("run directory")
+    is_one : whether a directory is one, of whatever version
+    files : matches the names below it of all that icrtool writes there; of a directory, with ``/`` at the end
+    """
+
+    name: str
+    is_one: Callable[[Path], bool]
+    files: re.Pattern[str]
 
 
 @contextmanager
@@ -73,170 +105,22 @@ def _place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> P
     if inside is not None:
         check_links(path.parent, inside)
         place /= path.name
-        if place.is_symlink() and not place.is_dir():
-            return place  # it is replaced itself
     if place.is_dir():
         raise OutputError(path, "is a directory", "name a file")
-    if place.exists():
-        if not place.is_file():
-            raise OutputError(path, "is a device or pipe, which would be replaced", "name a file")
-        from icrtool.logs.containers.open_log import container_of
+    if place.is_symlink() or not place.exists():
+        return place  # a link is replaced itself
+    if not place.is_file():
+        raise OutputError(path, "is a device or pipe, which would be replaced", "name a file")
+    from icrtool.logs.containers.open_log import container_of
 
-        try:
-            with open_regular(place) as stream:
-                first = stream.read(FIRST_BYTES)
-                is_log = container_of(stream) is not None and EXPORTED_MCAP not in first[:64]
-        except PermissionError:
-            return place  # it may be replaced without being read
-        if is_log or first.startswith(PACKED):
-            raise OutputError(path, "a log is there", "it is left alone; name another file")
-        if ours is not None and first and not ours(first):
-            why = "a file that icrtool did not write is there"
-            raise OutputError(path, why, "it is left alone; name another place")
+    with open_regular(place) as stream:
+        first = stream.read(FIRST_BYTES)
+        is_log = container_of(stream) is not None and EXPORTED_MCAP not in first[:64]
+    if is_log or first.startswith(PACKED):
+        raise OutputError(path, "a log is there", "it is left alone; name another file")
+    if ours is not None and first and not ours(first):
+        raise OutputError(path, "a file that icrtool did not write is there", "it is left alone; name another place")
     return place
-
-
-def is_page(first: bytes) -> bool:
-    """Return whether a file is a page of ours, by its first bytes."""
-    return b"icrtool</title>" in first
-
-
-def check_directory(directory: Path, ours: IsOurs, *, kind: str, inside: Path | None = None) -> None:
-    """Refuse a place where a directory of ours cannot be put; restore what a killed process renamed aside.
-
-    Parameters
-    ----------
-    directory : where it shall appear; nothing, an empty directory and one of ours may be there
-    ours : whether a directory may be replaced
-    kind : what is being written, for the message ("run directory")
-    inside : a directory above it; below that no link is followed. None: the user named `directory`, and links are
-
-    Raises
-    ------
-    OutputError
-        A file or a foreign directory is there; the place is inside a directory of this kind, holds one, or is a mount
-        point; or nothing can be known about the place.
-    """
-    why, advice = "", "it is left alone; name another place"
-    with reported(directory):
-        if inside is not None:
-            check_links(directory, inside)
-        # Unlike `Path.resolve`, this takes a link that leads to itself as it is.
-        place = Path(os.path.realpath(directory))
-        restore(place, ours)
-        if outer := next((parent for parent in place.parents if ours(parent)), None):
-            why, advice = f"lies inside the {kind} {outer}", "name a place outside it"
-        elif file := next((one for one in (place, *place.parents) if one.exists() and not one.is_dir()), None):
-            why = "a file is there" if file == place else f"{file} is a file"
-            advice = f"name another place for the {kind}"
-        elif not place.exists():
-            return
-        elif not ours(place) and own_files(place).kind != kind and any(place.iterdir()):
-            why = f"holds something that is not a {kind}"
-        elif inner := next((one for one in place.glob("**/*/") if ours(one)), None):
-            why = f"holds another {kind} ({inner.relative_to(place)})"
-        elif place.is_mount():
-            why, advice = "is a mount point, which cannot be replaced", "name a directory in it"
-    if why:
-        raise OutputError(directory, why, advice)
-
-
-def restore(directory: Path, ours: IsOurs) -> None:
-    """Rename an old directory back to its place, where a killed process left it aside and put nothing there.
-
-    Raises
-    ------
-    OSError
-        It cannot be renamed.
-    """
-    place = Path(os.path.realpath(directory))
-    if not os.path.lexists(place):
-        aside = [path for path in disk.hidden(place, ".old") if ours(path) or own_files(path).kind]
-        if aside:
-            max(aside, key=lambda path: path.stat().st_mtime_ns).rename(place)
-
-
-class OwnFiles(Record, frozen=True):
-    """What icrtool wrote in a directory, as its list states.
-
-    Attributes
-    ----------
-    kind : of directory; empty where no list states one
-    files : relative to the directory
-    made_from : absolute paths of the files that the directory was made from
-    """
-
-    kind: str = ""
-    files: frozenset[str] = frozenset()
-    made_from: frozenset[str] = frozenset()
-    schema: Literal["icrtool/files/1"] = "icrtool/files/1"
-
-
-def own_files(directory: Path) -> OwnFiles:
-    """Return what the list of a directory states; nothing where it has none."""
-    try:
-        return msgspec.convert(json.loads(read_regular(directory / OWN_FILES, directory)), OwnFiles)
-    except (OSError, ValueError, RecursionError):
-        return OwnFiles()
-
-
-def files_in(directory: Path) -> list[PurePosixPath]:
-    """Return all that is no directory, links to directories included, relative to `directory`."""
-    found = (path for path in directory.rglob("*") if path.is_symlink() or not path.is_dir())
-    return sorted(PurePosixPath(path.relative_to(directory).as_posix()) for path in found)
-
-
-def _write_own_files(directory: Path, own: OwnFiles) -> None:
-    """Write the list of a directory that is about to be put in place."""
-    document = {"schema": own.schema, "kind": own.kind, "files": sorted(own.files), "made_from": sorted(own.made_from)}
-    (directory / OWN_FILES).write_text(json.dumps(document, indent=0) + "\n", encoding="utf-8")
-
-
-def _keep_foreign(place: Path, partial: Path, names: Collection[str]) -> str:
-    """Give the files that icrtool did not write a second name in the directory that replaces theirs.
-
-    Parameters
-    ----------
-    partial : the new directory, in which its list is not yet written
-    names : as in `atomic_directory`
-
-    Returns
-    -------
-    str
-        A line about what the replacement removes and keeps; empty where that is nothing.
-
-    Raises
-    ------
-    OutputError
-        One has the name of a directory of ours, or ours of one of its directories.
-    """
-    new, there = files_in(partial), files_in(place)
-    parents = {parent for path in there for parent in path.parents}
-    of_lists = {parent / name for parent in parents for name in own_files(place / parent).files}
-    own = {path for path in there if path.name == OWN_FILES or str(path) in names or path in of_lists}
-    removed = [path for path in there if path in own and path not in new and path.name != OWN_FILES]
-    foreign = [path for path in there if path not in own]
-    kept = [path for path in foreign if not os.path.lexists(partial / path)]
-    if lost := [path for path in foreign if path not in kept and path not in new]:
-        raise OutputError(place, f"holds {_names(lost, ())}, which icrtool did not write", "move it elsewhere first")
-    for path in kept:
-        disk.link(place / path, partial / path)
-        # A directory of ours that it lies in stays one: its next content replaces it.
-        for parent in list(path.parents)[:-1]:
-            if kind := own_files(place / parent).kind:
-                _write_own_files(partial / parent, OwnFiles(kind))
-    tops = {path.parts[0] for path in new}
-    parts = [f"removed {_names(removed, tops)}"] if removed else []
-    parts += [f"kept {_names(kept, tops)}, not written by icrtool"] if kept else []
-    return f"replaced: {'; '.join(parts)}" if parts else ""
-
-
-def _names(paths: Collection[PurePosixPath], tops: Collection[str]) -> str:
-    """Return names in a line; a directory at the top stands for its files unless it is one of `tops`."""
-    names = dict.fromkeys(
-        f"{path.parts[0]}/" if len(path.parts) > 1 and path.parts[0] not in tops else str(path) for path in paths
-    )
-    return escaped(listed(list(names)))
 
 
 @contextmanager
@@ -255,12 +139,10 @@ def atomic_file(file: Path, inside: Path | None = None, ours: IsOurFile | None =
     OutputError
         As `check_place`, and for every OSError of the block (disk full, no permission); what was there before still is.
     """
-    with reported(file):
-        place = _place_of_file(file, inside, ours)
-        with disk.beside(place, lambda new: new.touch(exist_ok=False)) as partial:
-            yield partial
-            disk.sync(partial)
-            disk.put(partial, _place_of_file(file, inside, ours))
+    with reported(file), beside(_place_of_file(file, inside, ours), Path.touch) as partial:
+        yield partial
+        sync(partial)
+        put(partial, _place_of_file(file, inside, ours))
 
 
 def write_file(file: Path, content: str | bytes, inside: Path | None = None, ours: IsOurFile | None = None) -> None:
@@ -292,27 +174,60 @@ def make_folders(folder: Path, inside: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
 
-@contextmanager
-def atomic_directory(
-    directory: Path,
-    ours: IsOurs,
-    *,
-    kind: str,
-    inside: Path | None = None,
-    names: Collection[str] = (),
-    made_from: Sequence[str] = (),
-    note: Callable[[str], None] | None = None,
-) -> Iterator[Path]:
-    """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
-
-    Files in the old directory that icrtool did not write are kept in the new one.
+def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> None:
+    """Refuse a place where a directory of a kind cannot be put; rename back what a killed process left aside.
 
     Parameters
     ----------
-    directory, ours, kind, inside : as in `check_directory`
-    names : names at the top of the directory that are icrtool's though they are written later (``report.html``)
-    made_from : absolute paths of the files that the content is made from
-    note : called with one line where the replacement removed files that it did not write again, or kept foreign ones
+    directory : where it shall appear; nothing, an empty directory, or one of the kind without files of others is there
+    inside : a directory above it; below that no link is followed. None: the user named `directory`, and links are
+
+    Raises
+    ------
+    OutputError
+        A file, something else than a directory of the kind, or files of others are there; it is a mount point; or
+        nothing can be known about the place.
+    """
+    why, advice = "", "it is left alone; name another place"
+    with reported(directory):
+        if inside is not None:
+            check_links(directory, inside)
+        # Unlike `Path.resolve`, this takes a link that leads to itself as it is.
+        place = Path(os.path.realpath(directory))
+        aside = [path for path in place.parent.glob(_hidden_name(place, "*", ASIDE)) if not path.is_symlink()]
+        if aside and not os.path.lexists(place):
+            max(aside, key=lambda path: path.stat().st_mtime_ns).rename(place)
+        names = _names_in(place)
+        if file := next((one for one in (place, *place.parents) if one.exists() and not one.is_dir()), None):
+            why = "a file is there" if file == place else f"{file} is a file"
+            advice = f"name another place for the {kind.name}"
+        elif not kind.is_one(place):
+            if next(names, None) is not None:
+                why = f"holds something that is not a {kind.name}"
+        elif other := next((name for name in names if not kind.files.fullmatch(name)), None):
+            why = f"holds {other}, which is no part of a {kind.name}"
+            advice = "move it elsewhere first, or name another place"
+        if not why and place.is_mount():
+            why, advice = "is a mount point, which cannot be replaced", "name a directory in it"
+    if why:
+        raise OutputError(directory, why, advice)
+
+
+def _names_in(directory: Path) -> Iterator[str]:
+    """Yield all that is in a directory, relative to it; a directory with ``/`` at its end."""
+    for path in directory.rglob("*"):
+        parts = path.relative_to(directory).parts
+        if path.name not in OF_NOBODY and not any(part.startswith(HIDDEN) for part in parts):
+            yield "/".join(parts) + ("/" if path.is_dir() and not path.is_symlink() else "")
+
+
+@contextmanager
+def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) -> Iterator[Path]:
+    """Give a hidden directory to write into; put it in place when the block ends well, remove it otherwise.
+
+    Parameters
+    ----------
+    directory, kind, inside : as in `check_directory`
 
     Yields
     ------
@@ -324,17 +239,97 @@ def atomic_directory(
     OutputError
         As `check_directory`, and for every OSError of the block (disk full, no permission).
     """
-    check_directory(directory, ours, kind=kind, inside=inside)
+    check_directory(directory, kind, inside)
     place = Path(os.path.realpath(directory))
-    with reported(directory), with_parents(place) as made, disk.beside(place, Path.mkdir) as partial:
-        for parent in made:
-            disk.sync(parent.parent)
-        yield partial
-        check_directory(directory, ours, kind=kind, inside=inside)
-        own = OwnFiles(kind, frozenset(map(str, files_in(partial))), frozenset(made_from))
-        done = _keep_foreign(place, partial, names) if place.exists() else ""
-        _write_own_files(partial, own)
-        disk.sync_tree(partial)
-        disk.put(partial, place)
-    if note is not None and done:
-        note(f"{directory}: {done}")
+    with reported(directory):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with beside(place, Path.mkdir) as partial:
+            yield partial
+            sync_tree(partial)
+            check_directory(directory, kind, inside)
+            put(partial, place)
+
+
+@contextmanager
+def beside(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
+    """Make a file or directory under a hidden name beside a place, and remove what has that name at the end.
+
+    What killed processes left there is removed too, when it is `ABANDONED_S` old.
+    """
+    for left in list(place.parent.glob(_hidden_name(place, "*"))):
+        # What was renamed aside is needed as long as nothing is in its place.
+        with suppress(FileNotFoundError):
+            is_old = left.lstat().st_mtime < time.time() - ABANDONED_S
+            if is_old and (left.suffix == PARTIAL or place.exists()):
+                remove(left)
+    partial = place.with_name(_hidden_name(place, secrets.token_hex(4), PARTIAL))
+    with unfinished(partial):
+        try:
+            make(partial)
+            yield partial
+        finally:
+            remove(partial)
+
+
+def _hidden_name(place: Path, token: str, suffix: str = "") -> str:
+    """Return a name beside a place, which is never too long."""
+    return f"{HIDDEN}{blake2b(os.fsencode(place.name), digest_size=8).hexdigest()}-{token}{suffix}"
+
+
+def put(partial: Path, place: Path) -> None:
+    """Put a hidden file or directory, which is synced, in its place; `beside` removes the old one.
+
+    Raises
+    ------
+    OSError
+        It cannot be renamed; what was there still is.
+    """
+    # Where this process is ended by force, the old directory is not to be removed under the hidden name.
+    end(partial)
+    if not place.is_dir():
+        partial.replace(place)
+    elif not _exchange(partial, place):
+        old = place.with_name(_hidden_name(place, secrets.token_hex(4), ASIDE))
+        place.rename(old)
+        try:
+            partial.rename(place)
+        except BaseException:
+            old.rename(place)
+            raise
+        remove(old)
+    begin(partial)
+    sync(place.parent)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Give two directories each other's names in one step, and return whether that was possible here."""
+    if sys.platform != "linux" or not hasattr(ctypes.CDLL(None), "renameat2"):
+        return False
+    names = AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other)
+    return not ctypes.CDLL(None).renameat2(*names, RENAME_EXCHANGE)
+
+
+def sync(path: Path) -> None:
+    """Have the system write a file's content, or a directory's names, to the disk."""
+    if sys.platform == "win32" and path.is_dir():
+        return
+    # Windows syncs only what is open for writing.
+    handle = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as err:
+        # Some network file systems have no sync for directories; a file whose sync fails is not written.
+        if err.errno not in NO_SYNC or not path.is_dir():
+            raise
+    finally:
+        os.close(handle)
+
+
+def sync_tree(directory: Path) -> None:
+    """Sync all files below a directory, then all directories, the outermost last."""
+    paths = [directory, *directory.rglob("*")]
+    with ThreadPoolExecutor(SYNC_THREADS) as pool:
+        list(pool.map(sync, (path for path in paths if not path.is_dir())))
+    for path in reversed(paths):
+        if path.is_dir():
+            sync(path)

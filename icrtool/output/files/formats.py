@@ -187,6 +187,9 @@ It lists every file of the run and of its dropout report, but not the page. The 
 report is replaced it does not name its files.
 """
 
+SOURCES_FILE = ".icrtool-files"
+"""In a run: the absolute paths of the files that it was made from; those in run.json are as they were given."""
+
 LARGEST_RUN_FILE_BYTES = 1 << 33
 """Of a file of a run: 70 h at 100 Hz. A file may be far larger than what is on the disk, and take hours to read."""
 

@@ -14,8 +14,8 @@ from typing import TypeVar
 from icrtool.errors import IcrToolError, LogError, OutputError
 from icrtool.logs.containers.source import asked, filesystem
 from icrtool.logs.containers.unpack import ScratchFolder
-from icrtool.output.files.atomic import OWN_FILES, make_folders, reported, write_file
-from icrtool.output.files.formats import CHECKSUM_FILE
+from icrtool.output.files.atomic import make_folders, reported, write_file
+from icrtool.output.files.formats import CHECKSUM_FILE, SOURCES_FILE
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import UrlPath
 
@@ -36,7 +36,7 @@ Needed = Callable[[str], bool]
 
 def is_document(name: str) -> bool:
     """Return whether a file shows what lies beside it, and whether that may be replaced."""
-    own = name.endswith((".json", ".html", ".png")) or PurePosixPath(name).name in {OWN_FILES, CHECKSUM_FILE}
+    own = name.endswith((".json", ".html", ".png")) or PurePosixPath(name).name in {SOURCES_FILE, CHECKSUM_FILE}
     return own and not name.startswith("runs/")
 
 
@@ -164,9 +164,9 @@ class _Store:
         last = [name for name in COUNTS if name in now]
         self.remove([name for name in COUNTS if name in before])
         self.remove([name for name in gone if name not in COUNTS])
-        # What a broken upload leaves is known as icrtool's by the first of these.
-        others = [name for name in changed if name not in {OWN_FILES, *last}]
-        for names in ([name for name in changed if name == OWN_FILES], others, last):
+        # What a broken upload leaves is known as icrtool's by the first of these, run.json among them.
+        first = [name for name in changed if name.endswith(".json") and name not in last]
+        for names in (first, [name for name in changed if name not in {*first, *last}], last):
             self._each(lambda name: self._files.put_file(str(folder / name), self._of(name)), names)
 
     def _names(self, parts: Collection[str] | None) -> list[str]:

@@ -21,11 +21,11 @@ from icrtool.errors import RunError
 from icrtool.motion.models import FAMILY
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
 from icrtool.output.figure_catalogue import drive_charts
-from icrtool.output.files.atomic import is_page, write_file
+from icrtool.output.files.atomic import write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
 from icrtool.output.page.drive_data import ERROR_KEYS, drive_data
 from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
-from icrtool.output.run_directory import PAGE_FILE, check_sum
+from icrtool.output.run_directory import PAGE_FILE, check_sum, is_page
 from icrtool.output.tables.calibration import transfer_blocks
 from icrtool.output.tables.dropout import answer_sections, model_sections, outage_blocks, verdict_lines, worst_section
 from icrtool.output.tables.errors import errors_section, main_rows

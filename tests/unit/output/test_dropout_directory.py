@@ -23,7 +23,7 @@ from icrtool.output.dropout_directory import (
     write_report,
     write_tables,
 )
-from icrtool.output.files import disk
+from icrtool.output.files import atomic
 from icrtool.output.files.formats import json_bytes
 from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.run import Run
@@ -167,14 +167,16 @@ def test_trials_are_written_group_by_group_with_the_models_as_categories(run: Ru
     assert found["max"].tolist() == expected.max_m.tolist()
 
 
-def test_a_report_replaces_an_older_one_and_keeps_files_of_others(content: DropoutReport, tmp_path: Path) -> None:
+def test_a_report_replaces_an_older_one_but_no_files_of_others(content: DropoutReport, tmp_path: Path) -> None:
     write_report(lambda _: content, tmp_path / "dropout", plots=(), stamp_ns=np.arange(3))
     assert (tmp_path / "dropout" / TRIALS_FILE).exists()
-    (tmp_path / "dropout" / "notes.txt").touch()
     content.write(tmp_path / "dropout", plots=())
     assert [path.name for path in tmp_path.iterdir()] == ["dropout"]
     assert is_dropout_directory(tmp_path / "dropout")
     assert not (tmp_path / "dropout" / TRIALS_FILE).exists()
+    (tmp_path / "dropout" / "notes.txt").touch()
+    with pytest.raises(OutputError, match=r"dropout: holds notes\.txt, which is no part of a dropout report"):
+        content.write(tmp_path / "dropout", plots=())
     assert (tmp_path / "dropout" / "notes.txt").exists()
 
 
@@ -186,7 +188,7 @@ def test_a_report_that_fails_leaves_the_older_one(
     def fail(directory: Path) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(disk, "sync_tree", fail)
+    monkeypatch.setattr(atomic, "sync_tree", fail)
     with pytest.raises(ZeroDivisionError):
         content.write(written, plots=())
     assert (written / "report.json").read_bytes() == before

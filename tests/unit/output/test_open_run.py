@@ -134,7 +134,6 @@ def test_the_library_gives_what_the_command_gives(stored: Run, tmp_path: Path) -
         "ladder.csv",
         "report.json",
         "plots",
-        ".icrtool-files",
     }
     assert {"summary.png", "histogram.png", "worst.png", "outages.png"} == {
         path.name for path in (tmp_path / "report" / "plots").iterdir()

@@ -15,7 +15,6 @@ from icrtool.errors import OutputError
 from icrtool.output import figure_catalogue as catalogue
 from icrtool.output.dropout_directory import write_report
 from icrtool.output.files import run_columns
-from icrtool.output.files.atomic import atomic_directory
 from icrtool.output.files.formats import file_b2sum, json_bytes, read_sums
 from icrtool.output.run_directory import check_target, open_run, write_run
 from icrtool.records.run import Run
@@ -101,9 +100,8 @@ def test_the_list_of_a_run_names_its_report_too_and_is_true_at_every_moment(writ
     assert listed(written) == files
     report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0])
     report.write(written / "dropout", plots=("png",))
-    (written / "dropout" / "mine.txt").write_text("not of icrtool")
     first = listed(written)
-    assert first == set(names_in(written)) - {"B2SUMS", "dropout/mine.txt"}
+    assert first == set(names_in(written)) - {"B2SUMS"}
     assert {"dropout/report.json", "dropout/plots/summary.png"} < first
 
     def fail(_: object) -> None:
@@ -132,11 +130,42 @@ def test_the_same_run_makes_the_same_bytes(tmp_path: Path, run: Run) -> None:
 
 
 def test_an_old_run_is_replaced_with_its_dropout_analysis(written: Path, run: Run) -> None:
-    with atomic_directory(written / "dropout", lambda _: False, kind="dropout report") as partial:
-        (partial / "summary.csv").write_text("of the old states")
-    write_run(run, written, states="parquet", plots=())
+    (written / "dropout").mkdir()
+    (written / "dropout" / "summary.csv").write_text("of the old states")
+    (written / "report.html").write_text("of the old states")
+    notes: list[str] = []
+    write_run(run, written, states="parquet", plots=(), note=notes.append)
+    assert notes == [f"{written}: replaced: removed dropout, report.html, states.csv"]
     assert names_in(written) == ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.parquet"]
     assert [path.name for path in written.parent.iterdir()] == ["barn"]
+
+
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "plots/mine.png", "plots/histogram_mine.png", "dropout/notes.txt", "plots"]
+)
+def test_a_run_with_a_file_of_somebody_is_left_alone_whatever_is_asked(written: Path, run: Run, name: str) -> None:
+    (written / name).parent.mkdir(exist_ok=True)
+    (written / name).write_text("years of work")
+    before = {name: (written / name).read_bytes() for name in names_in(written)}
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match=f"barn: holds {name}, which is no part of a run directory"):
+            check_target(written, overwrite=overwrite)
+    with pytest.raises(OutputError, match="holds"):
+        write_run(run, written)
+    assert {name: (written / name).read_bytes() for name in names_in(written)} == before
+
+
+def test_every_file_that_icrtool_writes_is_known_as_its_own(tmp_path: Path, run: Run) -> None:
+    report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0, 10.0, 15.0, 20.0], outage_s=(4.0,), comparison=True)
+    for _ in range(2):
+        write_run(run, tmp_path / "run", plots=("png", "svg", "pdf"), figures="all")
+        for _ in range(2):
+            write_report(
+                lambda _: report, tmp_path / "run" / "dropout", plots=("png", "svg"), figures="all",
+                stamp_ns=run.table.stamp_ns[:0],
+            )  # fmt: skip
+        icrtool.write_page(run, report, tmp_path / "run" / "report.html")
+    assert len(names_in(tmp_path / "run")) > 30
 
 
 @pytest.mark.parametrize("content", ["{}", "[1]", "not json", '{"schema": 3}', '{"schema": "other/1"}'])

@@ -108,7 +108,7 @@ def test_a_study_that_cannot_be_drawn_leaves_nothing_behind(tmp_path: Path, monk
     monkeypatch.setattr(figure_study, "study_figure", fail)
     with pytest.raises(OutputError, match="No space left"):
         write_study(small_study("rate"), tmp_path / "deep" / "study")
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.rglob("*")) == [tmp_path / "deep"]
 
 
 def test_the_table_names_the_robot_settings_and_the_paper(tmp_path: Path) -> None:
@@ -208,8 +208,13 @@ def test_nothing_is_overwritten_unless_forced(tmp_path: Path) -> None:
 
 def test_a_directory_that_is_no_bag_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
-    with pytest.raises(OutputError, match="is a directory and no bag"):
+    (tmp_path / "photos" / "one.jpg").touch()
+    with pytest.raises(OutputError, match="holds something that is not a bag directory"):
         write_pair(tmp_path / "photos", force=True)
+    (tmp_path / "photos" / "metadata.yaml").touch()
+    with pytest.raises(OutputError, match=r"holds one\.jpg, which is no part of a bag directory"):
+        write_pair(tmp_path / "photos", force=True)
+    assert (tmp_path / "photos" / "one.jpg").exists()
 
 
 def test_a_place_that_does_not_exist_is_said_in_one_line(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import re
 import subprocess
 import sys
 import time
@@ -14,20 +15,23 @@ from random import Random
 import pytest
 
 from icrtool.errors import OutputError
-from icrtool.output.files.atomic import atomic_directory, check_directory
+from icrtool.output.files.atomic import Kind, atomic_directory, check_directory
 
 
 def marked(directory: Path) -> bool:
     return (directory / "mark").exists()
 
 
+REPORT = Kind("report", marked, re.compile(r"mark|old/|sub/([0-9]\.gen)?|[0-9]\.gen"))
+
+
 def write(directory: Path, text: str = "new") -> None:
-    with atomic_directory(directory, marked, kind="report") as fresh:
+    with atomic_directory(directory, REPORT) as fresh:
         (fresh / "mark").write_text(text)
 
 
 def test_nothing_is_seen_at_the_place_before_all_is_written(tmp_path: Path) -> None:
-    with atomic_directory(tmp_path / "a", marked, kind="report") as fresh:
+    with atomic_directory(tmp_path / "a", REPORT) as fresh:
         (fresh / "mark").write_text("new")
         assert not (tmp_path / "a").exists()
     assert (tmp_path / "a" / "mark").read_text() == "new"
@@ -75,7 +79,7 @@ def test_a_foreign_directory_is_left_alone(tmp_path: Path) -> None:
 def test_a_file_in_the_way_is_an_error(tmp_path: Path, place: str) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"is a file|a file is there|cannot be written"):
-        check_directory(tmp_path / place, marked, kind="report")
+        check_directory(tmp_path / place, REPORT)
     with pytest.raises(OutputError):
         write(tmp_path / place)
     assert (tmp_path / "file").read_text() == ""
@@ -85,7 +89,7 @@ def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None
     write(tmp_path / "a", "old")
 
     def fill() -> None:
-        with atomic_directory(tmp_path / "a", marked, kind="report") as fresh:
+        with atomic_directory(tmp_path / "a", REPORT) as fresh:
             (fresh / "mark").write_text("half")
             raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -96,20 +100,20 @@ def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, ValueError])
-def test_an_interruption_leaves_nothing_not_even_parents(tmp_path: Path, stop: type[BaseException]) -> None:
+def test_an_interruption_leaves_no_file_and_no_hidden_directory(tmp_path: Path, stop: type[BaseException]) -> None:
     def interrupted() -> None:
-        with atomic_directory(tmp_path / "a" / "b", marked, kind="report") as fresh:
+        with atomic_directory(tmp_path / "a" / "b", REPORT) as fresh:
             (fresh / "mark").write_text("half")
             raise stop
 
     with pytest.raises(stop):
         interrupted()
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.rglob("*")) == [tmp_path / "a"]
 
 
 def test_what_came_into_the_place_meanwhile_is_not_replaced(tmp_path: Path) -> None:
     def surprised() -> None:
-        with atomic_directory(tmp_path / "a", marked, kind="report") as fresh:
+        with atomic_directory(tmp_path / "a", REPORT) as fresh:
             (fresh / "mark").write_text("new")
             (tmp_path / "a").mkdir()
             (tmp_path / "a" / "thesis.txt").write_text("years of work")
@@ -131,7 +135,7 @@ FILES = 4
 
 
 def write_generation(directory: Path, text: str) -> None:
-    with atomic_directory(directory, marked, kind="report") as fresh:
+    with atomic_directory(directory, REPORT) as fresh:
         (fresh / "mark").write_text(text)
         (fresh / "sub").mkdir()
         for number in range(FILES):
@@ -143,7 +147,7 @@ class Fault:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, number: int, failure: BaseException, *, exchanges: bool):
         self.left, self.failure, self.name = number, failure, ""
-        for name in ("rename", "link", "fsync"):
+        for name in ("rename", "fsync"):
             monkeypatch.setattr(os, name, partial(self.call, name, getattr(os, name)))
         if exchanges:
             monkeypatch.setattr(ctypes, "CDLL", partial(self.call, "exchange", ctypes.CDLL))
@@ -171,7 +175,6 @@ def test_whatever_call_fails_the_old_or_the_new_one_is_there(tmp_path: Path, mon
     for number in range(1, 100):
         with monkeypatch.context() as patched:
             write_generation(place, f"old {number}")
-            (place / "mine.txt").write_text("years of work")
             fault = Fault(patched, number, failure, exchanges=exchanges)
             try:
                 write_generation(place, f"new {number}")
@@ -182,23 +185,23 @@ def test_whatever_call_fails_the_old_or_the_new_one_is_there(tmp_path: Path, mon
         if not fault.name:
             break
         failed.add(fault.name)
-        check_directory(place, marked, kind="report")
+        check_directory(place, REPORT)
         assert generation(place) in {f"old {number}", f"new {number}"}
-        assert (place / "mine.txt").read_text() == "years of work"
     write_generation(place, "last")
-    assert [path.name for path in tmp_path.iterdir()] == ["a"], "leftovers are removed by the next one"
-    assert failed == {"rename" if not exchanges else "exchange", "link", "fsync", "write", "mkdir"}
+    assert [path.name for path in tmp_path.iterdir()] == ["a"], "nothing is left"
+    assert failed == {"rename" if not exchanges else "exchange", "fsync", "write", "mkdir"}
 
 
 KILLED = """
-import sys
+import re, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[4])
-from icrtool.output.files.atomic import atomic_directory
+from icrtool.output.files.atomic import Kind, atomic_directory
+REPORT = Kind("report", lambda place: (place / "mark").exists(), re.compile(r"mark|[0-9].gen|sub/([0-9].gen)?"))
 if sys.argv[3] == "renames":
     sys.platform = "other"
 for number in range(int(sys.argv[2]), 1_000_000):
-    with atomic_directory(Path(sys.argv[1]), lambda place: (place / "mark").exists(), kind="report") as fresh:
+    with atomic_directory(Path(sys.argv[1]), REPORT) as fresh:
         for name in ("mark", "0.gen", "1.gen", "2.gen", "3.gen"):
             (fresh / name).write_text(str(number))
     print(number, flush=True)
@@ -211,7 +214,6 @@ for number in range(int(sys.argv[2]), 1_000_000):
 def test_killed_at_any_moment_the_old_or_the_new_one_is_there(tmp_path: Path, means: str) -> None:
     place, random = tmp_path / "a", Random(1)
     write_generation(place, "0")
-    (place / "mine.txt").write_text("years of work")
     written = 0
     for _ in range(int(os.environ.get("ICRTOOL_KILLS", "40"))):
         arguments = [str(place), str(written + 1), means, str(Path(__file__).parents[3])]
@@ -222,67 +224,77 @@ def test_killed_at_any_moment_the_old_or_the_new_one_is_there(tmp_path: Path, me
         process.kill()
         said = [first, *process.communicate()[0].splitlines()]
         whole = [int(line) for line in said if line.strip().isdigit()]
-        check_directory(place, marked, kind="report")
+        check_directory(place, REPORT)
         # The last one that was reported, or the next, which was put in place before it could be.
         assert int(generation(place)) in {whole[-1], whole[-1] + 1}
-        assert (place / "mine.txt").read_text() == "years of work"
         written = whole[-1] + 1
+    for left in tmp_path.glob(".icrtool-*"):
+        os.utime(left, (0, 0))
     write_generation(place, "last")
-    assert [path.name for path in tmp_path.iterdir()] == ["a"], "leftovers are removed by the next one"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"], "leftovers are removed an hour later"
 
 
-@pytest.mark.parametrize("where", ["mine.txt", "sub/deep/mine.txt", "inner/mine.txt"])
-def test_files_of_others_are_kept_and_reported(tmp_path: Path, where: str) -> None:
-    place, notes = tmp_path / "a", []
-
-    def write_outer(text: str) -> None:
-        judge = partial(Path.__eq__, place)
-        with atomic_directory(place, judge, kind="run", names=("later.html",), note=notes.append) as fresh:
-            (fresh / "outer").write_text(text)
-
-    write_outer("old")
-    write(place / "inner", "old")
+@pytest.mark.parametrize("where", ["mine.txt", "sub/deep/mine.txt", "sub/mine.txt", "mine/", "mark.txt", "plots"])
+def test_one_of_ours_with_a_file_of_somebody_is_refused_by_that_name_before_any_work(
+    tmp_path: Path, where: str
+) -> None:
+    place = tmp_path / "a"
+    write_generation(place, "old")
     mine = place / where
-    mine.parent.mkdir(parents=True, exist_ok=True)
-    mine.write_text("years of work")
-    (place / "later.html").write_text("of the old one")
-    write_outer("new")
-    assert mine.read_text() == "years of work"
-    assert (place / "outer").read_text() == "new"
-    assert not (place / "inner" / "mark").exists()
-    assert not (place / "later.html").exists()
-    assert len(notes) == 1
-    assert "later.html" in notes[0]
-    assert "inner/" in notes[0]
-    if where.startswith("inner"):
-        write(place / "inner", "next")  # it is still known as one of ours
-        assert mine.read_text() == "years of work"
+    if where.endswith("/"):
+        mine.mkdir()
+    else:
+        mine.parent.mkdir(exist_ok=True)
+        mine.write_text("years of work")
+    named = where if where != "sub/deep/mine.txt" else "sub/deep/"
+    with pytest.raises(OutputError, match=f"a: holds {named}, which is no part of a report; move it elsewhere first"):
+        check_directory(place, REPORT)
+    with pytest.raises(OutputError):
+        write(place)
+    assert generation(place) == "old"
+    assert mine.exists()
 
 
-def test_a_foreign_file_where_a_directory_of_ours_is_due_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["mark", "sub", "mine"])
+def test_a_link_in_one_of_ours_is_never_followed(tmp_path: Path, name: str) -> None:
     write(tmp_path / "a", "old")
-    (tmp_path / "a" / "plots").write_text("a file of mine")
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.txt").write_text("years of work")
+    link = tmp_path / "a" / name
+    link.unlink(missing_ok=True)
+    link.symlink_to(tmp_path / "home" / ("thesis.txt" if name == "mark" else "."))
+    if name == "mark":
+        write(tmp_path / "a")  # a file of ours by its name: the link itself is replaced
+        assert not link.is_symlink()
+    else:
+        with pytest.raises(OutputError, match=f"a: holds {name}, which is no part of a report"):
+            write(tmp_path / "a")
+    assert [(path.name, path.read_text()) for path in (tmp_path / "home").iterdir()] == [
+        ("thesis.txt", "years of work")
+    ]
+
+
+def test_what_came_into_one_of_ours_meanwhile_is_not_lost(tmp_path: Path) -> None:
+    write(tmp_path / "a", "old")
 
     def surprised() -> None:
-        with atomic_directory(tmp_path / "a", marked, kind="report") as fresh:
-            (fresh / "plots").mkdir()
-            (fresh / "plots" / "one.png").touch()
+        with atomic_directory(tmp_path / "a", REPORT) as fresh:
+            (fresh / "mark").write_text("new")
+            (tmp_path / "a" / "thesis.txt").write_text("years of work")
 
-    with pytest.raises(OutputError, match="a: holds plots"):
+    with pytest.raises(OutputError, match=r"holds thesis\.txt"):
         surprised()
-    assert (tmp_path / "a" / "plots").read_text() == "a file of mine"
+    assert (tmp_path / "a" / "thesis.txt").read_text() == "years of work"
     assert (tmp_path / "a" / "mark").read_text() == "old"
 
 
-@pytest.mark.parametrize("place", ["a", "a/sub", "a/b/c"])
-def test_what_holds_or_lies_in_one_of_the_kind_is_refused(tmp_path: Path, place: str) -> None:
-    write(tmp_path / "a", "old")
-    write_inner = tmp_path / "a" / "x" / "y"
-    write_inner.mkdir(parents=True)
-    (write_inner / "mark").write_text("another")
-    with pytest.raises(OutputError, match="holds another report" if place == "a" else "lies inside the report"):
-        write(tmp_path / place)
-    assert (write_inner / "mark").read_text() == "another"
+@pytest.mark.parametrize("name", [".DS_Store", "sub/Thumbs.db", ".icrtool-files", ".icrtool-0123-4567.partial/mark"])
+def test_what_file_managers_and_killed_processes_left_does_not_disturb(tmp_path: Path, name: str) -> None:
+    write_generation(tmp_path / "a", "old")
+    (tmp_path / "a" / name).parent.mkdir(exist_ok=True)
+    (tmp_path / "a" / name).write_text("")
+    write_generation(tmp_path / "a", "new")
+    assert generation(tmp_path / "a") == "new"
 
 
 def test_a_pipe_or_device_is_refused(tmp_path: Path) -> None:
@@ -306,7 +318,7 @@ def test_the_longest_name_a_file_system_takes_can_be_replaced(tmp_path: Path) ->
 
 
 def test_what_a_living_process_writes_is_not_cleaned(tmp_path: Path) -> None:
-    with atomic_directory(tmp_path / "a", marked, kind="report") as slow:
+    with atomic_directory(tmp_path / "a", REPORT) as slow:
         (slow / "mark").write_text("slow")
         write(tmp_path / "a", "quick")
         assert (slow / "mark").exists()
@@ -314,13 +326,60 @@ def test_what_a_living_process_writes_is_not_cleaned(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_what_a_killed_process_left_of_another_place_is_not_taken(tmp_path: Path) -> None:
-    for name in (".a.b.12345678.old", ".a.b.12345678.partial"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "mark").write_text("of a.b")
-    check_directory(tmp_path / "a", marked, kind="report")
-    assert not (tmp_path / "a").exists()
-    write(tmp_path / "a")
-    assert {path.name for path in tmp_path.iterdir()} == {"a", ".a.b.12345678.old", ".a.b.12345678.partial"}
-    check_directory(tmp_path / "a.b", marked, kind="report")
-    assert (tmp_path / "a.b" / "mark").read_text() == "of a.b"
+KILLED_AT = """
+import os, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[3])
+from test_atomic_directory import write
+sys.platform = "other"
+moment, renames, rename = sys.argv[2], [], Path.rename
+
+def counted(path, target):
+    renames.append(rename(path, target))
+    if len(renames) == int(moment):
+        os._exit(9)
+    return target
+
+Path.rename = counted
+if moment == "0":
+    Path.write_text = lambda *_: os._exit(9)
+write(Path(sys.argv[1]), "new")
+"""
+
+
+def killed(place: Path, moment: int) -> None:
+    """Write to a place, and end the process while it writes (0), or after the first or second rename."""
+    arguments = [str(place), str(moment), str(Path(__file__).parent)]
+    path = os.pathsep.join([str(Path(__file__).parents[3]), str(Path(__file__).parents[4])])
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED_AT, *arguments], check=False, env=os.environ | {"PYTHONPATH": path}
+    )
+    assert done.returncode == 9
+
+
+def test_what_a_killed_process_renamed_aside_is_found_again_and_only_at_its_place(tmp_path: Path) -> None:
+    write(tmp_path / "a.b", "old")
+    killed(tmp_path / "a.b", 1)
+    assert not (tmp_path / "a.b").exists()
+    for other in ("a", "b", "a.b.c"):
+        check_directory(tmp_path / other, REPORT)
+        write(tmp_path / other)
+    assert not (tmp_path / "a.b").exists()
+    check_directory(tmp_path / "a.b", REPORT)
+    assert (tmp_path / "a.b" / "mark").read_text() == "old"
+
+
+@pytest.mark.parametrize("moment", [0, 1, 2])
+def test_what_a_killed_process_left_is_removed_an_hour_later(tmp_path: Path, moment: int) -> None:
+    place = tmp_path / "a"
+    write(place, "old")
+    killed(place, moment)
+    left = [path for path in tmp_path.iterdir() if path != place]
+    assert left
+    write(place, "new")
+    assert (place / "mark").read_text() == "new"
+    for path in tmp_path.glob(".icrtool-*"):
+        os.utime(path, (0, 0))
+    write(place, "newer")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    assert (place / "mark").read_text() == "newer"

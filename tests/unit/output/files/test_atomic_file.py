@@ -69,12 +69,29 @@ def test_a_pipe_or_device_is_not_replaced(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
 
 
-def test_a_link_stays_a_link_and_leftovers_of_the_dead_are_removed(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_is_not_replaced(tmp_path: Path, monkeypatch) -> None:
+    """It may be a log."""
+    (tmp_path / "a.txt").write_text("old")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(OutputError, match="Permission denied"):
+        check_place(tmp_path / "a.txt")
+
+
+def test_a_link_stays_a_link_and_leftovers_of_the_dead_are_removed_an_hour_later(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "a.txt").symlink_to("real/b.txt")
-    (tmp_path / "real" / ".b.txt.12345678.partial").write_text("of a killed process")
     with atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
+        left = partial.with_name(partial.name.replace(partial.name[-16:], "12345678.partial"))
+        left.write_text("of a killed process")
+    write_file(tmp_path / "a.txt", "newer")
+    assert left.exists(), "another process may write it"
+    os.utime(left, (0, 0))
+    write_file(tmp_path / "a.txt", "new")
     assert (tmp_path / "a.txt").is_symlink()
     assert [(path.name, path.read_text()) for path in (tmp_path / "real").iterdir()] == [("b.txt", "new")]
 

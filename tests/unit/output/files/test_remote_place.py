@@ -116,7 +116,7 @@ def test_an_upload_that_breaks_leaves_no_run_that_counts_and_is_made_again(store
     (line,) = [one for one in said.splitlines() if one.startswith("Error: ")]
     assert "s3://field/runs/one: cannot be written" in line
     left = names(store, "runs/one/")
-    assert ".icrtool-files" in left
+    assert "run.json" in left
     assert "B2SUMS" not in left
     with pytest.raises(RunError):
         icrtool.open_run("s3://field/runs/one")
@@ -127,7 +127,6 @@ def test_an_upload_that_breaks_leaves_no_run_that_counts_and_is_made_again(store
 def test_a_run_that_is_replaced_does_not_count_before_it_is_whole(store, monkeypatch, capfd):
     fit = ("fit", MCAP, *ROBOT, "-o", "s3://field/runs/one", "--plots", "none")
     assert run(monkeypatch, capfd, *fit, "--smooth")[0] == 0
-    store.client.put_object(Bucket="field", Key="runs/one/notes.txt", Body=b"of a person")
     store.most_sent = store.sent + 1_000_000
     assert run(monkeypatch, capfd, *fit)[0] == 1
     store.most_sent = float("inf")
@@ -135,7 +134,17 @@ def test_a_run_that_is_replaced_does_not_count_before_it_is_whole(store, monkeyp
     assert run(monkeypatch, capfd, *fit)[0] == 0
     left = names(store, "runs/one/")
     assert "smoothed.csv" not in left
-    assert content(store, "runs/one/notes.txt") == b"of a person"
+
+
+def test_a_run_with_a_file_of_somebody_is_not_replaced(store, monkeypatch, capfd):
+    fit = ("fit", MCAP, *ROBOT, "-o", "s3://field/runs/one", "--plots", "none")
+    assert run(monkeypatch, capfd, *fit)[0] == 0
+    store.client.put_object(Bucket="field", Key="runs/one/notes.txt", Body=b"of a person")
+    before = {name: content(store, name) for name in names(store)}
+    status, said = run(monkeypatch, capfd, *fit, "--overwrite")
+    assert status == 1
+    assert "s3://field/runs/one: holds notes.txt" in said
+    assert {name: content(store, name) for name in names(store)} == before
 
 
 @pytest.mark.parametrize(
