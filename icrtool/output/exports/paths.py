@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 from xml.etree import ElementTree as ET
@@ -336,85 +336,79 @@ def format_kml(run: Run) -> str:
     globe, paths = find_globe(run), paths_of(run)
     ET.register_namespace("", KML)
     ET.register_namespace("gx", GX)
-    root = ET.Element(f"{{{KML}}}kml")
-    document = _child(root, "Document")
-    _child(document, "name", run_title(run.document))
     about = f"{utc_text(run.table.stamp_ns[:1])[0]}: {driven_text(run.document.drive)}"
-    _child(document, "description", about if run.usable else f"{about}. Not usable: {run.document.unusable_because}")
+    about = about if run.usable else f"{about}. Not usable: {run.document.unusable_because}"
+    styles = []
     for name, color in COLORS.items():
-        style = _child(document, "Style")
-        style.set("id", name)
-        line = _child(style, "LineStyle")
-        _child(line, "color", color)
-        _child(line, "width", "6" if name == "outage" else "3")
-    folder = _folder(document, "paths")
-    for one in _path_features(run, paths, globe):
-        facts = one["properties"]
-        drifts = facts["path"] not in ("filter", "smoothed")
-        note = f"ends {distance_text(facts['end_error_m'])} off the filter" if drifts else ""
-        _placemark(folder, facts["label"], note, facts["path"], geometry=one["geometry"])
-    _track(_folder(document, "drive over time"), paths[0], globe)
-    folder = _folder(document, "outages")
-    for number, one in enumerate(_outage_features(run, globe), start=1):
-        facts = one["properties"]
-        note = f"{duration_text(facts['duration_s'])} without usable GNSS"
-        span = facts["begin_utc"], facts["end_utc"]
-        _placemark(folder, f"outage {number}", note, "outage", span, one["geometry"])
-    folder = _folder(document, "slip events")
-    for one in _event_features(run, globe):
-        facts = one["properties"]
-        lasted = duration_text(facts["end_s"] - facts["begin_s"])
-        note = f"{lasted}, {100 * facts['severity']:.0f} % of the wheels' motion missed"
-        times = utc_text(np.array([facts["begin_ns"], facts["end_ns"]], np.int64))
-        _placemark(folder, facts["kind"], note, span=times, geometry=one["geometry"])
+        width = _element("width", "6" if name == "outage" else "3")
+        styles.append(_element("Style", _element("LineStyle", _element("color", color), width), id=name))
+    folders = [
+        _folder("paths", _path_features(run, paths, globe)),
+        _element("Folder", _element("name", "drive over time"), _track(paths[0], globe)),
+        _folder("outages", _outage_features(run, globe)),
+        _folder("slip events", _event_features(run, globe)),
+    ]
+    titled = _element("name", run_title(run.document)), _element("description", about)
+    root = _element("kml", _element("Document", *titled, *styles, *folders))
     ET.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode")
 
 
-def _child(parent: ET.Element, tag: str, text: str | None = None) -> ET.Element:
-    child = ET.SubElement(parent, f"{{{KML}}}{tag}")
-    child.text = xml_text(text) if text is not None else None
-    return child
-
-
-def _folder(document: ET.Element, name: str) -> ET.Element:
-    folder = _child(document, "Folder")
-    _child(folder, "name", name)
-    return folder
-
-
-def _placemark(
-    folder: ET.Element, name: str, note: str = "", style: str = "", span: Sequence[str] = (),
-    geometry: Mapping[str, Any] | None = None,
-) -> ET.Element:  # fmt: skip
-    """Add a place mark with a geometry of GeoJSON on the ground; its elements have a fixed order."""
-    placemark = _child(folder, "Placemark")
-    _child(placemark, "name", name)
-    if note:
-        _child(placemark, "description", note)
-    if span:
-        times = _child(placemark, "TimeSpan")
-        for tag, time in zip(("begin", "end"), span, strict=True):
-            _child(times, tag, time)
-    if style:
-        _child(placemark, "styleUrl", f"#{style}")
-    if geometry is not None:
-        shape, places = _child(placemark, geometry["type"]), geometry["coordinates"]
-        if geometry["type"] == "LineString":
-            _child(shape, "tessellate", "1")
+def _element(tag: str, *content: str | ET.Element, **attributes: str) -> ET.Element:
+    """Return an element of KML that holds a text or other elements, in their order."""
+    element = ET.Element(tag if tag.startswith("{") else f"{{{KML}}}{tag}", attributes)
+    for one in content:
+        if isinstance(one, str):
+            element.text = xml_text(one)
         else:
-            places = [places]
-        _child(shape, "coordinates", " ".join(f"{east:.9f},{north:.9f},0" for east, north in places))
-    return placemark
+            element.append(one)
+    return element
 
 
-def _track(folder: ET.Element, path: ExportPath, globe: Globe) -> None:
+def _folder(name: str, features: Iterable[Feature]) -> ET.Element:
+    """Return features as place marks on the ground."""
+    marks = []
+    for number, one in enumerate(features, start=1):
+        title, note, style, times = _description(one["properties"], number)
+        geometry, line = one["geometry"], one["geometry"]["type"] == "LineString"
+        places = geometry["coordinates"] if line else [geometry["coordinates"]]
+        text = " ".join(f"{east:.9f},{north:.9f},0" for east, north in places)
+        shape = [*([_element("tessellate", "1")] if line else []), _element("coordinates", text)]
+        facts = [
+            *([_element("description", note)] if note else []),
+            *([_element("TimeSpan", _element("begin", times[0]), _element("end", times[1]))] if times else []),
+            *([_element("styleUrl", style)] if style else []),
+        ]
+        marks.append(_element("Placemark", _element("name", title), *facts, _element(geometry["type"], *shape)))
+    return _element("Folder", _element("name", name), *marks)
+
+
+def _description(facts: Mapping[str, Any], number: int) -> tuple[str, str, str, Sequence[str]]:
+    """Return name, note, style and times of a feature, by its attributes."""
+    if facts["layer"] == "path":
+        drifts = facts["path"] not in ("filter", "smoothed")
+        note = f"ends {distance_text(facts['end_error_m'])} off the filter" if drifts else ""
+        return facts["label"], note, f"#{facts['path']}", ()
+    if facts["layer"] == "outage":
+        note = f"{duration_text(facts['duration_s'])} without usable GNSS"
+        return f"outage {number}", note, "#outage", (facts["begin_utc"], facts["end_utc"])
+    lasted = duration_text(facts["end_s"] - facts["begin_s"])
+    note = f"{lasted}, {100 * facts['severity']:.0f} % of the wheels' motion missed"
+    return facts["kind"], note, "", utc_text(np.array([facts["begin_ns"], facts["end_ns"]], np.int64))
+
+
+def _track(path: ExportPath, globe: Globe) -> ET.Element:
+    """Return the place mark of a path over time."""
     rows = rows_apart(path.stamp_ns, TRACK_INTERVAL_S)
-    track = ET.SubElement(_placemark(folder, "robot", style="filter"), f"{{{GX}}}Track")
-    _child(track, "altitudeMode", "clampToGround")
-    for time in utc_text(path.stamp_ns[rows]):
-        _child(track, "when", time)
-    for east, north in coordinates(path.x_m[rows], path.y_m[rows], globe):
-        ET.SubElement(track, f"{{{GX}}}coord").text = f"{east:.9f} {north:.9f} 0"
-    for heading_deg in np.mod(90.0 - np.degrees(path.yaw_rad[rows]), 360.0).tolist():
-        ET.SubElement(track, f"{{{GX}}}angles").text = f"{heading_deg:.1f} 0 0"
+    headings_deg = np.mod(90.0 - np.degrees(path.yaw_rad[rows]), 360.0).tolist()
+    track = _element(
+        f"{{{GX}}}Track",
+        _element("altitudeMode", "clampToGround"),
+        *(_element("when", time) for time in utc_text(path.stamp_ns[rows])),
+        *(
+            _element(f"{{{GX}}}coord", f"{east:.9f} {north:.9f} 0")
+            for east, north in coordinates(path.x_m[rows], path.y_m[rows], globe)
+        ),
+        *(_element(f"{{{GX}}}angles", f"{heading_deg:.1f} 0 0") for heading_deg in headings_deg),
+    )
+    return _element("Placemark", _element("name", "robot"), _element("styleUrl", "#filter"), track)
