@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Ints
@@ -16,8 +19,23 @@ TYPICAL_PERCENT, HEADROOM = 99.5, 1.6
 LEAST_END_M = 0.001
 """A scale of differences ends at `HEADROOM` times the 99.5 % one: a few outliers do not flatten the rest."""
 
+RANGE_PERCENT = (0.2, 99.8)
+"""A range passes over the extremes of so little of the time: one spike does not flatten the rest."""
+SCALE_MARGIN, LEAST_HALF_RANGE_M = 1.12, 0.02
+
 BREAK_SHARE, BREAK_IN_INTERVALS = 0.01, 5.0
 """No line is drawn over a gap of this share of the time and this many times the usual interval."""
+
+
+def every_so_many(rows: int, most: float) -> tuple[Ints, int]:
+    """Choose about `most` of so many rows: every so many-th and the last one; return them and every how many-th."""
+    every = max(math.ceil(rows / most), 1)
+    return np.unique(np.append(np.arange(0, rows, every), rows - 1)), every
+
+
+def round_steps(length: float) -> Floats:
+    """Return the round lengths (4,) about a length: 1, 2, 5 and 10 times the power of ten below it."""
+    return np.multiply([1.0, 2.0, 5.0, 10.0], 10.0 ** math.floor(math.log10(length)))
 
 
 def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
@@ -76,6 +94,12 @@ def places(north: Floats, east: Floats, cell_m: float) -> Ints:
         moved = (np.diff(np.floor(north[some] / cell_m)) != 0) | (np.diff(np.floor(east[some] / cell_m)) != 0)
         found.append(lo + 1 + np.flatnonzero(moved))
     return np.unique(np.concatenate(found))
+
+
+def scale_of(shown: Sequence[float]) -> tuple[float, float]:
+    """Return the ends of a scale [m] on which numbers [m] lie with a margin."""
+    middle, half = (min(shown) + max(shown)) / 2, max((max(shown) - min(shown)) / 2, LEAST_HALF_RANGE_M)
+    return middle - SCALE_MARGIN * half, middle + SCALE_MARGIN * half
 
 
 def scale_end_m(differences: Floats) -> float:

@@ -61,7 +61,7 @@ def forecast_figure(
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
     path.set(xlabel="East [m]", ylabel="North [m]")
-    figure.legend(ncols=4)
+    style.add_legend(figure, ncols=4)
     return figure
 
 

@@ -14,7 +14,7 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.figures.trajectory import CELLS, JUMP_LOOK, draw_path, fitted_box_in, look_down, name_directions
-from icrtool.output.series import places
+from icrtool.output.series import places, round_steps
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout_document import ExampleTrial, Outage, TrialDocument
 
@@ -145,8 +145,7 @@ def _draw_scale(axes: Axes) -> None:
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
     width, height = east - west, north - south
     longest = BAR_SHARE * width
-    decade = 10.0 ** math.floor(math.log10(longest))
-    length = max(step * decade for step in (1.0, 2.0, 5.0) if step * decade <= longest)
+    length = float(max(step for step in round_steps(longest) if step <= longest))
     drawn = np.concatenate([line.get_xydata() for line in axes.lines])
 
     def crossed(corner: tuple[float, float]) -> int:

@@ -8,7 +8,16 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats
 from icrtool.output.figures import style
-from icrtool.output.series import breaks_after, extremes, percentiles, scale_end_m
+from icrtool.output.series import (
+    LEAST_HALF_RANGE_M,
+    RANGE_PERCENT,
+    breaks_after,
+    extremes,
+    percentiles,
+    round_steps,
+    scale_end_m,
+    scale_of,
+)
 from icrtool.output.text_format import error_text, position_word, run_title, signed
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run
 from icrtool.records.run_document import IcrColumn
@@ -24,11 +33,9 @@ SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 
 NO_SLIP_PLACE = {"label": "no slip (±b/2, 0)", **style.HALF_WIDTH}
 
-RANGE_PERCENT = (0.2, 99.8)
 BAND_RANGE_PERCENT = (2.0, 98.0)
 CLUSTER_RANGE_PERCENT = (0.5, 99.5)
-"""A range passes over the extremes of so little of the time: one spike does not flatten the rest."""
-LEAST_HALF_RANGE_M = 0.02
+"""As `RANGE_PERCENT`, of the edges of a band and of a histogram."""
 
 LONG_RUN = 2.5
 """A run this many times longer than its learning gets a panel of its own for the learning."""
@@ -130,9 +137,8 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
             axes.axhline(spread[-1], **NO_SLIP_PLACE)
     else:
         spread += [*percentiles(low, BAND_RANGE_PERCENT[:1]), *percentiles(high, BAND_RANGE_PERCENT[1:])]
-    middle, half = (min(spread) + max(spread)) / 2, max(np.ptp(spread) / 2, LEAST_HALF_RANGE_M)
     axes.set_xlim(span_s[0] / unit, max(span_s[1] / unit, span_s[0] / unit + 1e-3))
-    axes.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
+    axes.set_ylim(*scale_of(spread))
     axes.locator_params(axis="y", nbins=5)
     for change in run.changes_s:
         axes.axvline(change / unit, zorder=2.6, label="terrain change", **style.CHANGE)
@@ -164,8 +170,7 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
     # The round width of about `BINS` bins.
     target = span_m / BINS
-    decade = 10.0 ** np.floor(np.log10(target))
-    width = float(min((step * decade for step in (1.0, 2.0, 5.0, 10.0)), key=lambda step: abs(step - target)))
+    width = float(min(round_steps(target), key=lambda step: abs(step - target)))
     first, last = int(np.floor(low / width)), int(np.ceil(high / width))
     share, edges = np.histogram(value, bins=last - first, range=(first * width, last * width), weights=weight)
     percent, label = 100 * share / max(weight.sum(), 1e-9), f"estimates, bins of {width:g} m"

@@ -8,7 +8,7 @@ open-loop trial starts. ICRs that differ by start have no such path: the page dr
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -26,11 +26,20 @@ from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, wrapped
 from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
 from icrtool.motion.recording import Recording, cut_windows, predicted_path
 from icrtool.motion.window_fit import own_constants
-from icrtool.output.series import breaks_after, extremes, scale_end_m
+from icrtool.output.series import (
+    RANGE_PERCENT,
+    breaks_after,
+    every_so_many,
+    extremes,
+    percentiles,
+    scale_end_m,
+    scale_of,
+)
 from icrtool.output.tables.errors import in_order, main_rows
 from icrtool.records.dropout_document import DropoutDocument, FitDocument
 from icrtool.records.plain_data import Record
-from icrtool.records.run import MeasurementOutcome, Run, track_of, width_or_usual_m
+from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, Run, track_of, width_or_usual_m
+from icrtool.records.tables import States
 
 MOST_STEPS = 150_000
 """Wheel samples of a page; of more, equally many are joined to one."""
@@ -57,10 +66,9 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
     coordinates : whether the axes of the map count from the datum; else from the first state
     """
     table = run.table
-    # Of many states every so many-th, and the last one.
-    joined = -(-len(table) // MOST_STEPS)
-    rows = np.unique(np.append(np.arange(0, len(table), joined), len(table) - 1))
+    rows, joined = every_so_many(len(table), MOST_STEPS)
     origin = float(np.round(table.north_m[0])), float(np.round(table.east_m[0]))
+    half = None if run.track_width_m is None else run.track_width_m / 2
     return {
         "origin": origin if coordinates else None,
         "duration_s": float(table.t_s[-1]),
@@ -68,7 +76,8 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "series": _series_data(run, rows),
         "fixes": _fixes_data(run, origin),
         "headings": _differences(run.heading, run.heading.used, np.degrees(run.heading.difference))[1],
-        "half_width_m": None if run.track_width_m is None else run.track_width_m / 2,
+        "half_width_m": half,
+        "icr_scale_m": _icr_scale(table, () if half is None else (half, -half)),
         **_models_data(run, report, rows, origin),
         "events": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in run.document.events],
         "outages": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
@@ -76,6 +85,12 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "errors": errors_data(report),
         "budgets_m": sorted({one.budget_m for one in report.budgets}),
     }
+
+
+def _icr_scale(table: States, shown: Sequence[float]) -> tuple[float, float]:
+    """Return the ends of a scale [m] of all three ICRs, on which further numbers lie; as of the figure of each."""
+    columns = [getattr(table, name) for name in ICR_COLUMNS]
+    return scale_of([*shown, *(end for one in columns for end in (*percentiles(one, RANGE_PERCENT), one[0], one[-1]))])
 
 
 def errors_data(report: DropoutDocument) -> dict[str, object]:
@@ -165,8 +180,7 @@ def _models_data(run: Run, report: DropoutDocument, steps: Ints, origin: tuple[f
         **dict(_held_out(recording, report, steps)),
         **dict(_calibrated(recording, report, steps)),
     }
-    every = max(-(-len(paths) * len(steps) // PATH_POINTS), 1)
-    rows = np.unique(np.append(np.arange(0, len(steps), every), len(steps) - 1))
+    rows, every = every_so_many(len(steps), PATH_POINTS / max(len(paths), 1))
     packed_paths = {
         name: {
             "every": every,

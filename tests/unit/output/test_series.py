@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from icrtool.output.series import breaks_after, extremes, places, scale_end_m
+from icrtool.output.series import (
+    breaks_after,
+    every_so_many,
+    extremes,
+    places,
+    round_steps,
+    scale_end_m,
+    scale_of,
+)
 
 
 @given(st.integers(1, 5000), st.integers(4, 600), st.integers(0, 99))
@@ -75,3 +83,29 @@ def test_a_few_outliers_do_not_flatten_a_scale_of_differences() -> None:
     assert scale_end_m(usual) == pytest.approx(1.1 * 0.02)
     assert scale_end_m(np.append(usual, 50.0)) == pytest.approx(1.6 * 0.02, rel=0.01)
     assert scale_end_m(np.empty(0)) == 1.0
+
+
+@given(st.integers(1, 5000), st.floats(1.0, 600.0))
+def test_every_so_many_rows_end_with_the_last_one(rows: int, most: float) -> None:
+    chosen, every = every_so_many(rows, most)
+    assert (chosen[0], chosen[-1]) == (0, rows - 1)
+    assert set(np.diff(chosen[:-1]).tolist()) <= {every}
+    assert len(chosen) <= most + 2
+    assert every == 1 or rows > most
+
+
+@given(st.floats(1e-6, 1e6))
+def test_a_length_lies_between_the_first_and_the_last_round_one(length: float) -> None:
+    steps = round_steps(length)
+    assert steps[0] <= length * (1 + 1e-12)
+    assert length < steps[-1] * (1 + 1e-12)
+    assert steps / steps[0] == pytest.approx([1.0, 2.0, 5.0, 10.0])
+
+
+def test_a_scale_holds_its_numbers_in_the_middle_and_is_never_a_point() -> None:
+    low, high = scale_of([3.0, -1.0, 2.0])
+    assert low < -1.0
+    assert high > 3.0
+    assert (low + high) / 2 == pytest.approx(1.0)
+    low, high = scale_of([0.5])
+    assert low < 0.5 < high

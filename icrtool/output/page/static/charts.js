@@ -194,12 +194,7 @@ const icrtoolCharts = (() => {
       { label: "y left", color: "left", dash: "dashed", value: s.y_left, std: s.std_y_left },
     ];
     const columns = [s.t], series = [], bands = [];
-    let low = Infinity, high = -Infinity;
     for (const one of entries) {
-      for (let i = 0; i < one.value.length; i++) {
-        low = Math.min(low, one.value[i]);
-        high = Math.max(high, one.value[i]);
-      }
       const first = columns.length;
       const edge = { label: one.label, stroke: "transparent", width: 0, points: { show: false } };
       columns.push(one.value.map((value, i) => value + 2 * one.std[i]), one.value, one.value.map((value, i) => value - 2 * one.std[i]));
@@ -213,11 +208,8 @@ const icrtoolCharts = (() => {
         series.push(line({ label: "half the track width", color: "reference", dash: "dotted", width: 1 }));
       }
       entries.push({ label: "half the track width", color: "reference", dash: "dotted" });
-      low = Math.min(low, -half);
-      high = Math.max(high, half);
     }
-    const margin = 0.12 * (high - low);
-    add("icrs", "ICR [m]", columns, series, { height: 250, bands, range: () => [low - margin, high + margin] });
+    add("icrs", "ICR [m]", columns, series, { height: 250, bands, range: () => data.icr_scale_m });
     keys(document.getElementById("icrs-keys"), entries);
   }
 

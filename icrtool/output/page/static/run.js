@@ -19,7 +19,7 @@ const icrtoolPage = (() => {
   }
 
   function metres(error) {
-    return `${error.toFixed(error < 1 ? 3 : 2)} m`;
+    return `${error.toFixed(error < 0.01 ? 4 : error < 1 ? 3 : 2)} m`;
   }
 
   function signed(value) {

@@ -29,7 +29,7 @@ from icrtool.records.measurements import ReferenceJump
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
 from icrtool.records.run_document import EventDocument
-from support.barn import configured, simulate
+from support.barn import TRACK_WIDTH_M, configured, simulate
 from support.documents import with_summary
 
 HOSTILE_PART = "window.hostile=1"
@@ -137,6 +137,16 @@ def test_a_run_with_too_few_turns_states_what_to_drive(run: Run, report: Dropout
     straight = with_summary(run, usable=False, unusable_because="it turns too little", excitation=excitation)
     page = run_page(straight, report.document, {})
     assert "hardly any turns" in page[page.index("Do not use") : page.index("How far without GNSS")]
+
+
+def test_a_spike_of_an_icr_does_not_flatten_the_others(run: Run, report: DropoutReport) -> None:
+    x_icr_m = run.table.x_icr_m.copy()
+    x_icr_m[len(x_icr_m) // 2] = 50.0
+    spiked = replace(run, table=replace(run.table, x_icr_m=x_icr_m))
+    scales = [data_of(run_page(one, report.document, {}))["icr_scale_m"] for one in (run, spiked)]
+    assert scales[0] == scales[1]
+    half_m = TRACK_WIDTH_M / 2
+    assert scales[0][0] < -half_m < half_m < scales[0][1]
 
 
 def test_the_numbers_of_the_drawings_are_those_of_the_run(page: str, run: Run) -> None:
