@@ -6,7 +6,6 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from io import BytesIO
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from icrtool.logs.containers.chunk import (
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
 from icrtool.logs.containers.container import CUT_OFF, Block, Channel, ros_type_name
-from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -131,12 +129,9 @@ class McapFile(ChunkedFile):
     _unpacks_parts = True
     _scan = staticmethod(scan_mcap)
     _message_index = staticmethod(_message_index)
-
-    def __init__(self, path: Path, message_compression: str = "", source: Source | None = None) -> None:
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, McapChannel] = {}
-        self._counts: dict[int, int] = {}
-        super().__init__(path, message_compression, source)
+    _schemas: dict[int, Schema]
+    _channels: dict[int, McapChannel]
+    _counts: dict[int, int]
 
     def _described_channels(self) -> list[Channel]:
         described = []
@@ -161,6 +156,8 @@ class McapFile(ChunkedFile):
     def _read_index(self) -> list[Chunk] | None:
         if self._source.read_at(0, len(MAGIC)) != MAGIC:
             raise LogError(self.path, "not an MCAP file", "its first bytes are not those of MCAP")
+        # those that the index describes; without one, the records do
+        self._schemas, self._channels, self._counts = {}, {}, {}
         start, summary = self._summary()
         chunks: list[Chunk] = []
         schemas: dict[int, Schema] = {}

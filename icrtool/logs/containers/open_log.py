@@ -5,7 +5,7 @@ from __future__ import annotations
 import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -103,12 +103,17 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
     return container
 
 
-FileState = tuple[int, int, int] | None
+FileState = tuple[int, int, int]
 
 
 def states_of(path: Path) -> dict[str, FileState]:
     """Return what changes where a file of a log is written to, by their paths; nothing of an address."""
-    return {} if isinstance(path, UrlPath) else {str(file): _state(file) for file in files_of_log(path)}
+    found: dict[str, FileState] = {}
+    for file in () if isinstance(path, UrlPath) else files_of_log(path):
+        with suppress(OSError):
+            status = file.stat()
+            found[str(file)] = status.st_ino, status.st_size, status.st_mtime_ns
+    return found
 
 
 def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterable[InputFile]) -> None:
@@ -127,17 +132,10 @@ def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterabl
     if isinstance(path, UrlPath):
         changed = changed_since(path, inputs)
     else:
-        changed = any(_state(Path(one.path)) != before.get(one.path) for one in inputs)
+        now = states_of(path)
+        changed = any(now.get(one.path) != before.get(one.path) for one in inputs)
     if changed:
         raise LogChangedError(path, "changed while it was read", "is it being recorded? read it when it is whole")
-
-
-def _state(file: Path) -> FileState:
-    try:
-        status = file.stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 @contextmanager
@@ -176,7 +174,7 @@ def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:
     if kind is SqliteBag:
         return "an SQLite file"
     try:
-        container = McapFile(path, source=remote) if kind is McapFile else Ros1Bag(path, remote)
+        container = (McapFile if kind is McapFile else Ros1Bag)(path, source=remote)
     except NotByRangesError:
         return "it has no index"
     container.origin = Origin((remote.input,), lambda: read_by_ranges([remote]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -26,7 +25,6 @@ from icrtool.logs.containers.chunk import (
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
 from icrtool.logs.containers.container import CUT_OFF, Block, Channel, ros_type_name
-from icrtool.logs.containers.source import Source
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -173,9 +171,7 @@ class Ros1Bag(ChunkedFile):
     _scan = staticmethod(scan_bag)
     _message_index = staticmethod(_message_index)
 
-    def __init__(self, path: Path, source: Source | None = None) -> None:
-        self._connections: dict[int, Channel] = {}
-        super().__init__(path, source=source)
+    _connections: dict[int, Channel]
 
     def _described_channels(self) -> list[Channel]:
         return list(self._connections.values())
@@ -187,6 +183,7 @@ class Ros1Bag(ChunkedFile):
             raise LogError(self.path, "a bag of another version", advice)
         if start != MAGIC:
             raise LogError(self.path, "not a ROS 1 bag", "its first bytes are not a bag's")
+        self._connections = {}
         chunks = self._listed_chunks()
         if chunks is None:
             self.report(f"has no index (not closed, or {CUT_OFF}); read from start to end")

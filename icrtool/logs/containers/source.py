@@ -134,6 +134,7 @@ class LocalFile:
 
     def __init__(self, path: Path) -> None:
         self._stream = path.open("rb")
+        self.close = self._stream.close
         self._lock = Lock()
         self.size = path.stat().st_size
 
@@ -148,10 +149,6 @@ class LocalFile:
         with self._lock:
             self._stream.seek(min(at, self.size))
             return self._stream.readinto(space.data)
-
-    def close(self) -> None:
-        """Release the file."""
-        self._stream.close()
 
 
 class RemoteFile:

@@ -52,6 +52,8 @@ _LARGEST_EXTRA_BYTES, _LARGEST_READ_BYTES = 1 << 16, 1 << 22
 
 _BEHIND = b"icrtool: behind the last frame"
 _BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
+_TAR, _TAR_MARK = b"ustar", slice(257, 262)
+"""What a tar archive has in its first block, and where."""
 
 
 class Readable(Protocol):
@@ -143,7 +145,7 @@ class ScratchFolder:
 
 def is_packed(start: bytes) -> bool:
     """Return whether a file is compressed or an archive, by its first 512 bytes."""
-    return start.startswith((_ZIP, *DECODERS)) or _is_tar(start)
+    return start.startswith((_ZIP, *DECODERS)) or start[_TAR_MARK] == _TAR
 
 
 def save(source: Readable, place: Path) -> str:
@@ -284,7 +286,7 @@ def _unpacked(
         entries = _zip_entries(file, budget)
     else:
         content = packed.decompressed()
-        if not _is_tar(content.start()):
+        if content.start()[_TAR_MARK] != _TAR:
             whole = folder / (unpacked_name(path.name) or "log")
             content.write_to(whole, watch)
             return whole
@@ -316,10 +318,6 @@ def _unpacked(
     if len(found) > 1:
         raise LogError(path, f"holds more than one recording: {some_of(logs)}", "unpack it, and name one of them")
     return found[0]
-
-
-def _is_tar(start: bytes) -> bool:
-    return start[257:262] == b"ustar"
 
 
 def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Stream]]:

@@ -20,9 +20,9 @@ import orjson
 from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Ints
-from icrtool.logs.containers.container import Block, Channel
-from icrtool.logs.messages.decoder import MESSAGES_AT_ONCE, Decoder, text_numbers
+from icrtool.kernels.arrays import Bools, Bytes, Ints
+from icrtool.logs.containers.container import Channel
+from icrtool.logs.messages.decoder import Decoder, text_numbers
 from icrtool.logs.messages.definitions import (
     BASE,
     DEEPEST,
@@ -91,25 +91,18 @@ class ValueDecoder:
     paths: Mapping[str, str]
     parse: Callable[[bytes], object] = field(repr=False)
 
-    def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, DecodedValues]]:
-        """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
-        rows = np.flatnonzero(block.channel == number)
+    def decode(self, data: Bytes, start: Ints, end: Ints) -> DecodedValues:
+        """Decode messages [start, end) (n,) of `data`."""
         takers = {column: _taker(path, self.slots[column].kind) for column, path in self.paths.items()}
-        for begin in range(0, len(rows), MESSAGES_AT_ONCE):
-            some = rows[begin : begin + MESSAGES_AT_ONCE]
-            values: dict[str, list[Any]] = {column: [] for column in self.paths}
-            readable = np.zeros(len(some), np.bool_)
-            for place, (start, end) in enumerate(
-                zip(block.start[some].tolist(), block.end[some].tolist(), strict=True)
-            ):
-                if end - start > LONGEST_MESSAGE_BYTES:
-                    continue
-                message = self.parse(block.data[start:end].tobytes())
-                if message is not None:
-                    readable[place] = True
-                    for column, take in takers.items():
-                        values[column].append(take(message))
-            yield some, DecodedValues(self.slots, values, readable)
+        values: dict[str, list[Any]] = {column: [] for column in self.paths}
+        readable = np.zeros(len(start), np.bool_)
+        for place, (begin, stop) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
+            message = self.parse(data[begin:stop].tobytes()) if stop - begin <= LONGEST_MESSAGE_BYTES else None
+            if message is not None:
+                readable[place] = True
+                for column, take in takers.items():
+                    values[column].append(take(message))
+        return DecodedValues(self.slots, values, readable)
 
 
 def _taker(path: str, kind: str) -> Callable[[object], Any]:
@@ -217,23 +210,23 @@ class SentenceDecoder:
     def __post_init__(self) -> None:
         self.slots = {path: slot for path, slot in self.inner.slots.items() if path != "sentence"} | _SLOTS
 
-    def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, DecodedValues]]:
-        """Yield the rows (m,) of a block whose channel is `number`; a sentence with a wrong checksum is unreadable."""
-        for rows, decoded in self.inner.decode(block, number):
-            sentences = [parse_sentence(text) for text in decoded.texts("sentence")]
-            is_one = np.array([one is not None for one in sentences], np.bool_)
-            read = [one for one in sentences if one is not None]
-            values: dict[str, Sequence[Any]] = {
-                path: [one.get(path, 0 if slot.kind == "int32" else math.nan) for one in read]
-                for path, slot in _SLOTS.items()
-            }
-            for path, slot in self.inner.slots.items():
-                if path != "sentence":
-                    column = np.array(decoded.texts(path), object) if slot.kind == "string" else decoded.numbers(path)
-                    values[path] = column[is_one].tolist()
-            readable = decoded.readable.copy()
-            readable[readable] = is_one
-            yield rows, DecodedValues(self.slots, values, readable)
+    def decode(self, data: Bytes, start: Ints, end: Ints) -> DecodedValues:
+        """Decode the first of messages [start, end) (n,) of `data`; one with a wrong checksum is unreadable."""
+        decoded = self.inner.decode(data, start, end)
+        sentences = [parse_sentence(text) for text in decoded.texts("sentence")]
+        is_one = np.array([one is not None for one in sentences], np.bool_)
+        read = [one for one in sentences if one is not None]
+        values: dict[str, Sequence[Any]] = {
+            path: [one.get(path, 0 if slot.kind == "int32" else math.nan) for one in read]
+            for path, slot in _SLOTS.items()
+        }
+        for path, slot in self.inner.slots.items():
+            if path != "sentence":
+                column = np.array(decoded.texts(path), object) if slot.kind == "string" else decoded.numbers(path)
+                values[path] = column[is_one].tolist()
+        readable = decoded.readable.copy()
+        readable[readable] = is_one
+        return DecodedValues(self.slots, values, readable)
 
 
 def parse_sentence(text: bytes) -> dict[str, Any] | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from struct import Struct
 from typing import Any, Literal, NamedTuple
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.chunk import unaligned
-from icrtool.logs.containers.container import Block, Channel
+from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.definitions import (
     COUNTED,
     MOST_ELEMENTS,
@@ -34,7 +33,6 @@ from icrtool.logs.messages.definitions import (
 )
 from icrtool.records.text import LONGEST_TEXT
 
-MESSAGES_AT_ONCE = 1 << 14
 _SHAPES_AT_ONCE, _COMPARED_SHAPES, _TRIED_SHAPES = 1 << 10, 1 << 8, 1 << 4
 """Shapes that messages decoded at once may have; those of them that messages are compared with; and the least."""
 
@@ -83,14 +81,6 @@ class Shape(NamedTuple):
         if same is None or not (size >= self.size if self.readable else size == self.size):
             return False
         return all(message.startswith(content, at) for at, content in same)
-
-    def of(self, messages: NDArray[Any]) -> Bools:
-        """Return which messages (n,), each its first `size` bytes, have what the shape's have in common."""
-        fit = np.ones(len(messages), np.bool_)
-        for at, content in self.same or ():
-            kind = np.dtype((np.void, len(content)))
-            fit &= np.ndarray(len(messages), kind, messages, at, messages.strides) == np.void(content)
-        return fit
 
 
 class _Run:
@@ -197,17 +187,7 @@ class Decoder:
     columns: type[Decoded] = field(default_factory=lambda: Decoded)
     _known: list[Shape] = field(default_factory=list)
 
-    def decode(self, block: Block, number: int) -> Iterator[tuple[Ints, Decoded]]:
-        """Yield the rows (m,) of a block whose channel is `number`, some at a time, with what those messages hold."""
-        rows = np.flatnonzero(block.channel == number)
-        while len(rows):
-            some = rows[:MESSAGES_AT_ONCE]
-            decoded = self._decode(block.data, block.start[some], block.end[some])
-            done = len(decoded.readable)
-            yield rows[:done], decoded
-            rows = rows[done:]
-
-    def _decode(self, data: Bytes, start: Ints, end: Ints) -> Decoded:
+    def decode(self, data: Bytes, start: Ints, end: Ints) -> Decoded:
         """Decode messages [start, end) (n,) of `data`: the first ones, as many as have few enough shapes."""
         size, left = end - start, np.arange(len(start))
         shapes: list[Shape] = []
@@ -227,7 +207,11 @@ class Decoder:
             if compare and shape.same is not None:
                 fits = size[left] >= shape.size if shape.readable else size[left] == shape.size
                 together = unaligned(data, np.dtype((np.void, shape.size)))[start[left[fits]]]
-                fits[fits] = shape.of(together)
+                alike = np.ones(len(together), np.bool_)
+                for at, content in shape.same:
+                    kind = np.dtype((np.void, len(content)))
+                    alike &= np.ndarray(len(together), kind, together, at, together.strides) == np.void(content)
+                fits[fits] = alike
                 if not shapes and shape.readable and shape.size and fits.all():
                     return self.columns(
                         self.layout,
@@ -268,7 +252,10 @@ class Decoded:
 
         What a message lacks is NaN or 0.
         """
-        number, (kind, result) = self.layout.slots[path].number, _types(self.layout.slots[path].kind)
+        name, number = self.layout.slots[path]
+        letter = name[0] if name.startswith(("int", "float")) else "u"
+        kind: np.dtype[Any] = np.dtype(f"<{letter}{SIZES[name]}")
+        result: np.dtype[Any] = np.dtype(np.float64 if letter == "f" else np.int64)
         offsets: list[list[int]] = [shape.taken[number] if shape.readable else [] for shape in self.shapes]
         width = max(map(len, offsets), default=0) if len(self.start) else 0
         if width == 0:
@@ -310,7 +297,16 @@ class Decoded:
         width = max((len(shape.taken[slot.number]) for shape in self.shapes if shape.readable), default=0)
         numbers: Ints = np.full((len(self.start), width), -1, np.int64)
         for shape, rows in self.by_shape():
-            codes = [self._codes(at, length, rows, known) for at, length in shape.taken[slot.number]]
+            codes = []
+            for at, length in shape.taken[slot.number]:
+                kind = np.dtype((np.void, length))
+                texts = (
+                    self._fields(at, kind)[:, 0]
+                    if len(self.shapes) == 1
+                    else unaligned(self.data, kind)[self.start[rows] + at]
+                )
+                is_one = length == 0 or bool((texts == texts[0]).all())
+                codes.append(text_numbers(texts[: 1 if is_one else None].tolist(), known))
             if len(self.shapes) == 1 and all(len(one) == 1 for one in codes):
                 numbers = np.broadcast_to(np.array(codes, np.int64).reshape(1, width), numbers.shape)
                 break
@@ -326,16 +322,6 @@ class Decoded:
             if length:
                 found[rows] = unaligned(self.data, np.dtype((np.void, length)))[self.start[rows] + at].tolist()
         return list(found)
-
-    def _codes(self, at: int, length: int, rows: Ints | slice, known: dict[bytes, int]) -> list[int]:
-        """Return the numbers of the texts at an offset in messages of one shape; of only one where all are the same."""
-        kind = np.dtype((np.void, length))
-        if len(self.shapes) == 1:
-            texts = self._fields(at, kind)[:, 0]
-        else:
-            texts = unaligned(self.data, kind)[self.start[rows] + at]
-        is_one = length == 0 or bool((texts == texts[0]).all())
-        return text_numbers(texts[: 1 if is_one else None].tolist(), known)
 
     def by_shape(self) -> Iterator[tuple[Shape, Ints | slice]]:
         """Yield each shape with the rows that have it."""
@@ -358,13 +344,6 @@ def text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
         kept = text if text in known or len(known) < MOST_TEXTS else FURTHER
         numbers.append(known.setdefault(kept, len(known)))
     return numbers
-
-
-@cache
-def _types(kind: str) -> tuple[np.dtype[Any], np.dtype[Any]]:
-    """Return the type of a slot's numbers in little-endian messages, and in columns."""
-    letter = kind[0] if kind.startswith(("int", "float")) else "u"
-    return np.dtype(f"<{letter}{SIZES[kind]}"), np.dtype(np.float64 if letter == "f" else np.int64)
 
 
 def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:

@@ -22,6 +22,9 @@ from icrtool.records.text import LogText
 _MOST_EXPECTED = 1 << 22
 """Numbers of a column that memory is set aside for on the log's word alone."""
 
+_MESSAGES_AT_ONCE = 1 << 14
+"""That are decoded together."""
+
 LARGEST = 1e30
 """No quantity of a robot is larger, in any unit: what is counts as infinite, so that no power of numbers overflows."""
 
@@ -49,19 +52,19 @@ class GrowingColumn:
         elif one is None or len(held) > 1 or one.shape != held.shape or one.tobytes() != held.tobytes():
             width = max(part.shape[1:], held.shape[1:])
             kind = np.result_type(part, held) if before else part.dtype
+            added = [(before, part)]
             if before == 0 or len(held) < self._rows or width > held.shape[1:] or kind != held.dtype:
                 likely = min(expected, _MOST_EXPECTED // max(*width, 1, 1))
                 self._values = np.empty((*width, max(2 * before, self._rows, likely)), kind).T
                 if before:
-                    self._put(0, held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:])))
-            self._put(before, part)
-
-    def _put(self, begin: int, part: NDArray[Any]) -> None:
-        rows = self._values[begin : begin + len(part)]
-        if part.ndim == 2 and part.shape[1] < rows.shape[1]:
-            rows[:, part.shape[1] :] = np.nan if rows.dtype.kind == "f" else self._lacking
-            rows = rows[:, : part.shape[1]]
-        _copy(part, rows)
+                    old = held[:before] if len(held) > 1 else np.broadcast_to(held, (before, *held.shape[1:]))
+                    added.insert(0, (0, old))
+            for begin, some in added:
+                rows = self._values[begin : begin + len(some)]
+                if some.ndim == 2 and some.shape[1] < rows.shape[1]:
+                    rows[:, some.shape[1] :] = np.nan if rows.dtype.kind == "f" else self._lacking
+                    rows = rows[:, : some.shape[1]]
+                _copy(some, rows)
 
     def taken(self) -> NDArray[Any]:
         """Return the rows (n,) or (n, k); they cannot be written to where all are the same."""
@@ -220,7 +223,11 @@ class TopicCollector:
     def feed(self, block: Block, number: int) -> None:
         """Add the messages of a block whose channel is `number`."""
         decoder, expected = self.decoders[number], self.channel.count or 0
-        for rows, decoded in decoder.decode(block, number):
+        left = np.flatnonzero(block.channel == number)
+        while len(left):
+            some = left[:_MESSAGES_AT_ONCE]
+            decoded = decoder.decode(block.data, block.start[some], block.end[some])
+            rows, left = np.split(left, [len(decoded.readable)])
             readable = rows[decoded.readable]
             self._unreadable += len(rows) - len(readable)
             if not len(readable):

@@ -9,7 +9,6 @@ import pytest
 from mcap.writer import IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from icrtool.logs.containers.container import Block
 from icrtool.logs.containers.mcap_file import McapFile, scan_mcap
 from icrtool.logs.containers.ros1_bag import scan_bag
 from icrtool.logs.messages import decoder
@@ -95,12 +94,14 @@ def joined(messages):
     return np.frombuffer(b"".join(parts), np.uint8), np.array(start, np.int64), np.array(end, np.int64)
 
 
-def decoded(layout, data, start, end):
+def decoded(layout, data, start, end, at_once=1000):
     """The readable ones among some messages: their rows, and each field by row."""
-    block = Block(data, np.zeros(len(start), np.int64), np.arange(len(start)), start, end)
     rows, known, parts = [], {path: {} for path in layout.slots}, {path: [] for path in layout.slots}
-    for some, found in Decoder(layout).decode(block, 0):
-        rows += some[found.readable].tolist()
+    decoder_of_topic, done = Decoder(layout), 0
+    while done < len(start):
+        found = decoder_of_topic.decode(data, start[done : done + at_once], end[done : done + at_once])
+        rows += (done + np.flatnonzero(found.readable)).tolist()
+        done += len(found.readable)
         for path, slot in layout.slots.items():
             if slot.kind == "string":
                 codes = found.text_numbers(path, known[path])
@@ -145,7 +146,6 @@ def test_messages_without_a_like_are_decoded_one_by_one(monkeypatch):
     """Texts of every length before the number: more shapes than are compared, and than are decoded at once."""
     monkeypatch.setattr(decoder, "_COMPARED_SHAPES", 40)
     monkeypatch.setattr(decoder, "_SHAPES_AT_ONCE", 100)
-    monkeypatch.setattr(decoder, "MESSAGES_AT_ONCE", 300)
     kind = "sensor_msgs/msg/Temperature"
     layout = compile_layout(STORE.fielddefs, "sensor_msgs/Temperature", ("header.frame_id", "temperature"), "cdr")
     rng = np.random.default_rng(1)
@@ -157,7 +157,7 @@ def test_messages_without_a_like_are_decoded_one_by_one(monkeypatch):
                                        variance=0.0), kind))
         for row, length in enumerate(lengths)
     ]  # fmt: skip
-    rows, found = decoded(layout, *joined(messages))
+    rows, found = decoded(layout, *joined(messages), at_once=300)
     assert rows == [*range(len(messages))]
     assert [values[0] for values in found["temperature"]] == [float(row) for row in rows]
     assert [texts[0] for texts in found["header.frame_id"]] == [b"f" * min(length, LONGEST_TEXT) for length in lengths]

@@ -100,8 +100,7 @@ def test_loops_over_elements_of_no_size_end(kind: int) -> None:
     layout = compile_layout({**inner, "x/msg/Top": ([], fields)}, "x/Top", ("v",), "ros1")
     data = np.tile(np.array([200, 0, 0, 0], np.uint8), 250)
     begin = time.process_time()
-    block = Block(data, np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(1, np.int64), np.array([len(data)]))
-    ((_, decoded),) = Decoder(layout).decode(block, 0)
+    decoded = Decoder(layout).decode(data, np.zeros(1, np.int64), np.array([len(data)]))
     assert not decoded.readable.any()
     assert time.process_time() - begin < LONGEST_S
 
