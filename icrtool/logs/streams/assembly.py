@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +18,12 @@ from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE, find_gyro, inert
 from icrtool.logs.streams.positions import antenna_place
 from icrtool.logs.streams.select import Candidates, Choice, choose_streams, ignored_joints, other_references
 from icrtool.logs.streams.sources import (
+    Clock,
     Convention,
     HeadingSource,
     PositionSource,
     Source,
     StampedRows,
-    Unit,
     WheelMotion,
     increasing,
 )
@@ -40,12 +40,11 @@ from icrtool.records.samples import (
     Samples,
     StreamChoice,
     WheelSamples,
+    WheelUnit,
     rate_and_jitter,
 )
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText
-
-Clock = Literal["header", "log"]
 
 MOST_PIECES = 10.0
 """Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
@@ -181,7 +180,7 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
             yield f"{role}: {counted}; log time is used for them"
 
 
-def common_clock(streams: Sequence[StampedRows]) -> Literal["header", "log"]:
+def common_clock(streams: Sequence[StampedRows]) -> Clock:
     """Return the clock for streams that are used together: header stamps or log time.
 
     Where some stream has only log times and another's header is far from them, all go by log time.
@@ -274,7 +273,7 @@ def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: s
     return WheelSamples(stamps, left, right, unit, is_position), notes
 
 
-def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, Unit, bool]:
+def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, WheelUnit, bool]:
     """Return left, right, their unit, and whether they are positions."""
     if motion.twist is not None:
         given = config.wheels.twist_width_m

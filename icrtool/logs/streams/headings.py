@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, turned_axi
 from icrtool.logs.messages.topic_table import FRAME, TopicTable
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
 from icrtool.logs.streams.sources import (
+    Clock,
     Convention,
     HeadingSource,
     StampedRows,
@@ -322,7 +322,7 @@ def find_gyro(
     tables: Sequence[TopicTable],
     wheels_topic: str,
     heading_topic: str,
-    clock: Literal["header", "log"],
+    clock: Clock,
     known: Mapping[str, StampedRows] = {},
 ) -> GyroSamples | None:
     """Return the turn rates of the best inertial unit, None without one.
@@ -344,7 +344,7 @@ def find_gyro(
 
 
 def inertial_units(
-    tables: Sequence[TopicTable], axes: Sequence[str], clock: Literal["header", "log"], known: Mapping[str, StampedRows]
+    tables: Sequence[TopicTable], axes: Sequence[str], clock: Clock, known: Mapping[str, StampedRows]
 ) -> Iterator[tuple[TopicTable, Ints, list[Floats]]]:
     """Yield the inertial units that measure about some axes, with the stamps (n,) and the sound rates about each."""
     for table in tables:

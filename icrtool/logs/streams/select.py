@@ -206,9 +206,11 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
         No candidate for one role or more; the error names them all and lists what the log holds.
     """
     topics = config.topics
-    _check_sides(topics, found, log, channels)
-    pair = f"{topics.wheel_left} + {topics.wheel_right}" if topics.wheel_left is not None else None
-    wheels = _chosen(found.wheels, topics.wheels or pair)
+    named = topics.wheels
+    if topics.wheel_left is not None and topics.wheel_right is not None:
+        _check_sides({"left": topics.wheel_left, "right": topics.wheel_right}, found, log, channels)
+        named = f"{topics.wheel_left} + {topics.wheel_right}"
+    wheels = _chosen(found.wheels, named)
     check_joints(wheels, found.wheels, config)
     _check_roles(topics, found, log, channels)
     gnss, heading = _chosen(found.gnss, topics.gnss), _chosen(found.heading, topics.heading)
@@ -249,18 +251,16 @@ def other_references(found: Candidates, choice: Choice, config: Config) -> tuple
     return tuple(choices[:MOST_REFERENCES])
 
 
-def _check_sides(topics: TopicsConfig, found: Candidates, log: str, channels: Sequence[Channel]) -> None:
-    """Refuse a configured pair of wheel topics that the log does not have or that cannot be used."""
-    for key, name in (("topics.wheel_left", topics.wheel_left), ("topics.wheel_right", topics.wheel_right)):
-        if name is None:
-            continue
-        topic = topic_of_side(name)
+def _check_sides(sides: Mapping[str, str], found: Candidates, log: str, channels: Sequence[Channel]) -> None:
+    """Refuse a configured pair of wheels, by side, that the log does not have or that cannot be used."""
+    for side, name in sides.items():
+        key, topic = f"topics.wheel_{side}", topic_of_side(name)
         needed = f"name the field of one side as {topic}.left or {topic}.data[0]"
         if (kind := _type_in(log, channels, found.unread, key, topic)) not in PAIR_TYPES and topic == name:
             raise ConfigError(key, f"{topic}: {kind} is not the number of one side", needed)
         if topic in found.unread:
             raise ConfigError(key, f"{topic}: {found.unread[topic]}", needed)
-    if topics.wheel_left is not None and found.wheels and found.wheels[0].is_empty:
+    if found.wheels and found.wheels[0].is_empty:
         why = f"{found.wheels[0].topic}: {found.wheels[0].problem}"
         raise ConfigError("topics.wheel_left", why, "name another pair")
 

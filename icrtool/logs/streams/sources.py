@@ -16,9 +16,12 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, STAMPS, SetBack, TopicTable
+from icrtool.records.samples import WheelUnit
 
 LARGEST_SHARE_BACKWARDS = 0.01
 LARGEST_SHARE_ZERO = 0.01
+
+Clock = Literal["header", "log"]
 
 AROUND = 25
 """Messages before and after a step of a clock whose median delay to log time shows its size."""
@@ -58,7 +61,7 @@ class StampedRows:
     set_back: SetBack = NOT_SET_BACK
     clock_set: ClockSet = NEVER_SET
 
-    def on(self, clock: Literal["header", "log"]) -> Ints:
+    def on(self, clock: Clock) -> Ints:
         """Return the stamps on a clock; the log's where the header's cannot be used."""
         return self.header_ns if clock == "header" and self.header_ns is not None else self.log_ns
 
@@ -217,8 +220,6 @@ class HeadingSource(Source):
         return np.pi - np.mod(np.pi - heading, 2 * np.pi)
 
 
-Unit = Literal["rad", "m", "counts", "unknown"]
-
 Pair = tuple[Floats, Floats]
 """Of the left and of the right side, (n,) each."""
 
@@ -239,7 +240,7 @@ class WheelMotion(Source):
 
     position: Pair | None = None
     speed: Pair | None = None
-    unit: Unit = "rad"
+    unit: WheelUnit = "rad"
     twist: Floats | None = None
     joints: tuple[str, ...] = ()
 

@@ -18,8 +18,9 @@ from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import number_fields
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import KNOWN_TYPES
-from icrtool.logs.streams.sources import StampedRows, Unit, WheelMotion, motion_of, of_topic, stamp_rows
+from icrtool.logs.streams.sources import StampedRows, WheelMotion, motion_of, of_topic, stamp_rows
 from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTE, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
+from icrtool.records.samples import WheelUnit
 from icrtool.records.text import LogText
 
 _NUMBERS = ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32", "UInt64")
@@ -228,7 +229,7 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
     moments, first, integer = times[both], lefts[both].astype(np.float64), lefts.dtype.kind == "i"
     not_recorded = (None, None)
     position = speed = not_recorded
-    unit: Unit = "unknown"
+    unit: WheelUnit = "unknown"
     if _is_position(left, lefts, config, integer=integer):
         unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
         what = "ticks" if unit == "counts" else "angles or distances"

@@ -17,7 +17,8 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
-from icrtool.logs.streams.sources import Sides, Unit, WheelMotion, motion_of, moves, of_topic
+from icrtool.logs.streams.sources import Sides, WheelMotion, motion_of, moves, of_topic
+from icrtool.records.samples import WheelUnit
 from icrtool.records.text import some_of
 
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
@@ -30,7 +31,7 @@ MOST_WHEELS = 32
 
 
 def of_wheels(
-    wheels: Callable[[Quantity], list[NDArray[Any]]], lefts: int, names: Sequence[str], unit: Unit, **others: Any
+    wheels: Callable[[Quantity], list[NDArray[Any]]], lefts: int, names: Sequence[str], unit: WheelUnit, **others: Any
 ) -> WheelMotion:
     """Return the mean over the wheels of each side, those left out that have no encoder, or a dead one.
 
@@ -207,7 +208,7 @@ class FixedWheels:
     worth: float
     position: tuple[str, ...] = ()
     speed: tuple[str, ...] = ()
-    unit: Unit = "rad"
+    unit: WheelUnit = "rad"
     factor: float = 1.0
 
     @property
@@ -270,7 +271,7 @@ def read_ticks(table: TopicTable, _: Config) -> WheelMotion:
         steps = np.abs(np.mod(np.diff(ticks) + _HALF_COUNTER, 2 * _HALF_COUNTER) - _HALF_COUNTER)
         sides[side][1:] += np.cumsum(np.where(direction[1:] != 0, -steps, steps)) / len(axles)
     left, right = (side / (per_metre if known else 1.0) for side in sides)
-    unit: Unit = "m" if known else "counts"
+    unit: WheelUnit = "m" if known else "counts"
     why = f"ticks of the {' and '.join({'f': 'front', 'r': 'rear'}[axle] for axle in axles)} wheels"
     return motion_of(**of_topic(table), position=(left, right), unit=unit, score=90.0, why=why)
 
