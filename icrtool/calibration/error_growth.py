@@ -17,7 +17,7 @@ from msgspec.structs import astuple
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints
-from icrtool.kernels.track import Track
+from icrtool.kernels.track import Track, Windows
 from icrtool.kernels.window_residuals import OMEGA, VX, displacements, path_at
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, Recording, steps_of
@@ -79,22 +79,20 @@ class PathErrors(NamedTuple):
     of_sources: Spread
 
 
-def path_errors(
-    steps: Track, begin_s: Floats, end_s: Floats, fitted: FittedModel, width_m: float, own: LogConstants = NO_CONSTANTS
-) -> PathErrors:
+def path_errors(windows: Windows, fitted: FittedModel, width_m: float, own: LogConstants = NO_CONSTANTS) -> PathErrors:
     """Return displacement and turn of windows by a model, and how errors of its parameters and of each source spread.
 
     Parameters
     ----------
-    begin_s, end_s : (w,) times of the windows' starts and ends
     own : constants of the recording
     """
+    steps = windows.track
     gyro = None if steps.gyro is None else steps.gyro + own.gyro_later_s * steps.gyro_change()
     motion = wheel_motion(steps.v_left, steps.v_right, width_m, gyro)
     fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
     fixed[OMEGA] += own.gyro_bias_radps
     # the sources act all along the path, not at the ends of windows alone
-    of_start, of_end = begin_s + own.wheels_later_s, end_s + own.wheels_later_s
+    of_start, of_end = (steps.place_t[rows] + own.wheels_later_s for rows in (windows.begin, windows.end))
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
     path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), fitted.parameters, at)
     s, e = np.searchsorted(at, of_start), np.searchsorted(at, of_end)
@@ -310,11 +308,12 @@ def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Float
 
 def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: bool) -> Forecast:
     """Return the forecast after each metre of a track, and of its wheel samples as they are integrated."""
-    t, metres = track.t, np.arange(1.0, np.floor(track.distance[-1]) + 1.0)
+    metres = np.arange(1.0, np.floor(track.distance[-1]) + 1.0)
     if not len(metres):
         raise DataError("path", f"{track.distance[-1]:.2f} m long", "a forecast needs a metre at least")
     rows = np.searchsorted(track.distance, metres)
-    spread, expected, p95 = forecast_errors(calibration, steps, np.full(len(rows), t[0]), t[rows], with_gyro=with_gyro)
+    windows = Windows(steps, np.zeros_like(rows), rows, metres)
+    spread, expected, p95 = forecast_errors(calibration, windows, with_gyro=with_gyro)
     c, s = np.cos(track.heading[0]), np.sin(track.heading[0])
     xx, xy, yy = spread.xx[:, 0], spread.xy[:, 0], spread.yy[:, 0]
     north = np.sqrt(np.maximum(c * c * xx - 2 * c * s * xy + s * s * yy, 0.0))
@@ -325,16 +324,14 @@ def _along(calibration: Calibration, track: Track, steps: Track, *, with_gyro: b
     )  # fmt: skip
 
 
-def forecast_errors(
-    calibration: Calibration, steps: Track, begin_s: Floats, end_s: Floats, *, with_gyro: bool
-) -> tuple[Spread, Floats, Floats]:
-    """Return moments, expected and 95 % error (w,) [m] of windows of a drive from and to times (w,)."""
+def forecast_errors(calibration: Calibration, windows: Windows, *, with_gyro: bool) -> tuple[Spread, Floats, Floats]:
+    """Return moments, expected and 95 % error (w,) [m] of windows of a drive."""
     fitted, sources = calibration.fitted, calibration.error_sources
     if with_gyro and calibration.gyro is not None and (turned := calibration.fitted_with_gyro) is not None:
         fitted, sources = turned, calibration.gyro.error_sources
     if sources is None:
         why = "its error growth was not measured"
         raise DataError(calibration.name or "calibration", why, "calibrate again, with a longer drive or more logs")
-    found = path_errors(steps, begin_s, end_s, fitted, calibration.width_m)
+    found = path_errors(windows, fitted, calibration.width_m)
     spread = found.of_sources.combined(np.array(astuple(sources)[:SOURCES])).plus(found.of_parameters)
     return spread, sources.expected_factor * mean_error(spread), sources.p95_factor * radius(spread, 0.95)

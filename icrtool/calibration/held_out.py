@@ -307,16 +307,17 @@ def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HORI
 
 def _left_out_windows(
     table: HeldOut, name: str, lengths_m: Sequence[float]
-) -> Iterator[tuple[int, Windows, Ints, tuple[Floats, Floats], Prediction, Track]]:
-    """Yield recording, rows (w,) of windows, their times, what is predicted without them, and the steps around them."""
+) -> Iterator[tuple[int, Windows, Prediction]]:
+    """Yield recording, windows of it with the steps around them, and what is predicted without them."""
     for i, windows in table.error_windows:
         these = np.flatnonzero(np.isin(windows.length_m, lengths_m))
         start_m, end_m = (windows.track.distance[rows[these]] for rows in (windows.begin, windows.end))
         for fold, some in left_out(table.folds, i, start_m, end_m):
             if (predicted := table.without(name, fold)) is not None:
                 rows = these[some]
-                begin, end = (windows.track.place_t[one[rows]] for one in (windows.begin, windows.end))
-                yield i, windows, rows, (begin, end), predicted, windows.track.around(begin.min(), end.max())
+                begin, end = windows.begin[rows], windows.end[rows]
+                steps = windows.track.around(*windows.track.place_t[[begin.min(), end.max()]].tolist())
+                yield i, Windows(steps, begin, end, windows.length_m[rows]), predicted
 
 
 def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
@@ -334,13 +335,12 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     """
     found: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
     tested = [np.empty((0, 3))]
-    for i, windows, some, (begin, end), (fitted, own), steps in _left_out_windows(table, name, LENGTHS_M):
-        errors = error_growth.path_errors(steps, begin, end, fitted, table.recordings[i].width_m, own)
-        reference = np.exp(-1j * own.heading_offset_rad) * windows.moved[some]
-        length_m = windows.length_m[some]
-        found.append((length_m, errors, errors.turned - windows.turned[some], errors.moved - reference))
-        stretch = np.floor(windows.track.distance[windows.begin[some]] / length_m)
-        tested.append(np.column_stack([np.full(len(some), i), length_m, stretch]))
+    for i, windows, (fitted, own) in _left_out_windows(table, name, LENGTHS_M):
+        errors = error_growth.path_errors(windows, fitted, table.recordings[i].width_m, own)
+        reference = np.exp(-1j * own.heading_offset_rad) * windows.moved
+        found.append((windows.length_m, errors, errors.turned - windows.turned, errors.moved - reference))
+        stretch = np.floor(windows.track.distance[windows.begin] / windows.length_m)
+        tested.append(np.column_stack([np.full(len(stretch), i), windows.length_m, stretch]))
     stretches = Counter(np.unique(np.concatenate(tested), axis=0)[:, 1].tolist())
     measured_to_m = max(one for one in LENGTHS_M if one <= ALWAYS_TO_M or stretches[one] >= FEWEST_STRETCHES)
     length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
@@ -402,11 +402,12 @@ def _shares(missed: Floats, first: Floats, second: Floats) -> tuple[float, float
 def _controller_window_errors(table: HeldOut, length_m: float) -> Floats:
     """Return (m, 6): error along, across [m] and in heading [rad], duration [s], turn [rad], length [m] of windows."""
     rows = [np.empty((0, 6))]
-    for i, windows, some, (begin, end), predicted, steps in _left_out_windows(table, CONTROLLER, [length_m]):
-        path = predicted_path(table.recordings[i], *predicted, steps)
+    for i, windows, predicted in _left_out_windows(table, CONTROLLER, [length_m]):
+        path = predicted_path(table.recordings[i], *predicted, windows.track)
+        begin, end = (windows.track.place_t[at] for at in (windows.begin, windows.end))
         (theta, turned), (place, moved) = (np.split(one, 2) for one in path(np.append(begin, end)))
-        error = np.exp(-1j * theta) * (moved - place) - windows.moved[some]
-        turn = windows.turned[some]
+        error = np.exp(-1j * theta) * (moved - place) - windows.moved
+        turn = windows.turned
         off = turned - theta - turn
-        rows.append(np.column_stack([error.real, error.imag, off, end - begin, turn, windows.length_m[some]]))
+        rows.append(np.column_stack([error.real, error.imag, off, end - begin, turn, windows.length_m]))
     return np.concatenate(rows)

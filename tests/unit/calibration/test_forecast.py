@@ -26,6 +26,7 @@ from icrtool.calibration.error_growth import (
 from icrtool.calibration.pooled import calibrate_recordings, predictor
 from icrtool.calibration.record import Calibration, parameter_documents
 from icrtool.errors import DataError, IcrToolError
+from icrtool.kernels.track import Windows
 from icrtool.motion.models import FAMILY, FittedModel, wheel_motion
 from icrtool.motion.recording import Recording, Trials, cut_trials, steps_of
 from icrtool.output.files.formats import read_numbers
@@ -69,9 +70,10 @@ def forecast_trials(
     calibration: Calibration, recording: Recording, trials: Trials, *, with_gyro: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Expected and 95 % error (k, h) [m] forecast for trials of a recording, NaN where there is none."""
-    some, t = trials.ends >= 0, recording.track.t
-    begin = np.broadcast_to(t[trials.starts][:, None], some.shape)[some]
-    _, *forecast = forecast_errors(calibration, steps_of(recording), begin, t[trials.ends[some]], with_gyro=with_gyro)
+    some = trials.ends >= 0
+    begin, end = np.broadcast_to(trials.starts[:, None], some.shape)[some], trials.ends[some]
+    windows = Windows(steps_of(recording), begin, end, recording.track.distance[end] - recording.track.distance[begin])
+    _, *forecast = forecast_errors(calibration, windows, with_gyro=with_gyro)
     found = np.full((2, *trials.ends.shape), np.nan)
     found[:, some] = forecast
     return found[0], found[1]
