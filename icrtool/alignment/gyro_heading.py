@@ -126,6 +126,11 @@ class HeadingEstimate:
     noises: dict[str, float]
 
     @property
+    def offset(self) -> tuple[float, float]:
+        """Offset of the first absolute heading, and its standard deviation [rad]."""
+        return math.remainder(float(self.constants[OFFSET]), 2.0 * math.pi), float(self.constants_std[OFFSET])
+
+    @property
     def median_std(self) -> float:
         """Median standard deviation of the smoothed heading [rad]: how good its sources are."""
         return float(np.median(self.smoothed_std))
@@ -174,8 +179,8 @@ def estimate_heading(
         noises = problem.choose(grids, noises)
     found = problem.solve(noises)
     if absolute and math.isfinite(absolute[0].aligned_std):
-        offset = math.remainder(float(found.constants[OFFSET]), 2.0 * math.pi)
-        if abs(offset) <= SIGNIFICANT_SIGMAS * float(found.constants_std[OFFSET]):
+        offset, std = found.offset
+        if abs(offset) <= SIGNIFICANT_SIGMAS * std:
             # not significant: that of a sensor mounted along the robot
             problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
             found = problem.solve(noises)

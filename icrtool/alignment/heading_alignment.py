@@ -188,7 +188,7 @@ def align_heading(
     """
     corrects, mirrored = config.filter.preset == "field", convention.heading < 0
     offset, std, scatter, applied, correlation_s = math.nan, math.nan, math.nan, 0.0, 0.0
-    attitude = None if derived is None else derived.attitude_offset
+    attitude = None if derived is None or derived.attitude is None else derived.estimate.offset
     name, notes = NO_NAME, list[str]()
     if corrects and config.frames.heading_offset_deg != "auto" and (derived is None or attitude is not None):
         applied = -math.radians(config.frames.heading_offset_deg)

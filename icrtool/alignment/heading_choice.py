@@ -10,7 +10,6 @@ import numpy as np
 from icrtool.alignment.estimator import ATTITUDE_STD_RAD
 from icrtool.alignment.gyro_heading import (
     LAG,
-    OFFSET,
     WANDERS,
     AbsoluteHeading,
     HeadingEstimate,
@@ -106,8 +105,7 @@ class DerivedHeading:
     source : what it was made of, as in `HeadingFacts`; topic : of its parts
     estimate : causal and smoothed; causal, smoothed : the same as samples, the causal ones for the filter
     gyro : the turn rate that was used, None where it is the wheels'
-    attitude : the attitude sensor's own heading, corrected, None where none was used; attitude_offset : what was
-        subtracted from it, and its standard deviation [rad]
+    attitude : the attitude sensor's own heading, corrected by the offset of the estimate; None where none was used
     why : its parts and standard deviation, for the user
     """
 
@@ -118,7 +116,6 @@ class DerivedHeading:
     smoothed: HeadingSamples
     gyro: GyroSamples | None
     attitude: HeadingSamples | None
-    attitude_offset: tuple[float, float] | None
     why: str
 
     def apply(self, log: RobotLog) -> RobotLog:
@@ -242,14 +239,12 @@ def _derived(
     source = "gyro_course" if gyro_topic else "wheels_course"
     if bearing is not None:
         source = "antenna_pair"
-    attitude, attitude_offset = None, None
+    attitude = None
     if stated is not None:
         source = "fused"
         parts[0] += f" (error {math.degrees(estimate.noises[WANDERS]):.1f}°)"
-        offset = math.remainder(float(estimate.constants[OFFSET]), 2.0 * math.pi)
-        attitude_offset = offset, float(estimate.constants_std[OFFSET])
         lag = round(float(estimate.constants[LAG]) * 1e9)
-        attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - attitude_offset[0], thin(stated.var_rad2))
+        attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - estimate.offset[0], thin(stated.var_rad2))
     stamps, turn_stamps = (epoch + np.round(t * 1e9).astype(np.int64) for t in (estimate.t, turn.t))
     causal, smoothed = wrapped(estimate.causal), wrapped(estimate.smoothed)
     # the causal one from where it is known
@@ -263,7 +258,6 @@ def _derived(
         HeadingSamples(stamps, smoothed, estimate.smoothed_std**2),
         GyroSamples(gyro_topic, turn_stamps, turn.rate) if gyro_topic else None,
         attitude,
-        attitude_offset,
         f"{', '.join(parts)}; σ {math.degrees(estimate.median_causal_std):.2f}°",
     )
 

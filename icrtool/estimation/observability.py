@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from msgspec.structs import asdict, replace
 
 from icrtool.kernels.arrays import Floats, Ints, rows_at_steps
 from icrtool.kernels.filter_records import REFERENCE_STEP_S
@@ -203,12 +203,13 @@ SPIN_RATIO = 3.0
 """A turn counts as a spin where the sides differ by this many times their mean."""
 
 
-def find_excitation(windows: StateWindows) -> ExcitationDocument:
+def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> ExcitationDocument:
     """Return which ICRs a drive could show.
 
     Parameters
     ----------
     windows : of the recorded states
+    unlearned : of `unlearned_icrs`, which are not shown, whatever the drive could
 
     Notes
     -----
@@ -234,16 +235,18 @@ def find_excitation(windows: StateWindows) -> ExcitationDocument:
         for name, value in stds.items()
     }
     sentences = _sentences(stds, verdicts, right, left, windows)
+    for name, why in unlearned.items():
+        if verdicts[name] != "not shown":
+            sentences.append(f"{ICR_WORDS[name]} is not shown: {why}")
+        verdicts[name] = "not shown"
     return ExcitationDocument(
         NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(right),
-        math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), sentences,
+        math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), tuple(sentences),
     )  # fmt: skip
 
 
-def withhold_unlearned(
-    found: ExcitationDocument, table: States, *, std_m: Floats, start_std_m: Floats, least_icr_m: float
-) -> ExcitationDocument:
-    """Return the excitation with each final ICR "not shown" that the filter did not learn from the drive.
+def unlearned_icrs(table: States, *, std_m: Floats, start_std_m: Floats, least_icr_m: float) -> dict[str, str]:
+    """Return the final ICRs that the filter did not learn from the drive, and why not.
 
     Parameters
     ----------
@@ -252,43 +255,36 @@ def withhold_unlearned(
     start_std_m : (3,) of the filter's start
     least_icr_m : the filter keeps both y ICRs at least this far from the centre line; -inf: anywhere
     """
-    final = dict(zip(ICR_COLUMNS, table.icrs_at(-1), strict=True))
-    filter_std = {name: float(getattr(table, f"std_{name}")[-1]) for name in ICR_COLUMNS}
+    final, found = dict(zip(ICR_COLUMNS, table.icrs_at(-1), strict=True)), dict[str, str]()
     width = max(final["y_icr_right_m"] - final["y_icr_left_m"], MIN_ICR_SEPARATION_M)
-    verdicts, sentences = asdict(found.verdict), list(found.sentences)
     for name, std, start in zip(ICR_COLUMNS, std_m, start_std_m, strict=True):
-        side = -1.0 if name == "y_icr_left_m" else 1.0
+        side, filter_std = -1.0 if name == "y_icr_left_m" else 1.0, float(getattr(table, f"std_{name}")[-1])
         if name != "x_icr_m" and side * final[name] <= AT_LIMIT * least_icr_m:
-            why = f"stopped at the limit of {side * least_icr_m:+.2f} m that the filter keeps"
-        elif filter_std[name] > UNLEARNED * start:
-            why = f"± {filter_std[name]:.2f} m, about as uncertain as at the start (± {start:.2f} m)"
+            found[name] = f"stopped at the limit of {side * least_icr_m:+.2f} m that the filter keeps"
+        elif filter_std > UNLEARNED * start:
+            found[name] = f"± {filter_std:.2f} m, about as uncertain as at the start (± {start:.2f} m)"
         elif std > WEAK_SHARE * width:
-            why = f"± {std:.2f} m, by how much stretches of the drive differ"
-        else:
-            continue
-        if verdicts[name] != "not shown":
-            sentences.append(f"{ICR_WORDS[name]} is not shown: {why}")
-        verdicts[name] = "not shown"
-    return replace(found, verdict=VerdictByIcr(**verdicts), sentences=tuple(sentences))
+            found[name] = f"± {std:.2f} m, by how much stretches of the drive differ"
+    return found
 
 
 def _sentences(
     stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, windows: StateWindows
-) -> tuple[str, ...]:
+) -> list[str]:
     """Return sentences: what is not shown, why, and what to drive."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
-        return ()
+        return []
     unshown = ", ".join(f"{ICR_WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
     first = f"this drive could not show the ICRs well: {unshown}"
     turned = np.abs(windows.turned[1:])
     steered = float(turned[turned > SURELY_TURNED_RAD].sum())
     if steered > TURNS_NEEDED_RAD and right + left < STEERS * steered:
         angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(right + left):.0f}°"
-        return (first, f"{angles}: it steers as a car does, and has no track ICRs, or one side is a copy of the other")
+        return [first, f"{angles}: it steers as a car does, and has no track ICRs, or one side is a copy of the other"]
     if lacks := lacking_turns(right, left):
-        return (first, lacks)
-    return (first, f"too few turns in {windows.distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}")
+        return [first, lacks]
+    return [first, f"too few turns in {windows.distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}"]
 
 
 def lacking_turns(right_rad: float, left_rad: float) -> str:

@@ -16,7 +16,7 @@ from icrtool.estimation.observability import (
     final_covariance,
     find_excitation,
     multiplier_std,
-    withhold_unlearned,
+    unlearned_icrs,
 )
 from icrtool.estimation.odometry import drive_summary, odometry_end_error
 from icrtool.estimation.run_filter import Filtered
@@ -228,17 +228,15 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     table, width = filtered.table, config.robot.track_width_m
     track = track_of_states(table, filtered.in_gap, filtered.outages_ns)
     windows, own = cut_states(table, track, width), filtered.covariance[3:, 3:]
-    excitation = find_excitation(windows)
     if config.filter.preset == "paper":
-        return own, excitation, 0.0
+        return own, find_excitation(windows, {}), 0.0
     covariance = final_covariance(
         windows,
         own,
         process_icr_mps=config.filter.process_icr_mps,
         track_width_m=width,
     )
-    excitation = withhold_unlearned(
-        excitation,
+    unlearned = unlearned_icrs(
         table,
         std_m=np.sqrt(np.diag(covariance)),
         start_std_m=filtered.start_std_m,
@@ -248,7 +246,8 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     turning *= np.diff(table.t_s, append=table.t_s[-1:])
     speed = float(turning @ (track.v_left + track.v_right)) / 2 / max(float(turning.sum()), 1e-12)
     x_clock_std_m = abs(speed) * clock_std_s
-    return covariance + np.diag([0.0, 0.0, x_clock_std_m**2]), excitation, x_clock_std_m
+    covariance_of_all = covariance + np.diag([0.0, 0.0, x_clock_std_m**2])
+    return covariance_of_all, find_excitation(windows, unlearned), x_clock_std_m
 
 
 def _seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, float]:

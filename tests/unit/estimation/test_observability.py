@@ -13,7 +13,7 @@ from support.exact_drives import CONFIG, simulate
 
 
 def excitation_of(run: Run) -> ExcitationDocument:
-    return find_excitation(cut_states(run.table, track_of(run), run.track_width_m))
+    return find_excitation(cut_states(run.table, track_of(run), run.track_width_m), {})
 
 
 @pytest.fixture(scope="module")
