@@ -232,19 +232,14 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     ----------
     quiet : (m,) knots that may be inside a window
     """
-    windows = cut_windows(knots.track, WINDOW_M)
+    # intervals that no window spans
+    left_out = ~(quiet[1:] & quiet[:-1]) | (np.diff(knots.holes) > 0)
+    windows = cut_windows(knots.track._replace(slipping=np.append(left_out, False)), WINDOW_M)
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
-    turns = np.searchsorted(knots.t, [windows.turn_begin, windows.turn_end]).clip(0, len(knots.t) - 1)
-    kept, turns_kept = (
-        (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])
-        for begin, end in ((windows.begin, windows.end), turns)
-    )
-    windows = replace(
-        windows,
-        begin=windows.begin[kept], end=windows.end[kept], length_m=windows.length_m[kept], group=windows.group[kept],
-        turn_begin=windows.turn_begin[turns_kept], turn_end=windows.turn_end[turns_kept],
-        turn_group=windows.turn_group[turns_kept],
-    )  # fmt: skip
+    begin, end = np.searchsorted(knots.t, [windows.turn_begin, windows.turn_end]).clip(0, len(knots.t) - 1)
+    kept = (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])
+    turn_begin, turn_end = windows.turn_begin[kept], windows.turn_end[kept]
+    windows = replace(windows, turn_begin=turn_begin, turn_end=turn_end, turn_group=windows.turn_group[kept])
     fit = estimate_alignment(windows, width_m)
     if fit is None:
         return None
