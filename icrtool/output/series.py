@@ -9,6 +9,9 @@ import numpy as np
 
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Ints
 
+BLUE, ORANGE, GREEN, RED, PURPLE = "#2166ac", "#e08214", "#1b7837", "#b2182b", "#762a83"
+"""Of pictures and of what is exported; a page has them once more for a dark screen (`page.css`)."""
+
 LINE_POINTS = 2400
 """Points of a drawn line: some three per pixel column of every figure."""
 

@@ -20,6 +20,8 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 MODEL_WORDS = {"recommended": "whole model", "controller": "controller numbers", "icr": "ICR", "no_slip": "no slip"}
 
+PATH_WORDS = {"filter": "filter", "smoothed": "smoother", "icr": "ICR odometry", "no_slip": "no-slip odometry"}
+
 WORDS = {
     "ICR": "Instantaneous centre of rotation of a track: the point of the ground, seen from the robot, about which it "
     "turns. A robot that slips turns about points further out than its tracks.",
@@ -39,6 +41,11 @@ WORDS = {
 
 MOST_LINES = 50
 """Jumps of the reference that are printed, the largest decided ones first."""
+
+
+def model_word(name: str, label: str) -> str:
+    """Return what a model is called where there is little space: by its word, else by its label."""
+    return MODEL_WORDS.get(name, label)
 
 
 def run_title(summary: RunDocument) -> str:
@@ -97,6 +104,15 @@ def xml_text(text: str) -> str:
 def signed(metres: float) -> str:
     """Return a number with its sign, to the millimetre, as print has it (a minus, not a hyphen)."""
     return f"{metres:+.3f}".replace("-", "−") if round(metres, 3) else "0.000"
+
+
+def plus_minus(value: float | None, std: float | None, digits: int = 3, sign: str = "+") -> str:
+    """Return a value with its standard deviation, as ``+0.716 ± 0.018``; alone without one, and ``–`` for no value."""
+    if value is None:
+        return "–"
+    # Adding zero takes the sign off a rounded -0.0.
+    text = f"{float(f'{value:.{digits}f}') + 0.0:{sign}.{digits}f}"
+    return text if std is None else f"{text} ± {std:.{digits}f}"
 
 
 def duration_text(seconds: float) -> str:

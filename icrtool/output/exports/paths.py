@@ -26,21 +26,14 @@ from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icr
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.track import FrozenIcrs
-from icrtool.output.series import places
-from icrtool.output.text_format import driven_text, duration_text, run_title, xml_text
+from icrtool.output.series import BLUE, ORANGE, places
+from icrtool.output.text_format import PATH_WORDS, driven_text, duration_text, run_title, xml_text
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import States
 from icrtool.records.text import distance_text
 
 PathName = Literal["filter", "smoothed", "icr", "no_slip"]
-
-LABELS: dict[PathName, str] = {
-    "filter": "filter",
-    "smoothed": "smoother",
-    "icr": "ICR odometry",
-    "no_slip": "no-slip odometry",
-}
 
 ERROR_HORIZON_M = 10.0
 """Open-loop errors are exported after this distance."""
@@ -259,7 +252,7 @@ def _path_features(run: Run, paths: Sequence[ExportPath], globe: Globe) -> Itera
         length_m = float(np.hypot(np.diff(path.x_m), np.diff(path.y_m)).sum())
         begin, end = utc_text(path.stamp_ns[[0, -1]])
         properties = {
-            "path": path.name, "label": LABELS[path.name], "log": run.name, "begin_utc": begin, "end_utc": end,
+            "path": path.name, "label": PATH_WORDS[path.name], "log": run.name, "begin_utc": begin, "end_utc": end,
             "length_m": length_m, "end_error_m": path.end_error_m, "usable": run.usable,
         }  # fmt: skip
         yield _line("path", path.x_m, path.y_m, globe, properties)
@@ -320,9 +313,8 @@ TRACK_INTERVAL_S = 1.0
 """The drive over time has a place each second."""
 
 COLORS: dict[PathName | str, str] = {
-    "filter": "ff000000", "smoothed": "ff606060", "icr": "ffb27200", "no_slip": "ff005ed5", "outage": "ff00ffff",
+    "filter": "#000000", "smoothed": "#606060", "icr": BLUE, "no_slip": ORANGE, "outage": "#ffff00",
 }  # fmt: skip
-"""Alpha, blue, green, red: the colours of the figures."""
 
 
 def format_kml(run: Run) -> str:
@@ -340,8 +332,11 @@ def format_kml(run: Run) -> str:
     about = about if run.usable else f"{about}. Not usable: {run.document.unusable_because}"
     styles = []
     for name, color in COLORS.items():
+        red, green, blue = color[1:3], color[3:5], color[5:7]
         width = _element("width", "6" if name == "outage" else "3")
-        styles.append(_element("Style", _element("LineStyle", _element("color", color), width), id=name))
+        styles.append(
+            _element("Style", _element("LineStyle", _element("color", f"ff{blue}{green}{red}"), width), id=name)
+        )
     folders = [
         _folder("paths", _path_features(run, paths, globe)),
         _element("Folder", _element("name", "drive over time"), _track(paths[0], globe)),

@@ -45,7 +45,7 @@ def forecast_figure(
             grown.plot(one.distance_m, one.p95_m, label=f"95 %{words}", **style.ICR | dash)
             grown.plot(one.distance_m, one.expected_m, label=f"expected{words}", **style.FILTER | dash)
     for budget in budgets_m:
-        grown.axhline(budget, label=f"budget {budget:g} m", **style.CHANGE)
+        grown.axhline(budget, label=f"budget {budget:g} m", **style.BUDGET)
     if forecast.distance_m[-1] > measured_m:
         grown.axvline(measured_m, label="measured up to here", **style.MEAN)
     grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, None), ylim=(0.0, None))

@@ -10,7 +10,7 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
-from icrtool.output.text_format import MODEL_WORDS, error_text, run_title
+from icrtool.output.text_format import error_text, model_word, run_title
 from icrtool.records.dropout import BudgetDistance
 from icrtool.records.dropout_document import ModelResult, column_of
 
@@ -111,7 +111,7 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
     errors = ", ".join(error_text(model.document.by_horizon[h].p95_m).removesuffix(" m") for h in places)
     distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
     title = f"95 % of the trials end within {errors} m after {distances} m"
-    subtitle = f"{run_title(report.run_document)}: open-loop error, {MODEL_WORDS.get(model.name, model.label)}"
+    subtitle = f"{run_title(report.run_document)}: open-loop error, {model_word(model.name, model.label)}"
     height_in, margins_in = 1.55 + LOW_PANEL_IN * len(places), (0.75, 0.25, 0.85, 0.9)
     figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.38)
     panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
@@ -149,7 +149,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
     end = min(LEAST_HISTOGRAM_IN_P95 * max(p95), MOST_HISTOGRAM_IN_P95 * p95[0])
     for axes, result in zip(panels, results, strict=True):
-        color, word = _pens(report)[result.name]["color"], MODEL_WORDS.get(result.name, result.label)
+        color, word = _pens(report)[result.name]["color"], model_word(result.name, result.label)
         _draw_bins(axes, result, h, color, end, word)
     panels[-1].set_xlabel("Error [m]")
     style.add_legend(figure, columnspacing=3.0)
@@ -182,7 +182,7 @@ def _draw_model(
 
     No slip is a thin line. Between horizons lines are as `budget_distances` has them, from no error at no distance.
     """
-    label = MODEL_WORDS.get(result.name, result.label)
+    label = model_word(result.name, result.label)
     x = np.linspace(first_m, horizons_m[-1], CURVE_POINTS)
     known = np.isfinite(result.column("p95_m"))
     at = np.append(0.0, horizons_m[known])

@@ -15,7 +15,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.figures.trajectory import CELLS, JUMP_LOOK, draw_path, fitted_box_in, look_down, name_directions
 from icrtool.output.series import places, round_steps
-from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text, run_title, turn_text
+from icrtool.output.text_format import duration_text, error_text, model_word, run_title, turn_text
 from icrtool.records.dropout_document import ExampleTrial, Outage, TrialDocument
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
 
 def _word(report: DropoutReport, model: str) -> str:
     result = report.result(model)
-    return MODEL_WORDS.get(model) or (result.label if result is not None else model)
+    return model_word(model, result.label if result is not None else model)
 
 
 def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, east_m: Floats) -> None:

@@ -10,6 +10,7 @@ from icrtool.kernels.arrays import Bools, Floats
 from icrtool.output.figures import style
 from icrtool.output.series import (
     LEAST_HALF_RANGE_M,
+    ORANGE,
     RANGE_PERCENT,
     breaks_after,
     extremes,
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-SEGMENT = style.line("#e08214", width=1.6)
+SEGMENT = style.line(ORANGE, width=1.6)
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
 """Where no slip puts an ICR, in half track widths."""
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
+from icrtool.output.series import BLUE, GREEN, ORANGE, RED
 from icrtool.output.tables.study import finding_text, runs_text
 from icrtool.simulation.studies import shown_path
 from icrtool.simulation.study_records import Level, StudyResult, chi2_band, consistency_of
@@ -55,13 +56,13 @@ FATE_COLORS = np.array([(0.57, 0.77, 0.93), (0.50, 0.0, 0.10), (0.90, 0.90, 0.90
 
 LOOKS: tuple[style.Look, ...] = (
     *({key: value for key, value in look.items() if key != "label"} for look in style.ICR_LOOKS.values()),
-    {"color": "#1b7837", "linestyle": "-", "marker": "D", "markersize": 3.5},
+    {"color": GREEN, "linestyle": "-", "marker": "D", "markersize": 3.5},
 )
 """Of lines that are no ICRs, in turn."""
 
 OPEN_LOOP = {"label": "open loop, final ICRs", **LOOKS[3]}
 OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP}
-PATH_COLORS = ("#2166ac", "#e08214", "#1b7837", "#b2182b")
+PATH_COLORS = (BLUE, ORANGE, GREEN, RED)
 WIDE: style.Look = {"linewidth": 1.5}
 TRUTH: style.Look = {"linewidth": 0.9, "linestyle": (0, (4, 2))}
 

@@ -19,6 +19,7 @@ from matplotlib.transforms import ScaledTranslation
 from PIL import Image
 
 from icrtool.kernels.arrays import Floats
+from icrtool.output.series import BLUE, GREEN, ORANGE, PURPLE, RED
 from icrtool.records.text import LONGEST_MESSAGE, escaped, shortened
 
 if TYPE_CHECKING:
@@ -91,20 +92,20 @@ def line(color: str, dash: str | tuple[float, tuple[float, ...]] = "-", width: f
 
 
 FIX_COLOR = "0.70"
-FLOAT_COLOR = "#762a83"
-BAD_FIX_COLOR = "#b2182b"
+FLOAT_COLOR = PURPLE
+BAD_FIX_COLOR = RED
 OUTAGE_COLOR = "0.90"
 BAR_COLOR = "#5b8db8"
 BAND_COLOR = "#a6c4e0"
 FILTER = line("black", width=1.1)
-ICR = line("#2166ac", (0, (6, 2)), 1.5)
-NO_SLIP = line("#e08214", (0, (6, 1.5, 1.2, 1.5)), 1.5)
+ICR = line(BLUE, (0, (6, 2)), 1.5)
+NO_SLIP = line(ORANGE, (0, (6, 1.5, 1.2, 1.5)), 1.5)
 HALF_WIDTH = line("0.35", (0, (1.5, 2.0)), 1.1)
-CHANGE = line("#b2182b", (0, (3, 1.5)), 1.1)
+CHANGE = line(RED, (0, (3, 1.5)), 1.1)
 MEAN = line("black", (0, (5, 2)), 1.1)
-BUDGET = line("#b2182b", (0, (1.5, 2.0)), 1.2)
+BUDGET = line(RED, (0, (1.5, 2.0)), 1.2)
 MODEL_PENS = {
-    "recommended": line("#1b7837", "-", 1.8), "controller": line("#762a83", (0, (6, 1.5)), 1.5), "icr": ICR,
+    "recommended": line(GREEN, "-", 1.8), "controller": line(PURPLE, (0, (6, 1.5)), 1.5), "icr": ICR,
     "no_slip": NO_SLIP,
 }  # fmt: skip
 OTHER_PENS = (
@@ -115,8 +116,8 @@ OTHER_PENS = (
 """Of calibrations, in the order of the report."""
 
 ICR_LOOKS: dict[str, Look] = {
-    "y_icr_right": {"label": "y right", "color": "#2166ac", "linestyle": "-", "marker": "o", "markersize": 3.5},
-    "y_icr_left": {"label": "y left", "color": "#b2182b", "linestyle": (0, (6, 2)), "marker": "s", "markersize": 3.5},
+    "y_icr_right": {"label": "y right", "color": BLUE, "linestyle": "-", "marker": "o", "markersize": 3.5},
+    "y_icr_left": {"label": "y left", "color": RED, "linestyle": (0, (6, 2)), "marker": "s", "markersize": 3.5},
     "x_icr": {"label": "x", "color": "0.25", "linestyle": (0, (1.5, 1.5)), "marker": "^", "markersize": 3.5},
 }
 """Of the three ICRs where they share a panel, by `icrtool.simulation.study_runs.ICR_NAMES`."""

@@ -11,7 +11,7 @@ from icrtool.estimation.odometry import OdometryPath, drive_wheels, odometry_icr
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.series import places
-from icrtool.output.text_format import driven_text, error_text, position_word, run_title
+from icrtool.output.text_format import PATH_WORDS, driven_text, error_text, position_word, run_title
 from icrtool.records.run import Run
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from icrtool.records.tables import States
@@ -51,8 +51,8 @@ SLIP_LOOK: style.Look = style.spot("none", 6.5, "D", style.FLOAT_COLOR) | {"mark
 REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
 """Markers by class: shape and luminance distinguish them."""
 
-ODOMETRIES = {"icr": (style.ICR, "ICR odometry", 3), "no_slip": (style.NO_SLIP, "no-slip odometry", 2)}
-"""Pen, label and order of the paths that wheel speeds alone lead along."""
+ODOMETRIES = {"icr": (style.ICR, 3), "no_slip": (style.NO_SLIP, 2)}
+"""Pen and order of the paths that wheel speeds alone lead along."""
 
 MOST_STATES = 500_000
 """A path of wheels alone is drawn through at most so many states: 1 h at 100 Hz has each, 10 h one in 0.1 s."""
@@ -84,9 +84,9 @@ def trajectory(run: Run) -> Figure:
     _draw_fixes(axes, run, cell, lowest, highest)
     draw_path(axes, table.north_m, table.east_m, cell, style.FILTER, label="filter", zorder=4)
     for name, path in paths.items():
-        (low, high), (pen, label, order) = _corners(path), ODOMETRIES[name]
+        (low, high), (pen, order) = _corners(path), ODOMETRIES[name]
         leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
-        label = f"{label}, ends {distance_text(path.end_error_m)} off{leaves}"
+        label = f"{PATH_WORDS[name]}, ends {distance_text(path.end_error_m)} off{leaves}"
         draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
         # copies: views would keep the whole path in memory with the picture
         ends_m = path.east_m[-1:].copy(), path.north_m[-1:].copy()

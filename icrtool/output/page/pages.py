@@ -37,6 +37,7 @@ from icrtool.output.text_format import (
     driven_text,
     duration_text,
     error_text,
+    plus_minus,
     position_word,
     run_title,
     signed,
@@ -270,7 +271,11 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
     for one in calibrations:
         numbers = [Cell(one.reason), Cell("")]
         if one.multiplier is not None:
-            within = "–" if one.within_m is None else f"{'more than ' if one.within_beyond else ''}{one.within_m:.1f} m"
+            within = (
+                "–"
+                if one.within_m is None
+                else f"{'more than ' if one.within_beyond else ''}{distance_text(one.within_m)}"
+            )
             numbers = [Cell(f"{one.multiplier:.3f}", f"± {one.multiplier_std:.3f}"), Cell(within)]
         icrs = ", ".join(map(signed, one.icrs_m))
         more = [one.group] if grouped else []
@@ -334,8 +339,7 @@ def _cell(value: float | None, text: Callable[[Any], str]) -> Cell:
 
 
 def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
-    spread = f" ± {std:.3f}" if std is not None else ""
-    return _cell(value, lambda number: f"{number:{sign}.3f}{spread}".replace("-", "−"))
+    return _cell(value, lambda number: plus_minus(number, std, sign=sign))
 
 
 COMPARISON_FAMILY = "icrtool/compare/"

@@ -21,7 +21,7 @@ from icrtool.output.files.formats import csv_bytes
 from icrtool.output.tables.dropout import REACH_ROWS, parameter_table, reach_row
 from icrtool.output.tables.run import numbers_of
 from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
-from icrtool.output.text_format import model_text
+from icrtool.output.text_format import model_text, plus_minus
 from icrtool.records import calibration_document as documents
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
@@ -86,15 +86,15 @@ MEANINGS = "shown: found well enough to set; weak: found roughly; not shown, not
 OPTIONS_WIDTH = 76
 """Characters of options in a line of a terminal of 80 columns, beside indent and backslash."""
 
-FORMS = {"_deg": ("+.2f", "°"), "_m": ("+.3f", "m"), "_s": ("+.3f", "s"), "scale": (".4f", "")}
-"""Of value and standard deviation, and their unit, by the end of the key."""
+FORMS = {"_deg": (2, "+", " °"), "_m": (3, "+", " m"), "_s": (3, "+", " s"), "scale": (4, "", "")}
+"""Decimals, sign and unit of a value, by the end of the key."""
 
 
 def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
     """Return the settings that one log proposes, and the estimates that they come from."""
     facts = calibration.drive
     right, left = facts.turned_right_deg, facts.turned_left_deg
-    speed = f"{facts.speed_mean_mps:.2f} ± {facts.speed_std_mps:.2f} m/s"
+    speed = f"{plus_minus(facts.speed_mean_mps, facts.speed_std_mps, 2, '')} m/s"
     stretches = f"{calibration.independent_stretches} independent stretches"
     head = [
         ("drive", f"{facts.distance_m:.0f} m at {speed}, turned {right:.0f}° right and {left:.0f}° left"),
@@ -102,11 +102,9 @@ def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
     ]
     rows = []
     for key, one in calibration.parameters.items():
-        form, unit = next(one for ending, one in FORMS.items() if key.endswith(ending))
-        value = "–"
-        if one.value is not None:
-            std = f" ± {one.std:{form.lstrip('+')}}" if one.verdict != "given" else ""
-            value = f"{one.value:{form}}{std} {unit}".rstrip()
+        digits, sign, unit = next(form for ending, form in FORMS.items() if key.endswith(ending))
+        value = plus_minus(one.value, one.std if one.verdict != "given" else None, digits, sign)
+        value += unit if one.value is not None else ""
         rows.append((LABELS[key], value, one.verdict + (f": {one.note}" if one.note else "")))
     table = Table("lrl", rows, ("parameter", "value ± std", "verdict"))
     estimates = Section(calibration.log, [Facts(head), table, MEANINGS, ""], VERBOSE)

@@ -29,7 +29,14 @@ from icrtool.output.text_blocks import (
     Title,
     format_blocks,
 )
-from icrtool.output.text_format import controller_error_text, duration_text, error_text, run_title, turn_text
+from icrtool.output.text_format import (
+    controller_error_text,
+    duration_text,
+    error_text,
+    plus_minus,
+    run_title,
+    turn_text,
+)
 from icrtool.records.dropout import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
 from icrtool.records.run_document import RunDocument
@@ -225,7 +232,7 @@ def outage_blocks(report: DropoutDocument) -> Iterator[Block]:
         if ours := [one for one in report.outages if one.kind == kind]:
             worst = max(ours, key=lambda one: one.end_error_m or 0.0)
             parts.append(
-                f"{len(ours)} {kind}, the worst {error_text(worst.end_error_m)} after {worst.distance_m:.1f} m"
+                f"{len(ours)} {kind}, the worst {error_text(worst.end_error_m)} after {distance_text(worst.distance_m)}"
             )
     if not parts:
         return
@@ -233,7 +240,7 @@ def outage_blocks(report: DropoutDocument) -> Iterator[Block]:
     rows = [
         (
             f"{number} {one.kind}", duration_text(one.begin_s), duration_text(one.end_s - one.begin_s),
-            f"{one.distance_m:.1f} m", error_text(one.end_error_m), error_text(one.max_error_m),
+            distance_text(one.distance_m), error_text(one.end_error_m), error_text(one.max_error_m),
             error_text(p95_at(report, "icr", one.distance_m)),
         )
         for number, one in enumerate(report.outages, start=1)
@@ -265,7 +272,7 @@ def model_sections(report: DropoutDocument) -> Iterator[Section]:
 def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:
     """Return the parameters of a model with one standard deviation each, and those of the same one with a gyro."""
     rows = [
-        (name if one is fitted else f"with gyro: {name}", f"{round(value, 4) + 0.0:+.4f} ± {std:.4f}",
+        (name if one is fitted else f"with gyro: {name}", plus_minus(value, std, 4),
          "not shown" if name in one.not_shown else "shown", TERMS[name].meaning)
         for one in (fitted, gyro) if one is not None
         for name, value, std in zip(one.model.terms, one.parameters, one.std, strict=True)

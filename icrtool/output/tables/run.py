@@ -31,6 +31,7 @@ from icrtool.output.text_format import (
     duration_text,
     error_text,
     jump_count,
+    plus_minus,
     position_word,
     role_word,
     run_title,
@@ -153,7 +154,7 @@ def numbers_of(numbers: ControllerNumbers, width_m: float, icrs: Sequence[tuple[
     radii = f"{numbers.left_radius:.3f}, {numbers.right_radius:.3f}"
     std = max(numbers.left_radius_std, numbers.right_radius_std)
     rows = [
-        ("wheel_separation_multiplier", f"{numbers.multiplier:.3f} ± {numbers.multiplier_std:.3f}"),
+        ("wheel_separation_multiplier", plus_minus(numbers.multiplier, numbers.multiplier_std, sign="")),
         ("left, right wheel radius", f"{radii} ± {std:.3f} of the configured"),
     ]
     without = f"(right - left) / {width_m:g} m is the multiplier; without slip: ±{width_m / 2:.3g} m"
@@ -258,8 +259,7 @@ def _heading_checks(summary: RunDocument) -> Iterator[Check]:
         why = "could not be compared with the course over ground: too little straight driving"
         yield Check("fact", "heading", why, tuple(more))
         return
-    # Adding zero takes the sign off a rounded -0.0.
-    value = f"{round(heading.offset_deg, 1) + 0.0:+.1f} ± {heading.offset_std_deg:.1f}°"
+    value = f"{plus_minus(heading.offset_deg, heading.offset_std_deg, 1)}°"
     cause = f" ({heading.offset_name})" if heading.offset_name else ""
     applied = heading.applied_offset_deg
     more.insert(0, f"corrected by {0.0 - applied:+.1f}°" if applied else "not corrected")
@@ -274,7 +274,9 @@ def _delay_checks(summary: RunDocument) -> Iterator[Check]:
     for word, facts in (("headings", summary.heading), ("fixes", summary.gnss)):
         delay, std = facts.delay_s, facts.delay_std_s
         if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, SIGNIFICANT_SIGMAS * std):
-            found.append(f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {abs(delay):.2f} ± {std:.2f} s")
+            found.append(
+                f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {plus_minus(abs(delay), std, 2, '')} s"
+            )
     multiplier = summary.icr.separation_multiplier
     slips = multiplier is None or multiplier > SLIPPING_MULTIPLIER
     cause = "slip of the wheels" if slips else f"the robot's response to its wheels, up to {RESPONSE_S:g} s,"
@@ -312,7 +314,7 @@ def to_drive(summary: RunDocument) -> str:
 
 def log_sections(summary: RunDocument) -> list[Block]:
     """Return what was read, and what the filter and the alignment made of it."""
-    speed = f"{summary.drive.speed_mean_mps:.2f} ± {summary.drive.speed_std_mps:.2f} m/s (mean ± std)"
+    speed = f"{plus_minus(summary.drive.speed_mean_mps, summary.drive.speed_std_mps, 2, '')} m/s (mean ± std)"
     streams, alignment = [], []
     for stream in summary.streams:
         message_type = stream.message_type.replace("/msg/", "/")
@@ -323,9 +325,8 @@ def log_sections(summary: RunDocument) -> list[Block]:
     tables: list[Block] = [f"The robot drove at {speed}.", Table("lllrrl", streams, head), *_icr_tables(summary)]
     why: list[Block] = [Facts([(role_word(summary, one.role), one.why) for one in summary.streams])]
     for name, one in summary.alignment.items():
-        std = f" ± {one.std:.4f}" if one.std is not None else ""
-        value = "–" if one.value is None else f"{one.value:.4f}{std}"
-        alignment.append((name, value, f"{one.applied:.4f}" if one.applied else "–", one.why))
+        value, applied = plus_minus(one.value, one.std, 4, ""), plus_minus(one.applied or None, None, 4, "")
+        alignment.append((name, value, applied, one.why))
     if alignment:
         caption = "Alignment of the streams: what was found and corrected"
         why.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
@@ -348,7 +349,7 @@ def _icr_tables(summary: RunDocument) -> Iterator[Table]:
         convergence = f"{time_s:.1f} s" if time_s is not None else "none"
         final = icr_text(icr.final[column], icr.final_std[column])
         verdict = NOT_SHOWN_WORDS.get(summary.excitation.verdict[column], "")
-        rows.append((ICR_WORDS[column], found, final, convergence, f"{mean:+.3f} ± {std:.3f}", verdict))
+        rows.append((ICR_WORDS[column], found, final, convergence, plus_minus(mean, std), verdict))
     yield Table("lrrrrl", rows, ("ICR [m]", "value ± σ", "EKF: final ± σ", "converged in", "mean ± std after that", ""))
     segments = []
     for number, segment in enumerate(summary.segments, start=1):

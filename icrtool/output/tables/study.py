@@ -6,11 +6,11 @@ import math
 from itertools import groupby
 
 from icrtool.output.text_blocks import Block, Table
+from icrtool.records.run import ICR_WORDS
 from icrtool.records.text import counted
 from icrtool.simulation.study_records import Level, StudyNumber, StudyRequest, StudyResult
-from icrtool.simulation.study_runs import ICR_NAMES
 
-ERRORS = {f"error_{icr}_m": name for icr, name in zip(ICR_NAMES, ("y right", "y left", "x"), strict=True)}
+ERRORS = {f"error_{column}": word for column, word in ICR_WORDS.items()}
 SETTLE = {"settle_s": "all within 10 % [s]"}
 INVERTED = {"inverted": "inverted"}
 
