@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import platform
 import re
 import secrets
 import sys
@@ -20,6 +21,7 @@ from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import NamedTuple
+from zlib import crc32
 
 from icrtool.errors import OutputError
 from icrtool.records.places import check_links, open_regular
@@ -254,15 +256,14 @@ def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) ->
 def beside(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
     """Make a file or directory under a hidden name beside a place, and remove what has that name at the end.
 
-    What killed processes left there is removed too, when it is `ABANDONED_S` old.
+    What killed processes left there is removed too.
     """
-    for left in list(place.parent.glob(_hidden_name(place, "*"))):
+    for left in list(place.parent.glob(_hidden_name(place, "*-*-*"))):
         # What was renamed aside is needed as long as nothing is in its place.
         with suppress(FileNotFoundError):
-            is_old = left.lstat().st_mtime < time.time() - ABANDONED_S
-            if is_old and (left.suffix == PARTIAL or place.exists()):
+            if _is_left(left) and (left.suffix == PARTIAL or place.exists()):
                 remove(left)
-    partial = place.with_name(_hidden_name(place, secrets.token_hex(4), PARTIAL))
+    partial = place.with_name(_hidden_name(place, _writer(), PARTIAL))
     with unfinished(partial):
         try:
             make(partial)
@@ -271,9 +272,21 @@ def beside(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
             remove(partial)
 
 
-def _hidden_name(place: Path, token: str, suffix: str = "") -> str:
+def _hidden_name(place: Path, writer: str, suffix: str = "") -> str:
     """Return a name beside a place, which is never too long."""
-    return f"{HIDDEN}{blake2b(os.fsencode(place.name), digest_size=8).hexdigest()}-{token}{suffix}"
+    return f"{HIDDEN}{blake2b(os.fsencode(place.name), digest_size=8).hexdigest()}-{writer}{suffix}"
+
+
+def _writer() -> str:
+    """Return host and process in letters of a hidden name, and some that are used once."""
+    return f"{crc32(platform.node().encode()):08x}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
+def _is_left(path: Path) -> bool:
+    """Return whether no process writes what has a hidden name: its own has ended, or it is `ABANDONED_S` old."""
+    host, process, _ = path.name.split("-")[-3:]
+    is_here = sys.platform == "linux" and _writer().startswith(f"{host}-")
+    return (is_here and not Path("/proc", process).exists()) or path.lstat().st_mtime < time.time() - ABANDONED_S
 
 
 def put(partial: Path, place: Path) -> None:
@@ -289,7 +302,7 @@ def put(partial: Path, place: Path) -> None:
     if not place.is_dir():
         partial.replace(place)
     elif not _exchange(partial, place):
-        old = place.with_name(_hidden_name(place, secrets.token_hex(4), ASIDE))
+        old = place.with_name(_hidden_name(place, _writer(), ASIDE))
         place.rename(old)
         try:
             partial.rename(place)

@@ -86,10 +86,10 @@ def test_a_link_stays_a_link_and_leftovers_of_the_dead_are_removed_an_hour_later
     (tmp_path / "a.txt").symlink_to("real/b.txt")
     with atomic_file(tmp_path / "a.txt") as partial:
         partial.write_text("new")
-        left = partial.with_name(partial.name.replace(partial.name[-16:], "12345678.partial"))
+        left = partial.with_name(partial.name.replace(partial.name[-16:], "12345678.partial"))  # of this process
         left.write_text("of a killed process")
     write_file(tmp_path / "a.txt", "newer")
-    assert left.exists(), "another process may write it"
+    assert left.exists(), "another thread may write it"
     os.utime(left, (0, 0))
     write_file(tmp_path / "a.txt", "new")
     assert (tmp_path / "a.txt").is_symlink()
