@@ -55,7 +55,7 @@ def table_of(message_type: str, columns: Mapping[str, Any], topic: str = "/topic
 def fields_of(role: Role, message_type: str) -> tuple[str, ...]:
     """Return the fields that a role reads of a message type."""
     row = MESSAGE_TYPES[role].get(message_type)
-    return tuple(filter(None, row.fields)) if row is not None else ()
+    return row.fields if row is not None else ()
 
 
 def read_source(role: Role, table: TopicTable, config: Config) -> Source:

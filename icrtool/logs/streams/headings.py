@@ -58,7 +58,7 @@ class Bearing:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The fields that are read; an empty one is none."""
+        """The fields that are read."""
         return fields_in((self.angle, self.std, self.variance), (*self.valid, *self.independent))
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
@@ -165,8 +165,8 @@ class Orientation:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The fields that are read; an empty one is none."""
-        return (*(f"{self.path}.{axis}" for axis in "xyzw"), self.variance, self.absent, self.rate)
+        """The fields that are read."""
+        return fields_in((*(f"{self.path}.{axis}" for axis in "xyzw"), self.variance, self.absent, self.rate))
 
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
         """Return the yaw of its orientations."""

@@ -90,10 +90,11 @@ _NOVATEL_TYPES = {32: FLOAT_FIX, 33: FLOAT_FIX, 34: FLOAT_FIX, 48: FIXED_FIX, 49
                  51: FIXED_FIX, 55: FLOAT_FIX, 56: FIXED_FIX}  # fmt: skip
 """Position types of NovAtel, numbered as in novatel_oem7_msgs; all others have neither fixed nor float ambiguities."""
 
-# -2 is the default of ROS 2's NavSatStatus; err_horz is a 95 % radius, 2.45 standard deviations.
+# Type 0 is an unknown covariance: drivers leave its numbers at 0, or write arbitrary ones. -2 is the default of ROS 2's
+# NavSatStatus; err_horz is a 95 % radius, 2.45 standard deviations.
 _NAVSATFIX = Fix(
     "GNSS fix", 100.0, covariance=("position_covariance[4]", "position_covariance[0]", "position_covariance[1]"),
-    valid=("status.status >= 0 unless -2",),
+    stated=("position_covariance_type != 0",), valid=("status.status >= 0 unless -2",),
     solution=Solution("status.status", {_GBAS: RTK_FIX}, OTHER_FIX, informative=True),
 )  # fmt: skip
 _GPSFIX = replace(

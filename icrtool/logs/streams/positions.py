@@ -78,7 +78,6 @@ LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
 """Of the earth; UTM coordinates far from the equator may be as large, but have a height near 0."""
 
 NO_SOLUTION = Solution("", {})
-COVARIANCE_TYPE = "position_covariance_type"
 
 HIGHEST_M = 20_000.0
 """A height beyond this means "unknown"; it is replaced by the median of the others."""
@@ -102,7 +101,8 @@ class Fix:
     what, worth : what it is called where it is chosen, and how suitable it is as reference
     place : latitude and longitude [deg], height above the ellipsoid [m]; where `metric` x, y, z [m]
     std : standard deviation [m] to the north and to the east; one for both. These are as `number` reads them
-    covariance : the fields of the variances to the north and to the east and of their covariance, which have precedence
+    covariance : the variances to the north and to the east and their covariance, which have precedence
+    stated : checks that all must pass where a covariance is stated
     valid : checks that all must pass for a fix
     solution : how it was solved
     metric : x is taken as east and y as north, in the topic's own frame
@@ -115,6 +115,7 @@ class Fix:
     place: tuple[str, str, str] = ("latitude", "longitude", "altitude")
     std: tuple[str, ...] = ()
     covariance: tuple[str, ...] = ()
+    stated: tuple[str, ...] = ()
     valid: tuple[str, ...] = ()
     solution: Solution = NO_SOLUTION
     metric: bool = False
@@ -123,10 +124,9 @@ class Fix:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The fields that are read; an empty one is none."""
-        numbers = fields_in((*self.place, *self.std), (*self.valid, *self.independent))
-        covariance = (*self.covariance, COVARIANCE_TYPE) if self.covariance and not self.metric else self.covariance
-        return (*numbers, *covariance, self.solution.name)
+        """The fields that are read."""
+        numbers = (*self.place, *self.std, *self.covariance, self.solution.name)
+        return fields_in(numbers, (*self.valid, *self.stated, *self.independent))
 
     def read(self, table: TopicTable, _: Config) -> PositionSource:
         """Return its positions; usable: finite, with a fix, and if geodetic on earth, not at 0, 0, near the others.
@@ -183,9 +183,8 @@ class Fix:
             with np.errstate(over="ignore"):
                 variance[stated] = np.column_stack([north**2, east**2, np.zeros(len(table))])[stated]
         if self.covariance:
-            found = np.column_stack([table.floats(path) for path in self.covariance])
-            # COVARIANCE_TYPE_UNKNOWN: drivers leave the numbers at 0, or write arbitrary ones.
-            stated = (found[:, 0] > 0) & (found[:, 1] > 0) & (table.floats(COVARIANCE_TYPE) != 0)
+            found = np.column_stack([number(table, one) for one in self.covariance])
+            stated = (found[:, 0] > 0) & (found[:, 1] > 0) & all_valid(table, self.stated)
             variance[stated] = found[stated]
         return variance
 

@@ -98,7 +98,7 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
         if channel.message_type == GYRO_TYPE:
             paths += GYRO_AXES
         if paths:
-            wanted[channel.id] = tuple(dict.fromkeys([*HEADER, *filter(None, paths)]))
+            wanted[channel.id] = tuple(dict.fromkeys([*HEADER, *paths]))
         if is_static(channel):
             static[channel.id] = TRANSFORM_FIELDS
         elif channel.message_type in TRANSFORM_TYPES and (

@@ -351,7 +351,7 @@ def all_valid(table: TopicTable, checks: Sequence[str]) -> Bools:
     for names, mask, relation, wanted, unset in map(check_of, checks):
         if (path := names[0]) in table.texts:
             codes, texts = table.words(path)
-            valid &= np.array([*(text in wanted for text in texts), False])[codes]
+            valid &= np.array([*((text in wanted) != (relation == "!=") for text in texts), False])[codes]
             continue
         values = table.find(*names) if mask is None else table.integers(*names)
         if values is None or np.all(values == unset):

@@ -56,6 +56,11 @@ def imu(yaw: Any, frame: str = "imu_link", **more: Any) -> dict[str, Any]:
 # Positions
 
 
+def test_a_covariance_whose_type_is_a_word_is_stated() -> None:
+    source = position("sensor_msgs/NavSatFix", **fix(position_covariance_type=["KNOWN"] * 3))
+    assert np.isfinite(source.variance).all()
+
+
 @pytest.mark.parametrize("name", ["sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix"])
 def test_an_enu_covariance_is_turned_to_north_and_east(name: str) -> None:
     source = position(name, **fix())
