@@ -99,7 +99,7 @@ class Packed(NamedTuple):
     Attributes
     ----------
     compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
-    size : decompressed size stated in the log [bytes]
+    size : of it decompressed, as the log states; of what is not compressed, its own [bytes]
     partial : the data is cut off, or `size` is only a part of it: what can be decompressed is wanted
     checksum : CRC-32 of the decompressed bytes, 0 where that is not checked
     """
@@ -109,11 +109,6 @@ class Packed(NamedTuple):
     size: int
     partial: bool = False
     checksum: int = 0
-
-    @property
-    def claimed(self) -> int:
-        """The bytes that it takes when decompressed, as stated."""
-        return len(self.data) if self.compression in STORED else self.size
 
 
 def decompress(packed: Packed, space: Bytes) -> Bytes:
@@ -150,7 +145,7 @@ def decompress(packed: Packed, space: Bytes) -> Bytes:
                 raise DecompressionError(f"compression {compression!r} is not known")
     except (OSError, RuntimeError, EOFError, ValueError, MemoryError, zstandard.ZstdError) as err:
         raise DecompressionError(str(err) or "not enough memory") from err
-    if len(out) != packed.claimed and not partial:
+    if len(out) != size and not partial:
         raise DecompressionError(f"{len(out)} bytes instead of {size}")
     if checksum and zlib.crc32(out.data) != checksum:
         raise DecompressionError("its checksum is wrong")
@@ -195,27 +190,6 @@ class Inflation:
                 f"it inflates from {packed} to {unpacked} bytes; {LARGEST_RATIO} times are allowed"
             )
         self.left = left
-
-
-def unpack_message(data: bytes, compression: str, inflation: Inflation) -> bytes:
-    """Decompress one message, by the name of its compression.
-
-    Raises
-    ------
-    DecompressionError
-    """
-    if compression != "zstd":
-        raise DecompressionError(f"compression {compression!r} is not known")
-    try:
-        size = zstandard.frame_content_size(data)
-        if size >= 0:
-            inflation.count(len(data), size)
-        out = zstandard.ZstdDecompressor().decompress(data, max_output_size=PIECE_BYTES)
-        if size < 0:
-            inflation.count(len(data), len(out))
-    except (zstandard.ZstdError, MemoryError) as err:
-        raise DecompressionError(str(err)) from err
-    return out
 
 
 class Records(NamedTuple):

@@ -283,8 +283,8 @@ class ChunkedFile(Container):
             return len(part.records)
         if part.ranges is None:
             packed = self._packed(part, spaces.packed)
-            inflation.count(len(packed.data), packed.claimed)
-            if packed.claimed >= len(target):
+            inflation.count(len(packed.data), packed.size)
+            if packed.size >= len(target):
                 raise DecompressionError("larger than the index states")
             data = decompress(packed, target)
             if not np.may_share_memory(data, target):
@@ -293,13 +293,14 @@ class ChunkedFile(Container):
         first, needed = int(part.ranges[0, 0]), int(part.ranges[1, -1])
         if chunk.is_stored:
             begin = chunk.at + chunk.length - chunk.size + first
-            packed = Packed(self._content(begin, needed - first, spaces.packed, part.held), "", needed - first)
+            content = self._content(begin, needed - first, spaces.packed, part.held)
+            packed = Packed(content, "", len(content))
         else:
             # A whole frame is decompressed in one step.
             first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
             packed = self._packed(part, spaces.packed, needed=needed)
-        inflation.count(len(packed.data), packed.claimed)
-        data = decompress(packed, spaces.records.of(packed.claimed + 1))
+        inflation.count(len(packed.data), packed.size)
+        data = decompress(packed, spaces.records.of(packed.size + 1))
         if len(data) < needed - first:
             raise DecompressionError("smaller than the index states")
         for begin, end in (part.ranges - first).T.tolist():
@@ -353,8 +354,8 @@ class ChunkedFile(Container):
         self._at = min(chunk.at, self._size)
         try:
             packed = self._packed(part, spaces.packed)
-            self._inflation.count(len(packed.data), packed.claimed)
-            data = decompress(packed, spaces.records.of(packed.claimed + 1))
+            self._inflation.count(len(packed.data), packed.size)
+            data = decompress(packed, spaces.records.of(packed.size + 1))
         except (DecompressionError, MemoryError) as err:
             if not chunk.is_cut:
                 self.report(f"chunk at byte {place} left out: {err}")

@@ -12,9 +12,10 @@ from threading import Event
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
+import zstandard
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
-from icrtool.logs.containers.chunk import PIECE_BYTES, DecompressionError, Inflation, unpack_message
+from icrtool.logs.containers.chunk import PIECE_BYTES, DecompressionError, Inflation
 from icrtool.logs.containers.recording_files import inputs_of
 from icrtool.records.samples import InputFile
 from icrtool.records.text import LogText, escaped, shortened
@@ -180,9 +181,16 @@ def unpack_messages(
         for row in rows.tolist():
             packed = block.data[block.start[row] : block.end[row]].tobytes()
             try:
-                message = unpack_message(packed, compression, inflation)
-            except DecompressionError as err:
-                left_out, reason = left_out + 1, reason or str(err.args[0])
+                if compression != "zstd":
+                    raise DecompressionError(f"compression {compression!r} is not known")
+                size = zstandard.frame_content_size(packed)
+                if size >= 0:
+                    inflation.count(len(packed), size)
+                message = zstandard.ZstdDecompressor().decompress(packed, max_output_size=PIECE_BYTES)
+                if size < 0:
+                    inflation.count(len(packed), len(message))
+            except (DecompressionError, zstandard.ZstdError, MemoryError) as err:
+                left_out, reason = left_out + 1, reason or str(err)
             else:
                 kept.append(row)
                 messages.append(message)

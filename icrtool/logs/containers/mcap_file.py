@@ -15,6 +15,7 @@ from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.chunk import (
     LARGEST_CHUNK_BYTES,
+    STORED,
     Chunk,
     DecompressionError,
     Packed,
@@ -277,13 +278,14 @@ class McapFile(ChunkedFile):
             raise DecompressionError("its header is damaged")
         packed = int.from_bytes(content[name_end : name_end + 8], "little")
         data = content[name_end + 8 : name_end + 8 + packed]
+        if compression in STORED:
+            size = len(data)
         if part.chunk.is_cut or needed:
             return Packed(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
-        chunk = Packed(data, compression, size, checksum=checksum)
         # a header of zeros is that of an empty chunk
-        if len(data) < packed or (not checksum and chunk.claimed < part.chunk.size):
+        if len(data) < packed or (not checksum and size < part.chunk.size):
             raise DecompressionError("its header is damaged")
-        return chunk
+        return Packed(data, compression, size, checksum=checksum)
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         code, _, start, end = record

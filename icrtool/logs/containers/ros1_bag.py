@@ -261,7 +261,8 @@ class Ros1Bag(ChunkedFile):
                 break
             is_cut = record.length > self._size - record.at
             if record.op == _CHUNK:
-                yield from self._read_chunk(Part(_chunk_of(record)._replace(is_cut=is_cut)), next(spaces))
+                chunk = _chunk_of(record)._replace(is_cut=is_cut)
+                yield from self._read_chunk(Part(chunk), next(spaces))
             if is_cut:
                 break
             if self._learns and record.op == _CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:
@@ -276,7 +277,8 @@ class Ros1Bag(ChunkedFile):
         if chunk.size < 0:
             raise DecompressionError("no chunk")
         content = self._content(chunk.at, chunk.length, space, part.held)
-        return Packed(content, chunk.compression, chunk.size, partial=chunk.is_cut)
+        size = len(content) if chunk.compression in STORED else chunk.size
+        return Packed(content, chunk.compression, size, partial=chunk.is_cut)
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         _, at, start, end = record

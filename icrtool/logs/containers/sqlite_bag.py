@@ -188,7 +188,14 @@ class SqliteBag(Container):
         tables = self._tables
         if not {"topics", "messages"} <= tables:
             raise sqlite3.DatabaseError(f"its tables are {', '.join(sorted(map(str, tables))) or 'none'}")
-        definitions = self._read_definitions() if "message_definitions" in tables else {}
+        definitions: dict[str, tuple[str, str]] = {}
+        if "message_definitions" in tables:
+            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            try:
+                stored = self._query(query).fetchmany(_MOST_TOPICS)
+                definitions = {name: (encoding, str(text)) for name, encoding, text in stored}
+            except _DAMAGE as err:
+                self.report(f"its message definitions cannot be read ({err})")
         channels = []
         # A log may declare any number of topics; types and encodings are few.
         type_named, text = cache(ros_type_name), cache(LogText)
@@ -207,15 +214,6 @@ class SqliteBag(Container):
                 )
             )
         return channels
-
-    def _read_definitions(self) -> dict[str, tuple[str, str]]:
-        """Return encoding and text of the message definitions by type."""
-        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        try:
-            return {name: (encoding, str(text)) for name, encoding, text in self._query(query).fetchmany(_MOST_TOPICS)}
-        except _DAMAGE as err:
-            self.report(f"its message definitions cannot be read ({err})")
-            return {}
 
     def _in_order(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
         """Yield the messages in the order they were stored, up to the first row that SQLite cannot read.

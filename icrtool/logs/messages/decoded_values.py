@@ -32,7 +32,6 @@ from icrtool.logs.messages.definitions import (
     SEQUENCE,
     SIZES,
     Definitions,
-    Slot,
     Step,
     full_name,
     kind_at,
@@ -55,16 +54,17 @@ class DecodedValues:
 
     Attributes
     ----------
+    kinds : primitive type by column
     values : by column one of each readable message (n,): a number, a text, or a list of either
     """
 
-    slots: Mapping[str, Slot]
+    kinds: Mapping[str, str]
     values: Mapping[str, Sequence[Any]]
     readable: Bools
 
     def numbers(self, path: str) -> NDArray[Any]:
         """Return a field of numbers; what a message lacks is NaN or 0."""
-        lacking, result = (np.nan, np.float64) if self.slots[path].kind in _FLOATS else (0, np.int64)
+        lacking, result = (np.nan, np.float64) if self.kinds[path] in _FLOATS else (0, np.int64)
         if "[*]" in path:
             return _padded(self.values[path], lacking, result)
         return np.array(self.values[path], result)
@@ -82,18 +82,19 @@ class ValueDecoder:
 
     Attributes
     ----------
+    kinds : primitive type by column
     paths : by column, the field that it is made of
     parse : returns a message's nested values (mappings by field name, sequences, numbers, texts), None where it is not
         readable
     """
 
-    slots: Mapping[str, Slot]
+    kinds: Mapping[str, str]
     paths: Mapping[str, str]
     parse: Callable[[bytes], object] = field(repr=False)
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> DecodedValues:
         """Decode messages [start, end) (n,) of `data`."""
-        takers = {column: _taker(path, self.slots[column].kind) for column, path in self.paths.items()}
+        takers = {column: _taker(path, self.kinds[column]) for column, path in self.paths.items()}
         values: dict[str, list[Any]] = {column: [] for column in self.paths}
         readable = np.zeros(len(start), np.bool_)
         for place, (begin, stop) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
@@ -102,7 +103,7 @@ class ValueDecoder:
                 readable[place] = True
                 for column, take in takers.items():
                     values[column].append(take(message))
-        return DecodedValues(self.slots, values, readable)
+        return DecodedValues(self.kinds, values, readable)
 
 
 def _taker(path: str, kind: str) -> Callable[[object], Any]:
@@ -185,12 +186,7 @@ QUALITY_OF_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 
 NMEA_FIELDS = ("latitude", "longitude", "altitude", "heading", "north_std", "east_std")
 """What the sentences hold, NaN where one does not: degrees, m above the ellipsoid, degrees clockwise from north, m."""
 
-_SLOTS = {
-    path: Slot(kind, place)
-    for place, (path, kind) in enumerate(
-        {"sentence_kind": "int32", "quality": "int32", **dict.fromkeys(NMEA_FIELDS, "float64")}.items()
-    )
-}
+_KINDS_OF_NMEA = {"sentence_kind": "int32", "quality": "int32", **dict.fromkeys(NMEA_FIELDS, "float64")}
 _SENTENCE = re.compile(rb"\s*[$!]([ -)+-~]{5,})\*([0-9A-Fa-f]{2})\s*")
 _NUMBER = re.compile(r"-?\d{1,12}(?:\.\d{0,12})?")
 
@@ -205,10 +201,10 @@ class SentenceDecoder:
     """
 
     inner: Decoder
-    slots: dict[str, Slot] = field(init=False)
+    kinds: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.slots = {path: slot for path, slot in self.inner.slots.items() if path != "sentence"} | _SLOTS
+        self.kinds = {path: kind for path, kind in self.inner.kinds.items() if path != "sentence"} | _KINDS_OF_NMEA
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> DecodedValues:
         """Decode the first of messages [start, end) (n,) of `data`; one with a wrong checksum is unreadable."""
@@ -217,16 +213,16 @@ class SentenceDecoder:
         is_one = np.array([one is not None for one in sentences], np.bool_)
         read = [one for one in sentences if one is not None]
         values: dict[str, Sequence[Any]] = {
-            path: [one.get(path, 0 if slot.kind == "int32" else math.nan) for one in read]
-            for path, slot in _SLOTS.items()
+            path: [one.get(path, 0 if kind == "int32" else math.nan) for one in read]
+            for path, kind in _KINDS_OF_NMEA.items()
         }
-        for path, slot in self.inner.slots.items():
+        for path, kind in self.inner.kinds.items():
             if path != "sentence":
-                column = np.array(decoded.texts(path), object) if slot.kind == "string" else decoded.numbers(path)
+                column = np.array(decoded.texts(path), object) if kind == "string" else decoded.numbers(path)
                 values[path] = column[is_one].tolist()
         readable = decoded.readable.copy()
         readable[readable] = is_one
-        return DecodedValues(self.slots, values, readable)
+        return DecodedValues(self.kinds, values, readable)
 
 
 def parse_sentence(text: bytes) -> dict[str, Any] | None:
@@ -294,7 +290,7 @@ def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
     """Return the decoder of Protobuf or JSON; a JSON schema without fields leaves it to the messages what they hold."""
     definitions = _definitions_of(channel)
     paths: dict[str, str] = {}
-    slots: dict[str, Slot] = {}
+    kinds: dict[str, str] = {}
     for column in wanted:
         others = _OTHER_NAMES.get(column, ())
         for path in (column, *others) if definitions else others[:1] or (column,):
@@ -303,13 +299,13 @@ def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
             else:
                 kind = _FOXGLOVE_KINDS.get(path.rpartition(".")[2], "float64")
             if kind is not None:
-                paths[column], slots[column] = path, Slot(kind, len(slots))
+                paths[column], kinds[column] = path, kind
                 break
     if channel.encoding == "json":
-        return ValueDecoder(slots, paths, parse_json)
+        return ValueDecoder(kinds, paths, parse_json)
     descriptors = descriptors_of(channel.definition, channel.message_type)
     fields = wanted_fields(descriptors, channel.message_type, [steps_of(path) for path in paths.values()])
-    return ValueDecoder(slots, paths, ProtobufParser(fields).parse)
+    return ValueDecoder(kinds, paths, ProtobufParser(fields).parse)
 
 
 @lru_cache(maxsize=64)

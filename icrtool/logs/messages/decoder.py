@@ -27,7 +27,6 @@ from icrtool.logs.messages.definitions import (
     TEXT,
     Layout,
     Operation,
-    Slot,
     compile_layout,
     ros_definitions,
 )
@@ -178,12 +177,12 @@ class Decoder:
 
     Attributes
     ----------
-    slots : the wanted fields that the messages have, by path
+    kinds : primitive type by column that the messages have
     columns : what holds the messages
     """
 
     layout: Layout
-    slots: Mapping[str, Slot] = field(default_factory=dict)
+    kinds: Mapping[str, str] = field(default_factory=dict)
     columns: type[Decoded] = field(default_factory=lambda: Decoded)
     _known: list[Shape] = field(default_factory=list)
 
@@ -356,4 +355,4 @@ def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:
     """
     encoding: Literal["cdr", "ros1"] = "cdr" if channel.encoding == "cdr" else "ros1"
     layout = compile_layout(ros_definitions(channel), channel.message_type, wanted, encoding)
-    return Decoder(layout, layout.slots)
+    return Decoder(layout, {path: kind for path, (kind, _) in layout.slots.items()})

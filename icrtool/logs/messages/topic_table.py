@@ -16,7 +16,6 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Block, Channel
 from icrtool.logs.messages.decoded_values import NMEA_SENTENCE, SentenceDecoder, ValueDecoder, value_decoder
 from icrtool.logs.messages.decoder import Decoded, Decoder, ros_decoder
-from icrtool.logs.messages.definitions import Slot
 from icrtool.records.text import LogText
 
 _MOST_EXPECTED = 1 << 22
@@ -234,9 +233,9 @@ class TopicCollector:
                 continue
             self._times.add(block.log_time_ns[readable], expected)
             self._numbers.add(np.full(len(readable), number), expected)
-            for path, slot in decoder.slots.items():
+            for path, kind in decoder.kinds.items():
                 values: NDArray[Any]
-                if is_text := slot.kind == "string":
+                if is_text := kind == "string":
                     values = decoded.text_numbers(path, self._texts.setdefault(path, {}))
                 else:
                     values = decoded.numbers(path)
@@ -348,9 +347,9 @@ def _interface_decoder(channel: Channel) -> Decoder:
         raise DefinitionError(channel.topic, f"its lists within lists are not read in {str(channel.encoding)!r}")
     in_a_row = (f"{of}[{each}]" for of in (_INTERFACES, _VALUES) for each in "*#")
     decoder = ros_decoder(channel, (*HEADER, _NAMES, *in_a_row))
-    kinds = {path: slot.kind for path, slot in decoder.slots.items()}
+    kinds = decoder.kinds
     if f"{_VALUES}[*]" not in kinds or any(kinds.get(path) != "string" for path in (_NAMES, f"{_INTERFACES}[*]")):
         raise DefinitionError(channel.message_type, "its definition in the log lacks names or values of the joints")
-    slots = {path: slot for path, slot in decoder.slots.items() if path in HEADER}
-    slots |= {"name[*]": Slot("string", 0), "position[*]": Slot("float64", 1), "velocity[*]": Slot("float64", 2)}
-    return Decoder(decoder.layout, slots, JointColumns)
+    of_header = {path: kind for path, kind in kinds.items() if path in HEADER}
+    of_joints = {"name[*]": "string", "position[*]": "float64", "velocity[*]": "float64"}
+    return Decoder(decoder.layout, of_header | of_joints, JointColumns)
