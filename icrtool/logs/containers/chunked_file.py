@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import NamedTuple
@@ -79,7 +79,7 @@ class Spaces(NamedTuple):
 
 
 def reused_spaces() -> Iterator[Spaces]:
-    """Yield memory for blocks, again when as many further ones have been made as are made ahead."""
+    """Yield memory for blocks, again when as many further ones have been made as are made ahead: one for each block."""
     return cycle([Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1)])
 
 
@@ -344,13 +344,13 @@ class ChunkedFile(Container):
         content = space.of(length)
         return content[: self._source.read_into(at, content)]
 
-    def _read_chunk(self, part: Part, spaces: Spaces) -> Iterator[Block]:
-        """Yield the messages of a chunk."""
+    def _read_chunk(self, part: Part, spaces: Spaces) -> Generator[Block, None, bool]:
+        """Yield the messages of a chunk, and return whether there are blocks, which then hold the memory."""
         chunk = part.chunk
         place = chunk.at - self._chunk_head
         if chunk.size < 0:
             self.report(f"no chunk at byte {place}, where the index lists one")
-            return
+            return False
         self._at = min(chunk.at, self._size)
         try:
             packed = self._packed(part, spaces.packed)
@@ -359,7 +359,7 @@ class ChunkedFile(Container):
         except (DecompressionError, MemoryError) as err:
             if not chunk.is_cut:
                 self.report(f"chunk at byte {place} left out: {err}")
-            return
+            return False
         stop, begin = 0, -1
         while begin < stop < len(data):
             begin = stop
@@ -367,6 +367,7 @@ class ChunkedFile(Container):
             yield block
         if stop < len(data) and not chunk.is_cut:
             self.report(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+        return begin >= 0
 
     def _scanned(self, data: Bytes, begin: int = 0) -> tuple[Block, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""

@@ -236,6 +236,7 @@ class McapFile(ChunkedFile):
     def _read_in_order(self) -> Iterator[Block]:
         """Yield the messages record by record, up to the first place that holds none."""
         at, spaces = len(MAGIC), reused_spaces()
+        memory = next(spaces)
         while True:
             opcode, length = self._head(at)
             left = self._size - at - _HEAD_BYTES
@@ -243,7 +244,8 @@ class McapFile(ChunkedFile):
                 return
             if opcode == _CHUNK:
                 chunk = Chunk(at + _HEAD_BYTES, min(length, left), is_cut=length > left)
-                yield from self._read_chunk(Part(chunk), next(spaces))
+                if (yield from self._read_chunk(Part(chunk), memory)):
+                    memory = next(spaces)
             elif opcode in (_SCHEMA, _CHANNEL, _MESSAGE) and length <= left:
                 block, length = self._read_loose(at, length)
                 if block is not None:

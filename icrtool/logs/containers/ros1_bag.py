@@ -255,6 +255,7 @@ class Ros1Bag(ChunkedFile):
 
     def _read_in_order(self) -> Iterator[Block]:
         at, spaces = len(MAGIC), reused_spaces()
+        memory = next(spaces)
         while at < self._size:
             record = self._record(at)
             if record is None or not 0 < record.op <= _CONNECTION:
@@ -262,7 +263,8 @@ class Ros1Bag(ChunkedFile):
             is_cut = record.length > self._size - record.at
             if record.op == _CHUNK:
                 chunk = _chunk_of(record)._replace(is_cut=is_cut)
-                yield from self._read_chunk(Part(chunk), next(spaces))
+                if (yield from self._read_chunk(Part(chunk), memory)):
+                    memory = next(spaces)
             if is_cut:
                 break
             if self._learns and record.op == _CONNECTION and record.length <= _LARGEST_CONTENT_BYTES:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sqlite3
 import struct
+import time
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -199,6 +200,31 @@ def test_mcap_chunk_whose_place_was_overwritten_is_said_and_the_index_finds_the_
     assert [message for message in messages if message in found] == found
     (problem,) = problems
     assert problem.startswith(f"log.mcap: chunk at byte {third} left out: ")
+
+
+def test_a_block_stays_as_it_is_while_chunk_after_chunk_behind_it_is_left_out(tmp_path):
+    """Chunks are read while a block is used: those that give none must not take its memory."""
+    messages = [(topic, stamp, data[:150]) for topic, stamp, data in make_messages(600)]
+    path = write_mcap(tmp_path / "log.mcap", messages, "zstd", index_types=IndexType.NONE)
+    content = path.read_bytes()
+    places = chunk_places(content)
+    assert len(places) > 12
+    for place in places[1:-1]:
+        content = patched(content, place + 9 + 24, b"\1\2\3\4")  # of another checksum
+    path.write_bytes(content)
+    container = open_log(path)
+    blocks = container.blocks(frozenset({1, 2}))
+    first = next(blocks)
+    at_once = [first.data[start:end].tobytes() for start, end in zip(first.start, first.end, strict=True)]
+    assert at_once == [data for _, _, data in messages[: len(at_once)]]
+    for _ in range(100):
+        if len(container.problems) >= len(places) - 2:
+            break
+        time.sleep(0.02)
+    later = [first.data[start:end].tobytes() for start, end in zip(first.start, first.end, strict=True)]
+    blocks.close()
+    container.close()
+    assert later == at_once
 
 
 @pytest.mark.parametrize("checksum", [True, False], ids=["checksum", "no checksum"])
