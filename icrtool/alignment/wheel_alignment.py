@@ -34,8 +34,9 @@ side for so long."""
 HELD_SHARE = 0.65
 """Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
 
-SMALLEST_SCALE_ERROR, SCALE_SIGMAS, LARGEST_SCALE_STD, USUAL_SCALE_STD = 0.01, 2.0, 0.1, 0.04
-"""A scale that is shown is corrected by what remains of it beside a prior: wheels roll at their radius to 4 %."""
+LARGEST_SCALE_STD, USUAL_SCALE_STD = 0.1, 0.04
+"""Wheels roll exactly at their radius, or at it to 4 %: as likely before a drive, and the likelier one is taken after
+it, where the drive shows a scale. The correction is what remains of it beside that prior."""
 
 SMALLEST_SIDE_DIFFERENCE = 0.005
 """Sides are scaled apart where they differ by more than this. The robot then veers where both report one speed."""
@@ -173,10 +174,11 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
     may = config.filter.preset == "field" and sound and not given
     factor, notes = 1.0, list[str]()
     scale, std = fit.estimate("scale")
-    error = abs(scale - 1.0)
-    if std <= LARGEST_SCALE_STD and error > max(SMALLEST_SCALE_ERROR, SCALE_SIGMAS * std):
+    error, kept = abs(scale - 1.0), USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
+    # twice the log-likelihood of a scale of its own, less that of none
+    if std <= LARGEST_SCALE_STD and (error / std) ** 2 * kept + math.log1p(-kept) > 0.0:
         if small := error <= LARGEST_SCALE_CORRECTION:
-            scale = 1.0 + (scale - 1.0) * USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
+            scale = 1.0 + (scale - 1.0) * kept
         text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
         if may and (small or any(abs(scale / value - 1.0) < FACTOR_TWO_TOLERANCE for value in (0.5, 2.0))):
             factor = scale
