@@ -9,7 +9,6 @@ import os
 import sqlite3
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -50,36 +49,27 @@ class WriteOptions:
     wheels : message type of the wheels. ``float64_pair`` [m/s] and ``ticks`` (Int32, wraps) are pairs without header
     heading : convention of the Imu. ``enu``: REP-103. ``ned``: yaw is the compass heading, body z down, and the frame
         is ``imu_link_ned`` (REP-145)
-    namespace : put before every topic (``/j100_0042``)
     compression : one of `COMPRESSIONS` of the container
     wheel_radius_m : converts metres to radians and counts
     track_width_m : b, by which a wheel controller divides for its angular velocity [m]
     counts_per_rev : encoder counts of one wheel revolution
     heading_std_deg : written as the orientation's covariance
-    definitions : False: only the names of the types are written, as in ROS 2 Humble and older (not in a ROS 1 bag,
-        and not with ``zstd-file``)
     """
 
     container: Container = "mcap"
     wheels: WheelMessages = "joint_states"
     heading: Literal["enu", "ned"] = "enu"
-    namespace: str = ""
     compression: Compression = "none"
     wheel_radius_m: float
     track_width_m: float
     counts_per_rev: float = 8192.0
     heading_std_deg: float = 1.0
-    definitions: bool = True
 
     def __post_init__(self) -> None:
         offered = COMPRESSIONS[self.container]
         if self.compression not in offered:
             why = f"{self.compression} does not exist in a {self.container} log"
             raise ConfigError("compression", why, f"choose {', '.join(offered)}")
-        if not self.definitions and self.container == "bag":
-            raise ConfigError("definitions", "a ROS 1 bag always carries them", "choose mcap or db3 to leave them out")
-        if not self.definitions and self.compression == "zstd-file":
-            raise ConfigError("definitions", "a zstd-file log always carries them", "choose zstd to leave them out")
         for name in ("wheel_radius_m", "track_width_m", "counts_per_rev"):
             if not getattr(self, name) > 0:
                 raise ConfigError(name, f"{getattr(self, name)} is not a positive number")
@@ -220,14 +210,13 @@ def header_stamps(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
     }
 
 
-def serialise_topic(plan: TopicPlan, store: Typestore, *, prefix: str = "", ros1: bool = False) -> TopicMessages:
+def serialise_topic(plan: TopicPlan, store: Typestore, *, ros1: bool = False) -> TopicMessages:
     """Return the messages of one topic.
 
     Parameters
     ----------
     plan : its values
     store : holds the definition of its message type
-    prefix : put before the topic
     ros1 : serialise as ROS 1 does, else as CDR
     """
     message = blank_message(store, plan.message_type)
@@ -249,7 +238,7 @@ def serialise_topic(plan: TopicPlan, store: Typestore, *, prefix: str = "", ros1
             raise ValueError(f"{path} is not a {values.dtype} field of {plan.message_type}")
         little_endian = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
         payload[:, changed[0] : changed[-1] + 1] = little_endian.view(np.uint8).reshape(len(values), -1)
-    return TopicMessages(prefix + plan.topic, plan.message_type, plan.stamp_ns, payload)
+    return TopicMessages(plan.topic, plan.message_type, plan.stamp_ns, payload)
 
 
 def blank_message(store: Typestore, message_type: str) -> object:
@@ -282,25 +271,16 @@ def _put(message: object, path: str, value: object) -> None:
         setattr(message, last, value)
 
 
-_TO_SCHEMA_3 = """
-    DROP TABLE message_definitions;
-    ALTER TABLE topics DROP COLUMN type_description_hash;
-    UPDATE schema SET schema_version = 3, ros_distro = 'humble';
-"""
-"""Of a database of rosbag2: that of ROS 2 Humble, the last one without message definitions."""
-
-
 def write_mcap(
     path: Path,
     topics: Sequence[TopicMessages],
     store: Typestore,
     *,
     compression: Compression,
-    definitions: bool,
     metadata: Mapping[str, str] | None = None,
     library: str = "icrtool",
 ) -> None:
-    """Write one MCAP file of ROS 2 messages (CDR).
+    """Write one MCAP file of ROS 2 messages (CDR), with the definitions of those types that the store has.
 
     Parameters
     ----------
@@ -314,8 +294,9 @@ def write_mcap(
         writer.start(profile="ros2", library=library)
         channels = []
         for topic in topics:
-            text = store.generate_msgdef(topic.message_type, ros_version=2)[0] if definitions else ""
-            schema = writer.register_schema(topic.message_type, "ros2msg" if definitions else "", text.encode())
+            is_known = topic.message_type in store.fielddefs
+            text = store.generate_msgdef(topic.message_type, ros_version=2)[0] if is_known else ""
+            schema = writer.register_schema(topic.message_type, "ros2msg" if is_known else "", text.encode())
             channels.append(writer.register_channel(topic.topic, "cdr", schema))
         if metadata is not None:
             writer.add_metadata("icrtool", dict(metadata))
@@ -342,9 +323,6 @@ def write_rosbag(path: Path, topics: Sequence[TopicMessages], store: Typestore, 
         connections = [bag.add_connection(topic.topic, topic.message_type, typestore=store) for topic in topics]
         for index, stamp_ns, data in _in_time_order(topics):
             bag.write(connections[index], stamp_ns, data)
-    if not options.definitions:
-        with closing(sqlite3.connect(path / f"{path.name}.db3")) as database:
-            database.executescript(_TO_SCHEMA_3)
 
 
 def _in_time_order(topics: Sequence[TopicMessages]) -> Iterator[tuple[int, int, bytes]]:
@@ -390,17 +368,16 @@ def write_log(path: str | Path, columns: SensorColumns, options: WriteOptions) -
         raise OutputError(path, "exists already", "remove it or choose another name")
     ros1 = options.container == "bag"
     store = load_typestore(ros1=ros1)
-    prefix = "/" + options.namespace.strip("/") if options.namespace.strip("/") else ""
     plans = [plan for plan in topic_plans(columns, options) if len(plan.stamp_ns)]
-    topics = [serialise_topic(plan, store, prefix=prefix, ros1=ros1) for plan in plans]
+    topics = [serialise_topic(plan, store, ros1=ros1) for plan in plans]
     try:
         with (
             tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch,
             unfinished(Path(scratch)),
         ):
-            partial, compression = Path(scratch) / path.name, options.compression
+            partial = Path(scratch) / path.name
             if options.container == "mcap":
-                write_mcap(partial, topics, store, compression=compression, definitions=options.definitions)
+                write_mcap(partial, topics, store, compression=options.compression)
             else:
                 write_rosbag(partial, topics, store, options)
             partial.rename(path)

@@ -69,7 +69,7 @@ def mcap(folder: Path) -> Path:
     topics += (TopicMessages(f"/a{HOSTILE}", unknown, topics[0].stamp_ns[:1], np.zeros((1, 8), np.uint8)),)
     path = folder / f"{FORMULA.replace('/', '')}\x1b[2J\n\u202e$^{{<script>.mcap"
     store = load_typestore(ros1=False)
-    write_mcap(path, topics, store, compression="none", definitions=False, metadata={HOSTILE: HOSTILE})
+    write_mcap(path, topics, store, compression="none", metadata={HOSTILE: HOSTILE})
     return path
 
 

@@ -117,7 +117,7 @@ def write_foxglove(run: Run, path: Path) -> None:
     topics += [_event_topic("/events", slip, store), _event_topic("/outages", outages, store)]
     about = {name: "" if value is None else str(value) for name, value in about_run(run).items()}
     about["datum"] = "" if globe is None else " ".join(f"{value!r}" for value in globe)
-    write_log.write_mcap(path, topics, store, compression="zstd", definitions=True, metadata=about, library=LIBRARY)
+    write_log.write_mcap(path, topics, store, compression="zstd", metadata=about, library=LIBRARY)
 
 
 @cache

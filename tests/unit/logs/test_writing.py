@@ -64,7 +64,7 @@ def log_name(options: WriteOptions) -> str:
     return {"mcap": "drive.mcap", "bag": "drive.bag", "db3": "drive"}[options.container]
 
 
-def read_back(path: Path, *, default_types: bool = False) -> list[Recorded]:
+def read_back(path: Path) -> list[Recorded]:
     if path.suffix == ".mcap":
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
@@ -76,10 +76,8 @@ def read_back(path: Path, *, default_types: bool = False) -> list[Recorded]:
                 for schema, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False)
             ]
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE) if default_types else None
-    with AnyReader([path], default_typestore=store) as reader:
+    with AnyReader([path]) as reader:
         return [
             Recorded(connection.topic, connection.msgtype, stamp_ns, reader.deserialize(raw, connection.msgtype))
             for connection, stamp_ns, raw in reader.messages()
@@ -243,13 +241,6 @@ def test_stamps_out_of_order_are_written_in_order(tmp_path):
     np.testing.assert_array_equal(z, -shuffled.yaw_rate_radps[::-1])
 
 
-@pytest.mark.parametrize("namespace", ["j100_0042", "/j100_0042", "/j100_0042/"])
-def test_a_namespace_stands_before_every_topic(tmp_path, namespace):
-    path = write_log(tmp_path / "drive.mcap", make_columns(), replace(OPTIONS, namespace=namespace))
-    topics = {recorded.topic for recorded in read_back(path)}
-    assert topics == {"/j100_0042/joint_states", "/j100_0042/gps/fix", "/j100_0042/imu/data"}
-
-
 def test_ticks_wrap_around_at_32_bits(tmp_path):
     rollover_m = 2**31 / (COUNTS_PER_REV / (2 * np.pi * RADIUS_M))
     columns = replace(make_columns(wheels=2), wheel_position_left_m=np.array([rollover_m - 1e-6, rollover_m + 1.0]))
@@ -274,30 +265,6 @@ def test_a_sensor_without_rows_has_no_topic(tmp_path, container):
     options = replace(OPTIONS, container=container)
     messages = read_back(write_log(tmp_path / log_name(options), columns, options))
     assert {recorded.topic for recorded in messages} == {"/joint_states", "/imu/data"}
-
-
-def test_an_sqlite3_log_without_definitions_looks_like_humble(tmp_path):
-    columns = make_columns()
-    path = write_log(tmp_path / "drive", columns, replace(OPTIONS, container="db3", definitions=False))
-    with sqlite3.connect(path / "drive.db3") as database:
-        tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        assert database.execute("SELECT schema_version FROM schema").fetchone() == (3,)
-    database.close()
-    assert "message_definitions" not in tables
-    check_position(read_back(path, default_types=True), columns)
-
-
-def test_an_mcap_without_definitions_has_empty_schemas(tmp_path):
-    from mcap.reader import make_reader
-
-    path = write_log(tmp_path / "drive.mcap", make_columns(), replace(OPTIONS, definitions=False))
-    with path.open("rb") as stream:
-        schemas = make_reader(stream).get_summary().schemas.values()
-    assert {(schema.name, schema.data) for schema in schemas} == {
-        ("sensor_msgs/msg/JointState", b""),
-        ("sensor_msgs/msg/NavSatFix", b""),
-        ("sensor_msgs/msg/Imu", b""),
-    }
 
 
 @pytest.mark.parametrize("container", ["mcap", "bag", "db3"])
@@ -355,11 +322,6 @@ def test_a_folder_that_does_not_exist_is_an_output_error(tmp_path):
             {"container": "mcap", "compression": "bz2"},
             "compression: bz2 does not exist in a mcap log; choose none, lz4, zstd",
         ),
-        ({"container": "bag", "definitions": False}, "definitions: a ROS 1 bag always carries them"),
-        (
-            {"container": "db3", "compression": "zstd-file", "definitions": False},
-            "definitions: a zstd-file log always carries them; choose zstd",
-        ),
         ({"wheel_radius_m": 0.0}, "wheel_radius_m: 0.0 is not a positive number"),
         ({"track_width_m": float("nan")}, "track_width_m: nan is not a positive number"),
     ],
@@ -391,9 +353,9 @@ def test_the_ros_1_feedback_of_a_jackal_has_two_more_fields():
     assert [name for name in of_ros1 if name not in of_ros2] == ["pcb_temperature", "mcu_temperature"]
 
 
-def test_jackal_feedback_without_definitions_is_read_back(tmp_path):
+def test_jackal_feedback_is_read_back(tmp_path):
     columns = make_columns()
-    options = replace(OPTIONS, container="db3", wheels="jackal_feedback", definitions=False)
+    options = replace(OPTIONS, container="db3", wheels="jackal_feedback")
     config = load_config(sets=[f"robot.wheel_radius_m={RADIUS_M}", "wheels.quantity=velocity"])
     log = read_log(write_log(tmp_path / "drive", columns, options), config)
     assert log.wheels.unit == "rad"
