@@ -188,9 +188,10 @@ def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: 
         return False
     t = (derived.gyro.stamp_ns - int(log.wheels.stamp_ns[0])) / 1e9
     by_gyro = track._replace(heading_t=t, heading=trapezoids(t, derived.gyro.rate_radps))
-    found = compare_turns(by_gyro, width_m, 0.0, COMPARED_S)
-    alike = found is not None and found.left_rad < LEFT_SHARE * found.turn_rad
-    return found is not None and alike and LEAST_GAIN < found.ratio < LARGEST_GAIN
+    return any(
+        found.left_rad < LEFT_SHARE * found.turn_rad and LEAST_GAIN < found.ratio < LARGEST_GAIN
+        for found in compare_turns(by_gyro, width_m, 0.0, (COMPARED_S,))
+    )
 
 
 def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> DerivedHeading | None:

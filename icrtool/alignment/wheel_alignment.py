@@ -8,6 +8,7 @@ to an absolute heading stays near it, however long it drives.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -234,33 +235,34 @@ class Turns(NamedTuple):
     turn_rad: float
 
 
-def compare_turns(track: Track, width_m: float, delay_s: float, window_s: float) -> Turns | None:
-    """Compare the turns of heading and wheels over windows of some length; None where there are too few.
+def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Sequence[float]) -> list[Turns]:
+    """Compare the turns of heading and wheels over windows of some lengths; empty where there are too few of one.
 
     Parameters
     ----------
     width_m : the track width b
     delay_s : by which the heading lags the wheels
     """
-    t = track.t
+    t, travel, found = track.t, track.travel, list[Turns]()
     turned = track.cumulate(2.0 * track.half_difference / width_m)
-    first = max(t[0] + delay_s, track.heading_t[0])
-    last = min(t[-1] + delay_s, track.heading_t[-1]) - window_s
-    begin = np.arange(first, last, window_s / STARTS_A_SPAN)
-    by_wheels, by_heading = (
-        np.interp(begin + window_s - shift, times, angle) - np.interp(begin - shift, times, angle)
-        for shift, times, angle in ((delay_s, t, turned), (0.0, track.heading_t, track.heading))
-    )
-    travel = track.travel
-    moved = np.interp(begin + window_s - delay_s, t, travel) > np.interp(begin - delay_s, t, travel)
-    kept = np.flatnonzero(track.clear(begin - delay_s, begin + window_s - delay_s) & moved)
-    by_wheels, by_heading = by_wheels[kept], by_heading[kept]
-    if len(kept) < STARTS_A_SPAN * FEWEST_SPANS or not by_wheels.any():
-        return None
-    fit = robust_regression(by_wheels[:, None], by_heading)
-    variance = sandwich_covariance(fit, kept // STARTS_A_SPAN)[0, 0]
-    turn = math.sqrt(float(np.mean(by_heading**2)))
-    return Turns(float(fit.x[0]), math.sqrt(float(variance)), float(fit.scale[0]), turn)
+    for window_s in windows_s:
+        first = max(t[0] + delay_s, track.heading_t[0])
+        last = min(t[-1] + delay_s, track.heading_t[-1]) - window_s
+        begin = np.arange(first, last, window_s / STARTS_A_SPAN)
+        by_wheels, by_heading = (
+            np.interp(begin + window_s - shift, times, angle) - np.interp(begin - shift, times, angle)
+            for shift, times, angle in ((delay_s, t, turned), (0.0, track.heading_t, track.heading))
+        )
+        moved = np.interp(begin + window_s - delay_s, t, travel) > np.interp(begin - delay_s, t, travel)
+        kept = np.flatnonzero(track.clear(begin - delay_s, begin + window_s - delay_s) & moved)
+        by_wheels, by_heading = by_wheels[kept], by_heading[kept]
+        if len(kept) < STARTS_A_SPAN * FEWEST_SPANS or not by_wheels.any():
+            return []
+        fit = robust_regression(by_wheels[:, None], by_heading)
+        variance = sandwich_covariance(fit, kept // STARTS_A_SPAN)[0, 0]
+        turn = math.sqrt(float(np.mean(by_heading**2)))
+        found.append(Turns(float(fit.x[0]), math.sqrt(float(variance)), float(fit.scale[0]), turn))
+    return found
 
 
 NOISE_S, SHORT_S, MIDDLE_S, LONGEST_S = 0.3, 1.0, 5.0, 40.0
@@ -289,9 +291,8 @@ def find_filtering(fit: AlignmentFit) -> str:
     long_s = min(LONGEST_S, float(track.t[-1]) / LONG_WINDOWS)
     if long_s < SHORTEST_LONG_S:
         return ""
-    compared = (compare_turns(track, fit.width_m, delay, one) for one in (NOISE_S, SHORT_S, MIDDLE_S, long_s))
-    found = [one for one in compared if one is not None]
-    if len(found) < 4:
+    found = compare_turns(track, fit.width_m, delay, (NOISE_S, SHORT_S, MIDDLE_S, long_s))
+    if not found:
         return ""
     noise, short, middle, long = found
     change, std = long.ratio - short.ratio, math.hypot(short.ratio_std, long.ratio_std)
