@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
@@ -61,7 +60,7 @@ def drive_wheels(table: States, in_gap: Bools, icrs: Icrs, every: int = 1) -> Od
     table : the recorded states
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
     icrs : the run's final ones, or `no_slip_icrs`
-    every : the path is kept at so many states each, and at the last
+    every : the path is kept at the first state, at so many states each, and at the last
 
     Notes
     -----
@@ -74,18 +73,7 @@ def drive_wheels(table: States, in_gap: Bools, icrs: Icrs, every: int = 1) -> Od
         here = slice(*np.searchsorted(kept, [rows.start, rows.stop]))
         for column, values in zip(path, piece, strict=True):
             column[here] = values[kept[here] - rows.start]
-    return OdometryPath(*path, _apart(table, path))
-
-
-def odometry_end_error(table: States, in_gap: Bools, icrs: Icrs) -> float:
-    """Return `OdometryPath.end_error_m` [m] of `drive_wheels` without keeping its path."""
-    [(_, last)] = deque(_pieces(table, in_gap, icrs), maxlen=1)
-    return _apart(table, last)
-
-
-def _apart(table: States, path: OpenLoopPath) -> float:
-    """Return how far the end of a path is from the last state [m]."""
-    return math.hypot(path.north[-1] - table.north_m[-1], path.east[-1] - table.east_m[-1])
+    return OdometryPath(*path, math.hypot(path.north[-1] - table.north_m[-1], path.east[-1] - table.east_m[-1]))
 
 
 def _pieces(table: States, in_gap: Bools, icrs: Icrs) -> Iterator[tuple[slice, OpenLoopPath]]:

@@ -18,7 +18,7 @@ from icrtool.estimation.observability import (
     multiplier_std,
     unlearned_icrs,
 )
-from icrtool.estimation.odometry import drive_summary, odometry_end_error
+from icrtool.estimation.odometry import drive_summary, drive_wheels
 from icrtool.estimation.run_filter import Filtered
 from icrtool.estimation.run_warnings import (
     antenna_warning,
@@ -125,10 +125,10 @@ def summarise(
         unusable_because="; ".join(unusable) if unusable else None,
         icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, multiplier, hidden),
         odometry=OdometryDocument(
-            EndErrorDocument(odometry_end_error(table, filtered.in_gap, table.icrs_at(-1))),
+            EndErrorDocument(drive_wheels(table, filtered.in_gap, table.icrs_at(-1), len(table)).end_error_m),
             None
             if width is None
-            else EndErrorDocument(odometry_end_error(table, filtered.in_gap, no_slip_icrs(width))),
+            else EndErrorDocument(drive_wheels(table, filtered.in_gap, no_slip_icrs(width), len(table)).end_error_m),
         ),
         terrain=TerrainDocument(tuple(map(ChangeDocument, changes_s))),
         segments=segment_summary(table, changes_s),
