@@ -217,7 +217,7 @@ def run_adaptively(
     )
     if all(not len(one) or one.mean() <= TOLERATED_NIS for one in nis):
         return setup, output, noise
-    del setup, output  # of a long log, as large as all that the next run makes
+    del setup, output, nis  # of a long log, as large as all that the next run makes
     largest = min(LARGEST_HEADING_DEGPS, STEP * math.degrees(sensors.turn_wander_rad) / math.sqrt(REFERENCE_STEP_S))
     part = _busiest_part(sensors)
     moving = part.moving()
