@@ -21,7 +21,7 @@ from icrtool.alignment.turn_rates import TurnRate, course_changes, gyro_rate, wh
 from icrtool.alignment.wheel_alignment import compare_turns
 from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats, trapezoids, wrapped
+from icrtool.kernels.arrays import Floats, rows_of_cells, trapezoids, wrapped
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
 from icrtool.records.samples import (
@@ -74,7 +74,7 @@ def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> Absolu
     if not len(t):
         return AbsoluteHeading(t, angle, angle, angle)
     turned = np.interp(t, turn.t, turn.integrated)
-    first = np.flatnonzero(np.diff(np.floor(t / cell_s), prepend=-1.0) > 0)
+    first = rows_of_cells(t, lambda some: np.floor(some / cell_s))
     count = np.diff(first, append=len(t))
     last = first + count - 1
     mean = np.add.reduceat(np.exp(1j * (angle - turned)), first)
