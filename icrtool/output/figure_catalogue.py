@@ -26,9 +26,8 @@ Parts = Mapping[str, tuple[float, ...]]
 HISTOGRAM_HORIZONS_M = (5.0, 10.0, 20.0)
 
 
-def _where(content: Callable[[Any], object]) -> Callable[[Any], Parts]:
-    """Return the parts of a figure that is drawn once, where there is such content."""
-    return lambda subject: {"": ()} if content(subject) else {}
+ONCE: Parts = {"": ()}
+"""Parts of a figure that is drawn once."""
 
 
 def _histograms(report: DropoutReport, *, together: bool) -> Parts:
@@ -57,7 +56,7 @@ class Entry(NamedTuple):
     title: str
     caption: str
     place: str
-    parts: Callable[[Any], Parts] = _where(lambda _: True)
+    parts: Callable[[Any], Parts] = lambda _: ONCE
     with_place: bool = False
     further: bool = False
 
@@ -99,12 +98,12 @@ FIGURES = {
     ),
     "worst": Entry(
         "report", "The worst trials", "What they share (a turn, a slope, a place) is where the model fails.",
-        "dropout_paths.dropout_worst", _where(lambda report: report.worst), with_place=True,
+        "dropout_paths.dropout_worst", lambda report: ONCE if report.worst else {}, with_place=True,
     ),
     "outages": Entry(
         "report", "Outages",
         "The path without GNSS, forced or real, and where the estimate was when fixes returned.",
-        "dropout_paths.dropout_outages", _where(lambda report: report.outages), with_place=True,
+        "dropout_paths.dropout_outages", lambda report: ONCE if report.outages else {}, with_place=True,
     ),
     "histogram": Entry(
         "report", "How the errors scatter",
@@ -119,16 +118,17 @@ FIGURES = {
     "summary": Entry(
         "report", "Error over distance",
         "The lower a curve, the better the model. Where it crosses the budget line, the budget is used up.",
-        "dropout_errors.dropout_summary", _where(lambda report: any(row.trials for row in report.document.trials)),
+        "dropout_errors.dropout_summary",
+        lambda report: ONCE if any(row.trials for row in report.document.trials) else {},
     ),
     "icrs": Entry(
         "fleet", "Final ICRs of every log",
         "One robot on one ground should lie on one level; a step is other ground or wear.",
-        "calibrations.fleet_icrs", _where(lambda fleet: fleet.points),
+        "calibrations.fleet_icrs", lambda fleet: ONCE if fleet.points else {},
     ),
     "errors": Entry(
         "fleet", "Error of every log", "Which logs are worse than the others of their group?",
-        "calibrations.fleet_errors", _where(lambda fleet: fleet.errors_m),
+        "calibrations.fleet_errors", lambda fleet: ONCE if fleet.errors_m else {},
     ),
     "transfer": Entry(
         "comparison", "The cost of a foreign calibration",

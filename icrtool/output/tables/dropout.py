@@ -93,10 +93,16 @@ def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Secti
     if not (report.usable or report.budgets):
         unknown = Section("How far without GNSS?", ["Not known: the run is not usable."], VERBOSE)
         return [unknown, trust_section(summary, report)._replace(depth=VERBOSE)]
-    return [
-        reach_section(summary, report), numbers_section(summary, report), trust_section(summary, report),
-        *([_worst_card(summary, report)] if report.worst else []),
-    ]  # fmt: skip
+    cards = [reach_section(summary, report), numbers_section(summary, report), trust_section(summary, report)]
+    for one in report.worst[:1]:
+        note = _meanwhile(one, summary, report)
+        driven = f"{one.horizon_m:g} m from {duration_text(one.t_s)} on"
+        turned = f"turning {turn_text(one.heading_change_deg)} at {one.speed_mean_mps:.2f} m/s"
+        by = f"with the {label_of(report, one.model)}{f'; meanwhile: {note}' if note else ''}"
+        error = error_text(one.errors_m[one.model])
+        text = f"after {driven}, {turned}, {by}"
+        cards.append(Section("Where was it worst?", [], lead=error, text=text, label="Worst"))
+    return cards
 
 
 def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[list[Row], list[Row]]:
@@ -172,16 +178,6 @@ def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
 def verdict_lines(report: DropoutDocument) -> list[Line]:
     """Return the verdict on each acceptance limit."""
     return [Line(one.verdict, "good" if one.passed else "bad") for one in report.gates]
-
-
-def _worst_card(summary: RunDocument, report: DropoutDocument) -> Section:
-    """Return the worst trial in a sentence."""
-    one = report.worst[0]
-    note = _meanwhile(one, summary, report)
-    driven = f"{one.horizon_m:g} m from {duration_text(one.t_s)} on"
-    turned = f"turning {turn_text(one.heading_change_deg)} at {one.speed_mean_mps:.2f} m/s"
-    text = f"after {driven}, {turned}, with the {label_of(report, one.model)}{f'; meanwhile: {note}' if note else ''}"
-    return Section("Where was it worst?", [], lead=error_text(one.errors_m[one.model]), text=text, label="Worst")
 
 
 def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
