@@ -101,9 +101,9 @@ def xml_text(text: str) -> str:
     return _NOT_XML.sub("?", text)
 
 
-def signed(metres: float) -> str:
+def signed(metres: float, digits: int = 3) -> str:
     """Return a number with its sign, to the millimetre, as print has it (a minus, not a hyphen)."""
-    return f"{metres:+.3f}".replace("-", "−") if round(metres, 3) else "0.000"
+    return f"{metres:+.{digits}f}".replace("-", "−") if round(metres, digits) else f"{0:.{digits}f}"
 
 
 def plus_minus(value: float | None, std: float | None, digits: int = 3, sign: str = "+") -> str:

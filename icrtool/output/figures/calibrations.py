@@ -11,7 +11,8 @@ from matplotlib.patches import Circle
 
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.output.figures import style
-from icrtool.output.text_format import error_text
+from icrtool.output.figures.trajectory import name_directions
+from icrtool.output.text_format import error_text, signed
 from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.text import counted
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 
 CIRCLES = 20
 
+KEY_COLUMNS = 4
+"""Of the legend of a forecast."""
+
 
 @style.styled
 def forecast_figure(
@@ -32,13 +36,16 @@ def forecast_figure(
 ) -> Figure:
     """Return the figure of a forecast; a dashed line for each budget, and where the calibration's errors end."""
     reached = within_budget(forecast.distance_m, forecast.p95_m, budgets_m[0]) if budgets_m else None
-    answer = f"{forecast.p95_m[-1]:.2f} m off (95 %) at the end of {forecast.distance_m[-1]:.0f} m"
+    answer = f"{error_text(forecast.p95_m[-1])} off (95 %) at the end of {forecast.distance_m[-1]:.0f} m"
     if reached is not None:
         answer = f"Within {budgets_m[0]:g} m (95 %) for {reached[0]:.1f} m, {answer}"
     by = "wheels alone" if gyro is None else "wheels alone, and with gyro"
     subtitle = f"{title}: forecast error without GNSS from the start: {by}, by the calibration"
-    margins_in = (0.7, 0.25, 0.75, 0.95)
-    figure = style.new_figure(answer, subtitle, width_in=9.0, height_in=4.2, margins_in=margins_in, wspace=0.28)
+    # Of both errors of each forecast, budgets, and up to three more.
+    entries = 2 * (1 if gyro is None else 2) + len(budgets_m) + 3
+    keys_in = style.KEY_ROW_IN * max(-(-entries // KEY_COLUMNS) - 2, 0)
+    height_in, margins_in = 4.2 + keys_in, (0.7, 0.25, 0.75, 0.95 + keys_in)
+    figure = style.new_figure(answer, subtitle, width_in=9.0, height_in=height_in, margins_in=margins_in, wspace=0.28)
     grown, path = figure.subplots(1, 2)
     for one, words, dash in ((forecast, "", {}), (gyro, ", with gyro", {"linestyle": ":"})):
         if one is not None:
@@ -60,8 +67,8 @@ def forecast_figure(
     path.plot([], [], label=f"95 % of the errors, up to {measured_m:g} m", color=style.ICR["color"], linewidth=0.8)
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
-    path.set(xlabel="East [m]", ylabel="North [m]")
-    style.add_legend(figure, ncols=4)
+    name_directions(path)
+    style.add_legend(figure, ncols=KEY_COLUMNS)
     return figure
 
 
@@ -120,7 +127,8 @@ def transfer(found: GroupComparison) -> Figure:
     parts = [part[np.isfinite(part)] for part in (errors[~with_own], errors[with_own])]
     answer = f"No group has a trial of {CHOICE_HORIZON_M:g} m"
     if all(map(len, parts)):
-        other, own = (" to ".join(dict.fromkeys((f"{min(part):.2f}", f"{max(part):.2f}"))) for part in parts)
+        ends = [(error_text(min(part)).removesuffix(" m"), error_text(max(part)).removesuffix(" m")) for part in parts]
+        other, own = (" to ".join(dict.fromkeys(both)) for both in ends)
         answer = f"{other} m off after {CHOICE_HORIZON_M:g} m (95 %) with another's calibration, {own} m with its own"
     subtitle = f"{' · '.join(names)}: on the diagonal each trial is predicted by a fit that does not contain it"
     height_in, margins_in = 2.95 + 0.45 * len(names) + 0.12 * len(rows), (1.3, 0.2, 1.35, 0.75)
@@ -188,9 +196,8 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
 
     points, robots = fleet.points, dict.fromkeys(point.robot for point in fleet.points)
     icrs = {side: [point.icr[f"y_icr_{side}_m"] or 0.0 for point in points] for side in ("right", "left")}
-    spans = (f"y {side} {min(found):+.2f} to {max(found):+.2f} m" for side, found in icrs.items())
-    answer = ", ".join(spans).replace("-", "−")
-    title, subtitle = f"ICRs: {answer}", f"{fleet.title}: of each log, ±σ"
+    spans = (f"y {side} {signed(min(found), 2)} to {signed(max(found), 2)} m" for side, found in icrs.items())
+    title, subtitle = f"ICRs: {', '.join(spans)}", f"{fleet.title}: of each log, ±σ"
     figure = style.new_figure(title, subtitle, height_in=5.0, margins_in=(0.85, 0.2, 0.85, 0.95), hspace=0.12)
     panels = figure.subplots(2, 1, sharex=True)
     days = date2num([np.datetime64(point.start_utc.rstrip("Z")) for point in points])  # type: ignore[no-untyped-call]

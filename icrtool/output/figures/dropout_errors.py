@@ -39,8 +39,8 @@ LEAST_HISTOGRAM_IN_P95, MOST_HISTOGRAM_IN_P95 = 1.3, 4.0
 """The histograms of a picture share one scale: up to the largest p95 and a margin, but at most so many times that of
 the first model. The share of trials beyond it is written at its end."""
 
-KEY_COLUMNS, KEY_IN = 3, 0.19
-"""Columns of the legend of the summary, height of a row of it."""
+KEY_COLUMNS = 3
+"""Of the legend of the summary."""
 
 MOSTLY_BEYOND_PCT = 90.0
 
@@ -66,7 +66,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
         title = f"{refused}{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
     # Beside the models: the mean of the first, budget, outages.
     most = max(row.trials for row in report.document.trials)
-    keys_in = KEY_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
+    keys_in = style.KEY_ROW_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
     subtitle = f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals"
     margins_in = (0.75, 0.25, 0.65, 0.95 + keys_in)
     figure = style.new_figure(title, subtitle, height_in=4.6 + keys_in, margins_in=margins_in)
@@ -142,7 +142,8 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     # A model of constant parameters may have no trial of a length that others have.
     results = [result for result in found if len(result.histograms[h].left)]
     p95 = [float(result.column("p95_m")[h]) for result in results]
-    title = f"After {horizon_m:g} m 95 % of the trials end within {min(p95):.2f} to {max(p95):.2f} m, by model"
+    least, most = map(error_text, (min(p95), max(p95)))
+    title = f"After {horizon_m:g} m 95 % of the trials end within {least.removesuffix(' m')} to {most}, by model"
     subtitle = f"{run_title(report.run_document)}: open-loop error of {report.document.trials[h].trials:,} trials"
     height_in, margins_in = 1.5 + PANEL_HEIGHT_IN * len(results), (0.75, 0.2, 0.85, 0.9)
     figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.45)

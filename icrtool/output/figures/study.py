@@ -15,6 +15,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.series import BLUE, GREEN, ORANGE, RED
 from icrtool.output.tables.study import finding_text, runs_text
+from icrtool.output.text_format import signed
 from icrtool.simulation.studies import shown_path
 from icrtool.simulation.study_records import Level, StudyResult, chi2_band, consistency_of
 from icrtool.simulation.study_runs import FATES, STATES
@@ -35,7 +36,7 @@ def study_title(result: StudyResult) -> str:
 def study_subtitle(result: StudyResult) -> str:
     """Return a study's name, with the robot's where it has one, the true ICRs, the path and the runs."""
     request, robot = result.request, result.request.config.robot.name
-    icrs = ", ".join(f"{icr:+.2f}".replace("-", "−") for icr in request.plan.icrs_m)
+    icrs = ", ".join(signed(icr, 2) for icr in request.plan.icrs_m)
     return (
         f"{request.name}{f', {robot}' if robot else ''}: ICRs {icrs} m, {request.path.kind} path, "
         f"{request.path.speed_mps:g} m/s, {runs_text(request)}"

@@ -34,6 +34,9 @@ PNG_DPI = 130
 WIDTH_IN = 7.2
 """Of most figures: the text width of a page."""
 
+KEY_ROW_IN = 0.19
+"""Height of a row of a legend; there is space for two."""
+
 TITLE_CHARACTERS_PER_INCH, SUBTITLE_CHARACTERS_PER_INCH = 10.0, 14.0
 
 WEIGHTS = ("regular", "bold")

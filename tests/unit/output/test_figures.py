@@ -255,7 +255,9 @@ def test_the_picture_of_a_comparison_answers_with_both_errors_and_its_words_stan
         )
     )  # fmt: skip
     figure.draw_without_rendering()
-    assert "0.90 m off after 10 m (95 %) with another's calibration, 0.40 m with its own" in figure.texts[0].get_text()
+    assert (
+        "0.900 m off after 10 m (95 %) with another's calibration, 0.400 m with its own" in figure.texts[0].get_text()
+    )
     matrix = figure.axes[0]
     words = [*figure.texts, matrix.xaxis.label, *matrix.get_yticklabels()]
     boxes = [(one.get_text(), one.get_window_extent()) for one in words]
