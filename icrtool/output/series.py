@@ -1,4 +1,4 @@
-"""Long columns as pictures and pages draw them: fewer points, where lines break, and where a scale ends."""
+"""Long columns as pictures and pages draw them: fewer points, where lines break, where a scale ends; and colours."""
 
 from __future__ import annotations
 

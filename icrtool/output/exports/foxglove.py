@@ -99,11 +99,16 @@ def write_foxglove(run: Run, path: Path) -> None:
     """
     store, globe, paths = _typestore(), globe_of(run), paths_of(run)
     rows = rows_apart(run.table.stamp_ns, INTERVAL_S)
+    icrs: dict[str, NDArray[Any]] = {}
+    for name in ICR_COLUMNS:
+        value, std = (getattr(run.table, column)[rows] for column in (name, f"std_{name}"))
+        icrs |= {name: value, f"std_{name}": std}
+        icrs |= {f"{name[:-2]}_minus_std_m": value - std, f"{name[:-2]}_plus_std_m": value + std}
     plans = [
         _transforms(paths, rows, store),
         *(_odometry(run, path, rows) for path in paths),
         *(_fixes(run, rows, globe) if globe is not None else ()),
-        _icrs(run, rows),
+        _plan("/icrs", ICRS, run.table.stamp_ns[rows], BODIES["filter"], icrs),
         _errors(run, rows),
     ]
     topics = [write_log.serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
@@ -228,16 +233,6 @@ def _plan(
     return write_log.TopicPlan(
         topic, kind, stamp_ns, {"header.frame_id": frame, **fixed}, write_log.header_stamps(stamp_ns) | columns
     )
-
-
-def _icrs(run: Run, rows: Ints) -> write_log.TopicPlan:
-    table = run.table
-    columns: dict[str, NDArray[Any]] = {}
-    for name in ICR_COLUMNS:
-        value, std = getattr(table, name)[rows], getattr(table, f"std_{name}")[rows]
-        columns |= {name: value, f"std_{name}": std}
-        columns |= {f"{name[:-2]}_minus_std_m": value - std, f"{name[:-2]}_plus_std_m": value + std}
-    return _plan("/icrs", ICRS, table.stamp_ns[rows], BODIES["filter"], columns)
 
 
 def _errors(run: Run, rows: Ints) -> write_log.TopicPlan:

@@ -8,7 +8,7 @@ open-loop trial starts. ICRs that differ by start have no such path: the page dr
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -39,7 +39,6 @@ from icrtool.output.tables.errors import in_order, main_rows
 from icrtool.records.dropout_document import DropoutDocument, FitDocument
 from icrtool.records.plain_data import Record
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, Run, track_of, width_or_usual_m
-from icrtool.records.tables import States
 
 MOST_STEPS = 150_000
 """Wheel samples of a page; of more, equally many are joined to one."""
@@ -69,6 +68,10 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
     rows, joined = every_so_many(len(table), MOST_STEPS)
     origin = float(np.round(table.north_m[0])), float(np.round(table.east_m[0]))
     half = None if run.track_width_m is None else run.track_width_m / 2
+    # What the figure of the ICRs shows of each, and where no slip puts them.
+    shown = [] if half is None else [half, -half]
+    for icr in (getattr(table, name) for name in ICR_COLUMNS):
+        shown += [*percentiles(icr, RANGE_PERCENT), float(icr[0]), float(icr[-1])]
     return {
         "origin": origin if coordinates else None,
         "duration_s": float(table.t_s[-1]),
@@ -77,7 +80,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "fixes": _fixes_data(run, origin),
         "headings": _differences(run.heading, run.heading.used, np.degrees(run.heading.difference))[1],
         "half_width_m": half,
-        "icr_scale_m": _icr_scale(table, () if half is None else (half, -half)),
+        "icr_scale_m": scale_of(shown),
         **_models_data(run, report, rows, origin),
         "events": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in run.document.events],
         "outages": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
@@ -85,12 +88,6 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "errors": errors_data(report),
         "budgets_m": sorted({one.budget_m for one in report.budgets}),
     }
-
-
-def _icr_scale(table: States, shown: Sequence[float]) -> tuple[float, float]:
-    """Return the ends of a scale [m] of all three ICRs, on which further numbers lie; as of the figure of each."""
-    columns = [getattr(table, name) for name in ICR_COLUMNS]
-    return scale_of([*shown, *(end for one in columns for end in (*percentiles(one, RANGE_PERCENT), one[0], one[-1]))])
 
 
 def errors_data(report: DropoutDocument) -> dict[str, object]:
