@@ -191,9 +191,6 @@ SHOWN_SHARE, WEAK_SHARE = 0.03, 0.1
 AT_LIMIT = 1.1
 """A y ICR within this many times the filter's limit is the limit, not an estimate."""
 
-UNLEARNED = 0.7
-"""An ICR whose standard deviation is still more than this share of the start's was not learned."""
-
 TURNS_NEEDED_RAD = math.pi
 STEERS, SURELY_TURNED_RAD = 0.1, 0.1
 """Sides that turn by less than this part of what the robot turns do not turn it; and more than headings err."""
@@ -245,24 +242,21 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
     )  # fmt: skip
 
 
-def unlearned_icrs(table: States, *, std_m: Floats, start_std_m: Floats, least_icr_m: float) -> dict[str, str]:
+def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[str, str]:
     """Return the final ICRs that the filter did not learn from the drive, and why not.
 
     Parameters
     ----------
     table : the recorded states
     std_m : (3,) of the final ICRs, `icrtool.estimation.observability.final_covariance`
-    start_std_m : (3,) of the filter's start
     least_icr_m : the filter keeps both y ICRs at least this far from the centre line; -inf: anywhere
     """
     final, found = dict(zip(ICR_COLUMNS, table.icrs_at(-1), strict=True)), dict[str, str]()
     width = max(final["y_icr_right_m"] - final["y_icr_left_m"], MIN_ICR_SEPARATION_M)
-    for name, std, start in zip(ICR_COLUMNS, std_m, start_std_m, strict=True):
-        side, filter_std = -1.0 if name == "y_icr_left_m" else 1.0, float(getattr(table, f"std_{name}")[-1])
+    for name, std in zip(ICR_COLUMNS, std_m, strict=True):
+        side = -1.0 if name == "y_icr_left_m" else 1.0
         if name != "x_icr_m" and side * final[name] <= AT_LIMIT * least_icr_m:
             found[name] = f"stopped at the limit of {side * least_icr_m:+.2f} m that the filter keeps"
-        elif filter_std > UNLEARNED * start:
-            found[name] = f"± {filter_std:.2f} m, about as uncertain as at the start (± {start:.2f} m)"
         elif std > WEAK_SHARE * width:
             found[name] = f"± {std:.2f} m, by how much stretches of the drive differ"
     return found

@@ -59,7 +59,6 @@ class Filtered(NamedTuple):
     ----------
     covariance : (6, 6) at the end
     noise : process noise of the pose that the run was made with
-    start_std_m : (3,) of the ICRs at the start
     least_icr_m : what the filter kept the y ICRs from the centre line; -inf: anywhere
     began_with : ICRs and covariance of the warm start, None without one
     changes_s : terrain changes, seconds since the first recorded state, in order
@@ -73,7 +72,6 @@ class Filtered(NamedTuple):
     heading: MeasurementOutcome
     covariance: Floats
     noise: ProcessNoise
-    start_std_m: Floats
     least_icr_m: float
     began_with: WarmStart | None
     changes_s: tuple[float, ...]
@@ -99,8 +97,7 @@ def run_filter(
     _check_motion(sensors)
     changes_s = tuple(sorted(set(changes_s)))
     setup, output, noise = run_adaptively(sensors, config, warm_start, changes_s)
-    gap_s, start_std_m = wheel_gap_s(config, setup.data.wheel_t), np.sqrt(np.diag(setup.P0)[3:])
-    least_icr_m = setup.parameters.least_icr
+    gap_s, least_icr_m = wheel_gap_s(config, setup.data.wheel_t), setup.parameters.least_icr
     del setup  # of a long log, as large as three columns of the states
     table = _states(sensors.wheels, output)
     if table.fault:
@@ -122,7 +119,6 @@ def run_filter(
         heading=heading,
         covariance=output.P,
         noise=noise,
-        start_std_m=start_std_m,
         least_icr_m=least_icr_m,
         began_with=warm_start,
         changes_s=changes_s,

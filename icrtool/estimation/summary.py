@@ -236,12 +236,7 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
         process_icr_mps=config.filter.process_icr_mps,
         track_width_m=width,
     )
-    unlearned = unlearned_icrs(
-        table,
-        std_m=np.sqrt(np.diag(covariance)),
-        start_std_m=filtered.start_std_m,
-        least_icr_m=filtered.least_icr_m,
-    )
+    unlearned = unlearned_icrs(table, std_m=np.sqrt(np.diag(covariance)), least_icr_m=filtered.least_icr_m)
     turning = (track.v_left - track.v_right) ** 2
     turning *= np.diff(table.t_s, append=table.t_s[-1:])
     speed = float(turning @ (track.v_left + track.v_right)) / 2 / max(float(turning.sum()), 1e-12)

@@ -144,6 +144,9 @@ def test_a_warm_start_begins_with_the_other_runs_icrs_and_certainty() -> None:
     second = fit(make_log(seed=1), load_config(sets=[WIDTH]), warm_start=start)
     assert second.table.y_icr_right_m[0] == ICRS[0]
     assert second.table.std_y_icr_right_m[0] < 0.1 * 0.4
+    # certain ICRs that stay as certain are shown
+    assert second.usable
+    assert second.summary["icr"]["final_std"]["y_icr_right_m"] < ICR_TOLERANCE_M
 
 
 def test_a_terrain_change_opens_the_icrs_and_gives_segments() -> None:
