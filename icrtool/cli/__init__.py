@@ -21,7 +21,7 @@ from importlib.util import LazyLoader
 from types import FrameType, ModuleType
 from typing import Any, TextIO, cast
 
-from icrtool.records.process_resources import remove_unfinished, use_one_arena
+from icrtool.records.process_resources import keep_freed, remove_unfinished
 
 __all__ = ["main", "when_used"]
 
@@ -47,7 +47,7 @@ def main() -> None:
     os.environ["MPLBACKEND"] = "agg"
     if len(sys.argv) > 2:
         # Before the first thread starts; not where only help is asked for, since it takes some milliseconds.
-        use_one_arena()
+        keep_freed()
     # Little of what a command makes is cyclic rubbish; looking for it every 700 objects costs a tenth of loading
     # numba and matplotlib, and of drawing. What a command loads is less than so many.
     gc.set_threshold(300_000)

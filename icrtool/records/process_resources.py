@@ -58,16 +58,23 @@ def remove(path: Path) -> None:
 LARGE_BYTES = 600 << 20
 """A process that never took more has nothing to give back that would matter: all logs of up to an hour."""
 
-M_ARENA_MAX = -8
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Of glibc's ``malloc.h``."""
 
+KEPT_BYTES, OWN_PAGES_BYTES = 1 << 27, 1 << 24
+"""The free end of the memory is given back when it is larger; an array that is larger has pages of its own, which go
+back with it."""
 
-def use_one_arena() -> None:
-    """Have all threads that start from now on allocate where the main thread does.
 
-    glibc gives each thread an arena of its own, whose free end `malloc_trim` does not give back.
+def keep_freed() -> None:
+    """Have all threads that start from now on allocate where the main thread does, and use what others freed again.
+
+    glibc gives each thread an arena of its own, whose free end `malloc_trim` does not give back; and it gives the
+    memory of a column of an hour back to take it anew for the next one, half of all pages that a fit is given.
     """
     _call_libc("mallopt", M_ARENA_MAX, 1)
+    _call_libc("mallopt", M_TRIM_THRESHOLD, KEPT_BYTES)
+    _call_libc("mallopt", M_MMAP_THRESHOLD, OWN_PAGES_BYTES)
 
 
 def give_back_freed() -> None:
