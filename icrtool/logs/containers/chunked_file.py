@@ -293,14 +293,13 @@ class ChunkedFile(Container):
         first, needed = int(part.ranges[0, 0]), int(part.ranges[1, -1])
         if chunk.is_stored:
             begin = chunk.at + chunk.length - chunk.size + first
-            content = self._content(begin, needed - first, spaces.packed, part.held)
-            packed = Packed(content, "", len(content))
+            data = self._content(begin, needed - first, spaces.packed, part.held)
         else:
             # A whole frame is decompressed in one step.
             first, needed = 0, chunk.size if 2 * needed > chunk.size else needed
             packed = self._packed(part, spaces.packed, needed=needed)
-        inflation.count(len(packed.data), packed.size)
-        data = decompress(packed, spaces.records.of(packed.size + 1))
+            inflation.count(len(packed.data), packed.size)
+            data = decompress(packed, spaces.records.of(packed.size + 1))
         if len(data) < needed - first:
             raise DecompressionError("smaller than the index states")
         for begin, end in (part.ranges - first).T.tolist():
