@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import click
 
@@ -13,6 +13,7 @@ from icrtool.cli.fit import fitted_log
 from icrtool.cli.inputs import RUNS, ResultPlace, RunPlace, check_run_config, logs_of, run_directories
 from icrtool.cli.options import FILE, POSITIVE, Exports, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
+from icrtool.records.choices import Reference, Starts
 from icrtool.records.text import LogText, escaped
 
 with when_used():
@@ -73,11 +74,11 @@ FURTHER = options.together(
            "end; repeatable.", multiple=True),
     option("--outage-at outage_at_s", "SECONDS", float, "Begin of a forced outage, since the first state; default: "
            "equal spacing; repeatable.", multiple=True),
-    choice("--reference", ("filter", "smoothed"), "Compare trials with the states of the filter, or of the smoother "
+    choice("--reference", get_args(Reference), "Compare trials with the states of the filter, or of the smoother "
            "(fit --smooth).", default="filter"),
     flag("--without-events", "Leave out trials that cross a slip event, and report how much they change the errors."),
     flag("--with-jumps", "Count trials that cross a jump of the reference too."),
-    choice("--starts", ("moving", "all"), "moving: each standstill is one start; all: every recorded state is one.",
+    choice("--starts", get_args(Starts), "moving: each standstill is one start; all: every recorded state is one.",
            default="moving"),
     flag("--trials", "Write every single trial to trials.parquet."),
     option("--seed", None, click.IntRange(min=0), "Seed of the random draws."),

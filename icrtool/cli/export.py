@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, cast, get_args
 
 import click
 
@@ -11,6 +11,7 @@ from icrtool.cli import when_used
 from icrtool.cli.inputs import RUNS, read_calibration
 from icrtool.cli.options import FILE, PLACE, choice, flag, option
 from icrtool.cli.printing import Printer, write_or_print
+from icrtool.records.choices import ControllerTarget, TrajectoryFormat
 
 with when_used():
     from icrtool import errors
@@ -22,8 +23,7 @@ with when_used():
 if TYPE_CHECKING:
     from icrtool.records.run import Run
 
-CONTROLLERS = ("diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr")
-TRAJECTORIES = ("evo", "kitti")
+CONTROLLERS, TRAJECTORIES = get_args(ControllerTarget), get_args(TrajectoryFormat)
 TARGETS = (*CONTROLLERS, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
 
 TEXT_SUFFIXES = (".txt", ".csv")
@@ -65,7 +65,7 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
         # A file by what is there, else by a suffix that such files have.
         suffixes = (*paths.SUFFIXES.values(), *TEXT_SUFFIXES)
         if not (output.is_file() or (output.suffix.lower() in suffixes and not output.is_dir())):
-            _write_trajectories(_run(source), cast("paths.TrajectoryFormat", target), output)
+            _write_trajectories(_run(source), cast(TrajectoryFormat, target), output)
             return
     if output is not None:
         atomic.check_place(output)
@@ -74,20 +74,20 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
         if (reasons := record.unfit_reasons(found)) and not force:
             advice = f"calibrate with other logs; {ALL_THE_SAME}"
             raise errors.DataError(name, f"not fit for use: {reasons[0]}", advice)
-        text = controllers.format_export(found, cast("controllers.Target", target))
+        text = controllers.format_export(found, cast(ControllerTarget, target))
     else:
         run = _run(source, output)
         if target == "foxglove" and output is not None:
             _write_foxglove(run, output)
             return
         if target in TRAJECTORIES:
-            text = paths.format_trajectory(paths.paths_of(run)[0], cast("paths.TrajectoryFormat", target))
+            text = paths.format_trajectory(paths.paths_of(run)[0], cast(TrajectoryFormat, target))
         else:
             text = paths.format_geojson(run) if target == "qgis" else paths.format_kml(run)
     write_or_print(text if target in TRAJECTORIES else f"{text}\n", output)
 
 
-def _write_trajectories(run: Run, target: paths.TrajectoryFormat, directory: Path) -> None:
+def _write_trajectories(run: Run, target: TrajectoryFormat, directory: Path) -> None:
     """Write a file for each path of a run."""
     directory.mkdir(parents=True, exist_ok=True)
     files = {directory / f"{path.name}{paths.SUFFIXES[target]}": path for path in paths.paths_of(run)}

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -15,6 +15,7 @@ from icrtool.cli import options, when_used
 from icrtool.cli.inputs import ResultPlace, logs_of, run_directories
 from icrtool.cli.options import PLACE, Span, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
+from icrtool.records.choices import StatesFormat
 from icrtool.records.text import LogText, escaped
 
 with when_used():
@@ -37,7 +38,8 @@ ASKED = options.together(
     "asked",
     "icrtool.fleet.one_log:FitOptions",
     options.PLACES,
-    choice("--states", ("csv", "parquet"), "Format of the states; default: csv, parquet for over a million states."),
+    choice("--states", get_args(StatesFormat), "Format of the states; default: csv, parquet for over a million "
+           "states."),
     options.PLOTS,
     options.FIGURES,
     option("--warm-start", "RUN|CAL.json", PLACE, "Start from another run's final ICRs and covariance, or from those "

@@ -14,7 +14,7 @@ from functools import wraps
 from inspect import signature
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast, get_args
 
 import click
 from click.shell_completion import CompletionItem
@@ -22,6 +22,7 @@ from click.shell_completion import CompletionItem
 from icrtool.cli import when_used
 from icrtool.cli.inputs import ResultPlace
 from icrtool.cli.printing import Printer
+from icrtool.records.choices import FigureSet
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.text import escaped
 
@@ -264,7 +265,7 @@ def plot_formats(text: str) -> tuple[str, ...]:
 
 PLOTS = option("--plots", "png,svg,pdf|none", plot_formats, "Formats of the pictures.", default="png")
 FIGURES = choice(
-    "--figures", ("default", "all"), "all: also those of the paper, such as a histogram a distance.", default="default"
+    "--figures", get_args(FigureSet), "all: also those of the paper, such as a histogram a distance.", default="default"
 )
 BUDGETS = option(
     "--budget budgets_m", "METRES", POSITIVE, "Report how far 95 % of the errors stay within this; repeatable.",

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import click
 
@@ -14,6 +14,7 @@ from icrtool.cli import options, when_used
 from icrtool.cli.inputs import RUNS
 from icrtool.cli.options import FILE, NOT_NEGATIVE, POSITIVE, Change, Option, choice, flag, numbers, option, together
 from icrtool.cli.printing import Printer
+from icrtool.records.choices import HeadingConvention, PathKind, Preset, StudyName, WheelMessages
 
 with when_used():
     from icrtool import errors
@@ -24,16 +25,13 @@ with when_used():
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
-    from icrtool.logs.write_log import WheelMessages
     from icrtool.records.tables import Icrs
     from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, TruthTable
     from icrtool.simulation.study_records import Study, StudyRequest
 
-PATHS = ("circle", "curved", "lawnmower", "figure-eight", "spins", "straight")
 GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
 """Pentzer 2014, Sections 4 and 6.5."""
 
-WHEEL_MESSAGES = ("joint_states", "odometry", "float64_pair", "ticks", "jackal_feedback", "twist_stamped")
 DEFAULT_ROBOT = "pentzer-tracked"
 DEFAULT_MULTIPLIER = 1.5
 """The true ICRs where none are given: this many half track widths to either side, x 0."""
@@ -91,7 +89,7 @@ DRIVE = (
         numbers("YR,YL,X", 3),
         "True ICRs [m]; default: by the robot's width, or the study's.",
     ),
-    ("--path kind", None, click.Choice(PATHS), "Path to drive; study convergence then has no other."),
+    ("--path kind", None, click.Choice(get_args(PathKind)), "Path to drive; study convergence then has no other."),
     ("--duration duration_s", "S", POSITIVE, "Duration of a drive [s]; default: 100, or the study's."),
     ("--speed speed_mps", "MPS", POSITIVE, "Speed of the body; on the spot: of the faster track."),
     ("--radius radius_m", "M", NOT_NEGATIVE, "Radius of circles and of the tightest bends."),
@@ -114,14 +112,14 @@ RECORDED = (
     ("--start-heading start_heading_rad", "DEG", degrees(), "Heading at the start, clockwise from north.", 30.0),
     ("--wheels", None, click.Choice(["encoder", "commanded"]),
      "Content of the wheel messages: counted travel, or the motor commands.", "encoder"),
-    ("--wheel-messages", None, click.Choice(WHEEL_MESSAGES), "Message type of the wheels.", "joint_states"),
+    ("--wheel-messages", None, click.Choice(get_args(WheelMessages)), "Message type of the wheels.", "joint_states"),
     ("--wheel-rate", "HZ", POSITIVE, "Wheel messages a second; default 100, commanded 10.", None),
     ("--motor-lag motor_lag_s", "S", NOT_NEGATIVE, "Time constant with which the tracks follow their commands.", 0.0),
     ("--antenna", "FORWARD,RIGHT", numbers("FORWARD,RIGHT", 2), "Position of the antenna, from the body origin [m].",
      "0,0"),
     ("--gnss-delay gnss_delay_s", "S", float, "The stamps of the fixes lag by this.", 0.0),
-    ("--heading convention", None, click.Choice(["enu", "ned"]), "Convention of the Imu: REP-103, or REP-145's NED.",
-     "enu"),
+    ("--heading convention", None, click.Choice(get_args(HeadingConvention)),
+     "Convention of the Imu: REP-103, or REP-145's NED.", "enu"),
     ("--heading-std heading_std_rad", "DEG", degrees(NOT_NEGATIVE), "White noise of the heading.", 1.0),
     ("--heading-resolution heading_resolution_rad", "DEG", degrees(NOT_NEGATIVE), "Headings are rounded to this.",
      0.05),
@@ -162,7 +160,7 @@ def drive_options(*further: Option, **defaults: object) -> Option:
 def simulate_command(
     log: Path, force: bool, seed: int, speeds: Path | None, path: Change[PathPlan], plan: Change[DrivePlan],
     sensors: Change[Sensors], encoder_counts: float | None, wheel_rate: float | None, antenna: tuple[float, float],
-    wheel_messages: WheelMessages, convention: Literal["enu", "ned"], settings: ConfigSources, printer: Printer,
+    wheel_messages: WheelMessages, convention: HeadingConvention, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth beside it.
 
@@ -243,14 +241,8 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
     return "\n".join(lines)
 
 
-STUDY_NAMES = (
-    "convergence", "initial", "icr-change", "turn-radius", "input-noise", "input-bias", "input-source", "gnss", "rate",
-    "consistency",
-)  # fmt: skip
-
-
 @click.command("study")
-@click.argument("name", metavar="NAME", type=click.Choice(STUDY_NAMES))
+@click.argument("name", metavar="NAME", type=click.Choice(get_args(StudyName)))
 @option("-o --output", "DIR", FILE, "Study directory; default icrtool-runs/study-NAME.")
 @together(
     "request",
@@ -260,7 +252,7 @@ STUDY_NAMES = (
     option("--values", "V,V,...", numbers("V,V,..."), "Values of the quantity that the study varies, in its unit."),
     change=True,
 )
-@choice("--preset", ("paper", "field"), "Study this preset alone; default: both; initial: paper; convergence: paper, "
+@choice("--preset", get_args(Preset), "Study this preset alone; default: both; initial: paper; convergence: paper, "
         "or field with --robot.")  # fmt: skip
 @drive_options(
     choice("--wheels", ("ideal", "encoder"), "Wheel speeds without error, or counted travel."),
@@ -271,7 +263,7 @@ STUDY_NAMES = (
 @options.CONFIGURATION
 @options.printing(options.QUIET, options.VERBOSE)
 def study_command(
-    name: str, output: Path | None, request: Change[StudyRequest], preset: Literal["paper", "field"] | None,
+    name: str, output: Path | None, request: Change[StudyRequest], preset: Preset | None,
     path: Change[PathPlan], plan: Change[DrivePlan], sensors: Change[Sensors], encoder_counts: float | None,
     rate: float | None, plots: tuple[str, ...], settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
-from typing import Literal
 
 import msgspec
 import numpy as np
@@ -17,7 +16,7 @@ from icrtool.calibration.pooled import predictor, turning_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_models import FITTED_TO, ComparedModels, ComparedRow, Model, compare_models
 from icrtool.dropout_analysis import report, shown_paths
-from icrtool.dropout_analysis.starts import Starts, split_by_turning, with_smoothed_reference
+from icrtool.dropout_analysis.starts import split_by_turning, with_smoothed_reference
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
@@ -25,6 +24,7 @@ from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LE
 from icrtool.kernels.open_loop import TOLERANCE_M
 from icrtool.records import dropout_document as documents
 from icrtool.records.calibration_document import CalibrationFile
+from icrtool.records.choices import Reference, Starts
 from icrtool.records.dropout import DEFAULT_SEED, BudgetDistance, Gate, TurningSplit, UsedCalibration, Verdict
 from icrtool.records.plain_data import plain
 from icrtool.records.process_resources import give_back_freed
@@ -98,7 +98,7 @@ def dropout_report(
     with_jumps: bool = False,
     calibrations: Sequence[Calibration] = (),
     comparison: bool = True,
-    reference: Literal["filter", "smoothed"] = "filter",
+    reference: Reference = "filter",
     baseline: report.BaselineReport | None = None,
     strict: bool = False,
     allow_unusable: bool = False,

@@ -25,9 +25,10 @@ from icrtool.kernels.error_statistics import BlockSums, difference_half_width, w
 from icrtool.kernels.track import TrialCounts
 from icrtool.motion.models import FAMILY
 from icrtool.records import dropout_document as documents
+from icrtool.records.choices import FigureSet
 from icrtool.records.dropout import METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.plain_data import plain
-from icrtool.records.run import FigureSet, call_output
+from icrtool.records.run import call_output
 from icrtool.records.run_document import RunDocument, known_content
 from icrtool.records.text import escaped, listed
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, models_of
-from icrtool.dropout_analysis.starts import Starts, counted_ends, standing_states
+from icrtool.dropout_analysis.starts import counted_ends, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.run_filter import set_up_again
 from icrtool.kernels.arrays import Bools, Floats
@@ -17,6 +17,7 @@ from icrtool.kernels.open_loop import open_loop_errors, open_loop_path
 from icrtool.kernels.track import OpenLoopPath, Track, trial_ends
 from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Trials
+from icrtool.records.choices import Starts
 from icrtool.records.dropout_document import ExampleTrial, Outage, OutageDocument, TrialDocument
 from icrtool.records.plain_data import known
 from icrtool.records.run import Run, track_of

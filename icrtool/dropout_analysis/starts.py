@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -20,12 +19,12 @@ from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Bools, Floats, Ints, rows_of_cells
 from icrtool.kernels.open_loop import open_loop_errors
 from icrtool.kernels.track import STANDING, Track, trial_ends
+from icrtool.records.choices import Starts
 from icrtool.records.dropout import TurningSplit
 from icrtool.records.dropout_document import ReferenceRow
 from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 
-Starts = Literal["moving", "all"]
 """``moving``: each standstill gives one start, the state from which the robot drives on; ``all``: every state."""
 
 STANDING_MPS = 0.01

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from icrtool.calibration.run_models import ComparedRow, Model, models_of
 from icrtool.dropout_analysis.report import OpenLoopErrors
-from icrtool.dropout_analysis.starts import Starts, first_learned, leave_out, reference_error, standing_states
+from icrtool.dropout_analysis.starts import first_learned, leave_out, reference_error, standing_states
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels import error_statistics as statistics
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -21,6 +21,7 @@ from icrtool.kernels.open_loop import open_loop_errors
 from icrtool.kernels.track import FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
 from icrtool.motion.recording import MOST_TRIALS, Trials
 from icrtool.records import dropout_document as documents
+from icrtool.records.choices import Starts
 from icrtool.records.plain_data import known, plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import Run, track_of

@@ -19,10 +19,10 @@ from msgspec.structs import replace
 from icrtool import __version__
 from icrtool.errors import IcrToolError, OutputError
 from icrtool.fleet.recordings import as_text, unique_name
-from icrtool.output.figure_catalogue import FIGURES
+from icrtool.output.figure_catalogue import FIGURES, figures_of
 from icrtool.output.files import formats
 from icrtool.output.files.atomic import atomic_file, check_place, make_folders, write_file
-from icrtool.output.run_directory import PAGE_FILE, is_page
+from icrtool.output.run_directory import PAGE_FILE, is_page, open_run
 from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records import fleet_document as documents
 from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog
@@ -182,7 +182,6 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
     ----------
     folder : of the batch
     """
-    from icrtool.output.figure_catalogue import figures_of
     from icrtool.output.figures.calibrations import FleetNumbers
 
     points: list[FleetLog] = []
@@ -341,7 +340,6 @@ def _pooled(
     one: FleetCalibration, members: Sequence[FleetLog], directory: Path, place: Path, name: str, *, allow_unusable: bool
 ) -> FleetCalibration:
     from icrtool.calibration.pooled import calibrate_runs
-    from icrtool.output.run_directory import open_run
     from icrtool.output.tables.calibration import held_out_blocks
     from icrtool.output.text_blocks import format_blocks
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec.structs import replace
@@ -29,11 +29,12 @@ from icrtool.logs.containers.recording_files import file_sha256, files_of_log, l
 from icrtool.output.files.formats import open_calibration
 from icrtool.output.files.remote_place import on_disk, write_below
 from icrtool.output.run_directory import PAGE_FILE, check_target, new_run, open_run, replaced_log
+from icrtool.records.choices import FigureSet, Reference, Starts, StatesFormat
 from icrtool.records.dropout import DEFAULT_SEED
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import plain
-from icrtool.records.run import ICR_COLUMNS, FigureSet
+from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
 
@@ -83,8 +84,8 @@ class TrialOptions:
     outage_s: tuple[float, ...] | None = None
     outage_at_s: tuple[float, ...] = ()
     calibrations: tuple[Calibration, ...] = ()
-    starts: Literal["moving", "all"] = "moving"
-    reference: Literal["filter", "smoothed"] = "filter"
+    starts: Starts = "moving"
+    reference: Reference = "filter"
     without_events: bool = False
     with_jumps: bool = False
     seed: int = DEFAULT_SEED
@@ -118,7 +119,7 @@ class FitOptions:
     overwrite: bool = False
     plots: tuple[str, ...] = ("png",)
     figures: FigureSet = "default"
-    states: Literal["csv", "parquet"] | None = None
+    states: StatesFormat | None = None
     span: tuple[str | None, str | None] = (None, None)
     warm_start: Path | None = None
     changes_s: tuple[float, ...] = ()

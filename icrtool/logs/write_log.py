@@ -18,6 +18,7 @@ import numpy as np
 
 from icrtool.errors import ConfigError, OutputError
 from icrtool.logs.messages.definitions import bundled_definitions
+from icrtool.records.choices import HeadingConvention, WheelMessages
 from icrtool.records.process_resources import unfinished
 from icrtool.records.samples import SensorColumns
 
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from icrtool.kernels.arrays import Ints
 
 Container = Literal["mcap", "bag", "db3"]
-WheelMessages = Literal["joint_states", "odometry", "float64_pair", "ticks", "jackal_feedback", "twist_stamped"]
 Compression = Literal["none", "bz2", "lz4", "zstd", "zstd-file"]
 
 COMPRESSIONS: dict[Container, tuple[Compression, ...]] = {
@@ -58,7 +58,7 @@ class WriteOptions:
 
     container: Container = "mcap"
     wheels: WheelMessages = "joint_states"
-    heading: Literal["enu", "ned"] = "enu"
+    heading: HeadingConvention = "enu"
     compression: Compression = "none"
     wheel_radius_m: float
     track_width_m: float

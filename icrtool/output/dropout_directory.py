@@ -24,10 +24,10 @@ from icrtool.output import figure_catalogue
 from icrtool.output.files.atomic import Kind, atomic_directory
 from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, logs_of_fleet, read_document, schema_of
 from icrtool.output.run_directory import REPORT_FILES, is_run_directory
+from icrtool.records.choices import FigureSet
 from icrtool.records.dropout_document import DropoutDocument, EarlierReport, SummaryRow
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
-from icrtool.records.run import FigureSet
 from icrtool.records.run_document import known_content
 from icrtool.records.text import escaped
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from icrtool.output.text_blocks import Chart
+from icrtool.records.choices import FigureSet
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.run import FigureSet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -21,11 +21,12 @@ from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import formats, run_columns
 from icrtool.output.files.atomic import Kind, atomic_directory, check_directory
 from icrtool.output.files.remote_place import lies_there, on_disk
-from icrtool.output.files.run_columns import MEASUREMENTS_FILE, StatesFormat
+from icrtool.output.files.run_columns import MEASUREMENTS_FILE
+from icrtool.records.choices import FigureSet, StatesFormat
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of, read_regular
 from icrtool.records.plain_data import Record
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.run import FigureSet, Run
+from icrtool.records.run import Run
 from icrtool.records.run_document import EVENT_COLUMNS, RUN_SCHEMA, EventDocument, RunDocument
 from icrtool.records.samples import InputFile
 from icrtool.records.tables import States
@@ -35,7 +36,7 @@ RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
 PAGE_FILE = "report.html"
 
-STATES_FORMATS: tuple[StatesFormat, ...] = ("csv", "parquet")
+STATES_FORMATS: tuple[StatesFormat, ...] = get_args(StatesFormat)
 
 MOST_CSV_STATES = 1_000_000
 """With more states, states.csv would have over 300 MB, and take longer to read than the log."""

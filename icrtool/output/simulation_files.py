@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -16,9 +17,9 @@ from icrtool import __version__
 from icrtool.errors import DataError, OutputError
 from icrtool.output.files.atomic import Kind, atomic_directory, beside, check_directory, put, reported, sync_tree
 from icrtool.output.files.formats import csv_bytes, json_bytes, read_numbers, schema_of
+from icrtool.records.choices import StudyName
 from icrtool.records.process_resources import remove
 from icrtool.simulation.drives import TrackSpeeds, TruthTable
-from icrtool.simulation.studies import STUDIES
 from icrtool.simulation.study_records import StudyResult
 
 SPEED_COLUMNS = ("t_s", "v_left_mps", "v_right_mps")
@@ -150,11 +151,8 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
             save(study_figure(result), partial / name, plots)
 
 
-def is_study_directory(directory: Path) -> bool:
-    """Return whether a directory is a study of ours, of whatever version."""
-    return schema_of(directory / STUDY_FILE, directory).startswith(SCHEMA_FAMILY)
-
-
 STUDY = Kind(
-    "study directory", is_study_directory, re.compile(rf"study\.json|({'|'.join(STUDIES)})\.(csv|png|svg|pdf)")
+    "study directory",
+    lambda place: schema_of(place / STUDY_FILE, place).startswith(SCHEMA_FAMILY),
+    re.compile(rf"study\.json|({'|'.join(get_args(StudyName))})\.(csv|png|svg|pdf)"),
 )

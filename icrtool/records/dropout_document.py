@@ -15,6 +15,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import BlockSums, Histogram
 from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.calibration_document import CalibrationDocument
+from icrtool.records.choices import Starts
 from icrtool.records.dropout import BudgetDistance, OutageKind, TurningSplit, UsedCalibration, Verdict
 from icrtool.records.plain_data import Record
 from icrtool.records.run_document import DriveDocument, IcrDocument
@@ -313,7 +314,7 @@ class DropoutDocument(Record, frozen=True, kw_only=True):
     reference: str
     smoothed: bool = False
     starts: int
-    starts_counted: Literal["moving", "all"]
+    starts_counted: Starts
     starts_standing: int
     with_jumps: bool
     without_events: EventCostDocument | None

@@ -6,7 +6,7 @@ import importlib
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.kernels.filter_records import GATED, RECOVERED, USED
 from icrtool.kernels.track import Track
+from icrtool.records.choices import FigureSet, StatesFormat
 from icrtool.records.measurements import SensorData, intervals_in
 from icrtool.records.plain_data import plain
 from icrtool.records.tables import Icrs, States
@@ -32,7 +33,6 @@ STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 USUAL_WIDTH_M = 0.6
 """Track width of a small field robot [m], used where that of the robot is not known."""
 
-FigureSet = Literal["default", "all"]
 """The figures that a run and its report are written with: those that answer a question, or the paper's too."""
 
 MAKE_RUN = "icrtool.fit(log) makes one, icrtool.open_run(directory) reads one"
@@ -212,7 +212,7 @@ class Run:
         self,
         path: str | Path,
         *,
-        states: Literal["csv", "parquet"] | None = None,
+        states: StatesFormat | None = None,
         plots: tuple[str, ...] = ("png",),
         figures: FigureSet = "default",
     ) -> None:

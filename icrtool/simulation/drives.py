@@ -12,10 +12,9 @@ import numpy as np
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats, Ints, wrapped
 from icrtool.kernels.kinematics import drive, follow, poses_at
+from icrtool.records.choices import PathKind
 from icrtool.records.samples import SensorColumns
 from icrtool.records.tables import Icrs
-
-PathKind = Literal["circle", "curved", "lawnmower", "figure-eight", "spins", "straight"]
 
 CURVED_SWINGS = ((0.8, 1.4), (0.2, 3.0))
 """Share of the curvature, and length in radii per radian, of the two oscillations of path ``curved``: the heading

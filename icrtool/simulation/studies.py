@@ -15,9 +15,10 @@ from typing import Any, cast
 from icrtool.config import Config
 from icrtool.errors import ConfigError
 from icrtool.kernels.filter_records import GUARDED, PRINTED, UNGUARDED
+from icrtool.records.choices import PathKind
 from icrtool.records.tables import Icrs
 from icrtool.simulation import study_runs as measured
-from icrtool.simulation.drives import PathKind, PathPlan, check_drive
+from icrtool.simulation.drives import PathPlan, check_drive
 from icrtool.simulation.study_records import (
     IDEAL,
     PLAN,

@@ -12,7 +12,8 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.simulation.drives import DrivePlan, PathKind, PathPlan, Sensors
+from icrtool.records.choices import PathKind, Preset
+from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
 from icrtool.simulation.study_runs import ICR_NAMES, STATES, Measure, Scenario
 
 PLAN = DrivePlan(step_s=0.005)
@@ -20,7 +21,6 @@ PLAN = DrivePlan(step_s=0.005)
 
 IDEAL = Sensors(wheels="ideal", heading_resolution_rad=0.0)
 
-Preset = Literal["paper", "field"]
 Column = Floats | Ints | list[float | str]
 
 

@@ -9,7 +9,6 @@ import pytest
 from ruamel.yaml import YAML
 
 from icrtool.cli.export import CONTROLLERS
-from icrtool.output.exports import controllers as export
 from support.documents import with_summary
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,10 +41,6 @@ def test_what_is_printed_loads_as_yaml(icrtool, target: str) -> None:
 
 def test_without_an_argument_the_newest_run_is_taken(icrtool) -> None:
     assert icrtool("export", "--for", "clearpath") == icrtool("export", "--for", "clearpath", "icrtool-runs/mower")
-
-
-def test_the_choices_are_those_of_the_exports() -> None:
-    assert export.TARGETS == CONTROLLERS
 
 
 def test_a_log_is_no_run(icrtool) -> None:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from icrtool.cli.simulate import PATHS, WHEEL_MESSAGES
 from icrtool.cli.simulate import simulate_command as command
 from icrtool.config import load_config
 from icrtool.estimation.fit import fit
 from icrtool.logs.read_log import read_log
+from icrtool.records.choices import PathKind, WheelMessages
 from icrtool.records.run import Run
 
 SIGMAS = 3.0
@@ -60,7 +61,7 @@ EVERY_OPTION = [
     ("--wheels", "commanded"),
     ("--wheels", "commanded", "--motor-lag", 0.1),
     # The unit of a bare Float64 is told by straight driving against the fixes.
-    *(("--wheel-messages", kind, "--path", "lawnmower", "--leg", 8) for kind in WHEEL_MESSAGES[1:]),
+    *(("--wheel-messages", kind, "--path", "lawnmower", "--leg", 8) for kind in get_args(WheelMessages)[1:]),
     ("--wheel-rate", 20),
     ("--input-noise", 0.05),
     ("--input-bias", 0.02),
@@ -148,7 +149,7 @@ def test_wobbly_wheels_on_an_even_winding_way_show_no_delay(tmp_path: Path) -> N
 
 @pytest.mark.stress
 @pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("path", [path for path in PATHS if path != "straight"])
+@pytest.mark.parametrize("path", [path for path in get_args(PathKind) if path != "straight"])
 def test_the_grid_of_robots_paths_sensors_and_containers(tmp_path: Path, robot: str, path: str) -> None:
     size = 2.0 if robot == "warthog" else 1.0
     sensors = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from datetime import UTC, datetime
-from typing import Literal, get_args
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -20,11 +20,11 @@ from icrtool.output.files.formats import json_bytes
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.output.text_format import controller_error_text
 from icrtool.records.calibration_document import ControllerErrors
+from icrtool.records.choices import ControllerTarget
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
 
-Target = Literal["diff_drive_controller", "clearpath", "nav2", "husarion", "json", "icr"]
-TARGETS: tuple[Target, ...] = get_args(Target)
+TARGETS: tuple[ControllerTarget, ...] = get_args(ControllerTarget)
 
 EXPORT_SCHEMA = "icrtool/export/1"
 
@@ -35,7 +35,7 @@ ODOMETRY_USED = (6, 11)
 """Of robot_localization's fifteen, x y z roll pitch yaw, their velocities, accelerations: vx and vyaw."""
 
 
-CONTROLLER_PLACES: dict[Target, tuple[str, ...]] = {
+CONTROLLER_PLACES: dict[ControllerTarget, tuple[str, ...]] = {
     "diff_drive_controller": ("diff_drive_controller:  # your controller's name", "  ros__parameters:"),
     "clearpath": (
         "# robot.yaml: merge into its platform section", "platform:", "  extras:", "    ros_parameters:",
@@ -67,7 +67,7 @@ amcl:
 """
 
 
-def format_export(calibration: Calibration, target: Target) -> str:
+def format_export(calibration: Calibration, target: ControllerTarget) -> str:
     """Return the text to paste, no line end.
 
     Notes
@@ -122,7 +122,7 @@ def format_export(calibration: Calibration, target: Target) -> str:
     return "\n".join([*_header(calibration, errors, driven), *_parameters(calibration, errors, target)])
 
 
-def _parameters(calibration: Calibration, errors: ControllerErrors, target: Target) -> list[str]:
+def _parameters(calibration: Calibration, errors: ControllerErrors, target: ControllerTarget) -> list[str]:
     """Return the lines of YAML: of a diff_drive_controller in its place, or for nav2 and robot_localization."""
     rest = _number(NOT_PLANAR)
     pose, twist = (

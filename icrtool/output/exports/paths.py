@@ -28,6 +28,7 @@ from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.kernels.track import FrozenIcrs
 from icrtool.output.series import BLUE, ORANGE, places
 from icrtool.output.text_format import PATH_WORDS, driven_text, duration_text, run_title, xml_text
+from icrtool.records.choices import TrajectoryFormat
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import States
@@ -159,8 +160,6 @@ def outage_rows(run: Run) -> Iterator[tuple[tuple[int, int], slice]]:
         first, last = np.searchsorted(stamps, [begin_ns, end_ns])
         yield (begin_ns, end_ns), slice(min(int(first), len(stamps) - 1), int(last) + 1)
 
-
-TrajectoryFormat = Literal["evo", "kitti"]
 
 SUFFIXES: dict[TrajectoryFormat, str] = {"evo": ".tum", "kitti": ".kitti"}
 

@@ -15,7 +15,7 @@ from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from tokenize import TokenError
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import msgspec
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.chunk import LARGEST_RATIO
 from icrtool.output.files.formats import file_b2sum
+from icrtool.records.choices import StatesFormat
 from icrtool.records.measurements import Fixes, ReferenceJump, SensorData, SlipEvent
 from icrtool.records.places import open_regular
 from icrtool.records.run import MeasurementOutcome, Run
@@ -36,7 +37,6 @@ from icrtool.records.tables import LARGEST, States
 if TYPE_CHECKING:
     import pyarrow as pa
 
-StatesFormat = Literal["csv", "parquet"]
 
 COLUMNS = tuple(field.name for field in fields(States))
 INTEGER_COLUMNS = frozenset({"stamp_ns"})

@@ -63,7 +63,7 @@ def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeyp
     numbers = f"multiplier {grass.multiplier:.4f} ± {grass.multiplier_std:.4f}, within 0.5 m (95 %) for"
     assert numbers in calibrations_text(found)
     write_fleet(logs, place, found)
-    monkeypatch.setattr("icrtool.output.run_directory.open_run", None)
+    monkeypatch.setattr("icrtool.fleet.fleet_files.open_run", None)
     assert list(pooled_calibrations(logs, place)) == found, "nothing changed: nothing is fitted"
     with pytest.raises(TypeError):
         list(pooled_calibrations(logs[:1], place))

@@ -9,14 +9,14 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from icrtool.cli.simulate import PATHS, STUDY_NAMES, study_command
+from icrtool.cli.simulate import study_command
 from icrtool.errors import ConfigError
 from icrtool.kernels.kinematics import body_velocity
+from icrtool.records.choices import PathKind, StudyName
 from icrtool.simulation.drives import (
     DATUM,
     START_NS,
     DrivePlan,
-    PathKind,
     PathPlan,
     Sensors,
     TrackSpeeds,
@@ -42,7 +42,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("kind", PATHS)
+@pytest.mark.parametrize("kind", get_args(PathKind))
 def test_track_speeds_give_the_body_what_the_path_asks(kind) -> None:
     t = np.linspace(0, 60, 500)
     icrs = (0.5, -0.75, -0.25)
@@ -233,11 +233,10 @@ def test_what_cannot_be_driven_is_refused_in_words(plan: DrivePlan, words: str) 
     assert str(refused.value).startswith(words)
 
 
-def test_the_command_knows_the_paths_and_studies_there_are() -> None:
+def test_the_command_knows_the_studies_there_are() -> None:
     from icrtool.simulation.studies import STUDIES
 
-    assert get_args(PathKind) == PATHS
-    assert set(STUDY_NAMES) == set(STUDIES)
+    assert set(get_args(StudyName)) == set(STUDIES)
     varied = {study.varied for study in STUDIES.values()} - {""}
     assert varied <= {option.name for option in study_command.params}
     assert {name for name, study in STUDIES.items() if study.varies and not study.varied} == {"initial"}
