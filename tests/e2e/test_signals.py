@@ -182,7 +182,8 @@ def partial(work: Path) -> set[Path]:
 
 def results(work: Path) -> set[str]:
     """Open all that was written; return the names of the results."""
-    visible = [path for path in work.rglob("*") if not any(".partial" in part for part in path.parts)]
+    # The processes of a killed batch may still remove what they were writing.
+    visible = [Path(place, name) for place, _, names in os.walk(work) for name in names if ".partial" not in place]
     for file in visible:
         if file.name == "run.json":
             icrtool.open_run(file.parent)

@@ -217,10 +217,14 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
 
 def _names_in(directory: Path) -> Iterator[str]:
     """Yield all that is in a directory, relative to it; a directory with ``/`` at its end."""
-    for path in directory.rglob("*"):
-        parts = path.relative_to(directory).parts
-        if path.name not in OF_NOBODY and not any(part.startswith(HIDDEN) for part in parts):
-            yield "/".join(parts) + ("/" if path.is_dir() and not path.is_symlink() else "")
+    for place, folders, files in os.walk(directory):
+        # What another process writes there may be gone at any moment.
+        folders[:] = [name for name in folders if not name.startswith(HIDDEN)]
+        for name in (*folders, *files):
+            path = Path(place, name)
+            if name not in OF_NOBODY and not name.startswith(HIDDEN):
+                slash = "/" if name in folders and not path.is_symlink() else ""
+                yield path.relative_to(directory).as_posix() + slash
 
 
 @contextmanager

@@ -273,6 +273,20 @@ def test_a_link_in_one_of_ours_is_never_followed(tmp_path: Path, name: str) -> N
     ]
 
 
+def test_what_another_process_writes_in_one_of_ours_is_not_looked_into(tmp_path: Path, monkeypatch) -> None:
+    write(tmp_path / "a", "old")
+    (tmp_path / "a" / ".icrtool-0123-4567.partial").mkdir()
+    real = os.scandir
+
+    def vanished(path: str) -> object:
+        if ".icrtool-" in str(path):
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", vanished)
+    check_directory(tmp_path / "a", REPORT)
+
+
 def test_what_came_into_one_of_ours_meanwhile_is_not_lost(tmp_path: Path) -> None:
     write(tmp_path / "a", "old")
 
