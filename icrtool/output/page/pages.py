@@ -27,10 +27,11 @@ from icrtool.output.page.drive_data import ERROR_KEYS, drive_data
 from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
 from icrtool.output.run_directory import PAGE_FILE, check_sum, is_page
 from icrtool.output.tables.calibration import transfer_blocks
+from icrtool.output.tables.configuration import format_settings
 from icrtool.output.tables.dropout import answer_sections, model_sections, outage_blocks, verdict_lines, worst_section
 from icrtool.output.tables.errors import errors_section, main_rows
-from icrtool.output.tables.run import advice_blocks, log_sections, unusable_lines
-from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Section, Table, Title
+from icrtool.output.tables.run import advice_blocks, streams_section, unusable_lines
+from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import (
     MODEL_WORDS,
     WORDS,
@@ -39,6 +40,7 @@ from icrtool.output.text_format import (
     error_text,
     plus_minus,
     position_word,
+    role_word,
     run_title,
     signed,
 )
@@ -117,7 +119,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     blocks = [
         Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {about}"),
         *page_blocks(summary, report),
-        Section("Log and settings", [*log_sections(summary), made_from], name="log"),
+        Section("Log and settings", [streams_section(summary), *_settings(summary), made_from], name="log"),
         Section("Words on this page", [words], name="words"),
     ]
     return render(
@@ -151,6 +153,22 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
         *([Section("Acceptance limits", verdict_lines(report), name="limits")] if report.gates else []),
         Section("Warnings", [Items(warnings) if warnings else "None."], PAGE, name="warnings"),
     ]  # fmt: skip
+
+
+def _settings(summary: RunDocument) -> list[Section]:
+    """Return why the streams of a run were taken, what was found of them, and its configuration."""
+    why: list[Block] = [Facts([(role_word(summary, one.role), one.why) for one in summary.streams])]
+    alignment = []
+    for name, one in summary.alignment.items():
+        value, applied = plus_minus(one.value, one.std, 4, ""), plus_minus(one.applied or None, None, 4, "")
+        alignment.append((name, value, applied, one.why))
+    if alignment:
+        caption = "Alignment of the streams: what was found and corrected"
+        why.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
+    return [
+        Section("Why these streams, and what was found of them", why, PAGE),
+        Section("Configuration that the run was made with", [Line(format_settings(summary.config), "as is")], PAGE),
+    ]
 
 
 def read_report(directory: Path) -> DropoutDocument | None:

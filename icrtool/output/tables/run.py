@@ -12,10 +12,8 @@ import numpy as np
 from icrtool.alignment.corrections import SIGNIFICANT_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.observability import lacking_turns
-from icrtool.output.tables.configuration import format_settings
 from icrtool.output.text_blocks import (
     BRIEF_WIDTH,
-    PAGE,
     VERBOSE,
     Block,
     Check,
@@ -102,7 +100,7 @@ def run_blocks(summary: RunDocument) -> list[Block]:
     found = [("corrected", "; ".join(corrections(summary))), ("inputs", inputs)]
     return [
         *blocks, Checks(run_checks(summary)), Facts([(label, text) for label, text in found if text]),
-        *log_sections(summary),
+        streams_section(summary),
     ]  # fmt: skip
 
 
@@ -312,29 +310,18 @@ def to_drive(summary: RunDocument) -> str:
     return next((one for one in excitation.sentences if "drive two full turns" in one), "")
 
 
-def log_sections(summary: RunDocument) -> list[Block]:
-    """Return what was read, and what the filter and the alignment made of it."""
+def streams_section(summary: RunDocument) -> Section:
+    """Return what was read, and what the filter made of it."""
     speed = f"{plus_minus(summary.drive.speed_mean_mps, summary.drive.speed_std_mps, 2, '')} m/s (mean ± std)"
-    streams, alignment = [], []
+    streams = []
     for stream in summary.streams:
         message_type = stream.message_type.replace("/msg/", "/")
         rate = f"{stream.rate_hz:.1f} Hz" if stream.rate_hz is not None else "unknown"
         names = (role_word(summary, stream.role), topics_text(stream.topic), message_type)
         streams.append((*names, rate, f"{stream.count:,}", stream.clock))
     head = ("stream", "topic", "type", "rate", "samples", "clock")
-    tables: list[Block] = [f"The robot drove at {speed}.", Table("lllrrl", streams, head), *_icr_tables(summary)]
-    why: list[Block] = [Facts([(role_word(summary, one.role), one.why) for one in summary.streams])]
-    for name, one in summary.alignment.items():
-        value, applied = plus_minus(one.value, one.std, 4, ""), plus_minus(one.applied or None, None, 4, "")
-        alignment.append((name, value, applied, one.why))
-    if alignment:
-        caption = "Alignment of the streams: what was found and corrected"
-        why.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
-    return [
-        Section("Streams, filter", tables, VERBOSE),
-        Section("Why these streams, and what was found of them", why, PAGE),
-        Section("Configuration that the run was made with", [Line(format_settings(summary.config), "as is")], PAGE),
-    ]
+    tables = [Table("lllrrl", streams, head), *_icr_tables(summary)]
+    return Section("Streams, filter", [f"The robot drove at {speed}.", *tables], VERBOSE)
 
 
 def _icr_tables(summary: RunDocument) -> Iterator[Table]:
