@@ -16,7 +16,7 @@ import zstandard
 
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.chunk import PIECE_BYTES, DecompressionError, Inflation
-from icrtool.logs.containers.recording_files import inputs_of
+from icrtool.logs.containers.recording_files import file_sha256
 from icrtool.records.samples import InputFile
 from icrtool.records.text import LogText, escaped, shortened
 
@@ -269,7 +269,9 @@ class Container(ABC):
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:
         """Return the files that make up this log, with their SHA-256: of their beginning once `ended` is set."""
-        return self.origin.inputs or inputs_of(self.files, ended)
+        return self.origin.inputs or tuple(
+            InputFile(str(file), file.stat().st_size, file_sha256(file, ended)) for file in self.files
+        )
 
     def transfer(self) -> str:
         """Return in words how much came over a connection, and why all of it; empty for nothing."""

@@ -9,7 +9,6 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from threading import Event
 from types import MappingProxyType
 from typing import BinaryIO
 
@@ -27,8 +26,8 @@ from icrtool.logs.containers.recording_files import (
     Span,
     bag_files,
     check_spans,
+    file_sha256,
     files_of_log,
-    inputs_of,
     split_files,
     unpacked_name,
 )
@@ -156,7 +155,7 @@ def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
             file, problem = unpack(file, scratch.path / "unpacked")
             if problem:
                 raise LogError(path, "does not decompress", problem)
-        yield file, (origin.inputs or inputs_of([path], Event()))[0]
+        yield file, origin.inputs[0] if origin.inputs else InputFile(str(path), path.stat().st_size, file_sha256(path))
 
 
 def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from threading import Event
@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 from icrtool.errors import LogError
 from icrtool.records.places import UrlPath, open_regular
-from icrtool.records.samples import InputFile
 from icrtool.records.text import some_of
 
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
@@ -323,11 +322,6 @@ def log_name(path: Path) -> str:
         plain = unpacked_name(name)
         name = Path(plain).stem if plain == name or Path(plain).suffix in {*LOG_SUFFIXES, ".csv"} else plain
     return name if name.strip(".") else "log"
-
-
-def inputs_of(files: Iterable[Path], ended: Event) -> tuple[InputFile, ...]:
-    """Return files with their size and SHA-256, as `file_sha256`."""
-    return tuple(InputFile(str(file), file.stat().st_size, file_sha256(file, ended)) for file in files)
 
 
 def file_sha256(file: Path, ended: Event | None = None) -> str:

@@ -81,7 +81,12 @@ def ros_definitions(channel: Channel) -> Definitions:
     """
     if channel.definition:
         types = {**_TIME, **_parse(channel.definition, channel.definition_format, channel.message_type)}
-        return types if _is_complete(types) else {**standard_definitions(), **types}
+        for _, fields in types.values():
+            for _, (node, detail) in fields:
+                inner = detail[0] if int(node) > NAME else (node, detail)
+                if int(inner[0]) == NAME and inner[1] not in types:
+                    return {**standard_definitions(), **types}
+        return types
     name = full_name(channel.message_type)
     if channel.encoding == "ros1":
         raise DefinitionError(channel.message_type, "its connection carries no definition")
@@ -108,16 +113,6 @@ def kind_at(definitions: Definitions, name: str, steps: Sequence[Step]) -> str |
         else:
             return None
     return str(detail[0]) if node == BASE else None
-
-
-def _is_complete(types: Definitions) -> bool:
-    """Return whether every type that a field refers to is among the types."""
-    for _, fields in types.values():
-        for _, (node, detail) in fields:
-            inner = detail[0] if int(node) > NAME else (node, detail)
-            if int(inner[0]) == NAME and inner[1] not in types:
-                return False
-    return True
 
 
 def full_name(message_type: str) -> str:
