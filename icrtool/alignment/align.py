@@ -139,8 +139,8 @@ def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
 LEAST_START_STD, INFLATION = 0.15, 3.0
 """The filter starts from the alignment's ICRs with three times their standard deviation, at least this part of b."""
 
-LARGEST_WIDTH_STD, WIDTHS = 0.2, (0.7, 6.0)
-"""The ICRs are shown where W is known to this share, and lies between so many b."""
+LARGEST_WIDTH_STD = 0.2
+"""The ICRs are shown where W is known to this share."""
 
 USUAL_WIDTH = 1.5
 """Most skid-steer robots turn as if they were this much wider than they are."""
@@ -211,8 +211,8 @@ def start_icrs(findings: dict[str, Finding], config: Config) -> IcrStart | None:
     known = [findings[name] for name in ("icr_separation_m", *ICR_COLUMNS) if name in findings]
     if known:
         (width, right, left, x), std = [one.value or 0.0 for one in known], [one.std or 0.0 for one in known]
-        shown = std[0] < LARGEST_WIDTH_STD * width and WIDTHS[0] * b < width < WIDTHS[1] * b
-        if shown and right > least > -least > left and max(std[1:]) < b:
+        shown = std[0] < LARGEST_WIDTH_STD * width and max(std[1:]) < b
+        if shown and right > least > -least > left:
             inflated = [max(INFLATION * one, least) for one in std[1:]]
             return IcrStart((right, left, x), (inflated[0], inflated[1], inflated[2]))
     return IcrStart((USUAL_WIDTH * b / 2, -USUAL_WIDTH * b / 2, 0.0), (b / 2, b / 2, b / 2))

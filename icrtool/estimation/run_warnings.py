@@ -18,8 +18,8 @@ from icrtool.records.run import ICR_WORDS
 from icrtool.records.run_document import ExcitationDocument
 from icrtool.records.tables import States
 
-SMALLEST_MULTIPLIER = 0.9
-"""ICRs nearer to each other than this share of the track width are no robot's that slips."""
+MULTIPLIERS = (0.9, 6.0)
+"""ICRs nearer to each other, or further apart, in parts of the track width, are no robot's that slips."""
 
 ROLLS, ROLLS_STD = 0.02, 0.05
 """A robot whose ICRs are as far apart as its tracks, within this or two standard deviations of at most the second, does
@@ -167,8 +167,8 @@ def run_warnings(
         if abs(value - 1.0) <= max(ROLLS, 2.0 * std) and std <= ROLLS_STD:
             rolls = f"this robot turns as a differential drive (multiplier {value:.3f} ± {std:.3f})"
             found.append(f"{rolls}: ICRs improve nothing")
-        elif value < SMALLEST_MULTIPLIER:
-            cause = "slip makes it more than 1: check robot.track_width_m, wheel radius and sides"
+        elif not MULTIPLIERS[0] <= value <= MULTIPLIERS[1]:
+            cause = f"slip makes it 1 to {MULTIPLIERS[1]:g}: check robot.track_width_m, wheel radius and sides"
             found.append(f"the ICRs are {value:.2f} of the track width apart; {cause}")
     if inverted:
         found.append(

@@ -149,6 +149,14 @@ def test_a_warm_start_begins_with_the_other_runs_icrs_and_certainty() -> None:
     assert second.summary["icr"]["final_std"]["y_icr_right_m"] < ICR_TOLERANCE_M
 
 
+@pytest.mark.parametrize("width_m", [0.05, 0.1, 0.15, 2.0])
+def test_a_track_width_of_another_robot_does_not_change_the_icrs(width_m: float) -> None:
+    run = fit(make_log(), load_config(sets=[f"robot.track_width_m={width_m}"]))
+    assert run.usable
+    assert run.table.icrs_at(-1) == pytest.approx(ICRS, abs=0.01)
+    assert any("of the track width apart" in warning for warning in run.warnings)
+
+
 def test_a_terrain_change_opens_the_icrs_and_gives_segments() -> None:
     """By the robot's width, the paper's 10 m, or what is configured."""
     for settings, std in ((), 0.8), (("filter.preset=paper",), 10.0), (("filter.terrain_icr_std_m=3.0",), 3.0):
