@@ -312,6 +312,8 @@ class _Problem:
         fixed[STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
         both = np.outer(fixed, fixed)
         start = np.where(fixed, states[-1], model.x), np.where(both, covariances[-1], model.P)
+        psi_variance, final_std = covariances[:, PSI, PSI].copy(), np.sqrt(np.diagonal(covariances[-1]))
+        del covariances
         causal = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
         t, turn, G = self.t, self.turn, self.G
         # at samples of the rate: carried on from the last event, or between events
@@ -332,8 +334,8 @@ class _Problem:
         # a rate may be the mean over the interval before its stamp, or after it
         delay_s = float(np.median(np.diff(turn.t))) / 2.0 if turn.delay_std_s is None else turn.delay_std_s
         stamp = (turn.rate[rows] * delay_s) ** 2
-        smoothed_std = np.sqrt(np.interp(s, t, covariances[:, PSI, PSI]) + stamp)
+        smoothed_std = np.sqrt(np.interp(s, t, psi_variance) + stamp)
         return HeadingEstimate(
             s, carried, np.sqrt(np.maximum(variance, 0.0) + stamp), smoothed, smoothed_std,
-            states[-1].copy(), np.sqrt(np.diagonal(covariances[-1])), noises,
+            states[-1].copy(), final_std, noises,
         )  # fmt: skip

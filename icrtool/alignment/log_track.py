@@ -242,7 +242,7 @@ def check_streams(log: RobotLog) -> None:
         if len(stamps) < 2:
             raise DataError(log.name, f"{len(stamps)} usable {what} samples", "a run needs at least two of each stream")
         back = stamps < np.append(stamps[:1], stamps[:-1])
-        bad = ~np.logical_and.reduce(np.isfinite(values))
+        bad = np.logical_or.reduce([~np.isfinite(one) for one in values])
         negative = np.logical_or.reduce([np.zeros(len(stamps), np.bool_), *(one < 0 for one in variances)])
         count = np.count_nonzero(bad)
         for rows, fault, advice in (
@@ -252,7 +252,8 @@ def check_streams(log: RobotLog) -> None:
         ):
             if rows.any():
                 raise DataError(log.name, f"{fault} {rows.argmax()}", advice)
-    fastest, farthest = np.abs([wheels.left, wheels.right]).max(), np.abs([gnss.north_m, gnss.east_m]).max()
+    fastest = max(np.abs(one).max() for one in (wheels.left, wheels.right))
+    farthest = max(np.abs(one).max() for one in (gnss.north_m, gnss.east_m))
     if fastest >= IMPOSSIBLE_MPS:
         raise DataError(log.name, f"a wheel speed of {fastest:.2g} m/s", "leave out what no wheel can do")
     if farthest >= IMPOSSIBLE_M:

@@ -80,8 +80,9 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
     t = plain.track.t
 
     def rate(later_s: float) -> Floats:
-        turned, dt = (np.diff(one, append=one[-1:]) for one in (np.interp(t + later_s, t, heading.angle_rad), t))
-        return np.divide(turned, dt, out=np.zeros(len(t)), where=dt > 0.0)
+        turned, dt, rates = np.diff(np.interp(t + later_s, t, heading.angle_rad)), np.diff(t), np.zeros(len(t))
+        np.divide(turned, dt, out=rates[:-1], where=dt > 0.0)
+        return rates
 
     line = _gyro_line(plain, rate(0.0))
     give_back_freed()

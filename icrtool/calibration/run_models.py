@@ -236,10 +236,9 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
         yield ComparedRow(public, shown, partial(found.errors, name, 0), partial(found.path, name, 0))
     if found.has_gyro:
         (recording,) = found.recordings
-        path = turned_path(run, recording)
         for one in models_of(run):
             if one.name != NO_SLIP:
-                errors_of = partial(_errors_along, path, recording.track, one.icrs)
+                errors_of = partial(_errors_turned, run, recording, one.icrs)
                 yield ComparedRow(f"{one.name}_{kind}", f"{one.label} + {kind}", errors_of)
 
 
@@ -266,15 +265,15 @@ def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
     return psi, np.cumsum(place, out=place)
 
 
-def _errors_along(path: tuple[Floats, Complexes], track: Track, icrs: FrozenIcrs, trials: Trials) -> TrialErrors:
-    """Return the errors (k, h) of ICRs (n,) or (1,) along the path of `turned_path`.
+def _errors_turned(run: Run, recording: Recording, icrs: FrozenIcrs, trials: Trials) -> TrialErrors:
+    """Return the errors (k, h) of ICRs (n,) or (1,) along the path of `turned_path`, which is kept for no longer.
 
     Notes
     -----
     With omega measured, displacement is the sum of V e^{j psi}, V the mean track speed, and
     ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j: W drops out.
     """
-    psi, place = path
+    (psi, place), track = turned_path(run, recording), recording.track
     errors = TrialErrors.none(trials.ends.shape)
     for h in range(trials.ends.shape[1]):
         some = trials.ends[:, h] >= 0

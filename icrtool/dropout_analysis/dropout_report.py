@@ -153,6 +153,9 @@ def dropout_report(
     forced = [outage for plan in plans for outage in shown_paths.force_outages(run, plan)]
     compared = with_smoothed_reference(run) if reference == "smoothed" else run
     unusable = "" if run.usable or allow_unusable else str(run.document.unusable_because)
+    # Before the comparison, whose columns of a long log are as large as theirs.
+    examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, starts)
+    give_back_freed()
     used, further = _calibration_rows(compared, () if unusable else calibrations)
     found, why = None, unusable
     if comparison and not unusable:
@@ -185,7 +188,7 @@ def dropout_report(
         calibrations=used,
         smoothed=reference == "smoothed",
         with_jumps=with_jumps,
-        examples=shown_paths.example_trials(compared),
+        examples=examples,
         worst=shown_paths.worst_trials(compared, found, starts=starts),
         outages=(*forced, *shown_paths.real_outages(compared)),
         budgets=tuple(one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)),
@@ -197,7 +200,7 @@ def dropout_report(
         ),
         usable=not unusable,
         baseline=baseline,
-        by_turning=split_by_turning(compared, starts),
+        by_turning=by_turning,
     )  # fmt: skip
 
 

@@ -87,14 +87,19 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
     moving = np.flatnonzero((ends >= 0) & ~standing_states(track))
     if not len(moving):
         return ()
-    columns = (track.north, track.east, track.heading)
-    north, east, turned = (column[ends[moving]] - column[moving] for column in columns)
-    chord = np.hypot(north, east)
+    reached = ends[moving]
+
+    def change(column: Floats) -> Floats:
+        return np.asarray(column[reached] - column[moving])
+
+    chord = np.hypot(change(track.north), change(track.east))
     # Further than its wheels rolled: the reference jumped.
     chord[chord > LONGEST_CHORD * horizon_m] = 0.0
-    off = np.abs(np.abs(turned) - np.pi)
+    straight = moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)]
+    del chord  # of a long log each column is large
+    off = np.abs(np.abs(change(track.heading)) - np.pi)
     found = []
-    for group in (moving[off <= off.min() + ALIKE_RAD], moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)]):
+    for group in (moving[off <= off.min() + ALIKE_RAD], straight):
         sample = group[:: -(-len(group) // TYPICAL_OF)]
         errors = [open_loop_errors(track, models[0].icrs, ends[one : one + 1, None], one)[0, 0] for one in sample]
         start = int(sample[np.argsort(errors, kind="stable")[len(sample) // 2]])

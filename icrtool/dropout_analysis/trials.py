@@ -18,8 +18,17 @@ from icrtool.kernels import error_statistics as statistics
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.open_loop import open_loop_errors
-from icrtool.kernels.track import FrozenIcrs, Track, TrialCounts, count_trials, ends_finder, trial_ends
-from icrtool.motion.recording import MOST_TRIALS, Trials
+from icrtool.kernels.track import (
+    STANDING,
+    FrozenIcrs,
+    Track,
+    TrialCounts,
+    count_trials,
+    ends_finder,
+    ends_from,
+    trial_ends,
+)
+from icrtool.motion.recording import MOST_TRIALS, TrialErrors, Trials
 from icrtool.records import dropout_document as documents
 from icrtool.records.choices import Starts
 from icrtool.records.plain_data import known, plain
@@ -80,8 +89,9 @@ def measure_errors(
     standing, learned = standing_states(track), first_learned(run)
     sparse = starts_of_further
     if sparse is None:
-        moving = np.flatnonzero(~standing)
-        sparse = moving[:: max(len(moving) // MOST_TRIALS, 1)]
+        sparse = np.flatnonzero(~standing)[:: max(np.count_nonzero(~standing) // MOST_TRIALS, 1)].copy()
+    left_out = standing if starts == "moving" else np.zeros_like(standing)
+    few = _errors_of_few(track, predictors, horizons, sparse, left_out)
     counts: list[TrialCounts] = []
     reference: list[documents.ReferenceRow] = []
     found: list[list[_AtHorizon]] = [[] for _ in predictors]
@@ -89,23 +99,23 @@ def measure_errors(
     after: list[documents.ErrorRow] = []
     together = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
     with ThreadPoolExecutor(THREADS) as pool:
-        for begin in range(0, len(horizons), together):
-            group = horizons[begin : begin + together]
-            ends, of_group = _ends(track, group, standing if starts == "moving" else np.zeros_like(standing), pool)
+        for columns in [slice(begin, begin + together) for begin in range(0, len(horizons), together)]:
+            group = horizons[columns]
+            ends, of_group = _ends(track, group, left_out, pool)
             counts.append(of_group)
-            trials = Trials(sparse, ends[:, sparse].T.astype(np.int64))
             blocks = _blocks(track.distance, group, (one >= 0 for one in ends))
             slipping = _slipping_trials(run, ends)
-            for model, rows in zip(predictors, found, strict=True):
+            for model, rows, of_few in zip(predictors, found, few, strict=True):
                 give_back_freed()
                 if isinstance(model, ComparedRow):
-                    errors, turned = model.errors_of(trials)
+                    errors = of_few.position[:, columns]
                     tested = _blocks(track.distance[sparse], group, np.isfinite(errors.T))
                     touching = [None if one is None else one[sparse] for one in slipping]
                 else:
-                    errors, turned = _errors(track, model, ends, pool), _turn_errors(track, model.icrs, trials)
-                    tested, touching = blocks, slipping
-                rows.extend(pool.map(_at_horizon, group.tolist(), errors.T, turned.T, tested, touching))
+                    errors, tested, touching = _errors(track, model, ends, pool), blocks, slipping
+                # Sorted beside each other, columns of a long log would fill the memory.
+                each = pool.map if together > THREADS else map
+                rows.extend(each(_at_horizon, group.tolist(), errors.T, of_few.heading.T[columns], tested, touching))
                 if model.name == "icr":
                     first = len(errors) if learned is None else learned
                     before += _rows(group, errors[:first])
@@ -133,6 +143,24 @@ def measure_errors(
     )
 
 
+def _errors_of_few(
+    track: Track, predictors: Sequence[Model | ComparedRow], horizons: Floats, starts: Ints, left_out: Bools
+) -> list[TrialErrors]:
+    """Return the errors (k, h) from some starts by model, of the filter's models those of their turns alone.
+
+    Of all horizons at once: a model drives the log for them once, before the tables of all starts fill the memory.
+    """
+    trials = Trials(starts, ends_from(track, horizons, starts))
+    trials.ends[left_out[starts]] = STANDING
+    none = np.empty((0, len(horizons)))
+    return [
+        model.errors_of(trials)
+        if isinstance(model, ComparedRow)
+        else TrialErrors(none, _turn_errors(track, model.icrs, trials))
+        for model in predictors
+    ]
+
+
 class _AtHorizon(NamedTuple):
     """The errors of one model at one horizon; `free`: of the trials that touch no slip event."""
 
@@ -152,7 +180,10 @@ def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> list[Bools | None]:
 
 def _turn_errors(track: Track, icrs: FrozenIcrs, trials: Trials) -> Floats:
     """Return the errors (k, h) [rad] of the turns that ICRs make, NaN where there is no trial."""
-    turn = np.concatenate([[0.0], np.cumsum(track.held * (track.v_left - track.v_right))])
+    turn = np.zeros(len(track.held) + 1)
+    np.subtract(track.v_left, track.v_right, out=turn[1:])
+    turn[1:] *= track.held
+    np.cumsum(turn, out=turn)
     at = trials.starts if len(icrs.y_icr_right) > 1 else np.zeros(1, np.int64)
     width = np.maximum(np.abs(icrs.y_icr_right[at] - icrs.y_icr_left[at]), MIN_ICR_SEPARATION_M)
     made, driven = (column[trials.ends] - column[trials.starts][:, None] for column in (turn, track.heading))
@@ -251,6 +282,7 @@ def _at_horizon(
     shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
     bins = statistics.histogram_sorted(ordered, statistics.round_bin_width(shown_m))
     sums = statistics.block_sums(errors, blocks, ordered, p50, p95)
+    del ordered  # as long as a column of the log, like what the intervals need
     intervals = statistics.error_intervals(errors, blocks, sums, p95)
     of_turns = statistics.error_summary(np.degrees(turned[:, None]))
     shares = 100.0 * expected / metres, 100.0 * p95 / metres

@@ -18,6 +18,7 @@ from icrtool.estimation.run_filter import smooth as smooth_run
 from icrtool.estimation.summary import summarise
 from icrtool.kernels.arrays import Ints
 from icrtool.records.measurements import ReferenceJump, SensorData
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MeasurementOutcome, Run, WarmStart
 from icrtool.records.tables import RobotLog
 
@@ -50,6 +51,7 @@ def fit(
     del log
     begin("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)
+    give_back_freed()
     jumps = followed_jumps(filtered.sensors, filtered.gnss, filtered.heading)
     filtered = filtered._replace(sensors=replace(filtered.sensors, jumps=jumps))
     begin("summary")
@@ -63,6 +65,7 @@ def fit(
         heading=filtered.heading,
         smoothed=None,
     )
+    give_back_freed()
     return replace(run, smoothed=smooth_run(run)) if smooth else run
 
 

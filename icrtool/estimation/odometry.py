@@ -127,7 +127,8 @@ def drive_summary(table: States) -> DriveDocument:
     stretched = np.divide(chords, modelled, out=np.zeros(len(chords)), where=known)
     even = np.divide(chords, lasted, out=np.zeros(len(chords)), where=~known & (lasted > 0))
     speed = np.divide(np.diff(table.distance_m), interval, out=np.zeros(len(interval)), where=interval > 0)
-    speed = speed * np.repeat(stretched, np.diff(rows)) + np.repeat(even, np.diff(rows))
+    speed *= np.repeat(stretched, np.diff(rows))
+    speed += np.repeat(even, np.diff(rows))
     mean = distance / duration if duration > 0 else 0.0
     spread = float(np.sqrt(np.average((speed - mean) ** 2, weights=interval))) if duration > 0 else 0.0
     return DriveDocument(duration, distance, mean, spread)
@@ -146,13 +147,15 @@ def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
     sensors = run.sensors
     stamps = run.table.stamp_ns
     if sensors.gyro is not None and _covers(sensors.gyro.stamp_ns, stamps):
-        yield MeasuredHeading("gyro", _integrate(sensors.gyro.stamp_ns, sensors.gyro.rate_radps, stamps))
+        yield MeasuredHeading(
+            "gyro", _integrate(_since(sensors.gyro.stamp_ns, stamps), sensors.gyro.rate_radps, run.table.t_s)
+        )
     needs_positions = sensors.heading_from_position or sensors.heading_is_estimated
     attitude = None if needs_positions else sensors.headings
     attitude = sensors.attitude if sensors.attitude is not None else attitude
     if attitude is not None and _covers(attitude.stamp_ns, stamps):
         turned = np.unwrap(attitude.heading_rad)
-        angle = np.interp(_since(stamps, stamps), _since(attitude.stamp_ns, stamps), turned)
+        angle = np.interp(run.table.t_s, _since(attitude.stamp_ns, stamps), turned)
         yield MeasuredHeading("heading", angle)
 
 
@@ -168,9 +171,8 @@ def _covers(measured_ns: Ints, states_ns: Ints) -> bool:
     return bool(np.max(np.diff(np.concatenate([states_ns[:1], within, states_ns[-1:]]))) < hole)
 
 
-def _integrate(gyro_ns: Ints, rate: Floats, states_ns: Ints) -> Floats:
-    """Return the turn [rad] up to each state: trapezoids, the first and last rate held beyond the samples."""
-    t, at = _since(gyro_ns, states_ns), _since(states_ns, states_ns)
+def _integrate(t: Floats, rate: Floats, at: Floats) -> Floats:
+    """Return the turn [rad] up to each state at times `at`: trapezoids, first and last rate held beyond the samples."""
     turned = np.zeros(len(t))
     np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2.0, out=turned[1:])
     whole: Floats = np.interp(at, t, turned)

@@ -220,7 +220,8 @@ def block_sums(
     errors, first = errors_m[blocks.rows], blocks.first
     trials = np.diff(first, append=len(errors))
     sums = np.add.reduceat(errors, first)
-    above = [np.add.reduceat(errors > limit, first, dtype=np.int64) for limit in (p50_m, p95_m)]
+    blocks_m = np.split(errors, first[1:])
+    above = [np.array([np.count_nonzero(one > limit) for one in blocks_m]) for limit in (p50_m, p95_m)]
     growth = []
     for share, count in zip(SHARES.values(), above, strict=True):
         # how a percentile grows with its share, over the uncertainty of the share (Woodruff 1952)

@@ -119,13 +119,12 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     """Draw one estimate over a span; the `first` panel also has b/2 and the begin and end of the convergence."""
     table, unit = run.table, _time_axis(span_s[1] - span_s[0])[1]
     rows = slice(*np.searchsorted(table.t_s, [span_s[0], np.nextafter(span_s[1], np.inf)]))
-    t, value = table.t_s[rows] / unit, getattr(table, column)[rows]
-    band = 2 * getattr(table, f"std_{column}")[rows]
-    low, high = value - band, value + band
+    t, value, std = table.t_s[rows], getattr(table, column)[rows], getattr(table, f"std_{column}")[rows]
     shown = extremes(value)
-    axes.plot(t[shown], value[shown], color="black", linewidth=1.0, label="estimate")
+    axes.plot(t[shown] / unit, value[shown], color="black", linewidth=1.0, label="estimate")
+    low, high = value - 2 * std, value + 2 * std
     shown = extremes(low, high)
-    axes.fill_between(t[shown], low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="±2σ")
+    axes.fill_between(t[shown] / unit, low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="±2σ")
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
         # Here the band is as wide as the prior: it is shown as far as the estimates go.
@@ -153,7 +152,7 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     for row, edge, arrow in ((int(value.argmin()), low_end, "↓"), (int(value.argmax()), high_end, "↑")):
         if not low_end <= value[row] <= high_end:
             text, va = f"{arrow} {signed(value[row])}", "top" if edge == high_end else "bottom"
-            style.write_beside(axes, text, (t[row], edge), va=va, fontsize=7.5, color=style.BAD_FIX_COLOR)
+            style.write_beside(axes, text, (t[row] / unit, edge), va=va, fontsize=7.5, color=style.BAD_FIX_COLOR)
 
 
 def _shade_outages(axes: Axes, run: Run, unit_s: float, label: str) -> None:

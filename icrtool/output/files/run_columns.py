@@ -132,7 +132,9 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None) ->
                 _check_columns(file.schema_arrow, types)
                 # One at a time: each one's memory is used again for the next.
                 read = partial(file.read, use_threads=False)
-                return States(**{name: _array(read([name]).column(0)) for name in COLUMNS})
+                table = States(**{name: _array(read([name]).column(0)) for name in COLUMNS})
+            pa.default_memory_pool().release_unused()
+            return table
         import pyarrow.csv as pc
 
         options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])

@@ -194,10 +194,11 @@ def _models_data(run: Run, report: DropoutDocument, steps: Ints, origin: tuple[f
 
 def _odometry(run: Run, rows: Ints, origin: tuple[float, float]) -> Paths:
     """Yield the odometries of the run, which the figure of the trajectory draws too."""
+    every = int(rows[1])  # the first of them is 0
     for name, icrs in odometry_icrs(run).items():
-        path = drive_wheels(run.table, run.in_gap, icrs)
+        path = drive_wheels(run.table, run.in_gap, icrs, every)
         model = "icr_final" if name == "icr" else name
-        yield model, (path.heading_rad[rows], path.north_m[rows] + 1j * path.east_m[rows] - complex(*origin))
+        yield model, (path.heading_rad, path.north_m + 1j * path.east_m - complex(*origin))
 
 
 def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Paths:

@@ -10,7 +10,7 @@ import pytest
 
 import icrtool
 from icrtool.calibration.pooled import recording_of
-from icrtool.calibration.run_models import ComparedModels, _errors_along, compare_models, turned_path
+from icrtool.calibration.run_models import ComparedModels, _errors_turned, compare_models
 from icrtool.config import parse_config
 from icrtool.errors import DataError
 from icrtool.estimation.fit import fit
@@ -49,7 +49,7 @@ def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
     recording = recording_of(run, MeasuredHeading("gyro", turned))
     trials = cut_trials(recording, (5.0,))
     icrs = FrozenIcrs.constant(0.5, -0.6, 0.1)
-    found = _errors_along(turned_path(run, recording), recording.track, icrs, trials).position
+    found = _errors_turned(run, recording, icrs, trials).position
     ahead = (0.5 * table.v_left_mps + 0.6 * table.v_right_mps) / width
     aside = -0.1 * (table.v_left_mps - table.v_right_mps) / width
     step = (dt * (ahead + 1j * aside))[:-1] * np.exp(0.5j * (turned[1:] + turned[:-1]))
