@@ -4,19 +4,66 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
 
 from icrtool.cli.printing import show
 from icrtool.output.tables.calibration import calibration_blocks
-from icrtool.output.text_blocks import TEXT_WIDTH, Facts, Line, Table, format_blocks
+from icrtool.output.tables.run import run_blocks
+from icrtool.output.text_blocks import (
+    TEXT_WIDTH,
+    Block,
+    Facts,
+    Line,
+    Section,
+    Table,
+    fitted,
+    format_blocks,
+    markdown_lines,
+)
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, SensorDocument, SensorDrive
+from icrtool.records.run import Run
 
 TABLE = Table("lr", [("wheels", "50.0 Hz"), ("a [bold]b", "1.25 Hz")], ("stream", "rate"))
 
 
 def test_columns_are_as_wide_as_their_cells_and_numbers_stand_at_the_right() -> None:
     assert format_blocks([TABLE]).splitlines() == ["stream        rate", "wheels     50.0 Hz", "a [bold]b  1.25 Hz"]
+
+
+def tables_of(blocks: list[Block]) -> Iterator[Table]:
+    """Every table of a document, those of its sections too."""
+    for block in blocks:
+        if isinstance(block, Table):
+            yield block
+        elif isinstance(block, Section):
+            yield from tables_of(block.blocks)
+
+
+@pytest.mark.parametrize("width", [40, 60, 80])
+def test_a_table_that_is_too_wide_cuts_no_number_of_a_run(run: Run, width: int) -> None:
+    tables = list(tables_of(run_blocks(run.document)))
+    assert len(tables) > 1
+    for table in tables:
+        narrow, left_out = fitted(table, width, 3)
+        shown = {cell for row in narrow.rows for cell in row if "…" in cell}
+        assert [cell for cell in shown if "±" in cell or cell.startswith(("+", "-"))] == []
+        assert len(narrow.head) + len(left_out) == len(table.head)
+        assert {*left_out} <= {*table.head}
+
+
+def test_a_table_without_rows_is_nothing() -> None:
+    assert format_blocks([Table("lr", [])]) == ""
+    assert fitted(Table("lr", []), 60, 3) == (Table("", []), [])
+
+
+def test_markdown_has_a_heading_a_section_an_item_a_sentence_and_escapes_names() -> None:
+    section = Section("Part <1>", ["a_b is 1", TABLE], depth=1)
+    lines = [line for line in markdown_lines([section]) if line]
+    assert lines[:2] == ["### Part \\<1\\>", "- a\\_b is 1"]
+    assert lines[2:4] == ["| stream | rate |", "| --- | ---: |"]
+    assert lines[-1] == "| a \\[bold\\]b | 1.25 Hz |"
 
 
 def test_sentences_are_wrapped_and_what_is_copied_is_not() -> None:
