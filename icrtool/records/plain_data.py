@@ -25,6 +25,13 @@ def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
 
     Of a dataclass the fields that are compared count: the others are no content; nor is what is not set.
     """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    # most values are single ones: they are asked for before what takes longer to find out
+    if value is None or isinstance(value, str | int):
+        return value
+    if isinstance(value, float):
+        return known(value)
     if isinstance(value, msgspec.Struct):
         value = dict(zip(value.__struct_encode_fields__, msgspec.structs.astuple(value), strict=True))
     elif is_dataclass(value):
@@ -33,8 +40,4 @@ def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
         return {str(key): plain(item) for key, item in value.items() if item is not msgspec.UNSET}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
     return value
