@@ -36,8 +36,8 @@ from icrtool.motion.recording import (
     trial_errors,
 )
 from icrtool.motion.window_fit import FEWEST_RESIDUALS, Fold, Pool, PooledFit, Prediction
+from icrtool.records.acceptance import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.calibration_document import ControllerErrors, ErrorSources
-from icrtool.records.dropout import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.plain_data import known
 
 HORIZONS_M = (5.0, 10.0, 20.0)

@@ -23,7 +23,7 @@ from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, Lever
 from icrtool.motion.recording import ErrorsOf, GyroLine, Recording, cut_windows, fit_gyro_line
 from icrtool.motion.window_fit import Fold, Prediction, own_constants
 from icrtool.records import calibration_document as documents
-from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
 from icrtool.records.run_document import RecommendedDocument

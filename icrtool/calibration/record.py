@@ -28,7 +28,7 @@ from icrtool.motion.models import (
     wheel_motion,
 )
 from icrtool.records import calibration_document as documents
-from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart, call_output
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument

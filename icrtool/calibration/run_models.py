@@ -25,7 +25,7 @@ from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
 from icrtool.motion.models import FIVE, ICRS, NO_SLIP, RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
-from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import ICR_COLUMNS, Run, WarmStart, check_type, no_slip_icrs, width_or_usual_m
 from icrtool.records.run_document import GeometryDocument, RunDocument

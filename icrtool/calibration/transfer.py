@@ -25,7 +25,7 @@ from icrtool.kernels.track import Track
 from icrtool.motion.models import RECOMMENDED
 from icrtool.motion.recording import Recording, cut_trials
 from icrtool.records import calibration_document as documents
-from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
 from icrtool.records.run import Run
 from icrtool.records.text import with_interval, with_std

@@ -36,7 +36,7 @@ with when_used():
 
 if TYPE_CHECKING:
     from icrtool.config import ConfigSources
-    from icrtool.records.dropout import Verdict
+    from icrtool.records.acceptance import Verdict
     from icrtool.records.fleet_document import FleetVerdict
 
 Command = Callable[..., Any]

@@ -208,7 +208,7 @@ class Inputs:
         """Exit with status 3 if an acceptance limit was not met, else 1 if an input, a `what`, could not be used."""
         failed = [shortened(escaped(source), LONGEST_NAME) for source in self.errors]
         if failed and len(self.documents) > 1:
-            error(f"{len(failed)} of {len(self.documents)} {what} could not be used: {listed(failed)}")
+            error(f"{len(failed)} of {len(self.documents)} {what} could not be used: {listed(failed, 5)}")
         if gate_failed or failed:
             raise SystemExit(3 if gate_failed else 1)
 

@@ -23,9 +23,10 @@ from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
 from icrtool.kernels.open_loop import TOLERANCE_M
 from icrtool.records import dropout_document as documents
+from icrtool.records.acceptance import DEFAULT_SEED, BudgetDistance, Gate, Verdict
 from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.choices import Reference, Starts
-from icrtool.records.dropout import DEFAULT_SEED, BudgetDistance, Gate, TurningSplit, UsedCalibration, Verdict
+from icrtool.records.dropout_document import TurningSplit, UsedCalibration
 from icrtool.records.plain_data import plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type

@@ -25,8 +25,8 @@ from icrtool.kernels.error_statistics import BlockSums, difference_half_width, w
 from icrtool.kernels.track import TrialCounts
 from icrtool.motion.models import FAMILY
 from icrtool.records import dropout_document as documents
+from icrtool.records.acceptance import METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.choices import FigureSet
-from icrtool.records.dropout import METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.plain_data import plain
 from icrtool.records.run import call_output
 from icrtool.records.run_document import RunDocument, known_content
@@ -229,7 +229,7 @@ class BaselineReport:
             found.append(f"another recording than in the baseline ({self.log}): the difference has a wider interval")
         keys = sorted(_different_keys(self.document.run.config, run_document.config.effective()))
         if keys:
-            found.append(f"another configuration than in the baseline: {listed(keys)}")
+            found.append(f"another configuration than in the baseline: {listed(keys, 5)}")
         if self.tool_version != __version__:
             found.append(f"icrtool {__version__}; the baseline was made with {self.tool_version}")
         return tuple(found)

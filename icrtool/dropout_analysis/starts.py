@@ -20,8 +20,7 @@ from icrtool.kernels.arrays import Bools, Floats, Ints, rows_of_cells
 from icrtool.kernels.open_loop import open_loop_errors
 from icrtool.kernels.track import STANDING, Track, trial_ends
 from icrtool.records.choices import Starts
-from icrtool.records.dropout import TurningSplit
-from icrtool.records.dropout_document import ReferenceRow
+from icrtool.records.dropout_document import ReferenceRow, TurningSplit
 from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 

@@ -14,7 +14,7 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.kinematics import chord_rows
 from icrtool.kernels.open_loop import open_loop_pieces
 from icrtool.kernels.track import OpenLoopPath
-from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.run import Run, no_slip_icrs, track_of_states
 from icrtool.records.run_document import DriveDocument
 from icrtool.records.tables import Icrs, States

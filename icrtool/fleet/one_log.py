@@ -29,8 +29,8 @@ from icrtool.logs.containers.recording_files import file_sha256, files_of_log, l
 from icrtool.output.files.formats import open_calibration
 from icrtool.output.files.remote_place import on_disk, write_below
 from icrtool.output.run_directory import PAGE_FILE, check_target, new_run, open_run, replaced_log
+from icrtool.records.acceptance import DEFAULT_SEED
 from icrtool.records.choices import FigureSet, Reference, Starts, StatesFormat
-from icrtool.records.dropout import DEFAULT_SEED
 from icrtool.records.fleet_document import ROWS, RUNS, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import plain

@@ -159,7 +159,7 @@ def new_run(
         formats.write_sums(partial, sums)
         yield partial
     if note is not None and (removed := before - set(directory.glob("[!.]*"))):
-        note(f"{directory}: replaced: removed {listed(sorted(path.name for path in removed))}")
+        note(f"{directory}: replaced: removed {listed(sorted(path.name for path in removed), 5)}")
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import counted, distance_text
 

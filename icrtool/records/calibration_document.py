@@ -36,16 +36,6 @@ class CalibratedRobot(Record, frozen=True, kw_only=True):
     track_width_m: Annotated[float, msgspec.Meta(ge=0.001, le=WIDEST_M)]
 
 
-class HeldOutScore(Record, frozen=True):
-    """Errors of one model at one horizon on a log, or block of one, that it was not fitted to."""
-
-    model: str
-    horizon_m: float
-    p95_m: float
-    expected_m: float
-    log: str
-
-
 class PooledScore(Record, frozen=True):
     """Errors of one model at one horizon, of the held-out trials of all logs, or blocks of one, together."""
 
@@ -53,6 +43,12 @@ class PooledScore(Record, frozen=True):
     horizon_m: float
     p95_m: float
     expected_m: float
+
+
+class HeldOutScore(PooledScore, frozen=True):
+    """Errors of one model at one horizon on a log, or block of one, that it was not fitted to."""
+
+    log: str
 
 
 class CalibrationLog(Record, frozen=True):

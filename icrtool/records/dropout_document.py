@@ -14,9 +14,9 @@ from icrtool.config import Config
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import BlockSums, Histogram
 from icrtool.kernels.track import OpenLoopPath
+from icrtool.records.acceptance import BudgetDistance, Verdict
 from icrtool.records.calibration_document import CalibrationDocument
 from icrtool.records.choices import Starts
-from icrtool.records.dropout import BudgetDistance, OutageKind, TurningSplit, UsedCalibration, Verdict
 from icrtool.records.plain_data import Record
 from icrtool.records.run_document import DriveDocument, IcrDocument
 from icrtool.records.samples import InputFile
@@ -186,6 +186,41 @@ class LadderDocument(Record, frozen=True):
     fits: dict[str, FitDocument] | UnsetType = UNSET
 
 
+class UsedCalibration(Record, frozen=True):
+    """A calibration that a report has a row of.
+
+    Attributes
+    ----------
+    name, label : of its row
+    model : of the calibration
+    logs : how many it was fitted to; fitted_to_this : this log is among them
+    created : date and time, UTC
+    with_gyro : its row uses the gyro of the log
+    calibration : what its file holds, without the models that were not recommended, its scores, and what it shows of
+        sensors
+    fitted : whether this log was among those it was fitted to, in words
+    """
+
+    name: str
+    label: str
+    model: str
+    logs: int
+    fitted_to_this: bool
+    created: str
+    with_gyro: bool = False
+    calibration: CalibrationDocument | None = None
+    fitted: str = ""
+
+
+class TurningSplit(Record, frozen=True):
+    """Expected error [m] by model over the trials that are straight, or over those that turn."""
+
+    straight: bool
+    horizon_m: float
+    trials: int
+    expected_m: dict[str, float]
+
+
 class BaselineDocument(Record, frozen=True):
     """What the report was compared with, and what differs beside the numbers."""
 
@@ -207,7 +242,7 @@ class OutageDocument(Record, frozen=True):
         the same)
     """
 
-    kind: OutageKind
+    kind: Literal["forced", "real"]
     begin_s: float
     end_s: float
     distance_m: float

@@ -6,7 +6,7 @@ from typing import Literal
 
 from msgspec import UNSET, UnsetType, field
 
-from icrtool.records.dropout import Verdict
+from icrtool.records.acceptance import Verdict
 from icrtool.records.plain_data import Record
 
 FLEET_SCHEMA: Literal["icrtool/fleet/1"] = "icrtool/fleet/1"
@@ -32,7 +32,7 @@ ThisTime = Literal["processed", "skipped"]
 
 
 class FleetVerdict(Record, frozen=True, kw_only=True):
-    """An acceptance limit of a log, as `icrtool.records.dropout.Verdict`; `gate` is its text."""
+    """An acceptance limit of a log, as `icrtool.records.acceptance.Verdict`; `gate` is its text."""
 
     gate: str
     value_m: float | None

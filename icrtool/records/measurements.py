@@ -245,6 +245,21 @@ class Measurements:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class MeasuredHeading:
+    """Heading by a sensor of the robot, at the states of a run.
+
+    Attributes
+    ----------
+    kind : ``heading``: an attitude, its direction is taken as measured; ``gyro``: an integrated turn rate, which starts
+        from the reference heading and is given scale and bias by the distance outside the block
+    angle_rad : (n,), clockwise, unwrapped
+    """
+
+    kind: Literal["heading", "gyro"]
+    angle_rad: Floats
+
+
 SlipKind = Literal["immobilised", "slip", "skid", "spin"]
 """Wheels turn and the robot stands; it moves less than its wheels; it moves sideways; it turns less than expected."""
 

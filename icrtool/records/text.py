@@ -115,19 +115,14 @@ def shortened(text: str, longest: int) -> str:
     return f"{text[:head]}…{text[head + 1 - longest :]}"
 
 
-def listed(names: Sequence[str], most: int = 5) -> str:
-    """Return names with commas; beyond `most` of them, how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 MOST_NAMED = 12
-"""Names from a log that a message to the user lists; of more names it shows that there are more."""
+"""Names that one message to the user lists at most, where it is about them."""
 
 
-def some_of(names: Sequence[str]) -> str:
-    """Return names from a log, separated by commas; of many names only the first ones."""
-    shown = [str(LogText(name)) for name in names[:MOST_NAMED]]
-    return ", ".join([*shown, *(["…"] if len(names) > MOST_NAMED else [])])
+def listed(names: Sequence[str], most: int = MOST_NAMED) -> str:
+    """Return names, escaped and shortened, with commas; beyond `most` of them, how many more there are."""
+    shown = ", ".join(str(LogText(name)) for name in names[:most])
+    return shown + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 MOST_DIGITS = 5

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from icrtool.errors import LogError
 from icrtool.records.places import UrlPath, open_regular
-from icrtool.records.text import some_of
+from icrtool.records.text import listed
 
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
 """A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
@@ -68,7 +68,7 @@ def storage_files(directory: Path) -> list[Path]:
     if not found and len(others) == 1:
         raise LogError(directory, f"not a ROS 2 bag directory, but {others[0].name} is in it", "name that file")
     if found or others:
-        why = f"holds more than one recording: {some_of([entry.name for entry in (*found, *others)])}"
+        why = f"holds more than one recording: {listed([entry.name for entry in (*found, *others)])}"
         raise LogError(directory, why, "name one of them")
     if (directory / "run.json").is_file():
         raise LogError(directory, "is a run, not a log", "icrtool dropout-report reads it; or name the log itself")
@@ -76,7 +76,7 @@ def storage_files(directory: Path) -> list[Path]:
         advice = f"icrtool dropout-report {directory}/runs/NAME reads one of its runs; icrtool report makes its page"
         raise LogError(directory, "is the folder of a batch, not a log", advice)
     if runs := sorted(entry.parent.name for entry in directory.glob("*/run.json")):
-        raise LogError(directory, f"holds runs, not a log: {some_of(runs)}", "icrtool dropout-report reads one of them")
+        raise LogError(directory, f"holds runs, not a log: {listed(runs)}", "icrtool dropout-report reads one of them")
     raise LogError(directory, "not a ROS 2 bag directory", "it holds no .mcap or .db3 file")
 
 
@@ -128,7 +128,7 @@ def bag_files(directory: Path, report: Callable[[str], None]) -> BagFiles:
         else:
             missing[stored[0].name] = None
     if missing:
-        report(f"metadata.yaml names files that are not there: {some_of([*missing])}")
+        report(f"metadata.yaml names files that are not there: {listed([*missing])}")
     if there:
         return BagFiles([*there], message_compression)
     return BagFiles(storage_files(directory), message_compression, by_name=True)
@@ -220,7 +220,7 @@ def check_spans(directory: Path, spans: Sequence[Span]) -> list[str]:
         pause_s = (after.begin_ns - max(span.end_ns for span in ordered[: number + 1])) / 1e9
         if pause_s > LONGEST_PAUSE_S:
             why = f"not one recording: {pause_s / 3600:.1f} h pass between {before.file} and {after.file}"
-            raise LogError(directory, why, f"name one of {some_of([span.file for span in ordered])}")
+            raise LogError(directory, why, f"name one of {listed([span.file for span in ordered])}")
         overlap_s = (min(before.end_ns, after.end_ns) - after.begin_ns) / 1e9
         if overlap_s > LEAST_OVERLAP_S:
             odd.append(

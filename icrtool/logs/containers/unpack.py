@@ -37,7 +37,7 @@ from icrtool.logs.containers.container import CUT_OFF
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
 from icrtool.records import process_resources
 from icrtool.records.places import open_regular
-from icrtool.records.text import some_of
+from icrtool.records.text import listed
 
 _PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED})?$|\.db3-wal$|^metadata\.yaml$")
 
@@ -309,14 +309,14 @@ def _unpacked(
         if not target.exists():
             entry.decompressed().write_to(target, watch)
     if not logs and not budget.trouble:
-        raise LogError(path, "no log in it", f"it holds {some_of(others) or 'nothing'}")
+        raise LogError(path, "no log in it", f"it holds {listed(others) or 'nothing'}")
     if not found:
         return folder
     # Whatever its directory is called, a bag is one recording; a file that is there twice is two.
     bags = {group for group in groups.values() if is_bag_directory(group)}
     found = [*bags] + [file for file in found if file.parent not in bags]
     if len(found) > 1:
-        raise LogError(path, f"holds more than one recording: {some_of(logs)}", "unpack it, and name one of them")
+        raise LogError(path, f"holds more than one recording: {listed(logs)}", "unpack it, and name one of them")
     return found[0]
 
 

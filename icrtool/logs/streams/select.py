@@ -23,7 +23,7 @@ from icrtool.logs.streams.positions import (
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelMotion, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
 from icrtool.records.samples import ROLE_WORDS, Role
-from icrtool.records.text import did_you_mean, some_of
+from icrtool.records.text import did_you_mean, listed
 
 Kind = TypeVar("Kind", WheelMotion, PositionSource, HeadingSource)
 
@@ -290,8 +290,8 @@ def _type_in(log: str, channels: Sequence[Channel], unread: Mapping[str, str], k
     """
     types: dict[str, str] = {channel.topic: channel.message_type for channel in channels}
     if topic not in types:
-        listed = f"{did_you_mean(topic, types)}it holds {', '.join(_listing(channels, unread))}"
-        raise ConfigError(key, f"{topic} is not in {log}", listed)
+        advice = f"{did_you_mean(topic, types)}it holds {', '.join(_listing(channels, unread))}"
+        raise ConfigError(key, f"{topic} is not in {log}", advice)
     return types[topic]
 
 
@@ -301,7 +301,7 @@ def _chosen(sources: Sequence[Kind], configured: str | None) -> Kind | None:
     if best is None:
         return None
     rest = [source.topic for source in sources if source is not best]
-    over = f"; chosen over {some_of(rest[:3])}" if rest else ""
+    over = f"; chosen over {listed(rest[:3])}" if rest else ""
     return replace(best, why=best.why + (over if configured is None else "; configured"))
 
 
@@ -343,7 +343,7 @@ def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], 
     closest = min(range(len(listing)), key=lambda place: len(unlisted[place]), default=None)
     if closest is not None and unlisted[closest]:
         key, name = unlisted[closest][0]
-        why, advice = f"no message of {listing[closest].topic} lists a joint {name}", some_of(listing[closest].joints)
+        why, advice = f"no message of {listing[closest].topic} lists a joint {name}", listed(listing[closest].joints)
         raise ConfigError(f"wheels.{key}", why, f"its joints are {advice}")
 
 

@@ -19,7 +19,7 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
 from icrtool.logs.streams.sources import Sides, WheelMotion, motion_of, moves, of_topic
 from icrtool.records.samples import WheelUnit
-from icrtool.records.text import some_of
+from icrtool.records.text import listed
 
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
 """Positions that stay within one turn, and jump by nearly one turn this often, are recorded modulo a turn."""
@@ -52,7 +52,7 @@ def of_wheels(
             turns_modulo = quantity == "position" and unit == "rad"
             means[quantity], stuck = _side_means([*map(_unwound, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
-    note = f"{some_of([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
+    note = f"{listed([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
     note = note if dead else ""
     return motion_of(position=means["position"], speed=means["speed"], unit=unit, note=note, **others)
 
@@ -124,7 +124,7 @@ class Joints:
         lefts, names, alike = len(left), [texts[i] for i in left + right], np.zeros(0, np.bool_)
         problem, places = "", codes
         if not (left and right):
-            named = f"no left and right wheel among its joints {some_of(texts)}"
+            named = f"no left and right wheel among its joints {listed(texts)}"
             problem = f"{named}; name them in wheels.{{left,right}}_joints" if texts else "lists no joints"
         elif max(lefts, len(right)) > MOST_WHEELS:
             problem = f"lists {lefts} left and {len(right)} right wheels; at most {MOST_WHEELS} of a side are read"
@@ -136,7 +136,7 @@ class Joints:
             return WheelMotion(**of_topic(table), joints=tuple(texts), problem=problem)
         if not alike.all():
             table, places = table.rows(alike), places[alike]
-        why = f"{self.what}: left {some_of(names[:lefts])}, right {some_of(names[lefts:])}"
+        why = f"{self.what}: left {listed(names[:lefts])}, right {listed(names[lefts:])}"
         paths = {"position": self.position, "speed": self.speed}
         return of_wheels(
             lambda quantity: _by_wheel(table.find(paths[quantity]), places), lefts, names, "rad",
@@ -156,9 +156,9 @@ def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: i
     rows, at = np.nonzero(wheel[codes] >= 0)
     places = np.full((len(wheels), len(codes)), -1).T
     places[rows, wheel[codes[rows, at]]] = at
-    listed = places >= 0
-    both: Bools = np.logical_and(listed[:, : len(left)].any(axis=1), listed[:, len(left) :].any(axis=1))
-    sets = listed[both]
+    present = places >= 0
+    both: Bools = np.logical_and(present[:, : len(left)].any(axis=1), present[:, len(left) :].any(axis=1))
+    sets = present[both]
     if len(sets) and np.any(sets != sets[0]):
         _, which, count = np.unique(sets, axis=0, return_inverse=True, return_counts=True)
         both[both] = which.reshape(-1) == int(np.argmax(count))

@@ -13,8 +13,8 @@ from icrtool.kernels.error_statistics import within_budget
 from icrtool.output.figures import style
 from icrtool.output.figures.trajectory import name_directions
 from icrtool.output.text_format import error_text, signed
+from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import GroupComparison
-from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.text import counted
 
 if TYPE_CHECKING:

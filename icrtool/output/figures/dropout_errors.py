@@ -11,7 +11,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.text_format import error_text, model_word, run_title
-from icrtool.records.dropout import BudgetDistance
+from icrtool.records.acceptance import BudgetDistance
 from icrtool.records.dropout_document import ModelResult, column_of
 
 if TYPE_CHECKING:

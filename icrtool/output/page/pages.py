@@ -44,8 +44,8 @@ from icrtool.output.text_format import (
     run_title,
     signed,
 )
+from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import GroupComparison
-from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument, TrialDocument
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
 from icrtool.records.places import is_regular

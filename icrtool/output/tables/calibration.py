@@ -23,7 +23,7 @@ from icrtool.output.tables.run import numbers_of
 from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import model_text, plus_minus
 from icrtool.records import calibration_document as documents
-from icrtool.records.dropout import CHOICE_HORIZON_M
+from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.text import counted, distance_text, with_interval, with_std

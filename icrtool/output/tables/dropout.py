@@ -37,7 +37,7 @@ from icrtool.output.text_format import (
     run_title,
     turn_text,
 )
-from icrtool.records.dropout import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
+from icrtool.records.acceptance import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened

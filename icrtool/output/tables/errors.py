@@ -14,7 +14,7 @@ from icrtool.kernels.error_statistics import difference_half_width
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.text_blocks import VERBOSE, Block, Cell, Chart, Figure, Items, Section, Table
 from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text
-from icrtool.records.dropout import CHOICE_HORIZON_M, METRICS
+from icrtool.records.acceptance import CHOICE_HORIZON_M, METRICS
 from icrtool.records.dropout_document import DropoutDocument, ModelDocument, column_of
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened

@@ -18,7 +18,7 @@ from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import FrozenIcrs
 from icrtool.motion.recording import cut_trials
-from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.run import Run, track_of
 from support.drives import make_log
 

@@ -32,7 +32,7 @@ from icrtool.output.files.formats import open_calibration, write_calibration
 from icrtool.output.tables.calibration import calibration_blocks
 from icrtool.output.text_blocks import format_blocks
 from icrtool.records.calibration_document import CalibratedRobot
-from icrtool.records.dropout import MeasuredHeading
+from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.samples import TWIST_TYPES
 from support.drives import make_log
 from support.recordings import WIDTH_M, make_recording, table_errors, trials_from_all

@@ -18,7 +18,7 @@ from icrtool.output.files.atomic import check_place
 from icrtool.output.tables.dropout import format_dropout, p95_at, reach_rows
 from icrtool.output.tables.errors import shown_horizons
 from icrtool.output.text_format import error_text
-from icrtool.records.dropout import BudgetDistance
+from icrtool.records.acceptance import BudgetDistance
 from icrtool.records.run import Run
 from support.reports import with_content, with_run
 

@@ -17,8 +17,8 @@ from icrtool.output.figures.calibrations import transfer
 from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style
 from icrtool.output.page.render import drawn_pictures
+from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import COMPARE_SCHEMA, ComparedGroup, GroupComparison, TransferCell
-from icrtool.records.dropout import CHOICE_HORIZON_M
 from icrtool.records.measurements import ReferenceJump
 from icrtool.records.run import Run
 from support.barn import configured, simulate

@@ -1,16 +1,10 @@
-"""Parts of a dropout report, for tables, files and figures."""
+"""What a dropout report is asked for, and its answers: distances within a budget, and verdicts on acceptance limits."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
 
-from icrtool.kernels.arrays import Floats
-from icrtool.records.calibration_document import CalibrationDocument
 from icrtool.records.plain_data import Record
-
-OutageKind = Literal["forced", "real"]
 
 DEFAULT_SEED = 20140311
 """Seed of random draws: any number, but the same for every run and every model."""
@@ -21,32 +15,6 @@ CHOICE_HORIZON_M = 10.0
 
 METRICS = {"expected": "expected_error_m", "p50": "p50_m", "p95": "p95_m", "max": "max_m"}
 """By its name in an acceptance limit: an error's name in files."""
-
-
-class UsedCalibration(Record, frozen=True):
-    """A calibration that a report has a row of.
-
-    Attributes
-    ----------
-    name, label : of its row
-    model : of the calibration
-    logs : how many it was fitted to; fitted_to_this : this log is among them
-    created : date and time, UTC
-    with_gyro : its row uses the gyro of the log
-    calibration : what its file holds, without the models that were not recommended, its scores, and what it shows of
-        sensors
-    fitted : whether this log was among those it was fitted to, in words
-    """
-
-    name: str
-    label: str
-    model: str
-    logs: int
-    fitted_to_this: bool
-    created: str
-    with_gyro: bool = False
-    calibration: CalibrationDocument | None = None
-    fitted: str = ""
 
 
 NEAR_HORIZONS_M = 1.5
@@ -186,27 +154,3 @@ class Verdict(Gate, frozen=True, kw_only=True):
                 interval = f" (95 %: {self.margin_low_m:+.4g} to {self.margin_high_m:+.4g} m)"
             bound = f"bound {bound_m:.4g} m (baseline {baseline_m:.4g} m), {bound}{interval}"
         return f"{word}  {self.text}: {self.value_m:.4g} m, {bound}{log}"
-
-
-class TurningSplit(Record, frozen=True):
-    """Expected error [m] by model over the trials that are straight, or over those that turn."""
-
-    straight: bool
-    horizon_m: float
-    trials: int
-    expected_m: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class MeasuredHeading:
-    """Heading by a sensor of the robot, at the states of a run.
-
-    Attributes
-    ----------
-    kind : ``heading``: an attitude, its direction is taken as measured; ``gyro``: an integrated turn rate, which starts
-        from the reference heading and is given scale and bias by the distance outside the block
-    angle_rad : (n,), clockwise, unwrapped
-    """
-
-    kind: Literal["heading", "gyro"]
-    angle_rad: Floats
