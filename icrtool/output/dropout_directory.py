@@ -83,7 +83,12 @@ def is_dropout_directory(directory: Path) -> bool:
     return schema_of(directory / REPORT_FILE, directory).startswith(SCHEMA_FAMILY)
 
 
-REPORT = Kind("dropout report", is_dropout_directory, re.compile(REPORT_FILES))
+REPORT = Kind(
+    "dropout report",
+    # In a run, one whose report.json was damaged is to be made again.
+    lambda place: is_dropout_directory(place) or is_run_directory(place.parent),
+    re.compile(REPORT_FILES),
+)
 
 
 def write_tables(report: DropoutReport, directory: Path) -> None:

@@ -23,7 +23,7 @@ from icrtool.output.files.atomic import Kind, atomic_directory, check_directory
 from icrtool.output.files.remote_place import lies_there, on_disk
 from icrtool.output.files.run_columns import MEASUREMENTS_FILE
 from icrtool.records.choices import FigureSet, StatesFormat
-from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of, read_regular
+from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_regular, is_special, place_of, read_regular
 from icrtool.records.plain_data import Record
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import Run
@@ -192,7 +192,12 @@ def is_run_directory(directory: Path) -> bool:
     return formats.schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
 
 
-RUN = Kind("run directory", is_run_directory, re.compile(RUN_FILES))
+RUN = Kind(
+    "run directory",
+    # One whose run.json was damaged is to be made again.
+    lambda place: is_run_directory(place) or is_regular(place / formats.SOURCES_FILE, place),
+    re.compile(RUN_FILES),
+)
 
 
 def is_page(first: bytes) -> bool:

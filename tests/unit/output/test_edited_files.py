@@ -118,7 +118,7 @@ def test_what_is_no_document_is_refused_everywhere(run_place: Path, tmp_path: Pa
     write_run(place, content)
     with pytest.raises(IcrToolError):
         icrtool.open_run(place)
-    icrtool.open_run(run_place).write(place, plots=())  # its list of files shows that it was ours
+    icrtool.open_run(run_place).write(place, plots=())  # its other files show that it was ours
     (tmp_path / "calibration.json").write_bytes(content)
     with pytest.raises(IcrToolError):
         open_calibration(tmp_path / "calibration.json")

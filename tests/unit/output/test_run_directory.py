@@ -155,6 +155,21 @@ def test_a_run_with_a_file_of_somebody_is_left_alone_whatever_is_asked(written: 
     assert {name: (written / name).read_bytes() for name in names_in(written)} == before
 
 
+def test_a_run_and_a_report_that_were_damaged_are_made_again(written: Path, run: Run) -> None:
+    report = icrtool.dropout_report(run, horizons_m=[1.0])
+    report.write(written / "dropout", plots=())
+    (written / "dropout" / "report.json").write_text("{")
+    report.write(written / "dropout", plots=())
+    assert json.loads((written / "dropout" / "report.json").read_bytes())
+    (written / "run.json").write_text("{")
+    (written / "notes.txt").write_text("years of work")
+    with pytest.raises(OutputError, match=r"holds notes\.txt"):
+        write_run(run, written, plots=())
+    (written / "notes.txt").unlink()
+    write_run(run, written, plots=())
+    assert open_run(written).name == "barn"
+
+
 def test_every_file_that_icrtool_writes_is_known_as_its_own(tmp_path: Path, run: Run) -> None:
     report = icrtool.dropout_report(run, horizons_m=[1.0, 5.0, 10.0, 15.0, 20.0], outage_s=(4.0,), comparison=True)
     for _ in range(2):
