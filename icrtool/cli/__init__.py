@@ -21,7 +21,7 @@ from importlib.util import LazyLoader
 from types import FrameType, ModuleType
 from typing import Any, TextIO, cast
 
-from icrtool.records.process_resources import keep_freed, remove_unfinished
+from icrtool.records.process_resources import keep_freed, may_end, remove_unfinished
 
 __all__ = ["main", "when_used"]
 
@@ -165,8 +165,10 @@ def _watch(arrived: int, over: threading.Event) -> None:
     os.close(arrived)
 
 
-def _end(number: int, _frame: FrameType | None = None) -> None:
+def _end(number: int, frame: FrameType | None = None) -> None:
     """Remove what this process is writing, and end it and its worker processes, whatever its threads do."""
+    if frame is not None and not may_end():
+        return  # `_watch` ends it
     # No import here: the main thread may hold its lock.
     if (processes := sys.modules.get("icrtool.fleet.processes")) is not None:
         processes.end_for_good()

@@ -15,6 +15,7 @@ TRIES = 20
 """Another thread may still add files to a directory while it is removed."""
 
 _paths: set[Path] = set()
+_undisturbed: list[bool] = []
 
 
 def begin(path: Path) -> None:
@@ -35,6 +36,21 @@ def unfinished(path: Path) -> Iterator[None]:
         yield
     finally:
         end(path)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Have a signal end the process behind the block: a short one that makes a file under a name of its choice."""
+    _undisturbed.append(True)
+    try:
+        yield
+    finally:
+        _undisturbed.pop()
+
+
+def may_end() -> bool:
+    """Return whether the process is in no block of `undisturbed`."""
+    return not _undisturbed
 
 
 def remove_unfinished() -> None:

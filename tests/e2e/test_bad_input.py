@@ -503,7 +503,7 @@ def test_an_interrupted_run_leaves_a_whole_directory_or_nothing(tmp_path, option
             process.send_signal(signal.SIGINT)
             process.communicate(timeout=120)
         after = set(listing(folder)) - set(before)
-        names = (".icrtool-files", "run.json", "states.csv", "measurements.npz", "B2SUMS")
+        names = (".icrtool-files", "run.json", "states.csv", "measurements.npz", "events.csv", "B2SUMS")
         files = {f"icrtool-runs/drive/{name}" for name in names}
         # The signal may come between the last rename and the last line of output.
         assert after in (set(), {"icrtool-runs"}, {"icrtool-runs", "icrtool-runs/drive", *files})

@@ -62,6 +62,25 @@ def test_what_was_ignored_stays_ignored(tmp_path: Path) -> None:
     assert load(tmp_path, signal.SIGINT, 0.0, before=before) == (0, ["loaded"])
 
 
+UNDISTURBED = """
+import os, signal, sys, time
+from icrtool.cli import end_at_once
+from icrtool.records.process_resources import undisturbed
+
+with end_at_once():
+    with undisturbed():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+        print("whole", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_signal_waits_for_the_end_of_a_block_that_it_must_not_disturb() -> None:
+    done = subprocess.run([sys.executable, "-c", UNDISTURBED], capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "whole\n", "Aborted!\n")
+
+
 COMPUTING = """
 import hashlib, os, signal, sys, threading
 from pathlib import Path

@@ -131,7 +131,9 @@ class ScratchFolder:
     """A temporary folder, removed when it is closed, or when the process is ended by force."""
 
     def __init__(self) -> None:
-        self.path = Path(tempfile.gettempdir()) / f"icrtool-{secrets.token_hex(8)}"
+        with process_resources.undisturbed():  # Python tries out which folder can be written
+            folder = Path(tempfile.gettempdir())
+        self.path = folder / f"icrtool-{secrets.token_hex(8)}"
         # before it is there: a signal may come at any time
         process_resources.begin(self.path)
         self.path.mkdir(mode=0o700)
