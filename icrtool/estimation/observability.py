@@ -131,6 +131,7 @@ def final_covariance(
     *,
     process_icr_mps: float,
     track_width_m: float | None = None,
+    since_s: float = 0.0,
 ) -> Floats:
     """Return the covariance (3, 3) of the final ICRs [m^2]: from how much the stretches of their drive differ.
 
@@ -140,6 +141,7 @@ def final_covariance(
     filter_covariance : (3, 3) of the ICRs at the end, and
     process_icr_mps : process noise of the filter: both give how fast it forgets
     track_width_m : b; None: not known
+    since_s : of the last terrain change: what was driven before shows other ICRs
 
     Notes
     -----
@@ -159,19 +161,19 @@ def final_covariance(
     x 98 %; that truth has the drive's own slip, and is nearer than another drive. Halves of recorded drives, which
     hold other turns at other speeds, are the least certain, x_icr above all.
     """
-    width_m = windows.separation_m
-    if len(windows.length_m) < 2:
+    width_m, kept = windows.separation_m, windows.track.t[windows.begin] >= since_s
+    if np.count_nonzero(kept) < 2:
         return filter_covariance + np.eye(3) * width_m**2
     forgets = process_icr_mps**2 * REFERENCE_STEP_S
     memory_m = float(np.trace(filter_covariance)) / 3.0 / forgets if forgets > 0.0 else math.inf
-    weight = np.tile(np.exp((windows.end_m - windows.end_m[-1]) / memory_m), 3)
-    kind = np.repeat(np.arange(3), len(windows.length_m))
-    scale = np.hypot(scale_by_kind(windows.residuals, kind), windows.noise[kind]) / np.sqrt(weight)
-    prior = np.diag(prior_std(width_m) ** -2.0)
-    at_final_icrs = Linearised(residuals=windows.residuals, jacobian=windows.jacobian, scale=scale, prior=prior)
+    weight = np.tile(np.exp((windows.end_m - windows.end_m[-1]) / memory_m)[kept], 3)
+    kind, rows = np.repeat(np.arange(3), np.count_nonzero(kept)), np.tile(kept, 3)
+    residuals, prior = windows.residuals[rows], np.diag(prior_std(width_m) ** -2.0)
+    scale = np.hypot(scale_by_kind(residuals, kind), windows.noise[kind]) / np.sqrt(weight)
+    at_final_icrs = Linearised(residuals=residuals, jacobian=windows.jacobian[rows], scale=scale, prior=prior)
     slip = 1.0 if track_width_m is None else min(max(abs(width_m / track_width_m - 1.0) / SLIPS, LEAST_SLIP), 1.0)
     of_stretch = slip * width_m * np.array([Y_OF_STRETCH, Y_OF_STRETCH, X_OF_STRETCH, 0.0, 0.0, 0.0])
-    return sandwich_covariance(at_final_icrs, np.tile(windows.stretch, 3), of_stretch)[:3, :3]
+    return sandwich_covariance(at_final_icrs, np.tile(windows.stretch[kept], 3), of_stretch)[:3, :3]
 
 
 def multiplier_std(covariance: Floats, track_width_m: float) -> float:

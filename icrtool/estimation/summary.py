@@ -235,6 +235,7 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
         own,
         process_icr_mps=config.filter.process_icr_mps,
         track_width_m=width,
+        since_s=max((t for t in filtered.changes_s if t < table.t_s[-1]), default=0.0),
     )
     unlearned = unlearned_icrs(table, std_m=np.sqrt(np.diag(covariance)), least_icr_m=filtered.least_icr_m)
     turning = (track.v_left - track.v_right) ** 2

@@ -72,6 +72,24 @@ def test_segments_have_their_own_icrs_and_stand_in_every_result() -> None:
         assert any(t in np.asarray(line.get_xdata()) for axes in panels for line in axes.lines)
 
 
+@pytest.mark.parametrize("path", ["curved", "figure eights", "spins"])
+def test_icrs_of_a_terrain_that_the_drive_hardly_saw_are_not_shown(path: str) -> None:
+    log = drive(1, PATHS[path], 121.0, ((120.0, WIDER),))
+    before, after = (fit(log, CONFIG, changes_s=changes_s) for changes_s in ((), (120.0,)))
+    assert before.document.excitation.verdict.shows_sides
+    assert after.document.excitation.verdict.not_shown == ICR_COLUMNS
+    assert not after.usable
+
+
+def test_final_sigma_is_that_of_the_last_terrain() -> None:
+    log = drive(1, PATHS["curved"], 140.0, ((120.0, WIDER),))
+    run = fit(log, CONFIG, changes_s=(120.0,))
+    final, std = ([run.summary["icr"][key][column] for column in ICR_COLUMNS] for key in ("final", "final_std"))
+    assert np.all(np.abs(np.subtract(final, WIDER)) < 2.0 * np.array(std))
+    # windows on both terrains together show a σ of y that is up to twice as large
+    assert max(std[:2]) < 0.04 * (WIDER[0] - WIDER[1])
+
+
 def test_a_change_given_twice_is_one() -> None:
     log = drive(0, PATHS["curved"], 30.0)
     once, twice = (fit(log, CONFIG, changes_s=(20.0,) * times) for times in (1, 2))
