@@ -209,7 +209,11 @@ class McapFile(ChunkedFile):
         return start, summary
 
     def _holds_all(self, chunks: Sequence[Chunk], end: int) -> bool:
-        """Return whether the chunks of the index lie one behind the other, and no message outside them before `end`."""
+        """Return whether the chunks of the index lie one behind the other, and no message outside them before `end`.
+
+        A chunk that is not where the index lists it is damage; or the index is wrong, where as many chunks are found
+        without it.
+        """
         at, damaged = len(MAGIC), []
         ranges = [(chunk.at - _HEAD_BYTES, chunk.at + chunk.length + chunk.index_length) for chunk in chunks]
         for begin, behind in [*ranges, (end, end)]:
@@ -224,9 +228,24 @@ class McapFile(ChunkedFile):
                     break
                 at += _HEAD_BYTES + length
             at = behind
+        # Asking a distant file for each head takes minutes; it is fetched where it may be damaged, or its index wrong.
+        heads = (self._head(chunk.at - _HEAD_BYTES) for chunk in (chunks[:1] if self._remote is not None else chunks))
+        suspect = damaged or any(head != (_CHUNK, chunk.length) for head, chunk in zip(heads, chunks, strict=False))
+        if suspect and (self._remote is not None or self._chunks_in_order(end) == len(chunks)):
+            return False
         for one in damaged:
             self.report(one)
         return True
+
+    def _chunks_in_order(self, end: int) -> int:
+        """Return how many chunks are among the records that follow one another up to `end`, 0 where they do not."""
+        at, count = len(MAGIC), 0
+        while at < end:
+            opcode, length = self._head(at)
+            if opcode == 0:
+                return 0
+            at, count = at + _HEAD_BYTES + length, count + (opcode == _CHUNK)
+        return count if at == end else 0
 
     def _head(self, at: int) -> tuple[int, int]:
         """Return opcode and length of the record at a file offset; opcode 0 where there is none."""
@@ -284,8 +303,8 @@ class McapFile(ChunkedFile):
             size = len(data)
         if part.chunk.is_cut or needed:
             return Packed(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
-        # a header of zeros is that of an empty chunk
-        if len(data) < packed or (not checksum and size < part.chunk.size):
+        # a header of zeros is that of an empty chunk; the index may state too much of one that is not
+        if len(data) < packed or (not checksum and not packed and part.chunk.size > 0):
             raise DecompressionError("its header is damaged")
         return Packed(data, compression, size, checksum=checksum)
 

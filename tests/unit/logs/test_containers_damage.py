@@ -327,27 +327,39 @@ def test_mcap_chunk_of_a_zstd_bomb_is_left_out(tmp_path, whole_header):
 
 INDEX_LIES = {
     "chunk place": (9 + 16, 1),
+    "chunk place, before it": (9 + 16, -9),
     "chunk place, far away": (9 + 16, 1 << 60),
     "chunk place, negative": (9 + 16, 1 << 63),
     "chunk length": (9 + 24, 3),
+    "chunk length, without the record's head": (9 + 24, -9),
     "chunk length, far too long": (9 + 24, 1 << 60),
+    "uncompressed size": (-8, 1),
+    "uncompressed size, far too large": (-8, 1 << 60),
+    "uncompressed size, too small": (-8, -1),
 }
+"""Where in a chunk index record, from its begin or from its end, and by how much."""
 
 
 @pytest.mark.parametrize("lie", INDEX_LIES)
 @pytest.mark.parametrize("checksum", [True, False], ids=["checksum", "no checksum"])
-def test_mcap_whose_index_lies_is_read_record_by_record(tmp_path, lie, checksum):
+@pytest.mark.parametrize("of_all", [True, False], ids=["of all", "of the third"])
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_mcap_whose_index_lies_loses_no_message(tmp_path, lie, checksum, of_all, compression):
     messages = make_messages()
-    path = write_mcap(tmp_path / "log.mcap", messages, enable_crcs=checksum)
+    path = write_mcap(tmp_path / "log.mcap", messages, compression, enable_crcs=checksum)
     whole = path.read_bytes()
-    data_end = whole.rindex(b"\x0f" + (4).to_bytes(8, "little"))
-    record = data_end
-    while whole[record] != 8:
-        record += 9 + int.from_bytes(whole[record + 1 : record + 9], "little")
+    records, at = [], whole.rindex(b"\x0f" + (4).to_bytes(8, "little"))
+    while whole[at] != 2:
+        end = at + 9 + int.from_bytes(whole[at + 1 : at + 9], "little")
+        if whole[at] == 8:
+            records.append((at, end))
+        at = end
     offset, error = INDEX_LIES[lie]
-    at = record + offset
-    wrong = int.from_bytes(whole[at : at + 8], "little") + error
-    path.write_bytes(patched(whole, at, wrong.to_bytes(8, "little")))
+    for begin, end in records if of_all else records[2:3]:
+        at = (begin if offset > 0 else end) + offset
+        wrong = int.from_bytes(whole[at : at + 8], "little") + error
+        whole = patched(whole, at, (wrong % (1 << 64)).to_bytes(8, "little"))
+    path.write_bytes(whole)
     assert read_log(path) == (messages, [])
 
 

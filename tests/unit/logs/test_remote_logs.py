@@ -6,6 +6,7 @@ import gzip
 import hashlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -233,6 +234,28 @@ def test_a_log_without_an_index_is_fetched_and_read_to_its_end(tmp_path):
     (tmp_path / "cut.mcap").write_bytes(MCAP.read_bytes()[:-5000])
     with file_server(tmp_path) as server:
         assert messages(UrlPath(f"{server.url}/cut.mcap")) == messages(tmp_path / "cut.mcap")
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_a_log_whose_index_is_wrong_about_a_chunk_is_fetched_and_loses_no_message(tmp_path, number):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1000, enable_crcs=False)
+        writer.start("ros2", "test")
+        channel = writer.register_channel("/a", "cdr", writer.register_schema("std_msgs/msg/String", "ros2msg", b""))
+        for row in ROWS:
+            writer.add_message(channel, row, bytes([row] * 100), row)
+        writer.finish()
+    whole = messages(path)
+    assert len(whole) == len(ROWS)
+    content = bytearray(path.read_bytes())
+    head = b"\x08" + (8 + 8 + 8 + 8 + 14 + 8 + 8 + 8 + 8).to_bytes(8, "little")
+    at = [found.start() for found in re.finditer(re.escape(head), content)][number] + 9 + 24
+    length = int.from_bytes(content[at : at + 8], "little")
+    content[at : at + 8] = (length - 9).to_bytes(8, "little")
+    path.write_bytes(content)
+    with file_server(tmp_path) as server:
+        assert messages(UrlPath(f"{server.url}/a.mcap")) == whole
 
 
 def test_about_a_file_that_is_fetched_the_server_is_asked_once(tmp_path, monkeypatch):
