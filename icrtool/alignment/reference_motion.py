@@ -74,7 +74,7 @@ class Knots(NamedTuple):
     heading : (m,) [rad], unwrapped; turn_variance : of one value of it [rad^2]
     velocity : complex (m,), the mean of the sides along the heading [m/s]; apart : (m,) left minus right [m/s]
     held_m2 : (m,) variance that values held from sample to sample add to a side's distance
-    holes : (m,) number of holes in any stream so far
+    holes : (m,) number of steps so far that lie in a hole of any stream, even in part
     fix_class : (m,) classes of the fixes
     turn_follows_place : the headings are estimated from the positions, and jump with them
     gyro : (m,) turn of the gyro [rad], in sense and scale of the headings; None without one that turns with them
@@ -180,9 +180,11 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         for gone in (track.cumulate(left), track.cumulate(right))
     )
     heading = track.heading_at(t)
-    holes = np.zeros(len(t), np.int64)
+    in_hole = np.zeros(len(t) - 1, np.bool_)
     for sampled in (track.t, track.heading_t, t):
-        holes += np.searchsorted(sampled[:-1][is_hole(np.diff(sampled), LONGEST_HOLE_S)], t)
+        before = np.flatnonzero(is_hole(np.diff(sampled), LONGEST_HOLE_S))
+        # a step that begins or ends inside of one, or holds it whole
+        in_hole |= np.searchsorted(sampled[before], t[1:]) > np.searchsorted(sampled[before + 1], t[:-1], side="right")
     gyro, by_gyro = sensors.gyro, None
     if gyro is not None and len(gyro.stamp_ns) >= FEWEST_FIXES:
         at = (gyro.stamp_ns - wheels.stamp_ns[0]) / 1e9
@@ -197,8 +199,8 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         heading=heading, turn_variance=mad_std(np.diff(heading, 2), 0.0) ** 2 / 6,
         velocity=(v_left + v_right) / 2 * np.exp(1j * heading), apart=v_left - v_right,
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
-        holes=holes, fix_class=fixes.fix_class[rows], turn_follows_place=sensors.heading_is_estimated,
-        gyro=by_gyro,
+        holes=np.concatenate([[0], np.cumsum(in_hole)]), fix_class=fixes.fix_class[rows],
+        turn_follows_place=sensors.heading_is_estimated, gyro=by_gyro,
     )  # fmt: skip
 
 

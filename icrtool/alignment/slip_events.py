@@ -343,6 +343,9 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
     end_s = float(t[span.stop - 1]) + time_in(span.stop - 1, 1.0) + time_in(span.stop, 0.0)
     if end_s - begin_s < SHORTEST_EVENT_S or span.stop - span.start < FEWEST_STEPS:
         return None
+    # rounding is evidence, too, where the wheels stand: a share of no motion is none
+    if not steps.path_m[span].any():
+        return None
     return _measured(steps.rows(span), span, shares, begin_s, end_s)
 
 

@@ -24,8 +24,6 @@ from icrtool.records.dropout_document import ReferenceRow, TurningSplit
 from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 
-"""``moving``: each standstill gives one start, the state from which the robot drives on; ``all``: every state."""
-
 STANDING_MPS = 0.01
 """The robot stands while both tracks are slower than this."""
 

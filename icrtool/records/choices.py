@@ -8,10 +8,12 @@ from __future__ import annotations
 from typing import Literal
 
 FigureSet = Literal["default", "all"]
+"""The figures that a run and its report are written with: those that answer a question, or the paper's too."""
+
 StatesFormat = Literal["csv", "parquet"]
 
 Starts = Literal["moving", "all"]
-"""Whether a standstill is one start of a trial, or every recorded state is one."""
+"""``moving``: each standstill gives one start, the state from which the robot drives on; ``all``: every state."""
 
 Reference = Literal["filter", "smoothed"]
 Preset = Literal["paper", "field"]

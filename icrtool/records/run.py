@@ -33,8 +33,6 @@ STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 USUAL_WIDTH_M = 0.6
 """Track width of a small field robot [m], used where that of the robot is not known."""
 
-"""The figures that a run and its report are written with: those that answer a question, or the paper's too."""
-
 MAKE_RUN = "icrtool.fit(log) makes one, icrtool.open_run(directory) reads one"
 """What to call for a run."""
 

@@ -44,6 +44,23 @@ def test_a_robot_that_is_held_is_found_with_begin_and_end(fix_hz: int, gyro: boo
     assert event.distance_m < 0.2
 
 
+def spin_and_stand(t: Floats, seed: int) -> Floats:
+    """Drive curves; every minute spin from the 25th second to the 35th, and stand until the 40th."""
+    spin = 0.16 + np.array([[-0.3], [0.3]]) * np.ones(len(t))
+    phase = t % 60.0
+    return np.select([phase < 25.0, phase < 35.0, phase < 40.0], [curves(t, seed), spin, 0.0 * spin], curves(t, seed))
+
+
+@pytest.mark.parametrize("fix_hz", [20, 10, 5])
+@pytest.mark.parametrize("seconds", [1.0, 3.0, 6.0])
+def test_a_pause_of_the_wheel_data_is_no_slip(fix_hz: int, seconds: float) -> None:
+    sensors = drive(wheels=spin_and_stand, fix_hz=fix_hz)
+    t = (sensors.wheels.stamp_ns - START_NS) / 1e9
+    for begin in (20.0, 28.0, 30.0, 33.0):
+        kept = (t < begin) | (t > begin + seconds)
+        assert not found_events(replace(sensors, wheels=sensors.wheels.cut(kept)), WIDTH_M)
+
+
 def after_parking(sensors: SensorData, seconds: float = 300.0) -> SensorData:
     """Let the robot park first, its heading without noise, as units hold it while nothing turns."""
     parked = START_NS + np.rint(np.arange(seconds * RATE_HZ) / RATE_HZ * 1e9).astype(np.int64)
