@@ -216,8 +216,19 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
 
 
 def _names_in(directory: Path) -> Iterator[str]:
-    """Yield all that is in a directory, relative to it; a directory with ``/`` at its end."""
-    for place, folders, files in os.walk(directory):
+    """Yield all that is in a directory, relative to it; a directory with ``/`` at its end.
+
+    Raises
+    ------
+    OSError
+        One cannot be looked into: it may hold anything.
+    """
+
+    def unseen(err: OSError) -> None:
+        if not isinstance(err, FileNotFoundError):
+            raise err
+
+    for place, folders, files in os.walk(directory, onerror=unseen):
         # What another process writes there may be gone at any moment.
         folders[:] = [name for name in folders if not name.startswith(HIDDEN)]
         for name in (*folders, *files):

@@ -287,6 +287,28 @@ def test_what_another_process_writes_in_one_of_ours_is_not_looked_into(tmp_path:
     check_directory(tmp_path / "a", REPORT)
 
 
+@pytest.mark.parametrize("closed", ["", "sub"])
+def test_what_cannot_be_looked_into_is_left_alone(tmp_path: Path, monkeypatch, closed: str) -> None:
+    (tmp_path / "a" / "sub").mkdir(parents=True)
+    (tmp_path / "a" / "sub" / "thesis.txt").write_text("years of work")
+    if closed:
+        (tmp_path / "a" / "mark").write_text("old")
+    real, place = os.scandir, os.path.realpath(tmp_path / "a" / closed)
+
+    # Root may look into everything, so permissions are no means here.
+    def refused(path: str) -> object:
+        if str(path) == place:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return real(path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "scandir", refused)
+        with pytest.raises(OutputError, match="a: cannot be written; Permission denied"):
+            write(tmp_path / "a")
+    assert (tmp_path / "a" / "sub" / "thesis.txt").read_text() == "years of work"
+    assert list(tmp_path.iterdir()) == [tmp_path / "a"]
+
+
 def test_what_came_into_one_of_ours_meanwhile_is_not_lost(tmp_path: Path) -> None:
     write(tmp_path / "a", "old")
 
