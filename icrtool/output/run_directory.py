@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, get_args
 
 import msgspec
@@ -19,7 +19,7 @@ from icrtool.logs.containers.recording_files import file_sha256, files_of_log, n
 from icrtool.output import figure_catalogue
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.files import formats, run_columns
-from icrtool.output.files.atomic import Kind, atomic_directory, check_directory
+from icrtool.output.files.atomic import Kind, atomic_directory, check_directory, names_in
 from icrtool.output.files.remote_place import lies_there, on_disk
 from icrtool.output.files.run_columns import MEASUREMENTS_FILE
 from icrtool.records.choices import FigureSet, StatesFormat
@@ -47,8 +47,8 @@ _FIGURES = "|".join(f"{name}[0-9]+m" if name.endswith("_") else name for name in
 PICTURES = rf"plots/(({_FIGURES})\.(png|svg|pdf))?"
 REPORT_FILES = rf"report\.json|(summary|histogram|worst|ladder)\.csv|trials\.parquet|{PICTURES}"
 RUN_FILES = (
-    r"run\.json|events\.csv|measurements\.npz|(states|smoothed)\.(csv|parquet)|B2SUMS|report\.html"
-    rf"|{PICTURES}|dropout/({REPORT_FILES})?"
+    r"run\.json|events\.csv|measurements\.npz|(states|smoothed)\.(csv|parquet)|B2SUMS"
+    rf"|report\.html|{PICTURES}|dropout/({REPORT_FILES})?"
 )
 """All names that any version wrote: what has another is of somebody, and is not replaced."""
 
@@ -138,8 +138,10 @@ def new_run(
         states = "csv" if len(run.table) <= MOST_CSV_STATES else "parquet"
         if states != "csv" and note is not None:
             note(f"{directory}: {len(run.table):,} states: written as states.parquet, not states.csv (--states csv)")
-    before = set(directory.glob("[!.]*"))
     with atomic_directory(directory, RUN, inside) as partial, ThreadPoolExecutor(1) as pool:
+        # Not ".", which is the old run wherever it is moved.
+        place = Path(os.path.realpath(directory))
+        before = set(names_in(place))
         states_name = f"states.{states}"
         states_sum = pool.submit(run_columns.write_states, run.table, partial / states_name, states)
         if plots:
@@ -158,8 +160,10 @@ def new_run(
         sums[states_name] = states_sum.result()
         formats.write_sums(partial, sums)
         yield partial
-    if note is not None and (removed := before - set(directory.glob("[!.]*"))):
-        note(f"{directory}: replaced: removed {listed(sorted(path.name for path in removed), 5)}")
+    if note is not None and (gone := before.difference(names_in(place))):
+        # A folder stands for what was in it.
+        tops = [name for name in sorted(gone) if gone.isdisjoint(f"{one}/" for one in PurePosixPath(name).parents)]
+        note(f"{directory}: replaced: removed {listed(tops, 5)}")
 
 
 def replaced_log(directory: Path, run: Run) -> str | None:

@@ -199,7 +199,7 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
         aside = [path for path in place.parent.glob(_hidden_name(place, "*", ASIDE)) if not path.is_symlink()]
         if aside and not os.path.lexists(place):
             max(aside, key=lambda path: path.stat().st_mtime_ns).rename(place)
-        names = _names_in(place)
+        names = names_in(place)
         if file := next((one for one in (place, *place.parents) if one.exists() and not one.is_dir()), None):
             why = "a file is there" if file == place else f"{file} is a file"
             advice = f"name another place for the {kind.name}"
@@ -215,7 +215,7 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
         raise OutputError(directory, why, advice)
 
 
-def _names_in(directory: Path) -> Iterator[str]:
+def names_in(directory: Path) -> Iterator[str]:
     """Yield all that is in a directory, relative to it; a directory with ``/`` at its end.
 
     Raises

@@ -135,9 +135,20 @@ def test_an_old_run_is_replaced_with_its_dropout_analysis(written: Path, run: Ru
     (written / "report.html").write_text("of the old states")
     notes: list[str] = []
     write_run(run, written, states="parquet", plots=(), note=notes.append)
-    assert notes == [f"{written}: replaced: removed dropout, report.html, states.csv"]
+    assert notes == [f"{written}: replaced: removed dropout/, report.html, states.csv"]
     assert names_in(written) == ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.parquet"]
     assert [path.name for path in written.parent.iterdir()] == ["barn"]
+
+
+def test_a_run_replaced_from_inside_says_only_what_the_new_one_does_not_have(
+    tmp_path: Path, run: Run, monkeypatch
+) -> None:
+    write_run(run, tmp_path / "run", plots=("png",))
+    (tmp_path / "run" / "plots" / "icr_clusters.png").write_text("of the old states")
+    monkeypatch.chdir(tmp_path / "run")
+    notes: list[str] = []
+    write_run(run, Path(), plots=("png",), note=notes.append)
+    assert notes == [".: replaced: removed plots/icr_clusters.png"]
 
 
 @pytest.mark.parametrize(
