@@ -47,7 +47,7 @@ _FIGURES = "|".join(f"{name}[0-9]+m" if name.endswith("_") else name for name in
 PICTURES = rf"plots/(({_FIGURES})\.(png|svg|pdf))?"
 REPORT_FILES = rf"report\.json|(summary|histogram|worst|ladder)\.csv|trials\.parquet|{PICTURES}"
 RUN_FILES = (
-    r"run\.json|events\.csv|measurements\.npz|(states|smoothed)\.(csv|parquet)|B2SUMS"
+    r"run\.json|events\.csv|measurements\.npz|headings\.(npz|parquet)|(states|smoothed)\.(csv|parquet)|B2SUMS"
     rf"|report\.html|{PICTURES}|dropout/({REPORT_FILES})?"
 )
 """All names that any version wrote: what has another is of somebody, and is not replaced."""
