@@ -321,10 +321,12 @@ def put(partial: Path, place: Path) -> None:
         place.rename(old)
         try:
             partial.rename(place)
-        except BaseException:
-            old.rename(place)
-            raise
-        remove(old)
+        finally:
+            # An interruption, or the failure that a network file system reports, may come behind the rename.
+            if place.exists():
+                remove(old)
+            else:
+                old.rename(place)
     begin(partial)
     sync(place.parent)
 

@@ -144,10 +144,12 @@ def write_generation(directory: Path, text: str) -> None:
 
 
 class Fault:
-    """Lets the n-th call of the system that changes the disk, or of a write, fail."""
+    """Lets the n-th call of the system that changes the disk, or of a write, fail; `late`: when it is done."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, number: int, failure: BaseException, *, exchanges: bool):
-        self.left, self.failure, self.name = number, failure, ""
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, number: int, failure: BaseException, *, exchanges: bool, late: bool
+    ):
+        self.left, self.failure, self.late, self.name = number, failure, late, ""
         for name in ("rename", "fsync"):
             monkeypatch.setattr(os, name, partial(self.call, name, getattr(os, name)))
         if exchanges:
@@ -161,6 +163,8 @@ class Fault:
         self.left -= 1
         if self.left == 0:
             self.name = name
+            if self.late:
+                real(*args, **options)
             raise self.failure
         return real(*args, **options)
 
@@ -169,20 +173,25 @@ def partialmethod_of(fault: Fault, name: str, real: Callable[..., object]) -> Ca
     return lambda *args, **options: fault.call(name, real, *args, **options)
 
 
+@pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize("exchanges", [True, False])
 @pytest.mark.parametrize("failure", [OSError(errno.EIO, "Input/output error"), KeyboardInterrupt()])
-def test_whatever_call_fails_the_old_or_the_new_one_is_there(tmp_path: Path, monkeypatch, failure, exchanges) -> None:
+def test_whatever_call_fails_the_old_or_the_new_one_is_there(
+    tmp_path: Path, monkeypatch, failure, exchanges, late
+) -> None:
     place, failed = tmp_path / "a", set()
     for number in range(1, 100):
         with monkeypatch.context() as patched:
             write_generation(place, f"old {number}")
-            fault = Fault(patched, number, failure, exchanges=exchanges)
+            fault = Fault(patched, number, failure, exchanges=exchanges, late=late)
             try:
                 write_generation(place, f"new {number}")
-                said = False
-            except (OutputError, KeyboardInterrupt):
-                said = True
-        assert said == bool(fault.name), "a failure is an error, and only a failure is"
+                said = None
+            except OutputError as err:
+                said = err.__cause__
+            except KeyboardInterrupt as err:
+                said = err
+        assert said is (failure if fault.name else None), "a failure is an error, and only a failure is"
         if not fault.name:
             break
         failed.add(fault.name)
