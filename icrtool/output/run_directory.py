@@ -73,8 +73,9 @@ def check_target(
         path = next((one.path for one in _inputs_of(log)), "data frames")
         raise OutputError(log, "is a run, not a log", f"name its log ({path}), or: icrtool dropout-report {log}")
     check_directory(directory, RUN, inside)
-    if log is not None and not overwrite and is_run_directory(directory) and not _is_made_from(directory, log):
-        other = next((one.path for one in _inputs_of(directory)), "data frames")
+    if log is not None and not overwrite and RUN.is_one(directory) and not _is_made_from(directory, log):
+        unknown = "data frames" if is_run_directory(directory) else "its run.json is damaged"
+        other = next((one.path for one in _inputs_of(directory)), unknown)
         advice = "name another place, or replace it with --overwrite"
         raise OutputError(directory, f"holds the run of another recording ({other})", advice)
 

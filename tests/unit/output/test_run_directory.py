@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -15,7 +16,7 @@ from icrtool.errors import OutputError
 from icrtool.output import figure_catalogue as catalogue
 from icrtool.output.dropout_directory import write_report
 from icrtool.output.files import run_columns
-from icrtool.output.files.formats import file_b2sum, json_bytes, read_sums
+from icrtool.output.files.formats import SOURCES_FILE, file_b2sum, json_bytes, read_sums
 from icrtool.output.run_directory import check_target, open_run, write_run
 from icrtool.records.run import Run
 from support.contract import RUN_KEYS
@@ -180,6 +181,19 @@ def test_a_run_and_a_report_that_were_damaged_are_made_again(written: Path, run:
     (written / "notes.txt").unlink()
     write_run(run, written, plots=())
     assert open_run(written).name == "barn"
+
+
+def test_a_damaged_run_is_replaced_by_that_of_the_log_in_the_same_place_alone(written: Path, tmp_path: Path) -> None:
+    mine, other = tmp_path / "mine.mcap", tmp_path / "other.mcap"
+    for log in (mine, other):
+        log.write_bytes(log.name.encode())
+    sources = written / SOURCES_FILE
+    sources.write_text(json.dumps({**json.loads(sources.read_bytes()), "made_from": [os.path.realpath(mine)]}))
+    (written / "run.json").write_text("{")
+    check_target(written, mine)
+    with pytest.raises(OutputError, match=r"another recording \(its run.json is damaged\)"):
+        check_target(written, other)
+    check_target(written, other, overwrite=True)
 
 
 def test_every_file_that_icrtool_writes_is_known_as_its_own(tmp_path: Path, run: Run) -> None:
