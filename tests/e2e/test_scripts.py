@@ -142,4 +142,4 @@ def test_a_run_fitted_again_reports_what_it_removes_and_removes_nothing_of_other
     notes.unlink()
     status, _, err = icrtool("fit", "monday/drive.mcap", *FAST)
     assert status == 0
-    assert "removed dropout, report.html" in err
+    assert "removed dropout/, report.html" in err
