@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints, trapezoids
 from icrtool.kernels.kinematics import chord_rows
 from icrtool.kernels.open_loop import open_loop_pieces
 from icrtool.kernels.track import OpenLoopPath
@@ -173,10 +173,7 @@ def _covers(measured_ns: Ints, states_ns: Ints) -> bool:
 
 def _integrate(t: Floats, rate: Floats, at: Floats) -> Floats:
     """Return the turn [rad] up to each state at times `at`: trapezoids, first and last rate held beyond the samples."""
-    turned = np.zeros(len(t))
-    np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2.0, out=turned[1:])
-    whole: Floats = np.interp(at, t, turned)
-    del turned
+    whole: Floats = np.interp(at, t, trapezoids(t, rate))
     whole += np.minimum(at - t[0], 0.0) * rate[0]
     whole += np.maximum(at - t[-1], 0.0) * rate[-1]
     return whole

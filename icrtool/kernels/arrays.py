@@ -16,7 +16,9 @@ Bytes = NDArray[np.uint8]
 
 def trapezoids(t: Floats, rate: Floats) -> Floats:
     """Return the integral of a rate (n,) from the first of its times (n,) until each, by trapezoids."""
-    return np.concatenate([[0.0], np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2)])
+    sums = np.zeros(len(t))
+    np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2, out=sums[1:])
+    return sums
 
 
 def wrapped(angle: Floats) -> Floats:
