@@ -27,6 +27,7 @@ from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
 from icrtool.records.run_document import RecommendedDocument
+from icrtool.records.samples import are_twist
 
 
 def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: float | None = None) -> Recording:
@@ -356,12 +357,12 @@ def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unus
 
 def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
     """Return what a calibration holds of the robot of a run, of track width `width_m`."""
-    robot, of_twist = run.config.robot, any(stream.is_twist for stream in run.document.streams)
+    robot = run.config.robot
     return documents.CalibratedRobot(
         name=robot.name,
         wheel_radius_m=robot.wheel_radius_m,
         encoder_counts_per_rev=robot.encoder_counts_per_rev or UNSET,
-        twist_width_m=(run.config.wheels.twist_width_m or UNSET) if of_twist else UNSET,
+        twist_width_m=(run.config.wheels.twist_width_m or UNSET) if are_twist(run.document.streams) else UNSET,
         track_width_m=width_m,
     )
 
@@ -372,7 +373,7 @@ def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
     if alone:
         warnings += [] if run.usable else [f"not usable: {run.document.unusable_because}"]
         warnings += run.document.excitation.sentences
-    if any(stream.is_twist for stream in run.document.streams) and run.config.wheels.twist_width_m is None:
+    if are_twist(run.document.streams) and run.config.wheels.twist_width_m is None:
         warnings.append(
             "the wheels were read from body twists, which hold the controller's own multipliers: "
             "these numbers are right only where b and radius are those the twists were made with"

@@ -56,7 +56,7 @@ from icrtool.records.run_document import (
     TerrainDocument,
     WarmStartDocument,
 )
-from icrtool.records.samples import Datum, InputFile
+from icrtool.records.samples import Datum, InputFile, are_twist
 from icrtool.records.tables import States
 
 SETTLED_S = 2.0
@@ -92,7 +92,7 @@ def summarise(
     inverted = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1])
     field = config.filter.preset == "field"
     scale = measurements.findings["wheel_scale"] if field else None
-    of_twist = any(stream.is_twist for stream in measurements.streams) and config.wheels.twist_width_m is None
+    of_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
     # while the robot was in use
     of_fixes, of_headings = sensors.moving()
     rejected = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Self, cast
 
@@ -221,6 +222,11 @@ class StreamChoice:
     def is_twist(self) -> bool:
         """Whether the wheels' speeds were made of a body twist; a pair of topics or fields holds speeds of its own."""
         return self.role == "wheels" and self.message_type in TWIST_TYPES and " + " not in self.topic
+
+
+def are_twist(streams: Iterable[StreamChoice]) -> bool:
+    """Return whether the wheels' speeds of a log with these streams were made of a body twist."""
+    return any(stream.is_twist for stream in streams)
 
 
 def rate_and_jitter(stamps: Ints) -> tuple[float | None, float | None]:
