@@ -55,15 +55,23 @@ class DefinitionError(LogError):
 
 
 class MissingStreamError(LogError):
-    """A log without wheels, position or heading; `needs`: for each missing role, what could fill it."""
+    """A log without wheels, position or heading.
 
-    def __init__(self, log: Path | str, needs: Mapping[str, str], holds: Sequence[str]) -> None:
+    Parameters
+    ----------
+    needs : for each missing role, what could fill it
+    holds : topics of the log
+    lost : what of the log could not be read
+    """
+
+    def __init__(self, log: Path | str, needs: Mapping[str, str], holds: Sequence[str], lost: str = "") -> None:
         self.roles = tuple(needs)
         self.holds = tuple(holds)
         *others, last = (f"no {role}" for role in needs)
         missing = f"{', '.join(others)} and {last}" if others else last
         wanted = "; ".join(f"needs {need}" if len(needs) == 1 else f"{role}: {need}" for role, need in needs.items())
-        super().__init__(log, f"{missing} found", f"{wanted}; the log holds {', '.join(self.holds)}")
+        unread = f"; what could not be read: {lost}" if lost else ""
+        super().__init__(log, f"{missing} found", f"{wanted}; the log holds {', '.join(self.holds)}{unread}")
 
 
 class DataError(IcrToolError):

@@ -216,13 +216,13 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
     Raises
     ------
     DataError
-        The end is not after the start.
+        The end is not after the start, or the log has no message between them.
     """
     if start is None and end is None:
         return WHOLE
-    first = 0
+    first, span = 0, container.span_ns()
     if isinstance(start, float) or isinstance(end, float):
-        if (span := container.span_ns()) is not None:
+        if span is not None:
             first = span[0]
         else:  # without an index all messages are read for it
             blocks = container.blocks(frozenset(channel.id for channel in container.channels))
@@ -231,6 +231,11 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
     end_ns = nanoseconds(end, first) if end is not None else LATEST_NS
     if begin_ns >= end_ns:
         raise DataError(log, "the part to read ends before it begins", "give an end later than the start")
+    if span is not None and (begin_ns > span[1] or end_ns <= span[0]):
+        begun, lasts_s = np.datetime64(span[0] // 10**9, "s"), (span[1] - span[0]) / 1e9
+        raise DataError(
+            log, "the part to read holds no message", f"the log begins at {begun}Z and lasts {lasts_s:.1f} s"
+        )
     return Cut(begin_ns, min(end_ns, LATEST_NS))
 
 
@@ -375,7 +380,7 @@ def survey_document(survey: Survey) -> SurveyDocument:
     for role, sources in survey.candidates.by_role().items():
         found = []
         for one in sources:
-            delay = f"{round(one.stamps.delay_ns / 1e6, 1) + 0.0:.1f} ms"
+            delay = f"{one.stamps.delay_ns / 1e6:z.1f} ms"
             clock = one.stamps.note or f"header stamps, {delay} before log time"
             found.append(SurveyedSource(str(one.topic), str(one.message_type), one.why, one.problem or None, clock))
         candidates[role] = tuple(found)

@@ -44,6 +44,8 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
     OutputError
         Something is there, or the place cannot be written. It then stays as it was.
     """
+    if not log.name:
+        raise OutputError(log, "has no name for a log", "name an .mcap or .bag file, or a directory in it")
     truth = truth_path(log)
     if not log.is_file():
         check_directory(log, BAG)
@@ -54,7 +56,11 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
         if truth.is_dir():
             raise OutputError(truth, "is a directory", "it is left alone; choose another name")
         with beside(log.absolute(), Path.mkdir) as fresh:
-            yield fresh / log.name, fresh / truth.name
+            try:
+                yield fresh / log.name, fresh / truth.name
+            except OutputError as err:
+                # It names the hidden directory.
+                raise OutputError(log, err.why, err.advice) from err
             sync_tree(fresh)
             # Killed from here on, it leaves a log without its truth, never with that of another log.
             remove(truth)

@@ -33,6 +33,8 @@ START_NS = 1_760_000_000_000_000_000
 ROBOT = ("--set", "robot.track_width_m=0.55", "--set", "robot.wheel_radius_m=0.165")
 OPTIONS = WriteOptions(wheel_radius_m=0.165, track_width_m=0.55)
 CONFIG = load_config(sets=[*ROBOT[1::2]])
+CHUNK, DATA_END = 6, 15
+"""Operation codes of MCAP records."""
 NO_INTS, NO_FLOATS = np.zeros(0, np.int64), np.zeros(0)
 
 
@@ -155,6 +157,21 @@ def truncated_mcap(folder: Path) -> list[str]:
 def mcap_cut_before_anything(folder: Path) -> list[str]:
     path = rewritten(log(folder), lambda _, stamp, data: (stamp, data))
     path.write_bytes(path.read_bytes()[:60])
+    return [str(path)]
+
+
+def only_damaged_chunks(folder: Path) -> list[str]:
+    """A log of which no chunk can be decompressed."""
+    options = {"compression": CompressionType.ZSTD, "enable_crcs": False, "chunk_size": 2000}
+    path = rewritten(log(folder), lambda _, stamp, data: (stamp, data), **options)
+    content, at = bytearray(path.read_bytes()), 8
+    while content[at] != DATA_END:
+        length = int.from_bytes(content[at + 1 : at + 9], "little")
+        if content[at] == CHUNK:
+            # behind times, size, checksum, "zstd" and the length of what is compressed
+            content[at + 9 + 44 : at + 9 + length] = bytes(length - 44)
+        at += 9 + length
+    path.write_bytes(content)
     return [str(path)]
 
 
@@ -297,6 +314,12 @@ REFUSED: dict[str, tuple[Callable[[Path], list[str]], str]] = {
         "not a readable rosbag2",
     ),
     "cut before anything": (mcap_cut_before_anything, "nothing in it can be read; drive.mcap: cut off"),
+    "only damaged chunks": (
+        only_damaged_chunks,
+        "no message of /joint_states, /gps/fix, /imu/data could be read: chunk at byte ",
+    ),
+    "a part behind the end": (asked("--from", "1000"), "holds no message; the log begins at "),
+    "a part before the begin": (asked("--to", "2001-01-01"), "holds no message; the log begins at "),
     "an unknown compression": (unknown_compression, "compression 'oodl' is not known"),
     "missing definitions": (missing_definitions, "definition"),
     "another serialization": (other_serialization, "serialization 'flatbuffer' is not read"),

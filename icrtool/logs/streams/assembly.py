@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.errors import ConfigError, DataError
+from icrtool.errors import ConfigError, DataError, LogError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import NEAR_NS, TopicTable
@@ -44,7 +45,7 @@ from icrtool.records.samples import (
     rate_and_jitter,
 )
 from icrtool.records.tables import RobotLog
-from icrtool.records.text import LogText
+from icrtool.records.text import LogText, listed
 
 MOST_PIECES = 10.0
 """Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
@@ -75,7 +76,11 @@ class Survey:
 
 def assemble(survey: Survey, config: Config) -> RobotLog:
     """Return the log with its streams chosen and converted; errors as `read_log`."""
-    choice = choose_streams(survey.candidates, config, survey.path, survey.channels)
+    lost = _lost(survey)
+    if lost and survey.tables and not any(len(table) or table.unreadable for table in survey.tables):
+        why = f"no message of {listed([table.topic for table in survey.tables], 3)} could be read: {lost}"
+        raise LogError(survey.path, why, "copy the log again from where it was recorded")
+    choice = choose_streams(survey.candidates, config, survey.path, survey.channels, lost)
     log = _assemble(survey, config, choice)
     others = []
     for other in other_references(survey.candidates, choice, config):
@@ -83,6 +88,15 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
         with contextlib.suppress(DataError):
             others.append(_assemble(survey, config, other))
     return replace(log, other_references=tuple(others)) if others else log
+
+
+def _lost(survey: Survey) -> str:
+    """Return the first thing that could not be read of a log, and how many more there are; empty where all was read."""
+    if not survey.problems:
+        return ""
+    first, *others = survey.problems
+    first = first.removeprefix(f"{Path(survey.path).name}: ")
+    return f"{first} (icrtool info lists {len(others)} more)" if others else first
 
 
 def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
@@ -113,7 +127,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         if topic in unreadable
     ]
     antenna = antenna_place(survey.tables, position.topic)
-    place = "" if antenna is None else f"antenna {antenna[0]:+.2f} m forward, {antenna[1]:+.2f} m right of the base"
+    place = "" if antenna is None else f"antenna {antenna[0]:+z.2f} m forward, {antenna[1]:+z.2f} m right of the base"
     read: dict[Role, tuple[Samples, str]] = {
         "wheels": (wheels, "; position" if wheels.from_position else "; speed"),
         "gnss": (gnss, f"; {place} (/tf_static)" if place else ""),

@@ -195,8 +195,8 @@ def _other_robots(wheels: Sequence[WheelMotion]) -> frozenset[str]:
     return frozenset(_namespace(w.topic) for w in alike) - {_namespace(best.topic), ""}
 
 
-def choose_streams(found: Candidates, config: Config, log: str, channels: Sequence[Channel]) -> Choice:
-    """Return the source of each role.
+def choose_streams(found: Candidates, config: Config, log: str, channels: Sequence[Channel], lost: str = "") -> Choice:
+    """Return the source of each role; `lost`: what of the log could not be read.
 
     Raises
     ------
@@ -224,7 +224,7 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
                     refused.setdefault(topic, {})[source.problem] = None
         reasons = found.unread | {topic: ", ".join(problems) for topic, problems in refused.items()}
         needs = {ROLE_WORDS[role]: NEEDS[role] for role in missing}
-        raise MissingStreamError(log, needs, _listing(channels, reasons))
+        raise MissingStreamError(log, needs, _listing(channels, reasons), lost)
     return Choice(wheels, gnss, heading)
 
 

@@ -187,8 +187,8 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
     Raises
     ------
     OutputError
-        A file, something else than a directory of the kind, or files of others are there; it is a mount point; or
-        nothing can be known about the place.
+        A file, something else than a directory of the kind, or files of others are there; what is there could not be
+        removed; it is a mount point; or nothing can be known about the place.
     """
     why, advice = "", "it is left alone; name another place"
     with reported(directory):
@@ -209,6 +209,12 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
         elif other := next((name for name in names if not kind.files.fullmatch(name)), None):
             why = f"holds {other}, which is no part of a {kind.name}"
             advice = "move it elsewhere first, or name another place"
+        else:
+            folders = [place, *(place / name for name in names_in(place) if name.endswith("/"))]
+            if kept := next((one for one in folders if one.is_dir() and not os.access(one, os.W_OK | os.X_OK)), None):
+                # It could be renamed, but not removed: it would stay under a hidden name.
+                why = "is write-protected, and so cannot be replaced"
+                advice = f"make {kept.relative_to(place.parent)}/ writable, or name another place"
         if not why and place.is_mount():
             why, advice = "is a mount point, which cannot be replaced", "name a directory in it"
     if why:

@@ -196,6 +196,20 @@ def test_a_log_and_its_truth_appear_together_or_not_at_all(tmp_path: Path) -> No
     assert truth_path(log).read_text(encoding="utf-8") == "new"
 
 
+def test_a_log_that_cannot_be_written_is_named_as_it_was_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as caught, log_and_truth(tmp_path / "drive.mcap", force=False) as (fresh, _):
+        raise OutputError(fresh, "cannot be written", "No space left on device")
+    assert str(caught.value) == f"{tmp_path / 'drive.mcap'}: cannot be written; No space left on device"
+
+
+@pytest.mark.parametrize("place", [".", "/"])
+def test_a_folder_is_no_name_of_a_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match="has no name for a log"):
+        write_pair(Path(place), force=True)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_nothing_is_overwritten_unless_forced(tmp_path: Path) -> None:
     log = tmp_path / "drive.bag"
     write_pair(log, force=False, text="old")

@@ -318,6 +318,20 @@ def test_what_cannot_be_looked_into_is_left_alone(tmp_path: Path, monkeypatch, c
     assert list(tmp_path.iterdir()) == [tmp_path / "a"]
 
 
+@pytest.mark.parametrize("closed", ["", "sub"])
+def test_what_could_not_be_removed_is_not_replaced(tmp_path: Path, monkeypatch, closed: str) -> None:
+    write_generation(tmp_path / "a", "old")
+    real, place = os.access, os.path.realpath(tmp_path / "a" / closed)
+    # Root may write everywhere, so permissions are no means here.
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "access", lambda path, mode: os.path.realpath(path) != place and real(path, mode))
+        with pytest.raises(OutputError, match=f"a: is write-protected.*; make {Path('a', closed)}/ writable"):
+            write_generation(tmp_path / "a", "new")
+    assert generation(tmp_path / "a") == "old"
+    assert list(tmp_path.iterdir()) == [tmp_path / "a"]
+    write_generation(tmp_path / "a", "new")
+
+
 def test_what_came_into_one_of_ours_meanwhile_is_not_lost(tmp_path: Path) -> None:
     write(tmp_path / "a", "old")
 
