@@ -63,7 +63,7 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
     norths, found = [("", 0.0)], []
     for what, angle_deg in (("magnetic declination", declination), ("UTM grid convergence", convergence)):
         if angle_deg is not None and abs(angle_deg) > math.degrees(SMALLEST_NAME_RAD):
-            norths.append((f"{what} here is {angle_deg:+.1f}°", math.radians(angle_deg)))
+            norths.append((f"{what} here is {angle_deg:+z.1f}°", math.radians(angle_deg)))
     for turn, turn_text in TURNS.items():
         for north_text, north in norths:
             away = abs(math.remainder(offset_rad - math.radians(turn) + north, 2 * math.pi))
@@ -260,7 +260,7 @@ def _correction(
     elif significant and applies:
         notes.append(_offset_note(text, applied))
     elif significant:
-        notes.append(f"heading is {text} off the course over ground; {-math.degrees(fixed):+.1f}° is applied")
+        notes.append(f"heading is {text} off the course over ground; {-math.degrees(fixed):+z.1f}° is applied")
     return applied, name, notes
 
 
@@ -269,11 +269,11 @@ def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool
     rest = offset + math.pi / 2 if mirrored else offset
     name = name_offset(rest, std, log.datum, int(log.wheels.stamp_ns[0])) if _significant(rest, std) else NO_NAME
     cause = f" ({name.text})" if name.text else ""
-    return f"{math.degrees(math.remainder(rest, 2 * math.pi)):+.1f}° ± {math.degrees(std):.1f}°{cause}", name
+    return f"{math.degrees(math.remainder(rest, 2 * math.pi)):+z.1f}° ± {math.degrees(std):.1f}°{cause}", name
 
 
 def _offset_note(text: str, applied: float) -> str:
-    done = f"{-math.degrees(applied):+.1f}° is applied; frames.heading_offset_deg sets it"
+    done = f"{-math.degrees(applied):+z.1f}° is applied; frames.heading_offset_deg sets it"
     return f"heading is {text} off the course over ground: {done}"
 
 

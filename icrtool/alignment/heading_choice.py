@@ -234,7 +234,7 @@ def _derived(
     estimate = estimate_heading(track, turn, absolute, stands=gyro_topic is not None)
     if estimate is None:
         return None
-    bias = f"turn rate (bias {math.degrees(estimate.constants[1]):+.2f} deg/s at the end)"
+    bias = f"turn rate (bias {math.degrees(estimate.constants[1]):+z.2f} deg/s at the end)"
     parts = [*(one.part for one in absolute), bias if gyro_topic else f"wheels ({instead})", "course over ground"]
     names = [*(one.topic for one in absolute), gyro_topic or "wheels", log.topic("gnss", "positions")]
     source = "gyro_course" if gyro_topic else "wheels_course"

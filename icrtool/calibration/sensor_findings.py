@@ -166,7 +166,7 @@ def _derive(
         antenna_forward = _parameter(forward, 0.0, "given")
         x = _parameter(forward - ahead, ahead_std, of_ahead, "with the antenna as given")
     elif x_icr_m is not None:
-        note = f"with x ICR at {x_icr_m:+.3f} m, as given"
+        note = f"with x ICR at {x_icr_m:+z.3f} m, as given"
         antenna_forward = _parameter(ahead + x_icr_m, ahead_std, of_ahead, note)
         x = _parameter(x_icr_m, 0.0, "given")
     else:

@@ -233,10 +233,10 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
     lines = [
         f"robot  {config.robot.name or 'as configured'}, b = {needed(config, 'track_width_m'):g} m",
         f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {seed}",
-        f"ICRs   y right {plan.icrs_m[0]:+.3f}, y left {plan.icrs_m[1]:+.3f}, x {plan.icrs_m[2]:+.3f} m",
+        f"ICRs   y right {plan.icrs_m[0]:+z.3f}, y left {plan.icrs_m[1]:+z.3f}, x {plan.icrs_m[2]:+z.3f} m",
     ]
     lines += [
-        f"       from {time:g} s on {right:+.3f}, {left:+.3f}, {x:+.3f} m" for time, (right, left, x) in plan.changes
+        f"       from {time:g} s on {right:+z.3f}, {left:+z.3f}, {x:+z.3f} m" for time, (right, left, x) in plan.changes
     ]
     return "\n".join(lines)
 

@@ -258,7 +258,7 @@ def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[
     for name, std in zip(ICR_COLUMNS, std_m, strict=True):
         side = -1.0 if name == "y_icr_left_m" else 1.0
         if name != "x_icr_m" and side * final[name] <= AT_LIMIT * least_icr_m:
-            found[name] = f"stopped at the limit of {side * least_icr_m:+.2f} m that the filter keeps"
+            found[name] = f"stopped at the limit of {side * least_icr_m:+z.2f} m that the filter keeps"
         elif std > WEAK_SHARE * width:
             found[name] = f"± {std:.2f} m, by how much stretches of the drive differ"
     return found

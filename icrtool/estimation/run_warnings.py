@@ -118,7 +118,7 @@ def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str
         separation = abs(table.y_icr_right_m[-1] - table.y_icr_left_m[-1])
         if abs(final - found.value) > max(CONTRADICTION_SIGMAS * sigma, CONTRADICTION_SHARE * separation):
             apart.append(
-                f"y {word} is {final:+.2f} m by the filter and {found.value:+.2f} ± {found.std:.2f} m by windows"
+                f"y {word} is {final:+z.2f} m by the filter and {found.value:+z.2f} ± {found.std:.2f} m by windows"
             )
     return f"wheels and reference contradict each other ({'; '.join(apart)}): clocks or slip" if apart else ""
 
@@ -215,13 +215,13 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
             return []
         unknown = "as the log does not hold its place on the robot"
         advice = "frames.antenna_forward_m sets how far ahead of the body origin it is, and is added to x"
-        return [f"{name}: x {x:+.2f} m is counted from the position sensor (antenna), {unknown}: {advice}"]
+        return [f"{name}: x {x:+z.2f} m is counted from the position sensor (antenna), {unknown}: {advice}"]
     side, other = ("right", "left") if middle > 0 else ("left", "right")
     where = f"{abs(middle):.2f} m"
     return [
         (
             f"{name}: both ICRs lie {where} to the {side} of the position sensor (antenna): the sensor is {other} of "
             f"the centre line, or the sides slip unequally. If it is {where} {other} of it, set "
-            f"frames.antenna_right_m={-middle:.2f}, and frames.antenna_forward_m, from which x_icr is counted"
+            f"frames.antenna_right_m={-middle:z.2f}, and frames.antenna_forward_m, from which x_icr is counted"
         )
     ]

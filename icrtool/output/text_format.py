@@ -110,8 +110,7 @@ def plus_minus(value: float | None, std: float | None, digits: int = 3, sign: st
     """Return a value with its standard deviation, as ``+0.716 ± 0.018``; alone without one, and ``–`` for no value."""
     if value is None:
         return "–"
-    # Adding zero takes the sign off a rounded -0.0.
-    text = f"{float(f'{value:.{digits}f}') + 0.0:{sign}.{digits}f}"
+    text = f"{value:{sign}z.{digits}f}"
     return text if std is None else f"{text} ± {std:.{digits}f}"
 
 

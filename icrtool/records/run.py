@@ -248,7 +248,7 @@ class Run:
 
 def icr_text(value: float | None, std: float | None) -> str:
     """Return an ICR with its standard deviation, ``not shown`` where there is none."""
-    return f"{value:+.3f} ± {std:.3f}" if value is not None else "not shown"
+    return f"{value:+z.3f} ± {std:.3f}" if value is not None else "not shown"
 
 
 def width_or_usual_m(track_width_m: float | None) -> float:

@@ -140,20 +140,15 @@ def digits_of(std: float, least: int = 2) -> int:
 def with_std(value: float, std: float, least: int = 2) -> str:
     """Return a difference with its standard deviation, as ``+0.004 ± 0.007``, with `least` decimals or more."""
     digits = digits_of(std, least)
-    return f"{_rounded(value, digits)} ± {std:.{digits}f}"
+    return f"{value:+z.{digits}f} ± {std:.{digits}f}"
 
 
 def with_interval(metres: float, low: float | None, high: float | None) -> str:
     """Return a difference [m] with its 95 % interval, as ``+0.01 m (-0.05 to +0.07)``."""
     if low is None or high is None:
-        return f"{_rounded(metres, 2)} m (too short for an interval)"
-    value, low_text, high_text = (_rounded(one, digits_of((high - low) / 4)) for one in (metres, low, high))
+        return f"{metres:+z.2f} m (too short for an interval)"
+    value, low_text, high_text = (f"{one:+z.{digits_of((high - low) / 4)}f}" for one in (metres, low, high))
     return f"{value} m ({low_text} to {high_text})"
-
-
-def _rounded(value: float, digits: int) -> str:
-    # adding zero takes the sign off a rounded -0.0
-    return f"{round(value, digits) + 0.0:+.{digits}f}"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

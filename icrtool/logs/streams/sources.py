@@ -83,7 +83,7 @@ def stamp_rows(table: TopicTable) -> StampedRows:
     header, clock_set = _without_clock_steps(header, log_ns)
     delay = int(np.median(log_ns - header))
     if abs(delay) > NEAR_NS:
-        return unusable(f"header stamps are {delay / 1e9:+.1f} s from log time", clock_set)
+        return unusable(f"header stamps are {delay / 1e9:+z.1f} s from log time", clock_set)
     # A few stamps of another clock (a first message at 0) are replaced by their log times.
     other = np.abs(log_ns - header - delay) > NEAR_NS
     header[other] = log_ns[other] - delay

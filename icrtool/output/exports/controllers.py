@@ -167,13 +167,13 @@ def _header(calibration: Calibration, errors: ControllerErrors, driven: str) -> 
     fitted = f", fitted {calibration.created[:10]}" if calibration.created else ""
     origin = f"icrtool {__version__}: {_one_line(calibration.log_names())}, {driven}{robot}{fitted}"
     icrs = (
-        f"y_icr_right {right:+.3f} ± {std_right:.3f} m, y_icr_left {left:+.3f} ± {std_left:.3f} m, "
-        f"x_icr {x:+.3f} ± {std_x:.3f} m (body: x forward, y right)"
+        f"y_icr_right {right:+z.3f} ± {std_right:.3f} m, y_icr_left {left:+z.3f} ± {std_left:.3f} m, "
+        f"x_icr {x:+z.3f} ± {std_x:.3f} m (body: x forward, y right)"
     )
     held_out = f"{controller_error_text(errors)} ({calibration.recommended}; icrtool export --for icr)"
     lost = (
-        f"not expressible here: x_icr {x:+.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
-        f"and the ICRs' middle {(right + left) / 2:+.3f} m right of the body's"
+        f"not expressible here: x_icr {x:+z.3f} m (a turn also moves the robot sideways, {abs(x):.3f} m a radian) "
+        f"and the ICRs' middle {(right + left) / 2:+z.3f} m right of the body's"
     )
     sentences = [origin, icrs, held_out, lost]
     if (factor := factor_to_old(calibration)) is not None:

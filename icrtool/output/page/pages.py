@@ -104,7 +104,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     if coordinates:
         place = "metric reference, no datum"
         if datum is not None:
-            place = f"datum {datum[0]:.6f}° {datum[1]:.6f}°, {datum[2]:.1f} m"
+            place = f"datum {datum[0]:z.6f}° {datum[1]:z.6f}°, {datum[2]:z.1f} m"
     made = (
         f"icrtool {summary.tool_version}, {summary.schema}, {report.schema}; {report.starts:,} states; "
         f"intervals by {report.bootstrap.method}"

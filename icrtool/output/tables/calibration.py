@@ -243,7 +243,7 @@ def _pair_section(pair: documents.ComparedPair) -> Section:
     """Return how parameters and held-out errors of two groups differ."""
     rows, errors = [], []
     for one in pair.parameters:
-        values = (f"{round(value, 3) + 0.0:+.3f}" for value in (one.first, one.second))
+        values = (f"{value:+z.3f}" for value in (one.first, one.second))
         significant = "yes" if one.significant else "no, may be chance"
         rows.append((one.quantity, *values, with_std(one.difference, one.std, 3), significant))
     for row in pair.errors:

@@ -189,7 +189,7 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
         (
             f"{rank}", duration_text(one.t_s), error_text(one.errors_m[one.model]),
             error_text(one.errors_m.get("no_slip")), turn_text(one.heading_change_deg), f"{one.speed_mean_mps:.2f} m/s",
-            f"{one.north_m:.1f} m", f"{one.east_m:.1f} m", _meanwhile(one, summary, report),
+            f"{one.north_m:z.1f} m", f"{one.east_m:z.1f} m", _meanwhile(one, summary, report),
         )
         for rank, one in enumerate(report.worst, start=1)
     ]  # fmt: skip

@@ -242,7 +242,7 @@ def baseline_sections(report: DropoutReport) -> Iterator[Section]:
             sums = result.block_sums[h] if result.block_sums else None
             half = difference_half_width(sums, theirs, metric, 1.0, paired=same)
             interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
-            cells.append(f"{difference:+.3f} m{interval}" if math.isfinite(difference) else "-")
+            cells.append(f"{difference:+z.3f} m{interval}" if math.isfinite(difference) else "-")
         rows.append([f"{result.label}, {label}", *cells])
     table = Table("lr", rows, ("difference to the baseline", *(f"{horizon_m:g} m" for _, horizon_m in shown)))
     title = f"Against the baseline ({baseline.log}, icrtool {baseline.tool_version})"

@@ -45,7 +45,7 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
         east_m, north_m = (highest - lowest for lowest, highest in ends)
         where = " (metric positions)"
         if datum is not None:
-            where = f" about {datum.latitude_deg:.5f}°, {datum.longitude_deg:.5f}°"
+            where = f" about {datum.latitude_deg:z.5f}°, {datum.longitude_deg:z.5f}°"
         rows.append(("area", f"{east_m:.1f} m east-west x {north_m:.1f} m north-south{where}"))
     return rows
 

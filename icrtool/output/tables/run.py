@@ -193,7 +193,7 @@ def _filter_check(summary: RunDocument) -> Iterator[Check]:
         if of_drive is None or at is None or at_std is None:
             continue
         value, std = of_drive
-        ends.append(f"{word.removeprefix('y ')} {at:+.3f}")
+        ends.append(f"{word.removeprefix('y ')} {at:+z.3f}")
         sigmas = abs(at - value) / max(math.hypot(std, at_std), 1e-9)
         if sigmas > AGREES_SIGMAS:
             apart.append(f"{word} differs by {sigmas:.1f} σ: the end of the drive is not like the whole")
@@ -260,7 +260,7 @@ def _heading_checks(summary: RunDocument) -> Iterator[Check]:
     value = f"{plus_minus(heading.offset_deg, heading.offset_std_deg, 1)}°"
     cause = f" ({heading.offset_name})" if heading.offset_name else ""
     applied = heading.applied_offset_deg
-    more.insert(0, f"corrected by {0.0 - applied:+.1f}°" if applied else "not corrected")
+    more.insert(0, f"corrected by {-applied:+z.1f}°" if applied else "not corrected")
     yield Check("good", "heading", f"{value} from the course over ground{cause}", tuple(more))
 
 
@@ -296,7 +296,7 @@ def corrections(summary: RunDocument) -> list[str]:
         side, share = ("left", (right - left) / right) if left < right else ("right", (left - right) / left)
         found.append(f"{side} {100 * share:.1f} % less")
     if abs(offset := summary.heading.applied_offset_deg) >= SMALLEST_OFFSET_DEG:
-        found.append(f"heading {0.0 - offset:+.1f}°")
+        found.append(f"heading {-offset:+z.1f}°")
     delays = (("position", summary.filter.reference_delay_s), ("heading", summary.heading.applied_delay_s))
     found += [f"{word} {'lag' if delay > 0 else 'lead'} {abs(delay):.2f} s" for word, delay in delays if delay]
     return found

@@ -31,7 +31,7 @@ def study_blocks(result: StudyResult) -> list[Block]:
     """Return the tables of a study, of at most 80 columns but for the paper's numbers; no line end."""
     request, study = result.request, result.study
     figures = f" (Fig{'s' if len(study.figures) > 2 else ''}. {study.figures})" if study.figures else ""
-    icrs = ", ".join(f"{icr:+.3f}" for icr in request.plan.icrs_m)
+    icrs = ", ".join(f"{icr:+z.3f}" for icr in request.plan.icrs_m)
     driven = f"{request.path.kind} at {request.path.speed_mps:g} m/s, ICRs {icrs} m"
     blocks: list[Block] = [f"{request.name}{figures}: {study.about}"]
     blocks += [f"{runs_text(request)} each, seed {request.seed}; {driven}", ""]
@@ -55,7 +55,7 @@ def _level_rows(level: Level, shown: dict[str, str]) -> list[list[str]]:
     first, second = [level.setting.series, value if isinstance(value, str) else f"{value:g}"], ["", ""]
     for name in shown:
         found = level.metrics()[name]
-        form, never = "+.3f" if name in ERRORS else ".3g", len(level.found[name]) - found["count"]
+        form, never = "+z.3f" if name in ERRORS else ".3g", len(level.found[name]) - found["count"]
         if name == "inverted":
             middle, around = f"{100 * found['mean']:.0f} %", ""
         elif not found["count"]:
@@ -75,7 +75,7 @@ def finding_text(finding: StudyNumber) -> str:
     texts = []
     for value in finding.ours:
         digits = 3 if abs(value) < 1 else 2 if abs(value) < 10 else 1
-        texts.append(f"{value if abs(value) >= 5e-4 else 0.0:.{digits}f}")
+        texts.append(f"{value:z.{digits}f}")
     unit = f" {finding.unit}" if finding.unit else ""
     if len(texts) == 3:
         return f"{texts[1]}{unit} [{texts[0]}, {texts[2]}]"

@@ -1,7 +1,12 @@
 """Differences print with as many digits as their standard deviation needs."""
 
+import re
+from pathlib import Path
+
 import pytest
 
+import icrtool
+from icrtool.records.run import icr_text
 from icrtool.records.text import digits_of, with_interval, with_std
 
 
@@ -29,3 +34,14 @@ def test_an_interval_has_the_digits_it_needs_and_no_negative_zero() -> None:
 @pytest.mark.parametrize("std", [0.0, float("nan"), float("inf")])
 def test_without_a_spread_the_least_digits_are_printed(std: float) -> None:
     assert digits_of(std, 3) == 3
+
+
+def test_an_icr_that_rounds_to_zero_has_no_negative_sign() -> None:
+    assert icr_text(-0.0003, 0.02) == "+0.000 ± 0.020"
+
+
+def test_every_signed_number_of_fixed_digits_is_printed_without_a_negative_zero() -> None:
+    sources = {path: path.read_text(encoding="utf-8") for path in Path(icrtool.__file__).parent.rglob("*.py")}
+    signed = [form for text in sources.values() for form in re.findall(r":\+z?\.[\w{}()/. -]+f\}", text)]
+    assert len(signed) > 20
+    assert [form for form in signed if not form.startswith(":+z")] == [":+.{digits}f}"], "`signed` has no sign at zero"

@@ -22,8 +22,14 @@ const icrtoolPage = (() => {
     return `${error.toFixed(error < 0.01 ? 4 : error < 1 ? 3 : 2)} m`;
   }
 
+  // Adding zero takes the sign off a rounded -0.
+  function fixed(value, digits) {
+    return (Number(value.toFixed(digits)) + 0).toFixed(digits).replace("-", "−");
+  }
+
   function signed(value) {
-    return `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(3)}`;
+    const text = fixed(value, 3);
+    return text.startsWith("−") ? text : `+${text}`;
   }
 
   function setMoment(row) {
@@ -32,7 +38,7 @@ const icrtoolPage = (() => {
     range.value = t;
     range.setAttribute("aria-valuetext", clock(t));
     const parts = [`${clock(t)} (${t.toFixed(1)} s), ${data.steps.distance[series.step[row]].toFixed(1)} m driven`,
-      `wheels left ${series.v_left[row].toFixed(2)}, right ${series.v_right[row].toFixed(2)} m/s`,
+      `wheels left ${fixed(series.v_left[row], 2)}, right ${fixed(series.v_right[row], 2)} m/s`,
       `ICR y right ${signed(series.y_right[row])} ± ${series.std_y_right[row].toFixed(3)}, y left ${signed(series.y_left[row])} ± ${series.std_y_left[row].toFixed(3)}, x ${signed(series.x[row])} ± ${series.std_x[row].toFixed(3)} m`];
     if (off !== null) parts.push(`filter to fix ${metres(off)}`);
     readout.textContent = parts.join(" · ").replace(/(\d) (?=m|cm|s\)|±)|± /g, (found) => found.replace(" ", "\u00a0"));
