@@ -24,6 +24,7 @@ from icrtool.records.text import LogText, counted, escaped, shortened
 with when_used():
     from icrtool.fleet import batch as batches
     from icrtool.fleet import fleet_files, one_log
+    from icrtool.output import text_blocks
     from icrtool.output.exports import acceptance
     from icrtool.output.files import remote_place
 
@@ -114,7 +115,7 @@ def batch_command(
     exports.write(
         "batch",
         lambda: [acceptance.Suite(row.log, row.verdicts, row.reason if row.status == "failed" else "") for row in rows],
-        lambda: fleet_files.format_fleet_markdown(rows, missing),
+        lambda: text_blocks.format_markdown(fleet_files.fleet_blocks(rows, missing)),
     )
     printer.json("batch", replace(document, output=escaped(str(output))))
     printer.text(summary_of(rows, output, written))

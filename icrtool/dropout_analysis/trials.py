@@ -34,6 +34,7 @@ from icrtool.records.choices import Starts
 from icrtool.records.plain_data import known, plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import Run, track_of
+from icrtool.records.text import counted
 
 LARGEST_TABLE_BYTES = 96 << 20
 """Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
@@ -80,7 +81,7 @@ def measure_errors(
     track : `icrtool.records.run.track_of` the run, where it is at hand: of a long log it is large
     """
     if len(run.table) < 2:
-        raise DataError(run.name, f"the run has {len(run.table)} states", "at least two are needed")
+        raise DataError(run.name, f"the run has {counted(len(run.table), 'state')}", "at least two are needed")
     horizons = check_horizons(horizons_m)
     track = track if track is not None else track_of(run)
     predictors: list[Model | ComparedRow] = [*(models if models is not None else models_of(run)), *further]

@@ -23,6 +23,7 @@ from icrtool.output.figure_catalogue import FIGURES, figures_of
 from icrtool.output.files import formats
 from icrtool.output.files.atomic import atomic_file, check_place, make_folders, write_file
 from icrtool.output.run_directory import PAGE_FILE, is_page, open_run
+from icrtool.output.text_blocks import Block, Items, Section, Table, Title
 from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records import fleet_document as documents
 from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog
@@ -231,33 +232,31 @@ def counts_text(rows: Sequence[FleetLog]) -> str:
     return f"{text} ({skipped} of them before, skipped this time)" if skipped else text
 
 
-def format_fleet_markdown(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> str:
-    """Return a batch as Markdown: counts, limits that were missed, every log against the baseline, what changed.
+def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[Block]:
+    """Return a batch: counts, acceptance limits, every log against the baseline, what changed.
 
     Parameters
     ----------
     missing : logs of the baseline that the batch does not have
     """
-    from icrtool.output.text_blocks import escaped_markdown, markdown_table
+    # Not at import: a process that fits logs needs none of it.
+    from icrtool.output.exports.acceptance import limit_sections
 
-    lines = [f"## {len(rows)} logs", ""]
-    lines += [counts_text(rows), ""]
-    if verdicts := sorted((one for row in rows for one in row.verdicts), key=lambda one: one.passed):
-        missed = sum(not one.passed for one in verdicts)
-        lines += [f"**Acceptance limits not met: {missed}.**" if missed else "All acceptance limits are met.", ""]
-        lines += [*(f"- {escaped_markdown(one.line)}" for one in verdicts), ""]
-    errors = []
+    errors, changes = [], changes_of(rows, missing)
     for row in rows:
         if row.status == "failed":
-            errors.append([escaped_markdown(row.log), f"could not be used: {escaped_markdown(row.reason)}", "", ""])
+            errors.append([row.log, f"could not be used: {row.reason}", "", ""])
             continue
         now, before = row.shown_error(), row.shown_error(baseline=True)
         both = ["-" if one is None else f"{one:.3f} m" for one in (now, before)]
-        difference = f"{now - before:+.3f} m" if now is not None and before is not None else "-"
-        errors.append([escaped_markdown(row.log), *both, difference])
-    lines += markdown_table(("log", "95 % after 10 m", "baseline", "difference"), errors)
-    changes = changes_of(rows, missing)
-    return "\n".join([*lines, *([""] if changes else []), *(f"- {escaped_markdown(change)}" for change in changes), ""])
+        difference = f"{now - before:+z.3f} m" if now is not None and before is not None else "-"
+        errors.append([row.log, *both, difference])
+    return [
+        Title(counted(len(rows), "log"), counts_text(rows)),
+        *limit_sections([one for row in rows for one in row.verdicts]),
+        Table("lr", errors, ("log", "95 % after 10 m", "baseline", "difference")),
+        *([Section("Since the baseline", [Items(changes)])] if changes else []),
+    ]
 
 
 def changes_of(rows: Sequence[FleetLog], missing: Sequence[str]) -> list[str]:

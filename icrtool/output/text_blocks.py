@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from icrtool.records.text import shortened
@@ -315,27 +315,29 @@ def _wrap(text: str, first: str, later: str, width: int = TEXT_WIDTH, most: int 
     )  # fmt: skip
 
 
-def markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
-    """Yield all of a document as lines of Markdown: a heading each section, an item each sentence."""
+def format_markdown(blocks: Iterable[Block]) -> str:
+    """Return all of a document as Markdown: a heading each title and section, an item each sentence."""
+    return re.sub("\n{3,}", "\n\n", "\n".join(_markdown_lines(blocks))).strip() + "\n"
+
+
+def _markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
     for block in blocks:
+        if isinstance(block, Title):
+            yield from ("", f"## {_escaped_markdown(block.text)}", "", _escaped_markdown(block.facts), "")
+            continue
         for one in printed([block], verbose=True):
             if isinstance(one, Table):
-                rows = [[escaped_markdown(cell.strip()) for cell in row] for row in one.lines()]
-                texts = [column for column, side in enumerate(one.sides()) if side == "l"]
-                table = ["", *markdown_table(one.head, rows, texts), ""]
+                rows = [[_escaped_markdown(cell.strip()) for cell in row] for row in one.lines()]
+                rule = ["---" if side == "l" else "---:" for side in one.sides()]
+                head = map(_escaped_markdown, one.head)
+                table = ["", *(f"| {' | '.join(row)} |" for row in (head, rule, *rows)), ""]
                 yield from table if one.head else (f"- {' '.join(filter(None, row))}" for row in rows)
-            elif isinstance(one, Line) and one.look == "title" and not isinstance(block, Title):
-                yield from ("", f"### {escaped_markdown(one.text)}", "")
+            elif isinstance(one, Line) and one.look == "title":
+                yield from ("", f"### {_escaped_markdown(one.text)}", "")
             elif text := one.text if isinstance(one, Line) else one:
-                yield f"- {escaped_markdown(text)}"
+                yield f"- {_escaped_markdown(text)}"
 
 
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], texts: Collection[int] = (0,)) -> list[str]:
-    """Return a table as lines; columns but those in `texts` are aligned to the right."""
-    rule = ["---" if column in texts else "---:" for column in range(len(head))]
-    return [f"| {' | '.join(row)} |" for row in (head, rule, *rows)]
-
-
-def escaped_markdown(text: str) -> str:
+def _escaped_markdown(text: str) -> str:
     """Return text with what Markdown would take for markup escaped."""
     return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)

@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import IcrToolError
 from icrtool.output.files.atomic import write_file
-from icrtool.output.text_blocks import escaped_markdown, markdown_lines
+from icrtool.output.text_blocks import Block, Items, Section, Title, format_markdown
 from icrtool.output.text_format import run_title, xml_text
 from icrtool.records.fleet_document import FleetVerdict, fleet_verdict
 
@@ -58,26 +58,32 @@ def write_junit(path: Path, suites: Sequence[Suite], command: str = "dropout-rep
 
 def format_outcomes(outcomes: Iterable[tuple[str, Outcome]]) -> str:
     """Return a summary for a pull request, of the name and outcome of each run."""
-    return "\n".join(
-        f"## {escaped_markdown(name)}\n\nCould not be used: {escaped_markdown(str(outcome))}\n"
-        if isinstance(outcome, IcrToolError)
-        else format_markdown(outcome)
-        for name, outcome in outcomes
-    )
+    blocks: list[Block] = []
+    for name, outcome in outcomes:
+        if isinstance(outcome, IcrToolError):
+            blocks.append(Title(name, f"Could not be used: {outcome}"))
+        else:
+            blocks += _summary_blocks(outcome)
+    return format_markdown(blocks)
 
 
-def format_markdown(report: DropoutReport) -> str:
-    """Return one report as Markdown: the verdicts, then the sentences and tables that are printed."""
+def _summary_blocks(report: DropoutReport) -> list[Block]:
+    """Return one report: its title, the verdicts, then the sentences and tables that are printed."""
     # Not at import: a batch needs the verdicts alone.
     from icrtool.output.tables.dropout import dropout_blocks
 
-    verdicts = [one.verdict for one in report.document.gates]
-    lines = [f"## {escaped_markdown(run_title(report.run_document))}", ""]
-    if verdicts:
-        word = "All acceptance limits are met." if report.passed else "**An acceptance limit is not met.**"
-        lines += [word, "", *(f"- {escaped_markdown(line)}" for line in verdicts), ""]
     *blocks, _ = dropout_blocks(report)
-    return "\n".join([*lines, *markdown_lines(blocks)]) + "\n"
+    title = next(one for one in blocks if isinstance(one, Title))
+    verdicts = suite_of("", report).verdicts
+    return [title, *limit_sections(verdicts), *(one for one in blocks if one is not title)]
+
+
+def limit_sections(verdicts: Sequence[FleetVerdict]) -> list[Section]:
+    """Return the verdicts under what they come to, those that are not met first; nothing without any."""
+    missed = sum(not one.passed for one in verdicts)
+    title = f"Acceptance limits not met: {missed}" if missed else "All acceptance limits are met"
+    lines = [one.line for one in sorted(verdicts, key=lambda one: one.passed)]
+    return [Section(title, [Items(lines)])] if lines else []
 
 
 def _suite(one: Suite, command: str) -> ET.Element:

@@ -81,7 +81,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
         "headings": _differences(run.heading, run.heading.used, np.degrees(run.heading.difference))[1],
         "half_width_m": half,
         "icr_scale_m": scale_of(shown),
-        **_models_data(run, report, rows, origin),
+        **_models_data(run, report, rows, joined, origin),
         "events": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in run.document.events],
         "outages": [{"begin_s": one.begin_s, "end_s": one.end_s} for one in report.outages],
         "changes_s": list(run.changes_s),
@@ -168,12 +168,19 @@ Paths = Iterator[tuple[str, tuple[Floats, Complexes]]]
 """Name of a model; heading [rad] and place [m] of the robot along its path, at the steps of the page alone."""
 
 
-def _models_data(run: Run, report: DropoutDocument, steps: Ints, origin: tuple[float, float]) -> dict[str, object]:
-    """Return the models of the report, and where each of constant parameters leads from the begin of the drive."""
+def _models_data(
+    run: Run, report: DropoutDocument, steps: Ints, joined: int, origin: tuple[float, float]
+) -> dict[str, object]:
+    """Return the models of the report, and where each of constant parameters leads from the begin of the drive.
+
+    Parameters
+    ----------
+    steps, joined : rows of the states, and every how many-th they are
+    """
     labels = {one.name: one.label for one in report.models}
     recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(run.track_width_m)))
     paths = {
-        **dict(_odometry(run, steps, origin)),
+        **dict(_odometry(run, joined, origin)),
         **dict(_held_out(recording, report, steps)),
         **dict(_calibrated(recording, report, steps)),
     }
@@ -192,9 +199,8 @@ def _models_data(run: Run, report: DropoutDocument, steps: Ints, origin: tuple[f
     return {"models": models, "paths": packed_paths}
 
 
-def _odometry(run: Run, rows: Ints, origin: tuple[float, float]) -> Paths:
+def _odometry(run: Run, every: int, origin: tuple[float, float]) -> Paths:
     """Yield the odometries of the run, which the figure of the trajectory draws too."""
-    every = int(rows[1])  # the first of them is 0
     for name, icrs in odometry_icrs(run).items():
         path = drive_wheels(run.table, run.in_gap, icrs, every)
         model = "icr_final" if name == "icr" else name

@@ -13,8 +13,15 @@ from icrtool.cli.batch import line_of, summary_of
 from icrtool.cli.inputs import runs_or_logs
 from icrtool.cli.report import groups_of
 from icrtool.errors import RunError
-from icrtool.fleet.fleet_files import calibrations_text, pooled_calibrations, runs_of_fleet, write_fleet
+from icrtool.fleet.fleet_files import (
+    calibrations_text,
+    fleet_blocks,
+    pooled_calibrations,
+    runs_of_fleet,
+    write_fleet,
+)
 from icrtool.output.files.formats import open_calibration
+from icrtool.output.text_blocks import format_markdown
 from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog
 from icrtool.records.run import Run
 from support.documents import with_summary
@@ -44,6 +51,18 @@ def rows(*names: str, group: str = "grass", **values: object) -> list[FleetLog]:
             inputs=(FleetFile(name, 1, 1, CONTENT.get(name, name)),), **{"usable": name != "c"} | values)
         for name in names
     ]  # fmt: skip
+
+
+def test_a_summary_in_markdown_has_every_log_beside_the_baseline_and_escapes_names() -> None:
+    errors = {"recommended_p95_10m_m": 1.2}
+    (done,) = rows("a|b*c", errors=errors, baseline=errors, changes=("x_y changed",))
+    failed = replace(rows("d")[0], status="failed", reason="no <wheels>")
+    lines = format_markdown(fleet_blocks([done, failed], ["gone"])).splitlines()
+    assert lines[:3] == ["## 2 logs", "", "1 done, 1 failed"]
+    table = [line for line in lines if line.startswith("|")]
+    assert table[2] == "| a\\|b\\*c | 1.200 m | 1.200 m | +0.000 m |"
+    assert "no \\<wheels\\>" in table[3]
+    assert lines[-2:] == ["- not in this batch, but in the baseline: gone", "- a\\|b\\*c: x\\_y changed"]
 
 
 def test_the_logs_of_a_robot_and_group_have_one_calibration(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

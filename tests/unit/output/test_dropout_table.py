@@ -13,7 +13,7 @@ from icrtool.config import Config
 from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import OutputError, RunError
-from icrtool.output.exports.acceptance import format_markdown, format_outcomes, suite_of, write_junit
+from icrtool.output.exports.acceptance import format_outcomes, suite_of, write_junit
 from icrtool.output.files.atomic import check_place
 from icrtool.output.tables.dropout import format_dropout, p95_at, reach_rows
 from icrtool.output.tables.errors import shown_horizons
@@ -169,15 +169,14 @@ def test_junit_has_a_suite_a_run_and_a_case_a_gate(content: DropoutReport, tmp_p
 def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutReport) -> None:
     text = format_outcomes([("barn", content), ("runs/x", RunError("runs/x", "was edited"))])
     assert text.startswith("## barn")
-    assert "limit is not met" in text
+    assert "Acceptance limits not met: 1" in text
     assert "How far within 50 m (95 %)?" in text
     assert "Could not be used: runs/x: was edited" in text
     tables = [part for part in text.split("\n\n") if part.startswith("|")]
     assert len(tables) > 1
     assert all(len({line.count("|") for line in part.splitlines()}) == 1 for part in tables)
-    assert "All acceptance limits are met" in format_markdown(
-        with_content(content, gates=content.document.gates[:1], passed=True)
-    )
+    passed = with_content(content, gates=content.document.gates[:1], passed=True)
+    assert "All acceptance limits are met" in format_outcomes([("barn", passed)])
 
 
 def test_exports_replace_a_file_whole_or_refuse_in_one_line(content: DropoutReport, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from icrtool.output.text_blocks import (
     Table,
     fitted,
     format_blocks,
-    markdown_lines,
+    format_markdown,
 )
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, SensorDocument, SensorDrive
 from icrtool.records.run import Run
@@ -60,7 +60,7 @@ def test_a_table_without_rows_is_nothing() -> None:
 
 def test_markdown_has_a_heading_a_section_an_item_a_sentence_and_escapes_names() -> None:
     section = Section("Part <1>", ["a_b is 1", TABLE], depth=1)
-    lines = [line for line in markdown_lines([section]) if line]
+    lines = [line for line in format_markdown([section]).splitlines() if line]
     assert lines[:2] == ["### Part \\<1\\>", "- a\\_b is 1"]
     assert lines[2:4] == ["| stream | rate |", "| --- | ---: |"]
     assert lines[-1] == "| a \\[bold\\]b | 1.25 Hz |"

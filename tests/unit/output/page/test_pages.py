@@ -14,13 +14,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pytest
 
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.estimation.fit import fit
 from icrtool.output.figures.filter_estimates import gnss_difference
-from icrtool.output.page.drive_data import packed, packed_levels, packed_sums
+from icrtool.output.page.drive_data import drive_data, packed, packed_levels, packed_sums
 from icrtool.output.page.pages import draw_pictures, run_page, write_page
 from icrtool.output.page.render import pictures_of
 from icrtool.output.tables.dropout import reach_rows, report_blocks
@@ -29,6 +30,7 @@ from icrtool.records.measurements import ReferenceJump
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
 from icrtool.records.run_document import EventDocument
+from icrtool.records.tables import RobotLog
 from support.barn import TRACK_WIDTH_M, configured, simulate
 from support.documents import with_summary
 
@@ -273,6 +275,19 @@ def test_a_run_without_track_width_and_a_short_one_have_pages(make_run: Any) -> 
     narrow = make_run(track_width_m=None)
     page = run_page(narrow, dropout_report(narrow).document, {})
     assert "robot.track_width_m is not known" in unescape(page)
+
+
+@pytest.mark.parametrize("samples", [2, 3])
+def test_a_run_of_one_state_or_two_is_drawn(samples: int, report: DropoutReport) -> None:
+    t_s = 0.1 * np.arange(samples)
+    wheels = pd.DataFrame({"t_s": t_s, "v_left_mps": 3.0, "v_right_mps": 2.4})
+    fixes = pd.DataFrame({"t_s": [0.0, 1.0], "north_m": [0.0, 2.7], "east_m": [0.0, 0.01]})
+    headings = pd.DataFrame({"t_s": [0.01, 1.01], "heading_rad": [0.0, 0.05]})
+    run = fit(RobotLog.from_frames(wheels, fixes, headings), configured())
+    data = plain(drive_data(run, report.document, coordinates=True))
+    assert len(numbers(data["steps"]["left"])) == samples - 1
+    assert [len(numbers(path["north"])) for path in data["paths"].values()] == [samples - 1] * len(data["paths"])
+    assert "icr_final" in data["paths"]
 
 
 def test_drawn_pictures_are_those_of_the_run_directory(run: Run, report: DropoutReport, tmp_path: Path) -> None:
