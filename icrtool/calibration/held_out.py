@@ -247,16 +247,16 @@ def errors_without(
     without : gives the model for a fold, None where too little is left to fit it
     steps : the wheel samples joined; default single samples
     """
-    distance = recording.track.distance
+    track, distance = recording.track, recording.track.distance
     errors = TrialErrors.none(trials.ends.shape)
     # a horizon after the other, as the ends lie in memory
     column, row = np.nonzero(trials.ends.T >= 0)
     start, end = trials.starts[row], trials.ends[row, column]
-    t = recording.track.t
     for fold, some in left_out(folds, i, distance[start], distance[end]):
         if (found := without(fold)) is not None:
             s, e = start[some], end[some]
-            near = (steps if steps is not None else recording.track).around(t[s.min()], t[e.max()])
+            span = track.t[s.min()], track.t[e.max()]
+            near = recording.wheels(track.rows_around(*span)) if steps is None else steps.around(*span)
             missed = trial_errors(recording, s, e, predicted_path(recording, *found, near))
             for all_errors, of_fold in zip(errors, missed, strict=True):
                 all_errors[row[some], column[some]] = of_fold

@@ -31,7 +31,7 @@ from icrtool.records.samples import are_twist
 
 
 def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: float | None = None) -> Recording:
-    """Return a run as motion models see it: wheel speeds at the configured radius, reference, gyro.
+    """Return a run as motion models see it: wheels, reference, gyro.
 
     Parameters
     ----------
@@ -47,19 +47,17 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
     width = width_m if width_m is not None else run.track_width_m
     if width is None:
         raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
-    track, inputs = track_of(run), run.document.inputs
-    left_scale, right_scale = run.wheel_scales
-    if (left_scale, right_scale) != (1.0, 1.0):
-        track = track._replace(v_left=track.v_left / left_scale, v_right=track.v_right / right_scale)
+    inputs = run.document.inputs
     plain = Recording(
         name=run.name,
-        track=track,
+        track=track_of(run),
         width_m=width,
         path=inputs[0].path if inputs else "",
         sha256=(inputs[0].sha256 or "") if inputs else "",
         begin_ns=int(run.table.stamp_ns[0]),
         lever=Lever(*(place is not None for place in known_antenna_m(run))),
         x_clock_std_m=run.document.icr.x_clock_std_m,
+        wheel_scales=run.wheel_scales,
     )
     return plain if heading is None else with_turn_rate(plain, heading)
 
@@ -332,8 +330,9 @@ def _is_part(one: _Taken, of: _Taken) -> bool:
     if not (len(stamps) < len(theirs) and theirs[0] <= stamps[-1] and stamps[0] <= theirs[-1]):
         return False
     _, ours, others = np.intersect1d(stamps, theirs, assume_unique=True, return_indices=True)
-    same = np.isclose(part.track.v_left[ours], whole.track.v_left[others], rtol=SAME_SPEED)
-    same &= np.isclose(part.track.v_right[ours], whole.track.v_right[others], rtol=SAME_SPEED)
+    shorter, longer = part.wheels(ours), whole.wheels(others)
+    same = np.isclose(shorter.v_left, longer.v_left, rtol=SAME_SPEED)
+    same &= np.isclose(shorter.v_right, longer.v_right, rtol=SAME_SPEED)
     shared = np.count_nonzero(np.isin(one.positions, of.positions))
     return bool(same.sum() >= SAME_SHARE * len(stamps) and shared >= SAME_SHARE * len(one.positions))
 

@@ -207,8 +207,7 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     calibration = None
     if run.track_width_m is not None:
         calibration = pooled.calibration_from(found, pooled.robot_of(run, recording.width_m), pooled.use_warnings(run))
-    track = recording.track._replace(v_left=run.table.v_left_mps, v_right=run.table.v_right_mps)
-    return ComparedModels(tuple(rows), found, track, heading, tuple(notes), calibration)
+    return ComparedModels(tuple(rows), found, recording.track, heading, tuple(notes), calibration)
 
 
 def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, list[str]]:

@@ -108,9 +108,9 @@ class Track(NamedTuple):
 
     def cumulate(self, rate: Rate) -> Rate:
         """Return the integral of a rate (n,) until each wheel sample (n,)."""
-        by_sample = rate * self.held
-        sums = np.zeros_like(by_sample)
-        np.cumsum(by_sample[:-1], out=sums[1:])
+        sums = np.zeros_like(rate)
+        np.multiply(rate[:-1], self.held[:-1], out=sums[1:])
+        np.cumsum(sums[1:], out=sums[1:])
         return sums
 
     def at_places(self, rate: Rate) -> Rate:
@@ -136,17 +136,21 @@ class Track(NamedTuple):
         names = ("place_t", "north", "east", "distance", "in_outage", "jump", "slipping")
         return self._replace(**{name: getattr(self, name)[rows] for name in names})
 
-    def wheels(self, rows: slice) -> Self:
+    def wheels(self, rows: Ints | slice) -> Self:
         """Return the track with some of its wheel samples."""
         gyro = None if self.gyro is None else self.gyro[rows]
         left, right = self.v_left[rows], self.v_right[rows]
         return self._replace(t=self.t[rows], held=self.held[rows], v_left=left, v_right=right, gyro=gyro)
 
-    def around(self, begin_s: float, end_s: float) -> Self:
-        """Return the track with the wheel samples from a begin to an end, and of a little more for delays."""
+    def rows_around(self, begin_s: float, end_s: float) -> slice:
+        """Return the wheel samples from a begin to an end, and of a little more for delays."""
         edges = [begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S]
         first, stop = np.searchsorted(self.t, edges, side="right").tolist()
-        return self.wheels(slice(max(first - 1, 0), stop))
+        return slice(max(first - 1, 0), stop)
+
+    def around(self, begin_s: float, end_s: float) -> Self:
+        """Return the track with the wheel samples of `rows_around`."""
+        return self.wheels(self.rows_around(begin_s, end_s))
 
     def joined(self, first: Ints, into: float = 0.0) -> Self:
         """Return the track with the wheel samples from each row in `first` on joined to one: means over their time."""

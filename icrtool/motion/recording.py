@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Complexes, Floats, Ints, rows_at_steps
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats, Ints, rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.kernels.track import Track, Windows, cut, ends_from
 from icrtool.kernels.window_residuals import OMEGA, path_at
@@ -50,13 +50,14 @@ class Recording:
 
     Attributes
     ----------
-    track : its states, with wheel speeds at the configured radius, and the turn rate of its gyro
+    track : its states, and the turn rate of its gyro; its wheel speeds are as recorded
     width_m : track width b
     path, sha256 : the log's first file; empty where it is not known
     gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
     begin_ns : stamp of the first state; 0 where it is not known
     lever : what is known of the place of the position on the robot
     x_clock_std_m : what is not known of the time between position and heading looks like an x_icr so far off
+    wheel_scales : of left and right, from speeds at the configured wheel radius to those of `track`
     """
 
     name: str
@@ -68,6 +69,14 @@ class Recording:
     begin_ns: int = 0
     lever: Lever = NO_LEVER
     x_clock_std_m: float = 0.0
+    wheel_scales: tuple[float, float] = (1.0, 1.0)
+
+    def wheels(self, rows: Ints | slice = slice(None)) -> Track:
+        """Return the track with some of its wheel samples, with their speeds at the configured wheel radius."""
+        some, (left, right) = self.track.wheels(rows), self.wheel_scales
+        if (left, right) == (1.0, 1.0):
+            return some
+        return some._replace(v_left=some.v_left / left, v_right=some.v_right / right)
 
 
 class LogConstants(NamedTuple):
@@ -135,29 +144,44 @@ def cut_windows(
     return replace(windows, track=steps_of(recording, pooled.seconds))
 
 
-def samples_a_step(track: Track, pooled_s: float | None = None) -> int:
+def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
     """Return how many wheel samples make a step of the fits; `pooled_s` is the time of all that is fitted together.
 
     A tenth of a second; on a long drive longer, up to four tenths, as long as a step is no more than a quarter of a
     metre.
     """
-    lasting = track.held > 0.0
+    held = recording.track.held
+    lasting, travel = held > 0.0, np.empty(len(held))
     if not lasting.any():
         return 1
-    total_s = float(track.held.sum())
-    speed_mps = float((track.held * (np.abs(track.v_left) + np.abs(track.v_right))).sum()) / 2.0 / total_s
+    total_s = float(held.sum())
+    for lo in range(0, len(held), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        wheels = recording.wheels(some)
+        travel[some] = wheels.held * (np.abs(wheels.v_left) + np.abs(wheels.v_right))
+    speed_mps = float(travel.sum()) / 2.0 / total_s
     step_s = min(
         (total_s if pooled_s is None else pooled_s) / MOST_STEPS, LONGEST_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S
     )
-    return max(int(max(step_s, STEP_S) / float(np.median(track.held[lasting]))), 1)
+    return max(int(max(step_s, STEP_S) / float(np.median(held[lasting], overwrite_input=True))), 1)
 
 
 def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:
     """Return the track of a recording with its wheel samples joined to the steps of the fits (`samples_a_step`)."""
-    track, samples = recording.track, samples_a_step(recording.track, pooled_s)
+    samples = samples_a_step(recording, pooled_s)
     if samples == 1:
-        return track
-    return track.joined(np.arange(0, len(track.t), samples), (samples - 1) / (2.0 * samples))
+        return recording.wheels()
+    # some at a time, to bound memory
+    rows, into = max(ROWS_AT_ONCE // samples, 1) * samples, (samples - 1) / (2.0 * samples)
+    parts = []
+    for lo in range(0, len(recording.track.t), rows):
+        some = recording.wheels(slice(lo, lo + rows))
+        parts.append(some.joined(np.arange(0, len(some.t), samples), into))
+    t, held, left, right = (
+        np.concatenate([getattr(one, name) for one in parts]) for name in ("t", "held", "v_left", "v_right")
+    )
+    gyro = None if recording.track.gyro is None else np.concatenate([one.gyro for one in parts if one.gyro is not None])
+    return parts[0]._replace(t=t, held=held, v_left=left, v_right=right, gyro=gyro)
 
 
 MOST_TRIALS = 4_000
@@ -189,8 +213,10 @@ def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals
     """
     track = recording.track
     # starts where it stands are copies of one another
-    moving = np.flatnonzero(np.diff(track.distance) > TURNING_MPS * np.diff(track.t))
-    step = samples_a_step(track, None if pooled is None else pooled.seconds)
+    least = np.diff(track.t)
+    least *= TURNING_MPS
+    moving = np.flatnonzero(np.diff(track.distance) > least)
+    step = samples_a_step(recording, None if pooled is None else pooled.seconds)
     starts = moving[:: max(step, len(moving) // MOST_TRIALS)].copy()
     return Trials(starts, ends_from(track, np.array(horizons_m, np.float64), starts))
 
@@ -261,10 +287,11 @@ def predicted_path(
     of = steps if steps is not None else recording.track
 
     def twists(some: slice) -> tuple[Floats, Ints, Floats]:
-        gyro = None if of.gyro is None else of.gyro[some]
+        wheels = recording.wheels(some) if steps is None else steps.wheels(some)
+        gyro = wheels.gyro
         if gyro is not None and own.gyro_later_s:
             gyro = gyro + own.gyro_later_s * of.gyro_change(some)
-        motion = wheel_motion(of.v_left[some], of.v_right[some], recording.width_m, gyro)
+        motion = wheel_motion(wheels.v_left, wheels.v_right, recording.width_m, gyro)
         moving = fitted.twist(motion)
         moving[OMEGA] += own.gyro_bias_radps
         return moving, np.empty(0, np.int64), np.empty((0, len(motion.v)))

@@ -226,7 +226,7 @@ def test_a_run_with_configured_scales_gives_the_same_calibration(scales: tuple[f
     runs = [fit(log, parse_config({"robot": {"track_width_m": 0.6}, "wheels": wheels})) for wheels in ({}, given)]
     assert runs[1].wheel_scales == pytest.approx(scales)
     assert runs[1].table.v_left_mps == pytest.approx(scales[0] / runs[0].wheel_scales[0] * runs[0].table.v_left_mps)
-    for one, other in zip(*(recording_of(run).track[2:4] for run in runs), strict=True):
+    for one, other in zip(*(recording_of(run).wheels()[2:4] for run in runs), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
     robots = [robot_of(run, 0.6) for run in runs]
     assert robots[0] == robots[1]
