@@ -24,10 +24,9 @@ from icrtool.errors import DataError, DefinitionError, LogError
 from icrtool.logs.containers.container import LATEST_NS, WHOLE, Container, Cut
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED, log_name
-from icrtool.logs.messages.topic_table import HEADER, TopicCollector, TopicTable, collector_for
+from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, collector_for
 from icrtool.logs.streams.assembly import Survey, assemble, longest_part
-from icrtool.logs.streams.headings import GYRO_AXES
-from icrtool.logs.streams.positions import TRANSFORM_FIELDS, TRANSFORM_TYPES, is_static, transform_pose
+from icrtool.logs.streams.positions import TRANSFORM_TYPES, is_static, transform_pose
 from icrtool.logs.streams.select import fields_to_take, find_candidates
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import Record
@@ -89,16 +88,8 @@ def survey_log(
             raise
         channels, transfer = tuple(container.channels), container.transfer()
     check_unchanged(path, before, inputs.result())
-    drop_used_columns(tables)
     names = LogText(log_name(path)), escaped(str(path))
     return Survey(*names, channels, tuple(tables), candidates, problems, inputs.result(), transfer)
-
-
-def drop_used_columns(tables: list[TopicTable]) -> None:
-    """Remove the columns that only candidates were made of: half of what a log takes."""
-    for table in tables:
-        for name in table.columns.keys() - {*HEADER, *GYRO_AXES, *TRANSFORM_FIELDS}:
-            del table.columns[name]
 
 
 def read_log(

@@ -237,14 +237,16 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     """
     with np.errstate(over="ignore"):
         norm = _of_rows(lambda *fields: np.sqrt(sum(field * field for field in fields)), q)
-    usable = np.abs(norm - 1.0) < QUATERNION_NORM_TOLERANCE
+    off = norm - 1.0
+    usable = np.abs(off, out=off) < QUATERNION_NORM_TOLERANCE
+    del off
     norm[~usable] = np.nan
     places, note = _written_order(q, norm, usable, yaw_rate_radps)
     ordered = [q[place] for place in places]
 
     def tilt(axis: int) -> float:
-        upward = _of_rows(lambda *unit: turned_axis(axis, *unit)[2], ordered, norm)[usable]
-        return float(np.median(np.abs(upward))) if len(upward) else 1.0
+        upward = _of_rows(lambda *unit: np.abs(turned_axis(axis, *unit)[2]), ordered, norm)[usable]
+        return float(np.median(upward, overwrite_input=True)) if len(upward) else 1.0
 
     level = 0
     if tilt(2) < UPRIGHT_COSINE:

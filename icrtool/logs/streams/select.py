@@ -110,12 +110,17 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
 
 
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
-    """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace."""
+    """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace.
+
+    Columns that only these are made of are removed: those of topics that can be wheels alone before others are read.
+    """
     topics = config.topics
     # the wheels first: they take most memory for a while, which is then free for the others
     wheels = pair_candidates(tables, config)
     if topics.wheel_left is None:
         wheels = _read_all(tables, "wheels", config, WheelMotion) + wheels
+    others_read = MESSAGE_TYPES["gnss"].keys() | MESSAGE_TYPES["heading"].keys()
+    drop_used_columns([table for table in tables if table.message_type not in others_read])
     gnss = _read_all(tables, "gnss", config, PositionSource)
     heading = _read_all(tables, "heading", config, HeadingSource)
     filled = [{_namespace(source.topic) for source in sources if not source.problem} for sources in (gnss, heading)]
@@ -141,7 +146,15 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
         for table in tables
         if not len(table)
     }
+    drop_used_columns(tables)
     return Candidates(tuple(wheels), tuple(gnss), tuple(heading), unread | empty)
+
+
+def drop_used_columns(tables: Sequence[TopicTable]) -> None:
+    """Remove the columns that only candidates were made of: half of what a log takes."""
+    for table in tables:
+        for name in table.columns.keys() - {*HEADER, *GYRO_AXES, *TRANSFORM_FIELDS}:
+            del table.columns[name]
 
 
 def _read_all(tables: Sequence[TopicTable], role: Role, config: Config, kind: type[Kind]) -> list[Kind]:

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints
 from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, STAMPS, SetBack, TopicTable
 from icrtool.records.samples import WheelUnit
 
@@ -81,11 +81,13 @@ def stamp_rows(table: TopicTable) -> StampedRows:
     if zeros > max(1.0, LARGEST_SHARE_ZERO * len(header)):
         return unusable(f"{100 * zeros / len(header):.0f} % of the header stamps are 0")
     header, clock_set = _without_clock_steps(header, log_ns)
-    delay = int(np.median(log_ns - header))
+    delay = int(np.median(log_ns - header, overwrite_input=True))
     if abs(delay) > NEAR_NS:
         return unusable(f"header stamps are {delay / 1e9:+z.1f} s from log time", clock_set)
     # A few stamps of another clock (a first message at 0) are replaced by their log times.
-    other = np.abs(log_ns - header - delay) > NEAR_NS
+    off = log_ns - header
+    off -= delay
+    other = np.abs(off, out=off) > NEAR_NS
     header[other] = log_ns[other] - delay
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:
@@ -100,8 +102,12 @@ def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
     A step ahead counts where the whole stretch before it was later, too: a connection that was slow for a while and
     then lost messages is no clock.
     """
-    jump = np.diff(header)
-    steps = np.flatnonzero((jump < 0) | (jump - np.diff(log_ns) > OUT_OF_ORDER_NS))
+    found = []
+    for lo in range(0, len(header), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE + 1)
+        jump = np.diff(header[some])
+        found.append(lo + np.flatnonzero((jump < 0) | (jump - np.diff(log_ns[some]) > OUT_OF_ORDER_NS)))
+    steps = np.concatenate(found)
     if not len(steps) or len(steps) > LARGEST_SHARE_BACKWARDS * len(header) + 1:
         return header, NEVER_SET
     delay = log_ns - header
@@ -113,14 +119,14 @@ def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
     # a few stamps of another clock, as a first one at 0, are replaced by their log times
     many = np.diff(steps, prepend=-1) > max(1.0, LARGEST_SHARE_ZERO * len(header))
     lasting = (grown > OUT_OF_ORDER_NS) | ((grown < -OUT_OF_ORDER_NS) & (of_stretch < grown / 2) & many)
-    lasting &= (grown > 0) == (jump[steps] < 0)
+    lasting &= (grown > 0) == (header[steps + 1] - header[steps] < 0)
     if not lasting.any():
         return header, NEVER_SET
     largest = int(np.argmax(np.where(lasting, np.abs(grown), 0)))
     moved = np.zeros(len(header), np.int64)
     moved[steps[lasting] + 1] = grown[lasting]
-    found = ClockSet(abs(int(grown[largest])), back=bool(grown[largest] > 0), before_ns=int(header[steps[largest]]))
-    return header + np.cumsum(moved), found
+    clock_set = ClockSet(abs(int(grown[largest])), back=bool(grown[largest] > 0), before_ns=int(header[steps[largest]]))
+    return header + np.cumsum(moved), clock_set
 
 
 def increasing(stamps: Ints, usable: Bools | None = None) -> tuple[Ints | slice, int, int]:

@@ -278,7 +278,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Written]:
         if container == "db3 without definitions":
             forget_definitions(path)
         # with all columns, also those that candidates were made of
-        with mock.patch("icrtool.logs.read_log.drop_used_columns"):
+        with mock.patch("icrtool.logs.streams.select.drop_used_columns"):
             return Written(path, survey_log(path), decoded)
 
     def get(container: str) -> Written:

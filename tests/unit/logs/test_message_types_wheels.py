@@ -364,7 +364,7 @@ def test_more_elements_than_a_list_is_expected_to_hold_are_all_read(tmp_path: Pa
     names = [f"{side}_wheel_{i}" for i in range(150) for side in ("left", "right")]
     messages = [joint_state(ROS2, START_NS + i * STEP_NS, names[: 200 + i], np.arange(200.0 + i), []) for i in range(4)]
     path = write_mcap(tmp_path / "log.mcap", [("/joint_states", messages)], "sensor_msgs/msg/JointState")
-    with mock.patch("icrtool.logs.read_log.drop_used_columns"):
+    with mock.patch("icrtool.logs.streams.select.drop_used_columns"):
         (table,) = survey_log(path).tables
     assert table.columns["position[*]"].shape == (4, 203)
     assert table.columns["position[*]"][3].tolist() == list(range(203))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -101,7 +102,8 @@ def find(tables: Sequence[TopicTable], *sets: str) -> Candidates:
     """Read the tables that `fields_to_take` asks for, as reading a log does."""
     config = load_config(sets=sets)
     wanted = fields_to_take(channels_of(tables), config)
-    return find_candidates([each for i, each in enumerate(tables) if i in wanted], config, {})
+    read = [replace(each, columns=dict(each.columns)) for i, each in enumerate(tables) if i in wanted]
+    return find_candidates(read, config, {})
 
 
 def choose(tables: Sequence[TopicTable], *sets: str) -> Choice:
