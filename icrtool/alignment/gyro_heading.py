@@ -314,25 +314,28 @@ class _Problem:
         start = np.where(fixed, states[-1], model.x), np.where(both, covariances[-1], model.P)
         psi_variance, final_std = covariances[:, PSI, PSI].copy(), np.sqrt(np.diagonal(covariances[-1]))
         del covariances
-        causal = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
+        passes = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
+        causal, of_causal = passes.x, passes.P
+        del passes, events  # as large as what is carried on from there to each sample
         t, turn, G = self.t, self.turn, self.G
         # at samples of the rate: carried on from the last event, or between events
-        every = max(1, round(1.0 / (LARGEST_RATE_HZ * float(np.median(np.diff(turn.t))))))
+        interval_s = float(np.median(np.diff(turn.t), overwrite_input=True))
+        every = max(1, round(1.0 / (LARGEST_RATE_HZ * interval_s)))
         rows = np.flatnonzero((turn.t >= t[0]) & (turn.t <= t[-1] + 2.0))[::every]
         s = turn.t[rows]
         last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
         dt, dG = s - t[last], G[rows] - self.at[last]
-        x = causal.x[last]
-        carried = x[:, PSI] + (1 + x[:, SCALE]) * dG - x[:, BIAS] * dt
+        psi, scale, bias = (causal[last, state] for state in (PSI, SCALE, BIAS))
+        carried = psi + (1 + scale) * dG - bias * dt
         variance = noises["angle"] ** 2 * dt
         f = {PSI: np.ones(len(rows)), BIAS: -dt, SCALE: dG}
         for i, j in product(f, f):
-            variance += f[i] * causal.P[last, i, j] * f[j]
+            variance += f[i] * of_causal[last, i, j] * f[j]
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
-        scale = 1 + states[-1, SCALE]
-        smoothed = scale * G[rows] + np.interp(s, t, states[:, PSI] - scale * self.at)
+        gain = 1 + states[-1, SCALE]
+        smoothed = gain * G[rows] + np.interp(s, t, states[:, PSI] - gain * self.at)
         # a rate may be the mean over the interval before its stamp, or after it
-        delay_s = float(np.median(np.diff(turn.t))) / 2.0 if turn.delay_std_s is None else turn.delay_std_s
+        delay_s = interval_s / 2.0 if turn.delay_std_s is None else turn.delay_std_s
         stamp = (turn.rate[rows] * delay_s) ** 2
         smoothed_std = np.sqrt(np.interp(s, t, psi_variance) + stamp)
         return HeadingEstimate(

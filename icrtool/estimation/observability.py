@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from icrtool.kernels.arrays import Floats, Ints, rows_at_steps
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, rows_at_steps
 from icrtool.kernels.filter_records import REFERENCE_STEP_S
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kind
@@ -103,7 +103,7 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
     turned = np.diff(path.heading)
     by_offset = np.concatenate([jacobian[:, terms], np.zeros(len(turned))])
     by_terms = np.concatenate([jacobian[:, :terms], np.diff(path.heading_by).T]) @ by_icrs
-    place_std_m = float(np.median(np.hypot(table.std_north_m, table.std_east_m)))
+    place_std_m = float(np.median(np.hypot(table.std_north_m, table.std_east_m), overwrite_input=True))
     return StateWindows(
         track,
         windows.begin,
@@ -221,13 +221,9 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
     rows = windows.jacobian / np.hypot(slip, np.maximum(windows.noise, 1e-6)[:, None]).ravel()[:, None]
     information = rows.T @ rows + np.diag(prior_std(width) ** -2.0)
     std: Floats = np.sqrt(np.diag(np.linalg.solve(information, np.eye(6)))[:3])
-    # noise of standing encoders is no turn
-    moving = np.abs(track.v_left) + np.abs(track.v_right) > 0.02
-    turns = np.where(moving, track.held * (track.v_left - track.v_right) / width, 0.0)
-    spins = np.abs(track.v_left - track.v_right) > SPIN_RATIO * np.abs(track.v_left + track.v_right) / 2
-    right, left, spun_right, spun_left = (
-        float(np.maximum(side * some, 0.0).sum()) for some in (turns, turns[spins]) for side in (1.0, -1.0)
-    )
+    turns, spins = _turns(track, width)
+    right, spun_right = (float(some.clip(min=0.0).sum()) for some in (turns, turns[spins]))
+    left, spun_left = (0.0 - float(some.clip(max=0.0).sum()) for some in (turns, turns[spins]))
     stds: dict[str, float] = dict(zip(ICR_COLUMNS, std.tolist(), strict=True))
     verdicts: dict[str, Excited] = {
         name: "shown" if value / width <= SHOWN_SHARE else "weak" if value / width <= WEAK_SHARE else "not shown"
@@ -242,6 +238,19 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
         NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(right),
         math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), tuple(sentences),
     )  # fmt: skip
+
+
+def _turns(track: Track, width_m: float) -> tuple[Floats, Bools]:
+    """Return how far a robot turns with each wheel sample (n,) [rad], and which of these turns are spins."""
+    turns, spins = np.empty(len(track.t)), np.empty(len(track.t), np.bool_)
+    for lo in range(0, len(track.t), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        left, right = track.v_left[some], track.v_right[some]
+        # noise of standing encoders is no turn
+        moving = np.abs(left) + np.abs(right) > 0.02
+        turns[some] = np.where(moving, track.held[some] * (left - right) / width_m, 0.0)
+        spins[some] = np.abs(left - right) > SPIN_RATIO * np.abs(left + right) / 2
+    return turns, spins
 
 
 def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[str, str]:

@@ -114,7 +114,7 @@ def drive_summary(table: States) -> DriveDocument:
     follows the model's, or is constant where the model shows less than half of it.
     """
     interval, duration = np.diff(table.t_s), float(table.t_s[-1])
-    noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m)))
+    noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m), overwrite_input=True))
     rows = chord_rows(table.north_m, table.east_m, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
     chords = np.hypot(np.diff(table.north_m[rows]), np.diff(table.east_m[rows]))
     if rows[-1] != len(table) - 1:
@@ -130,7 +130,9 @@ def drive_summary(table: States) -> DriveDocument:
     speed *= np.repeat(stretched, np.diff(rows))
     speed += np.repeat(even, np.diff(rows))
     mean = distance / duration if duration > 0 else 0.0
-    spread = float(np.sqrt(np.average((speed - mean) ** 2, weights=interval))) if duration > 0 else 0.0
+    speed -= mean
+    speed *= speed
+    spread = float(np.sqrt(np.average(speed, weights=interval))) if duration > 0 else 0.0
     return DriveDocument(duration, distance, mean, spread)
 
 

@@ -26,7 +26,7 @@ from icrtool.estimation.filter_setup import (
 )
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, wrapped
 from icrtool.kernels.ekf import run_ekf, run_smoother
-from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutput
+from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutput, FilterParameters
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import SensorData
 from icrtool.records.process_resources import give_back_freed
@@ -96,9 +96,8 @@ def run_filter(
     check_start(config)
     _check_motion(sensors)
     changes_s = tuple(sorted(set(changes_s)))
-    setup, output, noise = run_adaptively(sensors, config, warm_start, changes_s)
-    gap_s, least_icr_m = wheel_gap_s(config, setup.data.wheel_t), setup.parameters.least_icr
-    del setup  # of a long log, as large as three columns of the states
+    parameters, output, noise = run_adaptively(sensors, config, warm_start, changes_s)
+    gap_s = wheel_gap_s(config, (sensors.wheels.stamp_ns - sensors.wheels.stamp_ns[0]) / 1e9)
     table = _states(sensors.wheels, output)
     if table.fault:
         advice = "check warm start and configuration, or cut the log there (--from, --to)"
@@ -119,7 +118,7 @@ def run_filter(
         heading=heading,
         covariance=output.P,
         noise=noise,
-        least_icr_m=least_icr_m,
+        least_icr_m=parameters.least_icr,
         began_with=warm_start,
         changes_s=changes_s,
     )
@@ -187,33 +186,34 @@ MOST_SAMPLES = 60_000
 
 def run_adaptively(
     sensors: SensorData, config: Config, warm_start: WarmStart | None, changes_s: tuple[float, ...]
-) -> tuple[FilterSetup, FilterOutput, ProcessNoise]:
+) -> tuple[FilterParameters, FilterOutput, ProcessNoise]:
     """Run the filter; where fixes or headings contradict the wheels, with the process noise that they show.
 
-    Returns set-up and output of the run, and the process noise that it was made with.
+    Returns parameters and output of the run, and the process noise that it was made with.
 
     The noise is searched for on at most ten minutes of driving; a log without contradiction takes one pass. Preset
     ``field`` only; what is configured is not searched for.
     """
 
-    def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterSetup, FilterOutput]:
+    def run(one: SensorData, noise: ProcessNoise) -> tuple[FilterParameters, FilterOutput]:
+        # The rest of the set-up is, of a long log, as large as three columns of the states.
         setup = set_up_filter(one, config, noise=noise, warm_start=warm_start, changes_s=changes_s)
         give_back_freed()
-        return setup, run_ekf(*setup)
+        return setup.parameters, run_ekf(*setup)
 
     noise, settings = configured_noise(config), config.filter
-    setup, output = run(sensors, noise)
+    parameters, output = run(sensors, noise)
     if settings.preset != "field":
-        return setup, output, noise
-    moving, limits = sensors.moving(), setup.parameters
+        return parameters, output, noise
+    moving = sensors.moving()
     # mean NIS per degree of freedom, each counted up to its gate
     nis = (
-        np.minimum(output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]], limits.gnss_gate) / 2.0,
-        np.minimum(output.heading_nis[(output.heading_code > UNSEEN) & moving[1]], limits.heading_gate),
+        np.minimum(output.gnss_nis[(output.gnss_code > UNSEEN) & moving[0]], parameters.gnss_gate) / 2.0,
+        np.minimum(output.heading_nis[(output.heading_code > UNSEEN) & moving[1]], parameters.heading_gate),
     )
     if all(not len(one) or one.mean() <= TOLERATED_NIS for one in nis):
-        return setup, output, noise
-    del setup, output, nis  # of a long log, as large as all that the next run makes
+        return parameters, output, noise
+    del output, nis  # of a long log, as large as all that the next run makes
     largest = min(LARGEST_HEADING_DEGPS, STEP * math.degrees(sensors.turn_wander_rad) / math.sqrt(REFERENCE_STEP_S))
     part = _busiest_part(sensors)
     moving = part.moving()

@@ -33,6 +33,7 @@ from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
 from icrtool.records.plain_data import known
+from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, no_slip_icrs, track_of_states
 from icrtool.records.run_document import (
     RUN_SCHEMA,
@@ -88,6 +89,7 @@ def summarise(
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
     covariance, excitation, x_clock_std_m = learned(filtered, config, measurements.clock_std_s)
+    give_back_freed()
     multiplier = None if width is None else (separation_multiplier(table, width), multiplier_std(covariance, width))
     inverted = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1])
     field = config.filter.preset == "field"
@@ -238,12 +240,18 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
         since_s=max((t for t in filtered.changes_s if t < table.t_s[-1]), default=0.0),
     )
     unlearned = unlearned_icrs(table, std_m=np.sqrt(np.diag(covariance)), least_icr_m=filtered.least_icr_m)
-    turning = (track.v_left - track.v_right) ** 2
-    turning *= np.diff(table.t_s, append=table.t_s[-1:])
-    speed = float(turning @ (track.v_left + track.v_right)) / 2 / max(float(turning.sum()), 1e-12)
-    x_clock_std_m = abs(speed) * clock_std_s
+    x_clock_std_m = abs(_speed_while_turning(table)) * clock_std_s
     covariance_of_all = covariance + np.diag([0.0, 0.0, x_clock_std_m**2])
     return covariance_of_all, find_excitation(windows, unlearned), x_clock_std_m
+
+
+def _speed_while_turning(table: States) -> float:
+    """Return the mean speed [m/s] of a drive, weighted by the square of the difference of the sides."""
+    turning = table.v_left_mps - table.v_right_mps
+    turning *= turning
+    turning[:-1] *= np.diff(table.t_s)
+    turning[-1:] = 0.0
+    return float(turning @ (table.v_left_mps + table.v_right_mps)) / 2 / max(float(turning.sum()), 1e-12)
 
 
 def _seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, float]:
@@ -305,7 +313,8 @@ def icr_summary(
         rows = zip(ICR_COLUMNS, values, strict=True)
         return NumberByIcr(*(None if column in hidden else known(value) for column, value in rows))
 
-    settled_icrs: list[Floats] = [getattr(table, column)[after] for column in ICR_COLUMNS]
+    settled_icrs = (getattr(table, column)[after] for column in ICR_COLUMNS)
+    means, stds = zip(*((float(one.mean()), float(one.std())) for one in settled_icrs), strict=True)
     if multiplier is None or {"y_icr_right_m", "y_icr_left_m"} & set(hidden):
         apart, apart_std = None, None
     else:
@@ -313,8 +322,8 @@ def icr_summary(
     return IcrDocument(
         final=by_icr(table.icrs_at(-1)),
         final_std=by_icr(np.sqrt(np.diag(covariance)).tolist()),
-        mean=by_icr(float(one.mean()) for one in settled_icrs),
-        std=by_icr(float(one.std()) for one in settled_icrs),
+        mean=by_icr(means),
+        std=by_icr(stds),
         convergence_s=NumberByIcr(*(span[1] - span[0] if span is not None else None for span in convergence.values())),
         convergence_span_s=SpanByIcr(*convergence.values()),
         separation_multiplier=apart,

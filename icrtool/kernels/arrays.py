@@ -17,7 +17,11 @@ Bytes = NDArray[np.uint8]
 def trapezoids(t: Floats, rate: Floats) -> Floats:
     """Return the integral of a rate (n,) from the first of its times (n,) until each, by trapezoids."""
     sums = np.zeros(len(t))
-    np.cumsum(np.diff(t) * (rate[:-1] + rate[1:]) / 2, out=sums[1:])
+    steps = sums[1:]
+    np.add(rate[:-1], rate[1:], out=steps)
+    steps *= np.diff(t)
+    steps /= 2
+    np.cumsum(steps, out=steps)
     return sums
 
 

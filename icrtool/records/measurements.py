@@ -121,9 +121,14 @@ class SensorData:
         What a robot measures while it stands shows neither delays nor contradictions, however long it stands.
         """
         stamps = self.wheels.stamp_ns
-        turning = np.abs(self.wheels.v_left_mps) + np.abs(self.wheels.v_right_mps) > 2.0 * TURNING_MPS
-        so_far = np.concatenate([[0], np.cumsum(turning)])
-        near = max(round(MOVING_S * 1e9), 2 * int(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0
+        so_far = np.zeros(len(stamps) + 1, np.int64)
+        for lo in range(0, len(stamps), ROWS_AT_ONCE):
+            left, right = (one[lo : lo + ROWS_AT_ONCE] for one in (self.wheels.v_left_mps, self.wheels.v_right_mps))
+            turning = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
+            so_far[lo + 1 : lo + 1 + len(turning)] = so_far[lo] + np.cumsum(turning)
+        near = 0
+        if len(stamps) > 1:
+            near = max(round(MOVING_S * 1e9), 2 * int(np.median(np.diff(stamps), overwrite_input=True)))
 
         def of(stamp_ns: Ints) -> Bools:
             moving = np.empty(len(stamp_ns), np.bool_)
