@@ -232,6 +232,9 @@ def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Fl
 WHEEL_TURN, WHEEL_SCALE_STD = 0.6, 0.5
 """Skid-steer robots turn about this much of what their wheels would without slip."""
 
+Z_UP = np.array([0.0, 0.0, -1.0])
+"""The downward vertical in a sensor whose z axis points up."""
+
 ALONG_AN_AXIS = 0.95
 """A sensor whose axis is this near to the vertical (cosine) is mounted along it."""
 
@@ -257,49 +260,70 @@ def wheel_rate(track: Track, width_m: float) -> TurnRate:
     return TurnRate(track.t, rate, holes, scale_std=WHEEL_SCALE_STD, bias_std=math.radians(0.5), delay_std_s=RESPONSE_S)
 
 
-def gyro_rate(
+def gyro_rates(
     track: Track, changes: tuple[Floats, Floats, Floats], gyro: GyroAxes, epoch_ns: int
-) -> tuple[TurnRate, str] | None:
-    """Return the turn rate of a gyro about the vertical, and how it is mounted; None where it does not cover courses.
+) -> list[tuple[TurnRate, str]]:
+    """Return what a gyro's turn rate about the vertical may be, each with how it is then mounted.
 
-    Changes of the course over ground are regressed on the turns about all three axes of the sensor.
+    One where the changes of the course over ground, regressed on the turns about all three axes of the sensor, show the
+    vertical, or where it turned most about its z axis, which then points up. Else, after that, both senses of the axis
+    about which it turned most: how well a heading by each agrees with the courses decides. None where the gyro does not
+    cover courses.
     """
     t = (gyro.stamp_ns - epoch_ns) / 1e9
     begin, end, change = changes
     inside = (begin >= t[0]) & (end <= t[-1])
     begin, end, change = begin[inside], end[inside], change[inside]
     if len(change) < 3:
-        return None
+        return []
     angles = [trapezoids(t, rate) for rate in gyro.rates_radps.T]
     turned = np.column_stack([np.interp(end, t, angle) - np.interp(begin, t, angle) for angle in angles])
     small = np.abs(turned).max(axis=1) < LARGEST_CHANGE_RAD
-    # the downward vertical in the sensor
-    axis, name = np.array([0.0, 0.0, -1.0]), "z up"
+    found = None
     if np.count_nonzero(small) >= 6:
-        axis, name = _vertical_axis(turned[small], (end - begin)[small], change[small], axis)
-    return _bridged(t, gyro.rates_radps @ axis, track), name
+        found = _axis_by_courses(turned[small], (end - begin)[small], change[small])
+    axes = [(Z_UP, "z up")] if found is None else [found]
+    if found is None and (about := _main_axis(turned, end - begin, change)) is not None:
+        axes += [_named(about), _named(-about)]
+    return [(_bridged(t, gyro.rates_radps @ axis, track), name) for axis, name in axes]
 
 
-def _vertical_axis(turned: Floats, seconds: Floats, change: Floats, up: Floats) -> tuple[Floats, str]:
-    """Return the direction of the downward vertical in the sensor (3,), and its name.
+def _named(axis: Floats) -> tuple[Floats, str]:
+    """Return the downward vertical in a sensor (3,), along an axis of it where it is near to one, and its name."""
+    main = int(np.argmax(np.abs(axis)))
+    if abs(axis[main]) <= ALONG_AN_AXIS:
+        return axis, "tilted"
+    return np.sign(axis[main]) * np.eye(3)[main], f"{'xyz'[main]} {'down' if axis[main] > 0 else 'up'}"
+
+
+def _axis_by_courses(turned: Floats, seconds: Floats, change: Floats) -> tuple[Floats, str] | None:
+    """Return the downward vertical in the sensor (3,), and its name; None where the courses over ground show none.
 
     Parameters
     ----------
     turned : (m, 3) turn about each axis; seconds : (m,) over which; change : (m,) of the course over ground [rad]
-    up : (3,) that of a sensor whose z axis points up
     """
     found = robust_regression(np.column_stack([turned, seconds]), change, AXIS_PRIOR_STD).x
     size = float(np.linalg.norm(found[:3]))
     if size <= LEAST_AXIS:
-        return up, "z up"
-    axis, name = found[:3] / size, "tilted"
-    main = int(np.argmax(np.abs(axis)))
-    if abs(axis[main]) > ALONG_AN_AXIS:
-        axis = np.sign(axis[main]) * np.eye(3)[main]
-        name = f"{'xyz'[main]} {'down' if axis[main] > 0 else 'up'}"
-    left = change[:, None] - found[3] * seconds[:, None] - turned @ np.column_stack([axis, up])
+        return None
+    axis, name = _named(found[:3] / size)
+    left = change[:, None] - found[3] * seconds[:, None] - turned @ np.column_stack([axis, Z_UP])
     scatter = np.abs(wrapped(left)).mean(axis=0)
-    return (axis, name) if scatter[0] < BETTER * scatter[1] else (up, "z up")
+    return (axis, name) if name == "z up" or scatter[0] < BETTER * scatter[1] else None
+
+
+def _main_axis(turned: Floats, seconds: Floats, change: Floats) -> Floats | None:
+    """Return the direction (3,), of either sense, of the axis about which a sensor turned most, a bias aside.
+
+    None where that is its z axis, or where it hardly turned; parameters as in `_axis_by_courses`.
+    """
+    beyond = turned - np.outer(seconds, turned.sum(axis=0) / seconds.sum())
+    largest = float(np.abs(beyond).max())
+    if not LEAST_AXIS * float(np.abs(change).max()) < largest < math.inf:
+        return None
+    axis = np.linalg.svd(beyond / largest, full_matrices=False)[2][0]
+    return None if abs(axis[2]) > ALONG_AN_AXIS else np.asarray(axis, np.float64)
 
 
 def _bridged(t: Floats, rate: Floats, track: Track) -> TurnRate:

@@ -56,6 +56,28 @@ def test_axis_and_sense_of_the_gyro_are_found(axis: int, sign: float) -> None:
     assert math.sqrt((error_deg(found.smoothed, truth) ** 2).mean()) < LARGEST_RMS_DEG
 
 
+@pytest.mark.parametrize(("axis", "sign", "name"), [(0, -1.0, "x up"), (1, 1.0, "y down"), (2, -1.0, "")])
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_gyro_on_its_side_is_found_beside_fixes_that_wander(axis: int, sign: float, name: str, seed: int) -> None:
+    """A receiver without corrections: the error of 0.8 m lasts for a minute, and the courses show no axis."""
+    log, truth = without_heading(seed, axis, sign)
+    rng, fixes = np.random.default_rng(300 + seed), log.gnss
+    kept = math.exp(-float(np.median(np.diff(fixes.stamp_ns))) / 60e9)
+    push = rng.normal(0.0, 0.8 * math.sqrt(1.0 - kept**2), (2, len(fixes.stamp_ns)))
+    push[:, 0] = rng.normal(0.0, 0.8, 2)
+    north, east = lfilter([1.0], [1.0, -kept], push, axis=1) + rng.normal(0.0, 0.1, push.shape)
+    variance = np.ones(len(fixes.stamp_ns))
+    wandering = replace(
+        fixes, north_m=fixes.north_m + north, east_m=fixes.east_m + east, var_north_m2=variance, var_east_m2=variance
+    )
+    found = derive_heading(replace(log, gnss=wandering), WIDTH_M)
+    assert found.source == "gyro_course"
+    assert found.topic.startswith(f"/imu ({name})" if name else "/imu +")
+    smoothed, std = error_deg(found.smoothed, truth), np.degrees(np.sqrt(found.smoothed.var_rad2))
+    assert math.sqrt((smoothed**2).mean()) < 3.0 * float(np.median(std))
+    assert float(np.median(std)) < 4.0
+
+
 def with_attitude(log: RobotLog, truth: Truth, seed: int, offset_deg: float = 0.0, lag_s: float = 0.0) -> RobotLog:
     """Return the log with an attitude sensor as well: slow error (0.85 deg, 30 s) and white noise (0.5 deg)."""
     rng, (stamps, psi) = np.random.default_rng(200 + seed), truth
