@@ -17,7 +17,7 @@ from icrtool.alignment.gyro_heading import (
 )
 from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensor_noise import is_hole
-from icrtool.alignment.turn_rates import TurnRate, course_changes, gyro_rates, wheel_rate
+from icrtool.alignment.turn_rates import BETTER, TurnRate, course_changes, gyro_rates, wheel_rate
 from icrtool.alignment.wheel_alignment import compare_turns
 from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.errors import DataError
@@ -198,14 +198,16 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
     """Return the estimate with the gyro that follows the courses over ground best; None where none covers them."""
     if not log.gyros:
         return None
-    best, changes, epoch = None, course_changes(track), int(log.wheels.stamp_ns[0])
+    best, least, changes, epoch = None, math.inf, course_changes(track), int(log.wheels.stamp_ns[0])
     for gyro in log.gyros:
         rates = gyro_rates(track, changes, gyro, epoch)
         # beside a stated heading, which bends to either sense of a turn rate, as the sensor is usually mounted
-        for turn, axis in rates if stated is None else rates[:1]:
+        for row, (turn, axis) in enumerate(rates if stated is None else rates[:1]):
             found = _derived(log, track, turn, gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})", stated)
-            if found is not None and (best is None or found.estimate.median_std < best.estimate.median_std):
-                best = found
+            std = math.inf if found is None else found.estimate.median_std
+            std *= 1.0 if row else BETTER
+            if std < least:
+                best, least = found, std
     return best
 
 

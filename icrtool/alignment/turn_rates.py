@@ -239,7 +239,8 @@ ALONG_AN_AXIS = 0.95
 """A sensor whose axis is this near to the vertical (cosine) is mounted along it."""
 
 BETTER = 0.9
-"""Another axis than z up is used where turns of the course over ground scatter about it by no more than this share."""
+"""Another axis than z up is used where turns of the course over ground scatter about it by no more than this share, or
+where that is the share of the heading's standard deviation with it."""
 
 LARGEST_CHANGE_RAD = 2.5
 SHORTEST_HOLE_S = 0.1
