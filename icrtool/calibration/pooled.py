@@ -18,7 +18,7 @@ from icrtool.calibration import held_out
 from icrtool.calibration.record import Calibration, fitted_document, parameter_documents
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
-from icrtool.kernels.arrays import Complexes, Floats
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, Lever
 from icrtool.motion.recording import ErrorsOf, GyroLine, Recording, cut_windows, fit_gyro_line
 from icrtool.motion.window_fit import Fold, Prediction, own_constants
@@ -79,8 +79,11 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
     t = plain.track.t
 
     def rate(later_s: float) -> Floats:
-        turned, dt, rates = np.diff(np.interp(t + later_s, t, heading.angle_rad)), np.diff(t), np.zeros(len(t))
-        np.divide(turned, dt, out=rates[:-1], where=dt > 0.0)
+        rates = np.zeros(len(t))
+        for lo in range(0, len(t) - 1, ROWS_AT_ONCE):
+            at = t[lo : lo + ROWS_AT_ONCE + 1]
+            turned, dt = np.diff(np.interp(at + later_s, t, heading.angle_rad)), np.diff(at)
+            np.divide(turned, dt, out=rates[lo : lo + len(dt)], where=dt > 0.0)
         return rates
 
     line = _gyro_line(plain, rate(0.0))

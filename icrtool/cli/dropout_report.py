@@ -164,7 +164,7 @@ def _report_one(source: Path, place: RunPlace | None, request: Request) -> Dropo
     with ExitStack() as stack:
         if place is None:
             folder = stack.enter_context(remote_place.on_disk(source, needed=bool))
-            run = run_directory.open_run(folder)
+            run = run_directory.open_run(folder, whole=False)
         else:
             # One result: where the report fails, an old run in this place stays, with its report.
             asked = one_log.FitOptions(

@@ -7,7 +7,10 @@ and the error that it has itself.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import repeat
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -90,18 +93,33 @@ GNSS_NIS, HEADING_NIS = 2.0, 1.0
 """Mean normalised innovation squared where the noise is right: the number of measured components."""
 
 
-def reference_error(
-    run: Run, track: Track, horizons_m: Floats, ends: NDArray[np.int32], seed: int
-) -> tuple[ReferenceRow, ...]:
+class DrawnTrials(NamedTuple):
+    """Some trials of one horizon [m], and the states at which they start and end; empty where it has none."""
+
+    horizon_m: float
+    start: Ints
+    end: Ints
+
+
+def drawn_trials(horizons_m: Floats, ends: NDArray[np.int32]) -> list[DrawnTrials]:
+    """Return `DRAWS` trials of each horizon (h,), or none, by the states (h, n) at which those of all starts end."""
+    drawn = []
+    for horizon_m, column in zip(horizons_m.tolist(), ends, strict=True):
+        start = np.flatnonzero(column >= 0)
+        if len(start):
+            start = start[np.linspace(0, len(start) - 1, DRAWS).astype(np.int64)]
+        drawn.append(DrawnTrials(horizon_m, start, column[start]))
+    return drawn
+
+
+def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int) -> tuple[ReferenceRow, ...]:
     """Return the error that the reference puts into the trials of each horizon.
 
     Parameters
     ----------
-    run : its standard deviations are those of the reference
-    track : its states
-    horizons_m : (h,)
-    ends : (h, n), the state at which the trial from each start ends, negative where there is none
-    seed : of the draws
+    run : its states are the reference
+    trials : of each horizon, in groups
+    seed : of the draws, which begin anew with each group
 
     Notes
     -----
@@ -117,22 +135,27 @@ def reference_error(
     independent: what both share, an offset of all fixes, is in no trial, and what they share in part makes the result
     an upper bound. A heading offset common to the whole log is not in the variances.
     """
-    table, noise, rows = run.table, run.document.filter, []
+    table, noise = run.table, run.document.filter
     # Fixes and headings spread by these factors more than the filter assumes, in variance; at least 1.
     position = max((noise.nis_gnss_mean or 0.0) / GNSS_NIS, 1.0)
     heading = max((noise.nis_heading_mean or 0.0) / HEADING_NIS, 1.0)
-    rng = np.random.default_rng(seed)
-    for horizon_m, column in zip(horizons_m.tolist(), ends, strict=True):
-        start = np.flatnonzero(column >= 0)
+    every = [one for group in trials for one in group]
+
+    def at_ends(column: Floats) -> list[tuple[Floats, Floats]]:
+        return [(column[one.start], column[one.end]) for one in every]
+
+    # one column after the other: a run that was read back may hold none of them
+    stds = at_ends(table.std_north_m), at_ends(table.std_east_m), at_ends(table.std_heading_rad)
+    generators = (rng for group in trials for rng in repeat(np.random.default_rng(seed), len(group)))
+    rows = []
+    for one, rng, of_north, of_east, (of_heading, _) in zip(every, generators, *stds, strict=True):
+        start, end = one.start, one.end
         if not len(start):
-            rows.append(ReferenceRow(horizon_m, None, None, None))
+            rows.append(ReferenceRow(one.horizon_m, None, None, None))
             continue
-        start = start[np.linspace(0, len(start) - 1, DRAWS).astype(np.int64)]
-        end = column[start]
-        north, east = track.north[end] - track.north[start], track.east[end] - track.east[start]
-        north_std = [np.sqrt(position) * table.std_north_m[states] for states in (start, end)]
-        east_std = [np.sqrt(position) * table.std_east_m[states] for states in (start, end)]
-        std_heading = np.sqrt(heading) * table.std_heading_rad[start]
+        north, east = table.north_m[end] - table.north_m[start], table.east_m[end] - table.east_m[start]
+        north_std, east_std = ([np.sqrt(position) * std for std in of_both] for of_both in (of_north, of_east))
+        std_heading = np.sqrt(heading) * of_heading
         drawn = rng.standard_normal((5, DRAWS))
         turned = std_heading * drawn[0]
         off_north = north_std[0] * drawn[1] - north_std[1] * drawn[2] - turned * east
@@ -141,7 +164,7 @@ def reference_error(
         square = sum(std**2 for std in (*north_std, *east_std))
         square = square + std_heading**2 * (north**2 + east**2)
         of_error = np.sqrt(np.mean(square)), error.mean(), np.percentile(error, 95)
-        rows.append(ReferenceRow(horizon_m, *(known(float(one)) for one in of_error)))
+        rows.append(ReferenceRow(one.horizon_m, *(known(float(number)) for number in of_error)))
     return tuple(rows)
 
 
@@ -161,7 +184,7 @@ def with_smoothed_reference(run: Run) -> Run:
     if run.smoothed is None:
         raise RunError(run.directory or run.name, "it has no smoothed states", "run icrtool fit --smooth")
     smoothed = {name: getattr(run.smoothed, name) for pose in POSE for name in (pose, f"std_{pose}")}
-    return replace(run, table=replace(run.table, **smoothed))
+    return replace(run, table=run.table.changed(**smoothed))
 
 
 SPLIT_HORIZON_M = 5.0

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from icrtool.calibration.run_models import ComparedRow, Model, models_of
 from icrtool.dropout_analysis.report import OpenLoopErrors
-from icrtool.dropout_analysis.starts import first_learned, leave_out, reference_error, standing_states
+from icrtool.dropout_analysis.starts import (
+    DrawnTrials,
+    drawn_trials,
+    first_learned,
+    leave_out,
+    reference_error,
+    standing_states,
+)
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels import error_statistics as statistics
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -94,7 +101,7 @@ def measure_errors(
     left_out = standing if starts == "moving" else np.zeros_like(standing)
     few = _errors_of_few(track, predictors, horizons, sparse, left_out)
     counts: list[TrialCounts] = []
-    reference: list[documents.ReferenceRow] = []
+    drawn: list[list[DrawnTrials]] = []
     found: list[list[_AtHorizon]] = [[] for _ in predictors]
     before: list[documents.ErrorRow] = []
     after: list[documents.ErrorRow] = []
@@ -127,7 +134,7 @@ def measure_errors(
                         errors[sparse] = of_some
                     sink(model.name, group, errors)
                 del errors  # before those of the next model are made
-            reference += reference_error(run, track, group, ends, seed)
+            drawn.append(drawn_trials(group, ends))
     by_learning = None
     if before:
         at, driven = (None if learned is None else float(one[learned]) for one in (run.table.t_s, run.table.distance_m))
@@ -139,7 +146,7 @@ def measure_errors(
         counts=TrialCounts(*(np.concatenate(column) for column in zip(*counts, strict=True))),
         states=len(run.table),
         standing=int(np.count_nonzero(standing)),
-        reference=tuple(reference),
+        reference=reference_error(run, drawn, seed),
         by_learning=by_learning,
     )
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from icrtool.kernels.arrays import Bools, Floats, Ints, trapezoids
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, trapezoids
 from icrtool.kernels.kinematics import chord_rows
 from icrtool.kernels.open_loop import open_loop_pieces
 from icrtool.kernels.track import OpenLoopPath
@@ -175,7 +175,11 @@ def _covers(measured_ns: Ints, states_ns: Ints) -> bool:
 
 def _integrate(t: Floats, rate: Floats, at: Floats) -> Floats:
     """Return the turn [rad] up to each state at times `at`: trapezoids, first and last rate held beyond the samples."""
-    whole: Floats = np.interp(at, t, trapezoids(t, rate))
-    whole += np.minimum(at - t[0], 0.0) * rate[0]
-    whole += np.maximum(at - t[-1], 0.0) * rate[-1]
+    whole, turned = np.empty(len(at)), trapezoids(t, rate)
+    for lo in range(0, len(at), ROWS_AT_ONCE):
+        some = at[lo : lo + ROWS_AT_ONCE]
+        within = np.interp(some, t, turned)
+        within += np.minimum(some - t[0], 0.0) * rate[0]
+        within += np.maximum(some - t[-1], 0.0) * rate[-1]
+        whole[lo : lo + len(some)] = within
     return whole

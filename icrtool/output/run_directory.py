@@ -221,12 +221,14 @@ NAMES = ("topic", "message_type")
 """Keys of run.json whose texts stand there as in the log."""
 
 
-def open_run(path: str | Path) -> Run:
+def open_run(path: str | Path, *, whole: bool = True) -> Run:
     """Read a run directory back, equal to the run that was written.
 
     Parameters
     ----------
     path : a directory that `icrtool fit` or `Run.write` made, or its address
+    whole : hold all columns; else the standard deviations of states in Parquet are read where they are used, and the
+        file has to stay as it is: a third less memory
 
     Raises
     ------
@@ -237,10 +239,10 @@ def open_run(path: str | Path) -> Run:
     """
     place = place_of(path) if isinstance(path, str) else path
     with on_disk(place, lambda name: "/" not in name, writes=False) as directory:
-        return _run_in(directory, place)
+        return _run_in(directory, place, whole=whole or directory is not place)
 
 
-def _run_in(directory: Path, place: Path) -> Run:
+def _run_in(directory: Path, place: Path, *, whole: bool) -> Run:
     """Return the run in a directory on disk; `place`: that it stands for."""
     stored = _read_document(directory)
     sums = formats.read_sums(directory)
@@ -250,14 +252,14 @@ def _run_in(directory: Path, place: Path) -> Run:
     try:
         config = parse_config(msgspec.convert(stored.get("config"), dict[str, Any]))
         document = msgspec.convert(stored | {"config": config}, RunDocument)
-        table = _read_states(directory, "states", sums)
+        table = _read_states(directory, "states", sums, whole=whole)
         if table is None:
             raise RunError(directory, f"{formats.CHECKSUM_FILE} names no states", FIT_AGAIN)
         if table.fault:
             raise ValueError(table.fault)
         check_sum(directory, MEASUREMENTS_FILE, sums)
         table, sensors, gnss, heading = run_columns.read_measurements(directory, table, document)
-        smoothed = _read_states(directory, "smoothed", sums)
+        smoothed = _read_states(directory, "smoothed", sums, whole=whole)
         if smoothed is not None and not np.array_equal(smoothed.stamp_ns, table.stamp_ns):
             raise RunError(directory, "its smoothed states are not at the stamps of its states", FIT_AGAIN)
         run = Run(
@@ -340,7 +342,7 @@ def _read_document(directory: Path) -> dict[str, Any]:
     return {key: value if key == "inputs" else escaped_texts(value, NAMES) for key, value in document.items()}
 
 
-def _read_states(directory: Path, stem: str, sums: Mapping[str, str]) -> States | None:
+def _read_states(directory: Path, stem: str, sums: Mapping[str, str], *, whole: bool) -> States | None:
     """Read the states of this name, in the format that the run has; None where it has none of them."""
     for states in STATES_FORMATS:
         if (name := f"{stem}.{states}") in sums:
@@ -348,7 +350,7 @@ def _read_states(directory: Path, stem: str, sums: Mapping[str, str]) -> States 
                 # Both read the file from end to end; hashing leaves the interpreter to the other.
                 checked = pool.submit(check_sum, directory, name, sums)
                 try:
-                    return run_columns.read_states(directory / name, states, directory)
+                    return run_columns.read_states(directory / name, states, directory, whole=whole)
                 finally:
                     checked.result()
     return None

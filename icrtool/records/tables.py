@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -315,6 +315,10 @@ class States:
         """Return the columns by name, in the order of states.csv."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    def changed(self, **columns: Floats | Ints) -> States:
+        """Return the states with some other columns."""
+        return replace(self, **cast(Any, columns))
+
     def icrs_at(self, row: int) -> Icrs:
         """Return the ICRs at a state."""
         return float(self.y_icr_right_m[row]), float(self.y_icr_left_m[row]), float(self.x_icr_m[row])
@@ -334,8 +338,8 @@ class States:
             return "its states are not in the order of time"
         if np.any(self.distance_m[1:] < self.distance_m[:-1]):
             return "the distance of its states decreases"
-        for name, values in self.columns().items():
-            possible = np.abs(values) < LARGEST
+        for name in (field.name for field in fields(self)):
+            possible = np.abs(getattr(self, name)) < LARGEST
             if name != "stamp_ns" and not possible.all():
                 return f"row {possible.argmin()} of its states has {name} that is not a finite number below {LARGEST:g}"
         return ""

@@ -10,9 +10,10 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from functools import partial
+from io import BufferedReader
 from pathlib import Path
 from tokenize import TokenError
 from typing import TYPE_CHECKING, Any
@@ -23,24 +24,27 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from icrtool.kernels.arrays import Ints
+from icrtool.errors import RunError
+from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.chunk import LARGEST_RATIO
 from icrtool.output.files.formats import file_b2sum
 from icrtool.records.choices import StatesFormat
 from icrtool.records.measurements import Fixes, ReferenceJump, SensorData, SlipEvent
 from icrtool.records.places import open_regular
-from icrtool.records.run import MeasurementOutcome, Run
+from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, thin
 from icrtool.records.tables import LARGEST, States
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
 
 COLUMNS = tuple(field.name for field in fields(States))
 INTEGER_COLUMNS = frozenset({"stamp_ns"})
 FLOAT_COLUMNS = tuple(name for name in COLUMNS if name not in INTEGER_COLUMNS)
+DEVIATIONS = frozenset(f"std_{name}" for name in STATE_COLUMNS)
 
 CHUNK_ROWS = 1024
 """Rows formatted at a time: their text stays in the processor's cache, and memory does not grow with the log."""
@@ -104,12 +108,13 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
     return digest.hexdigest()
 
 
-def read_states(path: Path, states: StatesFormat, inside: Path | None = None) -> States:
+def read_states(path: Path, states: StatesFormat, inside: Path | None = None, *, whole: bool = True) -> States:
     """Read what `write_states` wrote.
 
     Parameters
     ----------
     inside : as in `open_regular`
+    whole : hold the standard deviations, too; else, of Parquet, they are read where they are used
 
     Raises
     ------
@@ -130,11 +135,10 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None) ->
                 if 8 * numbers > FREE_STATES_BYTES + LARGEST_RATIO * os.fstat(source.fileno()).st_size:
                     raise ValueError(f"it claims {numbers} numbers, too many for its size")
                 _check_columns(file.schema_arrow, types)
-                # One at a time: each one's memory is used again for the next.
-                read = partial(file.read, use_threads=False)
-                table = States(**{name: _array(read([name]).column(0)) for name in COLUMNS})
+                held = {name: _parquet_column(file, name) for name in COLUMNS if whole or name not in DEVIATIONS}
+                read = partial(_read_again, path, inside, _identity(source))
             pa.default_memory_pool().release_unused()
-            return table
+            return States(**held) if whole else StoredStates(read, **held)
         import pyarrow.csv as pc
 
         options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])
@@ -147,6 +151,73 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None) ->
         return States(**{name: _array(columns.pop(name)) for name in COLUMNS})
     except pa.ArrowException as err:
         raise ValueError(" ".join(str(err).split())) from err
+
+
+class StoredStates(States):
+    """States whose standard deviations stay in their file, and are read each time that they are used."""
+
+    __slots__ = ("_held", "_read")
+    _read: Callable[[str], Floats]
+    _held: dict[str, Floats | Ints]
+
+    def __init__(self, read: Callable[[str], Floats], **held: Floats | Ints) -> None:
+        for name, column in held.items():
+            object.__setattr__(self, name, column)
+        object.__setattr__(self, "_read", read)
+        object.__setattr__(self, "_held", held)
+
+    def __getattr__(self, name: str) -> Floats:
+        # Called for what is not held.
+        if name not in DEVIATIONS:
+            raise AttributeError(name)
+        return self._read(name)
+
+    def __reduce__(self) -> tuple[type, tuple[Floats | Ints, ...]]:
+        return States, tuple(self.columns().values())
+
+    def changed(self, **columns: Floats | Ints) -> States:
+        """Return the states with some other columns."""
+        return StoredStates(self._read, **(self._held | columns))
+
+
+def _identity(file: BufferedReader) -> tuple[int, ...]:
+    """Return what changes where a file is replaced or written to."""
+    status = os.fstat(file.fileno())
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _read_again(path: Path, inside: Path | None, identity: tuple[int, ...], name: str) -> Floats:
+    """Return a column of states that were read before.
+
+    Raises
+    ------
+    RunError
+        The file is no longer the one that was read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with open_regular(path, inside) as source:
+            if _identity(source) != identity:
+                raise RunError(path.parent, f"{path.name} was replaced or edited while it was in use", "start again")
+            with pq.ParquetFile(source) as file:
+                return _parquet_column(file, name)
+    except (OSError, pa.ArrowException) as err:
+        raise RunError(path.parent, f"{path.name} cannot be read any more ({err})", "start again") from err
+
+
+def _parquet_column(file: pq.ParquetFile, name: str) -> NDArray[Any]:
+    """Return a column without nulls, read group by group: its memory is all that it takes."""
+    column = np.empty(file.metadata.num_rows, np.int64 if name in INTEGER_COLUMNS else np.float64)
+    filled = 0
+    for group in range(file.num_row_groups):
+        part = _array(file.read_row_group(group, [name], use_threads=False).column(0))
+        column[filled : filled + len(part)] = part
+        filled += len(part)
+    if filled < len(column):
+        raise ValueError(f"it holds {filled} of {len(column)} rows")
+    return column
 
 
 def _check_columns(schema: pa.Schema, types: dict[str, pa.DataType]) -> None:
@@ -288,7 +359,7 @@ def read_measurements(
     except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError, SyntaxError, TokenError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err
     first = len(stamps) - len(table)
-    states = replace(table, stamp_ns=stamps[first:], v_left_mps=left[first:], v_right_mps=right[first:])
+    states = table.changed(stamp_ns=stamps[first:], v_left_mps=left[first:], v_right_mps=right[first:])
     return states, sensors, outcomes[0], outcomes[1]
 
 

@@ -128,7 +128,6 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
     """Return the states that the time series show; each is a step too."""
     table, icrs = run.table, {"y_right": "y_icr_right_m", "y_left": "y_icr_left_m", "x": "x_icr_m"}
     values = {name: getattr(table, column)[steps] for name, column in icrs.items()}
-    spreads = {f"std_{name}": getattr(table, f"std_{column}") for name, column in icrs.items()}
     speeds = {"v_left": table.v_left_mps, "v_right": table.v_right_mps}
     rows = extremes(*(one[steps] for one in speeds.values()), *values.values(), points=SERIES_POINTS)
     state = steps[rows]
@@ -137,7 +136,8 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
         "t": packed_sums(table.t_s[state]),
         "heading": packed(wrapped(table.heading_rad[state])),
         **{name: packed(column[rows]) for name, column in values.items()},
-        **{name: packed_levels(column[state]) for name, column in (speeds | spreads).items()},
+        **{name: packed_levels(column[state]) for name, column in speeds.items()},
+        **{f"std_{name}": packed_levels(getattr(table, f"std_{column}")[state]) for name, column in icrs.items()},
     }
 
 

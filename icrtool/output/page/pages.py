@@ -245,7 +245,7 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[Run, DropoutDocume
     events = (one._replace(north_m=one.north_m - north, east_m=one.east_m - east) for one in sensors.events)
     at_origin = replace(
         run,
-        table=replace(table, north_m=table.north_m - north, east_m=table.east_m - east),
+        table=table.changed(north_m=table.north_m - north, east_m=table.east_m - east),
         sensors=replace(sensors, fixes=fixes, events=tuple(events)),
         document=shown,
     )

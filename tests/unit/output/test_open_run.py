@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
+import pickle
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import icrtool
@@ -88,6 +91,60 @@ def test_other_runs_come_back_too(drive: dict[str, Any], make_run: Callable[...,
     run = make_run(**drive)
     write_run(run, tmp_path / "barn", plots=(), states="parquet")
     assert differences(run, replace(open_run(tmp_path / "barn"), directory=None)) == []
+
+
+@pytest.fixture
+def lean(whole: Run, tmp_path: Path) -> Run:
+    """A run of which the standard deviations are read where they are used."""
+    write_run(whole, tmp_path / "barn", plots=(), states="parquet")
+    return open_run(tmp_path / "barn", whole=False)
+
+
+def test_columns_that_are_not_held_are_equal_to_those_that_are(whole: Run, lean: Run) -> None:
+    assert lean.smoothed is not None
+    assert whole.smoothed is not None
+    for one, other in ((lean.table, whole.table), (lean.smoothed, whole.smoothed)):
+        assert list(one.columns()) == list(other.columns())
+        for name, column in one.columns().items():
+            np.testing.assert_array_equal(column, getattr(other, name), err_msg=name)
+        assert one.std_north_m is not one.std_north_m
+    pd.testing.assert_frame_equal(lean.states, whole.states)
+    assert differences(whole.table, copy.copy(lean.table)) == []
+    assert differences(whole.table, pickle.loads(pickle.dumps(lean.table))) == []
+
+
+def test_changed_columns_stay_beside_those_that_are_not_held(lean: Run) -> None:
+    other = np.zeros(len(lean.table))
+    changed = lean.table.changed(std_north_m=other).changed(east_m=other)
+    assert changed.std_north_m is other
+    assert changed.east_m is other
+    np.testing.assert_array_equal(changed.std_x_icr_m, lean.table.std_x_icr_m)
+
+
+@pytest.mark.parametrize("how", ["replaced", "edited", "removed"])
+def test_a_file_that_changes_while_a_run_is_in_use_is_noticed(lean: Run, how: str) -> None:
+    assert lean.directory is not None
+    states = lean.directory / "states.parquet"
+    if how == "replaced":
+        other = states.with_name("other")
+        other.write_bytes(states.read_bytes())
+        other.replace(states)
+    elif how == "edited":
+        with states.open("r+b") as file:
+            file.write(b"PAR2")
+        os.utime(states, ns=(0, 0))
+    else:
+        states.unlink()
+    with pytest.raises(RunError, match=r"states\.parquet"):
+        assert lean.table.std_north_m
+
+
+@pytest.mark.parametrize("reference", ["filter", "smoothed"])
+def test_a_run_that_holds_fewer_columns_reports_the_same(reference: Any, whole: Run, lean: Run) -> None:
+    fresh, read = (
+        dropout_report(one, horizons_m=[1.0, 5.0], reference=reference, allow_unusable=True) for one in (whole, lean)
+    )
+    assert json_bytes(read.document) == json_bytes(fresh.document)
 
 
 def test_a_run_read_back_prints_the_same(whole: Run, stored: Run) -> None:
