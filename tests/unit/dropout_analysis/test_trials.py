@@ -181,7 +181,7 @@ def test_horizons_that_are_no_distances_are_refused(run: Run, horizons: list[flo
 
 def test_a_run_of_one_state_is_refused(run: Run) -> None:
     stub = changed(run, **{name: column[:1] for name, column in run.table.columns().items()})
-    with pytest.raises(DataError, match="1 states"):
+    with pytest.raises(DataError, match="1 state;"):
         dropout(stub, [1.0])
 
 
