@@ -221,7 +221,8 @@ def _parquet_column(file: pq.ParquetFile, name: str) -> NDArray[Any]:
 
 
 def _check_columns(schema: pa.Schema, types: dict[str, pa.DataType]) -> None:
-    if {name: schema.field(name).type for name in schema.names if name in types} != types:
+    found = [(name, kind) for name, kind in zip(schema.names, schema.types, strict=True) if name in types]
+    if sorted(name for name, _ in found) != sorted(types) or dict(found) != types:
         raise ValueError("its columns are not those of the states")
 
 

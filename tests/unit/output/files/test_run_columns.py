@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from icrtool.output.files.run_columns import CHUNK_ROWS, StatesFormat, read_states, write_states
@@ -76,6 +77,16 @@ def test_other_columns_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "states.csv").write_text(text)
     with pytest.raises(ValueError, match=r"CSV|[Cc]olumn"):
         read_states(tmp_path / "states.csv", "csv")
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_column_of_parquet_that_comes_twice_is_refused(tmp_path: Path, *, whole: bool) -> None:
+    path = tmp_path / "states.parquet"
+    write_states(table_of(np.arange(5.0)), path, "parquet")
+    stored = pq.read_table(path)
+    pq.write_table(stored.append_column("distance_m", stored["distance_m"]), path)
+    with pytest.raises(ValueError, match="columns are not"):
+        read_states(path, "parquet", whole=whole)
 
 
 def test_an_existing_file_is_not_overwritten(tmp_path: Path, run: Run) -> None:
