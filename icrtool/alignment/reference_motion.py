@@ -74,7 +74,7 @@ class Knots(NamedTuple):
     heading : (m,) [rad], unwrapped; turn_variance : of one value of it [rad^2]
     velocity : complex (m,), the mean of the sides along the heading [m/s]; apart : (m,) left minus right [m/s]
     held_m2 : (m,) variance that values held from sample to sample add to a side's distance
-    holes : (m,) number of steps so far that lie in a hole of any stream, even in part
+    holes : (m,) number of steps so far that lie in a hole of any stream, even in part; wheel_holes : of the wheels
     fix_class : (m,) classes of the fixes
     turn_follows_place : the headings are estimated from the positions, and jump with them
     gyro : (m,) turn of the gyro [rad], in sense and scale of the headings; None without one that turns with them
@@ -89,6 +89,7 @@ class Knots(NamedTuple):
     apart: Floats
     held_m2: Floats
     holes: Ints
+    wheel_holes: Ints
     fix_class: Bytes
     turn_follows_place: bool
     gyro: Floats | None
@@ -180,11 +181,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         for gone in (track.cumulate(left), track.cumulate(right))
     )
     heading = track.heading_at(t)
-    in_hole = np.zeros(len(t) - 1, np.bool_)
-    for sampled in (track.t, track.heading_t, t):
-        before = np.flatnonzero(is_hole(np.diff(sampled), LONGEST_HOLE_S))
-        # a step that begins or ends inside of one, or holds it whole
-        in_hole |= np.searchsorted(sampled[before], t[1:]) > np.searchsorted(sampled[before + 1], t[:-1], side="right")
+    of_wheels, *of_others = (_in_hole(sampled, t) for sampled in (track.t, track.heading_t, t))
     gyro, by_gyro = sensors.gyro, None
     if gyro is not None and len(gyro.stamp_ns) >= FEWEST_FIXES:
         at = (gyro.stamp_ns - wheels.stamp_ns[0]) / 1e9
@@ -199,9 +196,17 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         heading=heading, turn_variance=mad_std(np.diff(heading, 2), 0.0) ** 2 / 6,
         velocity=(v_left + v_right) / 2 * np.exp(1j * heading), apart=v_left - v_right,
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
-        holes=np.concatenate([[0], np.cumsum(in_hole)]), fix_class=fixes.fix_class[rows],
+        holes=np.append(0, np.cumsum(np.logical_or.reduce([of_wheels, *of_others]))),
+        wheel_holes=np.append(0, np.cumsum(of_wheels)), fix_class=fixes.fix_class[rows],
         turn_follows_place=sensors.heading_is_estimated, gyro=by_gyro,
     )  # fmt: skip
+
+
+def _in_hole(sampled: Floats, t: Floats) -> Bools:
+    """Return which steps between times t (m,) begin or end in a hole of a stream, or hold one whole (m - 1,)."""
+    before = np.flatnonzero(is_hole(np.diff(sampled), LONGEST_HOLE_S))
+    begun = np.searchsorted(sampled[before], t[1:])
+    return np.asarray(begun > np.searchsorted(sampled[before + 1], t[:-1], side="right"))
 
 
 def spans_by_duration(knots: Knots) -> list[tuple[float, Ints, Ints]]:
@@ -388,6 +393,8 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
         "turns faster than any robot": turned > slide,
     }
     why = np.select(list(causes.values()), list(causes), "")
+    # Where the wheels are not known, a step without a cause is how the robot drove.
+    shown &= (why != "") | (knots.wheel_holes[first] == knots.wheel_holes[last])
     level = np.exp(0.5j * (knots.heading[first] + knots.heading[last]))
     by = (windows.ahead + 1j * windows.aside) * level
     turn = np.zeros(len(first)) if knots.turn_follows_place else windows.turned / motion.lever_m

@@ -11,7 +11,7 @@ from icrtool.alignment.slip_events import find_disagreements
 from icrtool.kernels.arrays import Floats
 from icrtool.records.measurements import ReferenceJump, SensorData
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX
-from support.slip_drives import START_NS, WIDTH_M, drive
+from support.slip_drives import START_NS, WIDTH_M, curves, drive
 
 AT_S = 47.3
 
@@ -72,6 +72,21 @@ def test_a_step_that_slip_can_make_is_undecided_unless_the_receiver_states_a_new
     kinds = np.where(sensors.fixes.stamp_ns < jump.end_ns, FLOAT_FIX, FIXED_FIX).astype(np.uint8)
     (stated,) = jumps_of(replace(sensors, fixes=replace(sensors.fixes, fix_class=kinds)))
     assert not stated.undecided
+
+
+@pytest.mark.parametrize("fix_hz", [20, 5])
+@pytest.mark.parametrize("lasts_s", [2.0, 8.0])
+@pytest.mark.parametrize("size_m", [0.0, 10.0])
+def test_a_gap_of_the_wheels_has_no_step_but_one_that_no_robot_makes(
+    fix_hz: int, lasts_s: float, size_m: float
+) -> None:
+    sensors = drive(
+        wheels=lambda t, seed: 3 * curves(t, seed), fix_hz=fix_hz, position_error=lambda t: size_m * (t >= AT_S)
+    )
+    t_s = (sensors.wheels.stamp_ns - START_NS) / 1e9
+    known = (t_s < AT_S - lasts_s / 2) | (t_s > AT_S + lasts_s / 2)
+    found = jumps_of(replace(sensors, wheels=sensors.wheels.cut(known)))
+    assert [round(jump.size_m) for jump in found] == ([10] if size_m else [])
 
 
 def test_a_single_outlier_is_no_jump() -> None:
