@@ -122,6 +122,9 @@ class _Path(click.Path):
 
     def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Return the path."""
+        if not os.fspath(value):
+            # It would be the current directory.
+            self.fail("an empty name: is a variable of the shell not set?", param, ctx)
         address = place_of(os.fspath(value))
         if isinstance(address, UrlPath):
             if not self._addresses:

@@ -326,8 +326,10 @@ def _read_document(directory: Path) -> dict[str, Any]:
     except (OSError, ValueError) as err:
         if is_special(directory):
             raise RunError(directory, NOT_REGULAR, SAVE_IT) from err
-        why = "not a run directory" if directory.is_dir() else "no such run directory"
-        raise RunError(directory, why, f"it holds no readable {RUN_FILE}; icrtool fit makes one") from err
+        if not directory.is_dir():
+            raise RunError(directory, "no such run directory", "icrtool fit makes one") from err
+        why = f"it holds no readable {RUN_FILE}; icrtool fit makes one"
+        raise RunError(directory, "not a run directory", why) from err
     try:
         document = formats.parse_json(raw)
     except (ValueError, RecursionError) as err:

@@ -61,7 +61,10 @@ def open_regular(path: Path, inside: Path | None = None) -> BufferedReader:
         check_links(path, inside)
     handle = os.open(path, _FILE if inside is None else _FILE | _NO_LINK)
     try:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
+        mode = os.fstat(handle).st_mode
+        if stat.S_ISDIR(mode):
+            raise NotRegularFileError(path, "a directory; name a file")
+        if not stat.S_ISREG(mode):
             raise NotRegularFileError(path)
         return os.fdopen(handle, "rb")
     except BaseException:

@@ -54,6 +54,13 @@ def test_a_change_replaces_what_is_given_of_another_record(monkeypatch: pytest.M
     assert change(Pair(7.0, 8.0)) == Pair(-3.0, 8.0)
 
 
+@pytest.mark.parametrize("arguments", [("fit", ""), ("batch", "", "-o", "x"), ("export", "--for", "evo", "")])
+def test_an_empty_name_is_not_the_current_directory(arguments: tuple[str, ...]) -> None:
+    done = CliRunner().invoke(command_line, list(arguments))
+    assert done.exit_code == 2
+    assert "an empty name" in done.output
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_no_record_of_a_command_has_the_name_of_one_of_its_options(name: str) -> None:
     command = command_line.get_command(click.Context(command_line), name)

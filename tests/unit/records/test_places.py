@@ -34,6 +34,11 @@ def test_no_link_pipe_or_folder_is_read_below_a_directory(place: Path, name: str
     assert not is_regular(place / name, place)
 
 
+def test_a_directory_that_the_user_names_for_a_file_is_stated_to_be_one(place: Path) -> None:
+    with pytest.raises(NotRegularFileError, match="a directory; name a file"):
+        read_regular(place)
+
+
 def test_a_file_that_the_user_names_may_be_a_link_and_no_pipe(place: Path) -> None:
     assert read_regular(place / "link") == b"place/file"
     assert read_regular(place / "out" / "file") == b"outside/file"
