@@ -196,6 +196,10 @@ class Stream:
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the stream has
         return getattr(self._stream, name)
 
+    def isatty(self) -> bool:
+        """Return whether it is a terminal; a stream that was closed is none."""
+        return self._stream is not None and self._stream.isatty()
+
     def write(self, text: str) -> int:
         """Write a text, or drop it."""
         if self._stream is None:

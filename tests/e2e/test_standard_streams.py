@@ -28,6 +28,15 @@ def test_a_full_disk_behind_standard_output_is_one_error() -> None:
     assert done.returncode == 1
 
 
+@pytest.mark.parametrize(("closed", "status"), [(1, 1), (2, 0)])
+def test_a_standard_stream_that_was_closed_is_no_traceback(closed: int, status: int) -> None:
+    command = [*COMMAND, "robots"]
+    shell = ["sh", "-c", f'exec "$@" {closed}>&-', "sh", *command]
+    done = subprocess.run(shell, capture_output=True, text=True, check=False)
+    assert done.returncode == status, done.stderr
+    assert done.stderr in ("", "Error: standard output: cannot be written; Bad file descriptor\n")
+
+
 def test_a_reader_that_has_enough_stops_nothing(tmp_path: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
