@@ -309,6 +309,7 @@ class Container(ABC):
         """Return a block without the messages whose log time is negative or beyond `LATEST_NS`."""
         # Negative ones are above all others as unsigned numbers.
         possible = block.log_time_ns.view(np.uint64) < LATEST_NS
-        if not possible.all():
-            self.report("messages with an impossible log time left out")
+        if possible.all():
+            return block
+        self.report("messages with an impossible log time left out")
         return block.rows(possible)

@@ -208,8 +208,7 @@ class Decoder:
                 together = unaligned(data, np.dtype((np.void, shape.size)))[start[left[fits]]]
                 alike = np.ones(len(together), np.bool_)
                 for at, content in shape.same:
-                    kind = np.dtype((np.void, len(content)))
-                    alike &= np.ndarray(len(together), kind, together, at, together.strides) == np.void(content)
+                    alike &= as_first(together, at, len(content))
                 fits[fits] = alike
                 if not shapes and shape.readable and shape.size and fits.all():
                     return self.columns(
@@ -226,6 +225,22 @@ class Decoder:
         done = int(left[0]) if len(left) else len(start)
         readable = np.array([shape.readable for shape in shapes], np.bool_)[shape_of[:done]]
         return self.columns(self.layout, data, start[:done][readable], shapes, shape_of[:done][readable], readable)
+
+
+def as_first(records: NDArray[np.void], at: int, length: int) -> Bools:
+    """Return which records (n,) have the same bytes as the first one, `length` of them from `at` on.
+
+    Notes
+    -----
+    Numbers are compared four times as fast as bytes.
+    """
+    alike, end = np.ones(len(records), np.bool_), at + length
+    while at < end:
+        size = 1 << min((end - at).bit_length() - 1, 3)
+        number = records.getfield(f"u{size}", at)
+        alike &= number == number[0]
+        at += size
+    return alike
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +319,7 @@ class Decoded:
                     if len(self.shapes) == 1
                     else unaligned(self.data, kind)[self.start[rows] + at]
                 )
-                is_one = length == 0 or bool((texts == texts[0]).all())
+                is_one = bool(as_first(texts, 0, length).all())
                 codes.append(text_numbers(texts[: 1 if is_one else None].tolist(), known))
             if len(self.shapes) == 1 and all(len(one) == 1 for one in codes):
                 numbers = np.broadcast_to(np.array(codes, np.int64).reshape(1, width), numbers.shape)
