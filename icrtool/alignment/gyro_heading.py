@@ -10,6 +10,7 @@ and a smoothed one.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kalman import (
     HeadingEvents,
     HeadingModel,
+    HeadingPasses,
     filter_headings,
     heading_log_likelihood,
     smooth_headings,
@@ -177,14 +179,12 @@ def estimate_heading(
         problem = _Problem(courses, still, turn, absolute)
         grids = {f"{i} {name}": grid for i in range(len(absolute)) for name, grid in NOISES_OF_A_SOURCE.items()}
         noises = problem.choose(grids, noises)
-    found = problem.solve(noises)
     if absolute and math.isfinite(absolute[0].aligned_std):
-        offset, std = found.offset
+        offset, std = problem.offset(noises)
         if abs(offset) <= SIGNIFICANT_SIGMAS * std:
             # not significant: that of a sensor mounted along the robot
             problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
-            found = problem.solve(noises)
-    return found
+    return problem.solve(noises)
 
 
 def _standing(track: Track, turn: TurnRate) -> tuple[Floats, Floats]:
@@ -232,24 +232,20 @@ class _Problem:
             h[rows, first + LAG] = -one.rate
         z = np.concatenate([courses.angle, still_rate, *(one.heading for one in absolute), nothing])
         std = [courses.std, np.full(len(still_t), STANDING_RATE_STD), *(one.std for one in absolute), nothing + 1.0]
-        self.t, self.kind, self.h, self.z = t[order], kind[order], h[order], z[order]
-        self.std = np.concatenate(std)[order]
+        self.t, self.kind, h = t[order], kind[order], h[order]
         self.at = np.interp(self.t, turn.t, self.G)
-        self.holes = np.diff(turn.hole_variance(self.t), prepend=0.0)
-
-    def events(self, noises: dict[str, float], alike: float = 1.0) -> HeadingEvents:
-        """Return the events with the variances of some noises."""
-        r = self.std**2
-        course = self.kind == COURSE
-        r[course] = alike * (
-            (noises["fixes"] * self.std[course]) ** 2
-            + (noises["slip"] * self.h[course, X]) ** 2
-            + LEAST_COURSE_STD_RAD**2
-        )
-        for i in range(len(self.absolute)):
-            r[self.kind == ABSOLUTE + i] *= noises[f"{i} white"] ** 2
         elapsed, turned = (np.diff(column, prepend=column[:1]) for column in (self.t, self.at))
-        return HeadingEvents(elapsed, turned, self.holes, self.z, self.h, r, angle=self.h[:, PSI] > 0.0)
+        holes = np.diff(turn.hole_variance(self.t), prepend=0.0)
+        variance = np.concatenate(std)[order] ** 2
+        self.stated = HeadingEvents(elapsed, turned, holes, z[order], h, variance, angle=h[:, PSI] > 0.0)
+
+    def events(self, noises: dict[str, float], alike: float = 1.0, count: int | None = None) -> HeadingEvents:
+        """Return the events, or so many of them, with the variances of some noises."""
+        stated, kind = self.stated.cut(count), self.kind[:count]
+        of_course = noises["fixes"] ** 2 * stated.r + (noises["slip"] * stated.h[:, X]) ** 2 + LEAST_COURSE_STD_RAD**2
+        white = np.ones(ABSOLUTE + len(self.absolute))
+        white[ABSOLUTE:] = [noises[f"{i} white"] ** 2 for i in range(len(self.absolute))]
+        return stated._replace(r=np.where(kind == COURSE, alike * of_course, white[kind] * stated.r))
 
     def model(self, noises: dict[str, float]) -> HeadingModel:
         """Return start and process of the states."""
@@ -258,12 +254,12 @@ class _Problem:
         std[SCALE], std[BIAS] = self.turn.scale_std, self.turn.bias_std
         x, q, decay = np.zeros(len(std)), np.zeros(len(std)), np.zeros(len(std))
         first = int(np.argmax(self.kind == COURSE))
-        x[PSI] = self.z[first] - (self.at[first] - self.at[0])
+        x[PSI] = self.stated.z[first] - (self.at[first] - self.at[0])
         q[PSI], q[BIAS] = noises["angle"] ** 2, noises["bias"] ** 2
         for i in range(count):
             one = int(np.argmax(self.kind == ABSOLUTE + i))
             at = STATES_OF_A_SOURCE * i
-            x[at + OFFSET] = math.remainder(self.z[one] - x[PSI] - (self.at[one] - self.at[0]), 2 * math.pi)
+            x[at + OFFSET] = math.remainder(self.stated.z[one] - x[PSI] - (self.at[one] - self.at[0]), 2 * math.pi)
             growth, size = noises[f"{i} rate"] ** 2, noises[f"{i} size"]
             std[at + OFFSET] = self.absolute[i].offset_std
             x[at + OFFSET] *= math.isinf(std[at + OFFSET])
@@ -282,19 +278,23 @@ class _Problem:
     def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
         """Return the noises with those of the grids that have the largest likelihood, one after the other."""
         noises = {name: float(values[len(values) // 2]) for name, values in grids.items()} | noises
+
+        @functools.cache
+        def likelihood(*values: float) -> float:
+            tried = dict(zip(noises, values, strict=True))
+            return heading_log_likelihood(self.events(tried, count=MOST_EVENTS), self.model(tried))
+
         for _ in range(MOST_SWEEPS):
             before = noises
             for name, values in grids.items():
-                noises = max(
-                    (noises | {name: float(value)} for value in values),
-                    key=lambda tried: heading_log_likelihood(self.events(tried).cut(MOST_EVENTS), self.model(tried)),
-                )
+                tried = (noises | {name: float(value)} for value in values)
+                noises = max(tried, key=lambda one: likelihood(*one.values()))
             if noises == before:
                 break
         return noises
 
-    def solve(self, noises: dict[str, float]) -> HeadingEstimate:
-        """Return the estimate with some noises."""
+    def _forward(self, noises: dict[str, float]) -> tuple[HeadingEvents, HeadingModel, HeadingPasses]:
+        """Run the filter with some noises; courses that err alike count less."""
         events, model = self.events(noises), self.model(noises)
         passes = filter_headings(events, model)
         # by how much courses of windows that follow one another err alike, by slip that the model lacks
@@ -305,6 +305,16 @@ class _Problem:
         if alike > 1.0:
             events = self.events(noises, alike)
             passes = filter_headings(events, model)
+        return events, model, passes
+
+    def offset(self, noises: dict[str, float]) -> tuple[float, float]:
+        """Return the offset of the first absolute heading, and its standard deviation [rad]."""
+        passes = self._forward(noises)[2]
+        return math.remainder(passes.x[-1, OFFSET], 2.0 * math.pi), math.sqrt(passes.P[-1, OFFSET, OFFSET])
+
+    def solve(self, noises: dict[str, float]) -> HeadingEstimate:
+        """Return the estimate with some noises."""
+        events, model, passes = self._forward(noises)
         states, covariances = smooth_headings(events, model, passes)
         del passes  # of a long log, as large as what the pass below makes
         fixed = np.ones(len(model.x), np.bool_)

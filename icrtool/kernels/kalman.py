@@ -130,8 +130,8 @@ class HeadingEvents(NamedTuple):
     r: Floats
     angle: Bools
 
-    def cut(self, count: int) -> HeadingEvents:
-        """Return the first events."""
+    def cut(self, count: int | None) -> HeadingEvents:
+        """Return the first events; None: all."""
         return HeadingEvents._make(column[:count] for column in self)
 
 
