@@ -21,7 +21,7 @@ from icrtool.alignment.turn_rates import BETTER, TurnRate, course_changes, gyro_
 from icrtool.alignment.wheel_alignment import compare_turns
 from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Floats, rows_of_cells, trapezoids, wrapped
+from icrtool.kernels.arrays import Floats, rows_of_cells, trapezoids, unwrapped, wrapped
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
 from icrtool.records.samples import (
@@ -279,7 +279,7 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
         return None
     # about a sensor's upward axis
     rates = np.zeros((len(stamps) - 1, 3))
-    rates[:, 2] = -np.diff(np.unwrap(log.heading.heading_rad)[rows]) / (np.diff(stamps) / 1e9)
+    rates[:, 2] = -np.diff(unwrapped(log.heading.heading_rad)[rows]) / (np.diff(stamps) / 1e9)
     gyro = GyroAxes(log.topic("heading", "heading"), stamps[:-1] + np.diff(stamps) // 2, rates)
     why = (
         f"the heading drifts ({math.degrees(scatter_rad):.0f}° about the course over ground): only turn rates are used"

@@ -16,7 +16,7 @@ from icrtool.alignment.sensor_noise import (
     unbroken,
 )
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, unwrapped
 from icrtool.kernels.track import Track, Windows, cut
 from icrtool.records.measurements import TURNING_MPS, Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
@@ -103,7 +103,7 @@ def track_of_streams(
     turns = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
     so_far = np.concatenate([[0], np.cumsum(turns)])
     near = [np.searchsorted(wheel_t, heading_t + shift) for shift in (-STANDS_S, STANDS_S)]
-    angle = np.unwrap(heading.heading_rad)
+    angle = unwrapped(heading.heading_rad)
     if len(heading_t) > MOST_WHEEL_SAMPLES:
         # neighbours averaged: a delay then moves no single noise
         first = _thinned(so_far[near[1]] > so_far[near[0]])

@@ -18,7 +18,7 @@ from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
 from icrtool.alignment.log_track import FEWEST_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
-from icrtool.kernels.arrays import rows_at_steps
+from icrtool.kernels.arrays import rows_at_steps, unwrapped
 from icrtool.kernels.robust import robust_regression, sandwich_covariance
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import WheelFacts
@@ -115,7 +115,7 @@ def dead_or_copied(log: RobotLog) -> list[str]:
             span = f"from {seconds[begin]:.0f} s to {seconds[end]:.0f} s, while the others go {distance:.0f} m"
             meaning = "if so, do not use the ICRs: topics.wheels chooses others, --from and --to read the rest"
             return [f"the {side} wheels hardly ever move {span}: is their encoder dead? {meaning}"]
-    if np.array_equal(left, right) and float(np.ptp(np.unwrap(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
+    if np.array_equal(left, right) and float(np.ptp(unwrapped(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
         cause = "one is a copy of the other, or the robot steers as a car does, and has no track ICRs"
         return [f"left and right wheels are equal throughout while the robot turns: {cause}"]
     return []

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, trapezoids
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, trapezoids, unwrapped
 from icrtool.kernels.kinematics import chord_rows
 from icrtool.kernels.open_loop import open_loop_pieces
 from icrtool.kernels.track import OpenLoopPath
@@ -156,7 +156,7 @@ def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
     attitude = None if needs_positions else sensors.headings
     attitude = sensors.attitude if sensors.attitude is not None else attitude
     if attitude is not None and _covers(attitude.stamp_ns, stamps):
-        turned = np.unwrap(attitude.heading_rad)
+        turned = unwrapped(attitude.heading_rad)
         angle = np.interp(run.table.t_s, _since(attitude.stamp_ns, stamps), turned)
         yield MeasuredHeading("heading", angle)
 

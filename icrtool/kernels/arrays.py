@@ -1,4 +1,4 @@
-"""Types of arrays; integrals, rows at steps of what never decreases, wrapped angles, turns by quaternions."""
+"""Types of arrays; integrals, rows at steps of what never decreases, angles, turns by quaternions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,13 @@ def trapezoids(t: Floats, rate: Floats) -> Floats:
 
 def wrapped(angle: Floats) -> Floats:
     """Return angles within a half turn to either side [rad]."""
-    return np.asarray(np.angle(np.exp(1j * angle)))
+    return np.asarray(angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi)))
+
+
+def unwrapped(angle: Floats) -> Floats:
+    """Return angles (n,) that follow one another by no more than a half turn [rad]."""
+    turns = np.rint(np.diff(angle, prepend=angle[:1]) / (2.0 * np.pi))
+    return np.asarray(angle - 2.0 * np.pi * np.cumsum(turns))
 
 
 ROWS_AT_ONCE = 1 << 16
