@@ -16,7 +16,7 @@ from icrtool.alignment.sensor_noise import (
     unbroken,
 )
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, unwrapped
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, in_spans, runs_of, unwrapped
 from icrtool.kernels.track import Track, Windows, cut
 from icrtool.records.measurements import TURNING_MPS, Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
@@ -101,12 +101,11 @@ def track_of_streams(
         held[slice(*np.searchsorted(wheels.stamp_ns, span))] = 0.0
     left, right = wheels.v_left_mps, wheels.v_right_mps
     turns = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
-    so_far = np.concatenate([[0], np.cumsum(turns)])
-    near = [np.searchsorted(wheel_t, heading_t + shift) for shift in (-STANDS_S, STANDS_S)]
     angle = unwrapped(heading.heading_rad)
     if len(heading_t) > MOST_WHEEL_SAMPLES:
         # neighbours averaged: a delay then moves no single noise
-        first = _thinned(so_far[near[1]] > so_far[near[0]])
+        begin, behind = runs_of(turns)
+        first = _thinned(in_spans(heading_t, wheel_t[begin] - STANDS_S, wheel_t[behind - 1] + STANDS_S))
         count = np.diff(first, append=len(heading_t))
         heading_t, angle = (np.add.reduceat(column, first) / count for column in (heading_t, angle))
     none = np.zeros(len(fix_t), np.bool_)

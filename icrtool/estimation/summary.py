@@ -28,7 +28,7 @@ from icrtool.estimation.run_warnings import (
     run_warnings,
     unusable_reasons,
 )
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints, runs_of
 from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
@@ -276,7 +276,6 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
     spans: dict[IcrColumn, tuple[float, float] | None] = {}
     rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
     t_s = table.t_s[:rows]
-    settled_by = np.searchsorted(t_s, t_s + SETTLED_S)
     for column in ICR_COLUMNS:
         estimate: Floats = getattr(table, column)[:rows]
         settled = float(np.median(estimate[len(estimate) // 2 :]))
@@ -286,10 +285,10 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
             continue
         gone = (estimate - estimate[0]) / change
         first = int(np.argmax(np.abs(gone) >= 0.1))
-        inside = np.abs(gone - 1.0) <= 0.1
-        outside = np.concatenate([[0], np.cumsum(~inside)])
-        stays = inside & (outside[settled_by] == outside[:-1]) & (settled_by < len(inside))
-        spans[column] = (float(t_s[first]), float(t_s[np.argmax(stays)])) if stays.any() else None
+        begin, behind = runs_of(np.abs(gone - 1.0) <= 0.1)
+        settled_by = np.searchsorted(t_s, t_s[begin] + SETTLED_S)
+        stays = begin[(settled_by <= behind) & (settled_by < rows)]
+        spans[column] = (float(t_s[first]), float(t_s[stays[0]])) if len(stays) else None
     return spans
 
 

@@ -1,4 +1,4 @@
-"""Types of arrays; integrals, rows at steps of what never decreases, angles, turns by quaternions."""
+"""Types of arrays; integrals, rows at steps of what never decreases, runs and spans, angles, turns by quaternions."""
 
 from __future__ import annotations
 
@@ -65,6 +65,19 @@ def rows_of_cells(progress: Floats, cells_of: Callable[[Floats], Floats]) -> Int
         found.append(lo + np.flatnonzero(cell > np.append(last, cell[:-1])))
         last = cell[-1]
     return np.concatenate(found)
+
+
+def runs_of(marked: Bools) -> tuple[Ints, Ints]:
+    """Return the first row of each run of marked rows (n,), and the first one behind it."""
+    edges = np.flatnonzero(np.diff(marked, prepend=False, append=False))
+    return edges[::2], edges[1::2]
+
+
+def in_spans(at: Floats | Ints, begins: Floats | Ints, ends: Floats | Ints) -> Bools:
+    """Return which of some times (m,) lie in a span, its end included; times, begins and ends ascend."""
+    begun = np.bincount(np.searchsorted(at, begins), minlength=len(at) + 1)
+    begun -= np.bincount(np.searchsorted(at, ends, side="right"), minlength=len(at) + 1)
+    return np.asarray(np.cumsum(begun)[:-1] > 0)
 
 
 def quaternion_product(a: Floats, b: Floats) -> Floats:

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints, in_spans, runs_of
 from icrtool.records.plain_data import Record
 from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
@@ -121,23 +121,19 @@ class SensorData:
         What a robot measures while it stands shows neither delays nor contradictions, however long it stands.
         """
         stamps = self.wheels.stamp_ns
-        so_far = np.zeros(len(stamps) + 1, np.int64)
+        turning = np.empty(len(stamps), np.bool_)
         for lo in range(0, len(stamps), ROWS_AT_ONCE):
             left, right = (one[lo : lo + ROWS_AT_ONCE] for one in (self.wheels.v_left_mps, self.wheels.v_right_mps))
-            turning = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
-            so_far[lo + 1 : lo + 1 + len(turning)] = so_far[lo] + np.cumsum(turning)
+            turning[lo : lo + len(left)] = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
         near = 0
         if len(stamps) > 1:
             near = max(round(MOVING_S * 1e9), 2 * int(np.median(np.diff(stamps), overwrite_input=True)))
+        begin, behind = runs_of(turning)
+        # the last value holds until the next one
+        spans = stamps[begin] - near, stamps[np.minimum(behind, len(stamps) - 1)] + near
 
         def of(stamp_ns: Ints) -> Bools:
-            moving = np.empty(len(stamp_ns), np.bool_)
-            for lo in range(0, len(stamp_ns), ROWS_AT_ONCE):
-                some = slice(lo, lo + ROWS_AT_ONCE)
-                # the value before holds, too
-                first = np.maximum(np.searchsorted(stamps, stamp_ns[some] - near) - 1, 0)
-                last = np.searchsorted(stamps, stamp_ns[some] + near, side="right")
-                moving[some] = so_far[last] > so_far[first]
+            moving = in_spans(stamp_ns, *spans)
             return moving if moving.any() else np.ones(len(stamp_ns), np.bool_)
 
         return of(self.fixes.stamp_ns), of(self.headings.stamp_ns)
