@@ -281,8 +281,9 @@ class MotionOfWindows:
         track, v, u, drag = self.track, self.v, self.u, np.abs(self.u)
         nose, rate, ahead, aside = self._motion(x)
         t = self.edge_t - x[TP] - x[TH]
-        row = np.clip(np.searchsorted(track.t, t, side="right") - 1, 0, len(track.t) - 2)
-        part = np.clip((t - track.t[row]) / np.maximum(track.t[row + 1] - track.t[row], 1e-12), 0.0, 1.0)
+        passed = np.interp(t, track.t, np.arange(len(track.t)))
+        row = np.minimum(passed.astype(np.int64), len(track.t) - 2)
+        part = passed - row
 
         def laid(speed: Floats) -> Complexes:
             """Return a speed (n,) laid along the heading in each window (w,); found once where all of them end."""

@@ -24,7 +24,7 @@ from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapez
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
 from icrtool.motion.recording import fit_gyro_line
-from icrtool.records.measurements import ReferenceJump, SensorData
+from icrtool.records.measurements import RESPONSE_S, ReferenceJump, SensorData
 
 KNOT_S = 0.1
 """Fixes closer together than this are thinned: they show little more, and their noise much."""
@@ -209,8 +209,8 @@ def _in_hole(sampled: Floats, t: Floats) -> Bools:
     return np.asarray(begun > np.searchsorted(sampled[before + 1], t[:-1], side="right"))
 
 
-def spans_by_duration(knots: Knots) -> list[tuple[float, Ints, Ints]]:
-    """Return the durations of the windows [s], the longest first, and first and last rows of those of each (w,).
+def compare_by_duration(knots: Knots, motion: Motion) -> list[tuple[float, ComparedWindows]]:
+    """Return the durations of the windows [s], the longest first, and the windows of each.
 
     Durations are doubled until the usual distance stands out of the noise of the fixes. A window lasts so long, or one
     fix more, and spans no hole.
@@ -228,7 +228,7 @@ def spans_by_duration(knots: Knots) -> list[tuple[float, Ints, Ints]]:
         first = np.flatnonzero(last < len(knots.t))
         last = last[first]
         whole = (last - first >= FEWEST_INTERVALS) & (knots.holes[first] == knots.holes[last])
-        found.append((duration_s, first[whole], last[whole]))
+        found.append((duration_s, compare(knots, motion, first[whole], last[whole], RESPONSE_S)))
     return found
 
 

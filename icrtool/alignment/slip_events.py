@@ -25,11 +25,11 @@ from icrtool.alignment.reference_motion import (
     Knots,
     Motion,
     compare,
+    compare_by_duration,
     decide_jumps,
     fit_motion,
     lay_knots,
     model_error,
-    spans_by_duration,
     without_jumps,
 )
 from icrtool.alignment.sensor_noise import MOVES_MPS
@@ -115,26 +115,33 @@ def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
         if knots is None:
             return Disagreements()
         knots, steps = without_jumps(knots, width_m)
-        motion = fit_motion(knots, width_m, np.ones(len(knots.t), np.bool_))
+        quiet = np.ones(len(knots.t), np.bool_)
+        motion = fit_motion(knots, width_m, quiet)
         if motion is None:
             return Disagreements()
-        _, quiet = _find_events(knots, motion, np.ones(len(knots.t), np.bool_), FIRST_QUANTILE)
-        motion = motion if quiet.all() else fit_motion(knots, width_m, quiet)
-        if motion is None:
-            return Disagreements()
-        events, _ = _find_events(knots, motion, quiet, LATER_QUANTILE)
+        compared = compare_by_duration(knots, motion)
+        _, quiet = _find_events(knots, motion, compared, quiet, FIRST_QUANTILE)
+        if not quiet.all():
+            motion = fit_motion(knots, width_m, quiet)
+            if motion is None:
+                return Disagreements()
+            compared = compare_by_duration(knots, motion)
+        events, _ = _find_events(knots, motion, compared, quiet, LATER_QUANTILE)
         return Disagreements(tuple(events), decide_jumps(knots, motion, steps))
     return Disagreements()
 
 
-def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) -> tuple[list[SlipEvent], Bools]:
+def _find_events(
+    knots: Knots, motion: Motion, compared: list[tuple[float, ComparedWindows]], quiet: Bools, quantile: float
+) -> tuple[list[SlipEvent], Bools]:
     """Return the events, which do not overlap, and the knots (m,) outside of them.
 
     Parameters
     ----------
+    compared : of `compare_by_duration`
     quiet : (m,) knots that the model's error is taken from; it is this quantile of what they show
     """
-    windows, distance2, false_rate, error = _weigh(knots, motion, quiet, quantile)
+    windows, distance2, false_rate, error = _weigh(compared, quiet, quantile)
     row, outside = np.arange(len(knots.t)), np.ones(len(knots.t), np.bool_)
     if not len(windows.begin):
         return [], outside
@@ -171,7 +178,7 @@ def _find_events(knots: Knots, motion: Motion, quiet: Bools, quantile: float) ->
 
 
 def _weigh(
-    knots: Knots, motion: Motion, quiet: Bools, quantile: float
+    compared: list[tuple[float, ComparedWindows]], quiet: Bools, quantile: float
 ) -> tuple[ComparedWindows, Floats, Floats, Floats]:
     """Return the windows (w,) of all durations that disagree with the model, and how surely.
 
@@ -182,17 +189,16 @@ def _weigh(
     """
     shown: list[tuple[ComparedWindows, Floats]] = []
     error = np.full(3, LEAST_MODEL_ERROR)
-    for duration, first, last in spans_by_duration(knots):
-        windows = compare(knots, motion, first, last, RESPONSE_S)
+    for duration, windows in compared:
         error = model_error(windows, quiet, quantile)
         # while the robot parks, sensors without noise leave no variance to divide by
-        windows = windows.rows(windows.path_m > MOVES_MPS * duration)
-        square = (windows.residual**2 / (windows.sensor + (error * windows.path_m[:, None]) ** 2)).sum(axis=1)
-        missed = np.hypot(np.hypot(windows.ahead, windows.turned), windows.aside)
-        drives = np.abs(windows.model_ahead) > np.abs(windows.model_turned)
-        least = np.where(_of_one_side(windows) & drives, LEAST_OF_SIDE, LEAST_SHARE)
-        shows = (square > LEAST_DISTANCE2) & (missed > least * windows.path_m)
-        shown.append((windows.rows(shows), square[shows]))
+        moving = windows.rows(windows.path_m > MOVES_MPS * duration)
+        missed2 = moving.residual**2
+        square = (missed2 / (moving.sensor + (error * moving.path_m[:, None]) ** 2)).sum(axis=1)
+        drives = np.abs(moving.model_ahead) > np.abs(moving.model_turned)
+        least = np.where(_of_one_side(moving) & drives, LEAST_OF_SIDE, LEAST_SHARE)
+        shows = (square > LEAST_DISTANCE2) & (np.sqrt(missed2.sum(axis=1)) > least * moving.path_m)
+        shown.append((moving.rows(shows), square[shows]))
     windows = ComparedWindows._make(map(np.concatenate, zip(*(one for one, _ in shown), strict=True)))
     square, beyond = np.concatenate([one for _, one in shown]), _exceeds(windows)
     # what stands still is rarer than any slip, and so is its opposite: twice the motion of the wheels

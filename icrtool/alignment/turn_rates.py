@@ -164,7 +164,7 @@ def measure_courses(track: Track, turn: TurnRate, guess: Guess) -> Courses:
     of_scale = product(centred(laid(step * psi) - guess.x * turned * swing)).real / square - turned[end]
     # about no bias, no x and no delay
     bias_at = np.interp(t[end], turn.t, guess.bias)
-    angle = np.angle(seen * np.exp(1j * turned[end])) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
+    angle = np.angle(seen * swing[end]) + bias_at * of_bias + guess.x * of_x + guess.delay_s * of_delay
     found = Courses(
         t[begin], t[end], angle, of_x, of_delay, of_bias, of_scale, track.place_std_m / np.sqrt(square),
         np.abs(seen), product(centred(laid(u * nose))).real / square,
