@@ -274,8 +274,10 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
     scatter_rad : of the heading about the course over ground
     width_m : the track width b
     """
+    if scatter_rad < NOISY_SCATTER_RAD:
+        return None
     stamps, rows = np.unique(log.heading.stamp_ns, return_index=True)
-    if scatter_rad < NOISY_SCATTER_RAD or len(stamps) < 3:
+    if len(stamps) < 3:
         return None
     # about a sensor's upward axis
     rates = np.zeros((len(stamps) - 1, 3))

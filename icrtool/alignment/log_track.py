@@ -146,7 +146,7 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
     stated = math.sqrt(float(np.median(known))) if len(known) else USUAL_POSITION_STD_M
     if len(gnss.stamp_ns) < FEWEST_FIXES:
         return stated
-    bend = np.hypot(np.diff(gnss.north_m, 2), np.diff(gnss.east_m, 2))
+    bend = np.sqrt(np.diff(gnss.north_m, 2) ** 2 + np.diff(gnss.east_m, 2) ** 2)
     seen = float(np.median(bend)) / (MEDIAN_OF_RAYLEIGH * math.sqrt(6.0))
     return seen if seen > NOISIER * stated else stated
 

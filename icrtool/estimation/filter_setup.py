@@ -302,8 +302,8 @@ def _response_variance(data: FilterInputs, width_m: float) -> Floats:
     """
     t = data.wheel_t
     turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m
-    before, now, after = (np.interp(t + shift, t, turned) for shift in (-CHANGE_S, 0.0, CHANGE_S))
-    change = (after - 2.0 * now + before) / CHANGE_S
+    before, after = (np.interp(t + shift, t, turned) for shift in (-CHANGE_S, CHANGE_S))
+    change = (after - 2.0 * turned + before) / CHANGE_S
     return np.asarray((RESPONSE_S * change) ** 2 / CHANGE_S)
 
 

@@ -49,7 +49,7 @@ def mad_std(values: Floats, centre: float | None = None) -> float:
     if not len(values):
         return float("nan")
     middle = float(np.median(values)) if centre is None else centre
-    return MAD_TO_STD * float(np.median(np.abs(values - middle)))
+    return MAD_TO_STD * float(np.median(np.abs(values - middle), overwrite_input=True))
 
 
 def soft_l1_loss(z: Floats) -> float:

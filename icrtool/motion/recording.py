@@ -341,8 +341,8 @@ def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: 
 
     def evaluate(x: Floats) -> tuple[Floats, Floats]:
         read = at[every] + x[2]
-        by_scale, by_lead = (np.diff(np.interp(read, t, column)) for column in (turned, x[0] * rate))
-        return x[0] * by_scale + x[1] * lasting - made, np.column_stack([by_scale, lasting, by_lead])
+        by_scale, by_lead = (np.diff(np.interp(read, t, column)) for column in (turned, rate))
+        return x[0] * by_scale + x[1] * lasting - made, np.column_stack([by_scale, lasting, x[0] * by_lead])
 
     zero = np.zeros(3)
     return GyroLine(*robust_least_squares(evaluate, zero, zero, GYRO_PRIOR_STD, overlap=10.0).x.tolist())

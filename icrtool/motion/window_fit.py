@@ -357,8 +357,9 @@ class Pool:
         self.recording = np.repeat(np.arange(len(windows)), sizes)
         stretch_m = STRETCH_M * np.array([size_of(one) for one in widths_m])
         stretch = np.column_stack([self.recording, np.floor(self.start_m / stretch_m[self.recording])])
-        self.group = np.unique(stretch, axis=0, return_inverse=True)[1].reshape(-1)
-        covered_m = float(stretch_m[np.unique(stretch, axis=0)[:, 0].astype(np.int64)].sum())
+        stretches, group = np.unique(stretch, axis=0, return_inverse=True)
+        self.group = group.reshape(-1)
+        covered_m = float(stretch_m[stretches[:, 0].astype(np.int64)].sum())
         self.overlap = max(float(self.length_m.sum()) / len(KINDS) / covered_m, 1.0)
 
     def prior(self, model: MotionModel) -> tuple[Floats, Floats]:
