@@ -329,17 +329,16 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
         return
     headings, psi, rows = sensors.headings, table.heading_rad, np.flatnonzero(used)
     stamps = headings.stamp_ns[rows]
-    # from the end on: a heading is compared with the states before it, which are then still the filter's
-    for lo in reversed(range(0, len(psi), ROWS_AT_ONCE)):
+    seen_s = (stamps - table.stamp_ns[0]) / 1e9
+    off = wrapped(headings.heading_rad[rows] - np.interp(seen_s, table.t_s, psi))
+    for lo in range(0, len(psi), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE)
         last = np.searchsorted(stamps, table.stamp_ns[some], side="right") - 1
-        row, seen_s = rows[last], (stamps[last] - table.stamp_ns[0]) / 1e9
-        age = table.t_s[some] - seen_s
+        age = table.t_s[some] - seen_s[last]
         recent = (last >= 0) & (age < LONGEST_CARRY_S)
-        std = np.sqrt(headings.var_rad2[row] + TURN_WANDER_RAD**2 * np.abs(age))
+        std = np.sqrt(headings.var_rad2[rows[last]] + TURN_WANDER_RAD**2 * np.abs(age))
         clear = recent & (CLEARLY * std < table.std_heading_rad[some])
-        off = wrapped(headings.heading_rad[row] - np.interp(seen_s, table.t_s, psi))
-        np.add(psi[some], off, out=psi[some], where=clear)
+        np.add(psi[some], off[last], out=psi[some], where=clear)
         np.copyto(table.std_heading_rad[some], std, where=clear)
 
 
