@@ -6,7 +6,7 @@ import numpy as np
 from table import Table, cpu_seconds_of
 
 from icrtool.kernels.arrays import Floats
-from icrtool.kernels.error_statistics import block_sums, cut_blocks, error_intervals, error_summary, sort_trials
+from icrtool.kernels.error_statistics import RankedTrials, block_sums, cut_blocks, error_intervals, error_summary
 from icrtool.kernels.open_loop import open_loop_errors, open_loop_errors_direct
 from icrtool.kernels.track import FrozenIcrs, Track, trial_ends
 
@@ -62,7 +62,8 @@ def open_loop_rows(table: Table, hours: float, repeats: int) -> None:
     def intervals() -> None:
         for h, horizon in enumerate(HORIZONS_M):
             blocks, p95 = cut_blocks(ends[:, h] >= 0, drive.distance, horizon), float(summary.p95[h])
-            sums = block_sums(errors[:, h], blocks, sort_trials(errors[:, h]), float(summary.p50[h]), p95)
+            ranked = RankedTrials.of(errors[:, h])
+            sums = block_sums(errors[:, h], blocks, ranked, float(summary.p50[h]), p95)
             error_intervals(errors[:, h], blocks, sums, p95)
 
     jobs = {

@@ -158,10 +158,10 @@ def _sum_up(
     errors_m: Floats, path_m: Floats, horizon_m: float
 ) -> tuple[documents.ErrorsAt, statistics.BlockSums | None]:
     """Return p95 and mean [m] of trials (k,) of one horizon with their intervals, and the sums of blocks of path."""
-    summary = statistics.error_summary(errors_m[:, None])
-    p50, p95, expected = (float(one[0]) for one in (summary.p50, summary.p95, summary.expected))
+    ranked = statistics.RankedTrials.of(errors_m)
+    _, expected, p50, p95, _ = ranked.summary()
     blocks = statistics.cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
-    sums = statistics.block_sums(errors_m, blocks, statistics.sort_trials(errors_m), p50, p95)
+    sums = statistics.block_sums(errors_m, blocks, ranked, p50, p95)
     low, high, p95_low, p95_high = statistics.error_intervals(errors_m, blocks, sums, p95)
     return documents.ErrorsAt(horizon_m, *map(known, (p95, p95_low, p95_high, expected, low, high))), sums
 

@@ -121,13 +121,13 @@ def measure_errors(
                     touching = [None if one is None else one[sparse] for one in slipping]
                 else:
                     errors, tested, touching = _errors(track, model, ends, pool), blocks, slipping
-                # Sorted beside each other, columns of a long log would fill the memory.
+                # Beside each other, columns of a long log would fill the memory.
                 each = pool.map if together > THREADS else map
                 rows.extend(each(_at_horizon, group.tolist(), errors.T, of_few.heading.T[columns], tested, touching))
                 if model.name == "icr":
                     first = len(errors) if learned is None else learned
-                    before += _rows(group, errors[:first])
-                    after += _rows(group, errors[first:])
+                    before += each(_row, group.tolist(), errors[:first].T)
+                    after += each(_row, group.tolist(), errors[first:].T)
                 if sink is not None:
                     if isinstance(model, ComparedRow):
                         of_some, errors = errors, np.full((len(track.distance), len(group)), np.nan)
@@ -251,12 +251,10 @@ def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tu
     return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
 
 
-def _rows(horizons: Floats, errors: Floats) -> list[documents.ErrorRow]:
-    """Return errors (n, h) [m] in numbers, a row a horizon."""
-    found = statistics.error_summary(errors)
-    return list(
-        map(documents.ErrorRow, *plain([horizons, found.trials, found.expected, found.p50, found.p95, found.largest]))
-    )
+def _row(metres: float, errors: Floats) -> documents.ErrorRow:
+    """Return the errors (n,) [m] at one horizon in numbers."""
+    trials, *numbers = statistics.RankedTrials.of(errors).summary()
+    return documents.ErrorRow(metres, trials, *map(known, numbers))
 
 
 def _blocks(path_m: Floats, horizons: Floats, tried: Iterable[Bools]) -> list[statistics.Blocks | None]:
@@ -283,20 +281,19 @@ def _at_horizon(
 
     `slipping` (n,) marks the trials that touch a slip event.
     """
-    ordered = statistics.sort_trials(errors)
-    trials, *found = (one[0] for one in statistics.summary_of_sorted([ordered]))
-    expected, p50, p95, largest = map(float, found)
+    ranked = statistics.RankedTrials.of(errors)
+    trials, expected, p50, p95, largest = ranked.summary()
     # Bins that show the bulk of the trials, few outliers apart, in at most some hundred bins.
     shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
-    bins = statistics.histogram_sorted(ordered, statistics.round_bin_width(shown_m))
-    sums = statistics.block_sums(errors, blocks, ordered, p50, p95)
-    del ordered  # as long as a column of the log, like what the intervals need
+    bins = ranked.histogram(statistics.round_bin_width(shown_m))
+    sums = statistics.block_sums(errors, blocks, ranked, p50, p95)
+    del ranked  # as long as a column of the log, like what the intervals need
     intervals = statistics.error_intervals(errors, blocks, sums, p95)
-    of_turns = statistics.error_summary(np.degrees(turned[:, None]))
+    _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.of(np.degrees(turned)).summary()
     shares = 100.0 * expected / metres, 100.0 * p95 / metres
-    numbers = (expected, p50, p95, largest, *shares, *intervals, of_turns.expected[0], of_turns.p95[0])
-    row = documents.SummaryRow(metres, int(trials), *(known(float(number)) for number in numbers))
-    free = None if slipping is None else _rows(np.array([metres]), errors[~slipping, None])[0]
+    numbers = (expected, p50, p95, largest, *shares, *intervals, turn_mean, turn_p95)
+    row = documents.SummaryRow(metres, trials, *(known(float(number)) for number in numbers))
+    free = None if slipping is None else _row(metres, errors[~slipping])
     return _AtHorizon(row, bins, sums, free)
 
 

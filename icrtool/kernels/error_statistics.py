@@ -8,10 +8,10 @@ path, not from trials. No kernel is here.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Bools, Floats, Ints, rows_of_cells
 
@@ -200,7 +200,7 @@ def difference_half_width(
 
 
 def block_sums(
-    errors_m: Floats, blocks: Blocks | None, ordered: Floats, p50_m: float, p95_m: float
+    errors_m: Floats, blocks: Blocks | None, ranked: RankedTrials, p50_m: float, p95_m: float
 ) -> BlockSums | None:
     """Sum the trials of one horizon over blocks of path.
 
@@ -208,7 +208,7 @@ def block_sums(
     ----------
     errors_m : (n,) [m], NaN where there was no trial
     blocks : of `cut_blocks`
-    ordered : errors of the trials in ascending order
+    ranked : of `errors_m`
     p50_m, p95_m : percentiles of all
 
     Returns
@@ -227,20 +227,62 @@ def block_sums(
         # how a percentile grows with its share, over the uncertainty of the share (Woodruff 1952)
         std = math.sqrt(variance_of_sum(np.asarray((count - (1.0 - share) * trials) / len(errors))))
         low, high = max(share - std, 0.0), min(share + std, 1.0)
-        growth.append((quantile(ordered, high) - quantile(ordered, low)) / (high - low) if high > low else 0.0)
+        growth.append((ranked.quantile(high) - ranked.quantile(low)) / (high - low) if high > low else 0.0)
     return BlockSums(trials, sums, above[0], above[1], *growth)
 
 
-def quantile(ordered: Floats, share: float) -> float:
-    """Return numpy's 'linear' quantile of sorted values."""
-    rank = share * (len(ordered) - 1)
-    below = math.floor(rank)
-    low, high = ordered[below], ordered[min(below + 1, len(ordered) - 1)]
-    return float(low + (high - low) * (rank - below))
+CELLS = 1024
+"""So many that few errors are in one."""
 
 
-TAIL = 0.05
-"""Share of trials above the 95th percentile."""
+class RankedTrials(NamedTuple):
+    """The trials of one horizon, in which any rank is found without sorting: by cells of equal width.
+
+    Attributes
+    ----------
+    errors_m : (m,) [m], in the order of their starts
+    cell : int16 (m,) the cell of each
+    before : (cells + 1,) trials in all cells before each
+    """
+
+    errors_m: Floats
+    cell: NDArray[np.int16]
+    before: Ints
+
+    @classmethod
+    def of(cls, errors_m: Floats) -> RankedTrials:
+        """Return the trials among errors (n,) [m], NaN where there was none."""
+        trials = errors_m[~np.isnan(errors_m)]
+        width = trials.max(initial=0.0) / CELLS
+        cell = (trials / (width or 1.0)).astype(np.int16)
+        return cls(trials, cell, np.append(0, np.cumsum(np.bincount(cell))))
+
+    def quantile(self, share: float) -> float:
+        """Return numpy's 'linear' quantile of the errors, of which there are some."""
+        last = len(self.errors_m) - 1
+        rank = share * last
+        ranks = np.array([math.floor(rank), min(math.floor(rank) + 1, last)])
+        # plain numbers: comparing with those of numpy would widen the cells
+        begin, end = (np.searchsorted(self.before, ranks, side="right") - 1).tolist()
+        near = self.errors_m[(self.cell >= begin) & (self.cell <= end)]
+        ranks -= self.before[begin]
+        low, high = np.partition(near, ranks)[ranks].tolist()
+        return float(low + (high - low) * (rank % 1.0))
+
+    def summary(self) -> tuple[int, float, float, float, float]:
+        """Return number, mean, p50, p95 and largest; NaN without trials."""
+        if not len(self.errors_m):
+            return 0, math.nan, math.nan, math.nan, math.nan
+        p50, p95 = map(self.quantile, SHARES.values())
+        return len(self.errors_m), float(self.errors_m.mean()), p50, p95, float(self.errors_m.max())
+
+    def histogram(self, bin_width_m: float) -> Histogram:
+        """Count the trials in bins of `bin_width_m` [m] from zero to the largest error (Figs. 28-30)."""
+        counts = np.bincount((self.errors_m / bin_width_m).astype(np.int32))
+        edges = bin_width_m * np.arange(len(counts) + 1, dtype=np.float64)
+        return Histogram(edges[:-1], edges[1:], 100.0 * counts / max(len(self.errors_m), 1))
+
+
 BLOCK_PARTS = 4
 """Blocks begin at every quarter of a horizon."""
 BINS = 50
@@ -255,24 +297,9 @@ def error_summary(errors_m: Floats) -> Summary:
     Section 6.4. The paper's expected error weighs a histogram, which is the mean once bins are narrow. Percentiles
     interpolate linearly between order statistics, as ``numpy.percentile`` does.
     """
-    # One at a time: a column of a long log is large.
-    columns = [summary_of_sorted([sort_trials(column)]) for column in errors_m.T]
-    return Summary(*(np.concatenate(numbers) for numbers in zip(*columns, strict=True)))
-
-
-def sort_trials(errors_m: Floats) -> Floats:
-    """Return the errors of one horizon's trials in ascending order, without the NaN of those that were none."""
-    ordered = np.sort(errors_m)  # NaN last
-    return ordered[: np.searchsorted(ordered, np.inf, side="right")]
-
-
-def summary_of_sorted(ordered: Sequence[Floats]) -> Summary:
-    """Summarise trials as `error_summary` does; `ordered` has the result of `sort_trials` for each horizon."""
-    table = np.full((4, len(ordered)), np.nan)
-    for h, errors in enumerate(ordered):
-        if len(errors):
-            table[:, h] = errors.mean(), quantile(errors, 0.5), quantile(errors, 1.0 - TAIL), errors[-1]
-    return Summary(np.array([len(errors) for errors in ordered], np.int64), *table)
+    columns = [RankedTrials.of(column).summary() for column in errors_m.T]
+    trials, *numbers = np.array(columns).reshape(-1, len(Summary._fields)).T
+    return Summary(trials.astype(np.int64), *numbers)
 
 
 def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
@@ -307,22 +334,6 @@ def round_bin_width(largest_m: float) -> float:
     least = largest_m / BINS
     power = 10.0 ** math.floor(math.log10(least))
     return next((factor * power for factor in (1.0, 2.0, 5.0) if factor * power >= least), 10.0 * power)
-
-
-def histogram_sorted(ordered: Floats, bin_width_m: float) -> Histogram:
-    """Count the trials of one horizon in bins of `bin_width_m` from zero to the largest error (Figs. 28-30).
-
-    Parameters
-    ----------
-    ordered : of `sort_trials` [m]
-    bin_width_m : [m], see `round_bin_width`
-    """
-    if not len(ordered):
-        return Histogram(*np.empty((3, 0)))
-    edges = bin_width_m * np.arange(int(ordered[-1] / bin_width_m) + 3, dtype=np.float64)
-    edges = edges[: np.searchsorted(edges, ordered[-1], side="right") + 1]
-    counts = np.diff(np.searchsorted(ordered, edges))
-    return Histogram(edges[:-1], edges[1:], 100.0 * counts / len(ordered))
 
 
 def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool, tuple[float, float]] | None:

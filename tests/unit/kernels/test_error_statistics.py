@@ -7,15 +7,13 @@ import pytest
 from scipy.special import stdtrit
 
 from icrtool.kernels.error_statistics import (
+    RankedTrials,
     block_sums,
     cut_blocks,
     error_intervals,
     error_summary,
-    histogram_sorted,
     round_bin_width,
-    sort_trials,
     student_factor,
-    summary_of_sorted,
 )
 
 STATES_PER_M = 40  # of the drives made here
@@ -41,10 +39,9 @@ def errors_along(path_blocks, rng, wander_m=0.0):
 
 
 def interval_of(errors, path, horizon=1.0):
-    blocks, ordered = cut_blocks(~np.isnan(errors), path, horizon), sort_trials(errors)
-    summary = summary_of_sorted([ordered])
-    p50, p95 = float(summary.p50[0]), float(summary.p95[0])
-    return error_intervals(errors, blocks, block_sums(errors, blocks, ordered, p50, p95), p95)
+    blocks, ranked = cut_blocks(~np.isnan(errors), path, horizon), RankedTrials.of(errors)
+    _, _, p50, p95, _ = ranked.summary()
+    return error_intervals(errors, blocks, block_sums(errors, blocks, ranked, p50, p95), p95)
 
 
 class TestSummary:
@@ -61,6 +58,15 @@ class TestSummary:
             (summary.largest, np.nanmax(errors, axis=0)),
         ]:
             np.testing.assert_allclose(column, expected, rtol=1e-14)  # another order of adding
+
+    @pytest.mark.parametrize("scale", [0.0, 1e-300, 1.0, 1e300])
+    def test_any_quantile_equals_numpys_whatever_the_errors(self, scale):
+        rng = np.random.default_rng(1)
+        errors = scale * np.floor(20.0 * rng.exponential(size=500))  # many alike
+        for some in (errors, np.append(errors, 1e6 * scale), errors[:1], errors[:2]):
+            ranked = RankedTrials.of(some)
+            for share in (0.0, 0.05, 0.5, 0.95, 1.0, *rng.random(9)):
+                assert ranked.quantile(share) == pytest.approx(np.quantile(some, share), rel=1e-14, abs=0.0)
 
     def test_of_no_trial_is_nan_and_of_one_is_that_trial(self):
         summary = error_summary(np.array([[np.nan, 2.0], [np.nan, np.nan]]))
@@ -139,13 +145,13 @@ class TestIntervals:
 class TestHistogram:
     def test_is_percent_of_the_trials_per_bin(self):
         errors = np.array([0.0, 0.05, 0.1, 0.25, np.nan, 0.31])
-        bins = histogram_sorted(sort_trials(errors), 0.1)
+        bins = RankedTrials.of(errors).histogram(0.1)
         np.testing.assert_allclose(bins.left, [0.0, 0.1, 0.2, 0.3])
         np.testing.assert_allclose(bins.right, [0.1, 0.2, 0.3, 0.4])
         np.testing.assert_allclose(bins.percent, [40.0, 20.0, 20.0, 20.0])
 
     def test_of_no_trial_is_empty(self):
-        assert len(histogram_sorted(sort_trials(np.array([np.nan])), 0.1).percent) == 0
+        assert len(RankedTrials.of(np.array([np.nan])).histogram(0.1).percent) == 0
 
     @pytest.mark.parametrize(
         ("largest", "width"), [(0.0, 0.01), (math.nan, 0.01), (0.5, 0.01), (0.51, 0.02), (12.0, 0.5), (49.0, 1.0)]
@@ -155,6 +161,6 @@ class TestHistogram:
 
     def test_expected_error_is_the_mean_of_the_histogram_as_bins_narrow(self):
         errors = np.random.default_rng(0).exponential(size=5000)
-        bins = histogram_sorted(sort_trials(errors), 0.001)
+        bins = RankedTrials.of(errors).histogram(0.001)
         middle = 0.5 * (bins.left + bins.right)
         assert np.sum(middle * bins.percent) / 100.0 == pytest.approx(errors.mean(), abs=0.0005)
