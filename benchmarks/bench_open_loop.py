@@ -44,7 +44,7 @@ def drive_around(hours: float) -> tuple[Track, FrozenIcrs]:
 def open_loop_rows(table: Table, hours: float, repeats: int) -> None:
     """Add the times of the analysis of one model; one core, compilation is not counted."""
     tiny = drive_around(0.01)
-    open_loop_errors_direct(*tiny, np.zeros((1, 1), dtype=np.int64))
+    open_loop_errors_direct(*tiny, np.zeros((1, 1), np.int32))
     drive, icrs = drive_around(hours)
     ends = trial_ends(drive, HORIZONS_M)
     by_direct = "by direct integration, compiled"

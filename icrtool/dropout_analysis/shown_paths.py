@@ -54,7 +54,7 @@ def worst_trials(
     compared : held-out models, of which ``recommended`` is evaluated; without them the momentary ICRs
     """
     track, models = track_of(run), models_of(run)
-    ends, rows = counted_ends(track, horizon_m, starts), compared.rows if compared is not None else ()
+    ends, rows = counted_ends(track, np.array([horizon_m]), starts), compared.rows if compared is not None else ()
     held_out = next((row for row in rows if row.name == RECOMMENDED), None)
     if compared is not None and held_out is not None:
         some = compared.table.trials[0].starts

@@ -14,14 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from icrtool.calibration.run_models import models_of
 from icrtool.errors import RunError
 from icrtool.estimation.observability import WEAK_SHARE
-from icrtool.kernels.arrays import Bools, Floats, Ints, rows_of_cells
+from icrtool.kernels.arrays import Bools, Floats, Ints, Rows, rows_of_cells
 from icrtool.kernels.open_loop import open_loop_errors
-from icrtool.kernels.track import STANDING, Track, trial_ends
+from icrtool.kernels.track import STANDING, Track, ends_from
 from icrtool.records.choices import Starts
 from icrtool.records.dropout_document import ReferenceRow, TurningSplit
 from icrtool.records.plain_data import known
@@ -44,16 +43,14 @@ def standing_states(track: Track) -> Bools:
     return standing
 
 
-def leave_out(ends: NDArray[np.signedinteger], standing: Bools) -> None:
-    """Mark the trials of standing starts as none, in the ends (n, h) of `trial_ends`."""
-    ends[standing[:, None] & (ends >= 0)] = STANDING
-
-
-def counted_ends(track: Track, horizon_m: float, starts: Starts) -> Ints:
-    """Return `trial_ends` (n, 1) of one horizon, without the starts that do not count."""
-    ends = trial_ends(track, np.array([horizon_m]))
-    if starts == "moving":
-        leave_out(ends, standing_states(track))
+def counted_ends(track: Track, horizons_m: Floats, counted: Starts, starts: Ints | None = None) -> Rows:
+    """Return `ends_from` some starts, default all states, those marked that do not count."""
+    starts = starts if starts is not None else np.arange(len(track.distance))
+    ends = ends_from(track, horizons_m, starts)
+    if counted == "moving":
+        standing = standing_states(track)[starts]
+        for column in ends.T:
+            column[standing & (column >= 0)] = STANDING
     return ends
 
 
@@ -98,10 +95,10 @@ class DrawnTrials(NamedTuple):
 
     horizon_m: float
     start: Ints
-    end: Ints
+    end: Rows
 
 
-def drawn_trials(horizons_m: Floats, ends: NDArray[np.int32]) -> list[DrawnTrials]:
+def drawn_trials(horizons_m: Floats, ends: Rows) -> list[DrawnTrials]:
     """Return `DRAWS` trials of each horizon (h,), or none, by the states (h, n) at which those of all starts end."""
     drawn = []
     for horizon_m, column in zip(horizons_m.tolist(), ends, strict=True):
@@ -201,7 +198,7 @@ def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
     What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
     """
     track = track_of(run)
-    ends = counted_ends(track, SPLIT_HORIZON_M, starts)
+    ends = counted_ends(track, np.array([SPLIT_HORIZON_M]), starts)
     tried = np.flatnonzero(ends[:, 0] >= 0)
     straight = heading_range(track, SPLIT_HORIZON_M)[tried] < STRAIGHT_RAD
     models = [model for model in models_of(run) if model.name in SPLIT_MODELS]

@@ -8,31 +8,27 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from icrtool.calibration.run_models import ComparedRow, Model, models_of
 from icrtool.dropout_analysis.report import OpenLoopErrors
 from icrtool.dropout_analysis.starts import (
     DrawnTrials,
+    counted_ends,
     drawn_trials,
     first_learned,
-    leave_out,
     reference_error,
     standing_states,
 )
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels import error_statistics as statistics
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints, Rows
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.kernels.open_loop import open_loop_errors
+from icrtool.kernels.open_loop import fill_open_loop_errors, open_loop_errors
 from icrtool.kernels.track import (
-    STANDING,
     FrozenIcrs,
     Track,
     TrialCounts,
     count_trials,
-    ends_finder,
-    ends_from,
     trial_ends,
 )
 from icrtool.motion.recording import MOST_TRIALS, TrialErrors, Trials
@@ -98,8 +94,7 @@ def measure_errors(
     sparse = starts_of_further
     if sparse is None:
         sparse = np.flatnonzero(~standing)[:: max(np.count_nonzero(~standing) // MOST_TRIALS, 1)].copy()
-    left_out = standing if starts == "moving" else np.zeros_like(standing)
-    few = _errors_of_few(track, predictors, horizons, sparse, left_out)
+    few = _errors_of_few(track, predictors, Trials(sparse, counted_ends(track, horizons, starts, sparse)))
     counts: list[TrialCounts] = []
     drawn: list[list[DrawnTrials]] = []
     found: list[list[_AtHorizon]] = [[] for _ in predictors]
@@ -109,8 +104,8 @@ def measure_errors(
     with ThreadPoolExecutor(THREADS) as pool:
         for columns in [slice(begin, begin + together) for begin in range(0, len(horizons), together)]:
             group = horizons[columns]
-            ends, of_group = _ends(track, group, left_out, pool)
-            counts.append(of_group)
+            ends = counted_ends(track, group, starts).T
+            counts.append(count_trials(ends.T))
             blocks = _blocks(track.distance, group, (one >= 0 for one in ends))
             slipping = _slipping_trials(run, ends)
             for model, rows, of_few in zip(predictors, found, few, strict=True):
@@ -151,16 +146,12 @@ def measure_errors(
     )
 
 
-def _errors_of_few(
-    track: Track, predictors: Sequence[Model | ComparedRow], horizons: Floats, starts: Ints, left_out: Bools
-) -> list[TrialErrors]:
-    """Return the errors (k, h) from some starts by model, of the filter's models those of their turns alone.
+def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], trials: Trials) -> list[TrialErrors]:
+    """Return the errors (k, h) in some trials by model, of the filter's models those of their turns alone.
 
     Of all horizons at once: a model drives the log for them once, before the tables of all starts fill the memory.
     """
-    trials = Trials(starts, ends_from(track, horizons, starts))
-    trials.ends[left_out[starts]] = STANDING
-    none = np.empty((0, len(horizons)))
+    none = np.empty((0, trials.ends.shape[1]))
     return [
         model.errors_of(trials)
         if isinstance(model, ComparedRow)
@@ -178,7 +169,7 @@ class _AtHorizon(NamedTuple):
     free: documents.ErrorRow | None
 
 
-def _slipping_trials(run: Run, ends: NDArray[np.int32]) -> list[Bools | None]:
+def _slipping_trials(run: Run, ends: Rows) -> list[Bools | None]:
     """Return which trials (n,) of each horizon touch a slip event, by their ends (h, n); None where there is none."""
     if not run.sensors.events:
         return [None] * len(ends)
@@ -235,22 +226,6 @@ def check_horizons(horizons_m: Iterable[float]) -> Floats:
     return horizons
 
 
-def _ends(track: Track, horizons: Floats, left_out: Bools, pool: Executor) -> tuple[NDArray[np.int32], TrialCounts]:
-    """Return where the trials of all starts end (h, n), as `trial_ends` has it in half the memory; and their counts."""
-    states, find = len(track.distance), ends_finder(track)
-    ends = np.empty((len(horizons), states), np.int32)
-
-    def fill(lo: int) -> TrialCounts:
-        hi = min(lo + STARTS_AT_ONCE, states)
-        found = find(horizons, np.arange(lo, hi))
-        leave_out(found, left_out[lo:hi])
-        ends[:, lo:hi] = found.T
-        return count_trials(found)
-
-    counts = pool.map(fill, range(0, states, STARTS_AT_ONCE))
-    return ends, TrialCounts(*(np.sum(column, axis=0) for column in zip(*counts, strict=True)))
-
-
 def _row(metres: float, errors: Floats) -> documents.ErrorRow:
     """Return the errors (n,) [m] at one horizon in numbers."""
     trials, *numbers = statistics.RankedTrials.of(errors).summary()
@@ -262,13 +237,12 @@ def _blocks(path_m: Floats, horizons: Floats, tried: Iterable[Bools]) -> list[st
     return [statistics.cut_blocks(one, path_m, metres) for one, metres in zip(tried, horizons.tolist(), strict=True)]
 
 
-def _errors(track: Track, model: Model, ends: NDArray[np.int32], pool: Executor) -> Floats:
+def _errors(track: Track, model: Model, ends: Rows, pool: Executor) -> Floats:
     """Return the errors (n, h) [m] of all starts, one horizon contiguous, NaN where there is no trial."""
     states, errors = ends.shape[1], np.empty(ends.shape)
 
     def fill(lo: int) -> None:
-        hi = min(lo + STARTS_AT_ONCE, states)
-        errors[:, lo:hi] = open_loop_errors(track, model.icrs, ends[:, lo:hi].T.astype(np.int64), lo).T
+        fill_open_loop_errors(track, model.icrs, ends, errors, lo, min(lo + STARTS_AT_ONCE, states))
 
     list(pool.map(fill, range(0, states, STARTS_AT_ONCE)))
     return errors.T

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Rows = NDArray[np.int32]
 Complexes = NDArray[np.complex128]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]

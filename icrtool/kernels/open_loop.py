@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Ints
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Rows
 from icrtool.kernels.compiled import njit
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, euler_step
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
@@ -39,7 +39,7 @@ Columns = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
 
 @njit
 def integrate_trials(
-    columns: Columns, icrs: FrozenIcrs, ends: Ints, lo: int, row_lo: int, row_hi: int, errors: Floats
+    columns: Columns, icrs: FrozenIcrs, ends: Rows, lo: int, row_lo: int, row_hi: int, errors: Floats
 ) -> None:
     """Fill rows [row_lo, row_hi) of `errors` (n_horizons, n_starts): each path is integrated once for all horizons.
 
@@ -101,14 +101,14 @@ def compiled_icrs(icrs: FrozenIcrs) -> FrozenIcrs:
     return FrozenIcrs(*[np.require(column, np.float64, ["C", "A", "W"]) for column in icrs])
 
 
-def open_loop_errors_direct(track: Track, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
+def open_loop_errors_direct(track: Track, icrs: FrozenIcrs, ends: Rows, lo: int = 0) -> Floats:
     """Integrate every trajectory step by step: O(starts x steps), the oracle.
 
     Parameters
     ----------
     track : of recorded states (n,)
     icrs : what each start drives with
-    ends : int64 (n_starts, n_horizons) of `trial_ends`, for the starts from `lo` on
+    ends : (n_starts, n_horizons) of `trial_ends`, for the starts from `lo` on
 
     Returns
     -------
@@ -297,7 +297,7 @@ def freeze_starts(plan: BlockPlan, icrs: FrozenIcrs, heading: Floats, turn: Floa
 
 @njit
 def fill_errors(
-    ends: Ints, row_lo: int, first: int, sums: Floats, frozen: Floats, start: int, north: Floats, east: Floats,
+    ends: Rows, row_lo: int, first: int, sums: Floats, frozen: Floats, start: int, north: Floats, east: Floats,
     errors: Floats,
 ) -> None:  # fmt: skip
     """Fill `errors` of the trials that end at the states of `sums`, which begin at `first`.
@@ -344,7 +344,7 @@ def solve_block(
     columns: Columns,
     icrs: FrozenIcrs,
     plan: BlockPlan,
-    ends: Ints,
+    ends: Rows,
     row_lo: int,
     starts: slice,
     last: int,
@@ -366,34 +366,40 @@ def solve_block(
         fill_errors(ends, row_lo, steps.first, sums, frozen, starts.start, north, east, errors)
 
 
-def open_loop_errors(track: Track, icrs: FrozenIcrs, ends: Ints, lo: int = 0) -> Floats:
-    """Return what `open_loop_errors_direct` returns, equal to 1e-9 m, far sooner.
+def open_loop_errors(track: Track, icrs: FrozenIcrs, ends: Rows, lo: int = 0) -> Floats:
+    """Return what `open_loop_errors_direct` returns, equal to 1e-9 m, far sooner."""
+    by_horizon = np.ascontiguousarray(ends.T)
+    errors = np.empty(by_horizon.shape)
+    fill_open_loop_errors(track, icrs, by_horizon, errors, 0, len(ends), lo)
+    return errors.T
+
+
+def fill_open_loop_errors(
+    track: Track, icrs: FrozenIcrs, ends: Rows, errors: Floats, row_lo: int, starts: int, lo: int = 0
+) -> None:
+    """Fill the `errors` of `open_loop_errors` of the starts [row_lo, starts); (n_horizons, n_starts) as `ends`.
 
     Notes
     -----
-    Beyond the result and `ends`, memory is a few MB whatever the log; call it for ranges
-    of starts to bound those as well. Blocks whose ICRs vary too much over their turns, or whose ICRs nearly coincide,
-    are halved; the smallest blocks are integrated directly.
+    Memory is a few MB whatever the log. Blocks whose ICRs vary too much over their turns, or whose ICRs nearly
+    coincide, are halved; the smallest blocks are integrated directly.
     """
-    by_horizon = np.ascontiguousarray(ends.T)
-    errors = np.full(by_horizon.shape, np.nan)
+    errors[:, row_lo:starts] = np.nan
     columns, icrs = compiled_columns(track), compiled_icrs(icrs)
-    constant = len(icrs.x_icr) == 1
-    row_lo, size, starts = 0, MAX_BLOCK, len(ends)
+    constant, size = len(icrs.x_icr) == 1, MAX_BLOCK
     while row_lo < starts:
         # a robot that hardly moves has long windows: longer blocks share them
-        first_window = int(by_horizon[:, row_lo].max(initial=-1)) - lo - row_lo
+        first_window = int(ends[:, row_lo].max(initial=-1)) - lo - row_lo
         row_hi = min(row_lo + min(max(CONSTANT_BLOCK if constant else BLOCK, first_window), size), starts)
         while True:
-            block, last = slice(lo + row_lo, lo + row_hi), int(by_horizon[:, row_lo:row_hi].max(initial=-1))
+            block, last = slice(lo + row_lo, lo + row_hi), int(ends[:, row_lo:row_hi].max(initial=-1))
             own = icrs if constant else FrozenIcrs(*(column[block] for column in icrs))
             plan = plan_block(columns, own, last, block)
             if plan.moments or row_hi - row_lo <= MIN_BLOCK:
                 break
             row_hi = row_lo + (row_hi - row_lo) // 2
         if plan.moments:
-            solve_block(columns, own, plan, by_horizon, row_lo, block, last, errors)
+            solve_block(columns, own, plan, ends, row_lo, block, last, errors)
         else:
-            integrate_trials(columns, icrs, by_horizon, lo, row_lo, row_hi, errors)
+            integrate_trials(columns, icrs, ends, lo, row_lo, row_hi, errors)
         row_lo, size = row_hi, min(2 * (row_hi - row_lo), MAX_BLOCK)
-    return errors.T

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Complexes, Floats, Ints, rows_at_steps
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, Rows, rows_at_steps
+from icrtool.kernels.compiled import njit
 
 Rate = TypeVar("Rate", Floats, Complexes)
 
@@ -19,9 +20,6 @@ LONGEST_DELAY_S = 1.0
 SHORT, GAP, OUTAGE, STANDING, JUMP = -1, -2, -3, -4, -5
 """No row is so far away: the drive ends before; a gap in the wheel data, no reference there, the robot stands at the
 start and another start counts for this standstill, the reference jumps in between."""
-
-BEFORE = 1.0 - 2.0**-51
-"""Of a path length: less than rounding may add to it."""
 
 
 class Track(NamedTuple):
@@ -224,53 +222,61 @@ def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Windows:
     begins = begins[~track.in_outage[begins]]
     ends = ends_from(track, lengths, begins)
     column, row = np.nonzero(ends.T >= 0)
-    begin, end = begins[row], ends[row, column]
+    begin, end = begins[row], ends[row, column].astype(np.int64)
     # as many flags are set before one end as before the other
     slips = np.flatnonzero(track.slipping)
     quiet = np.searchsorted(slips, begin) == np.searchsorted(slips, end)
     return Windows(track, begin[quiet], end[quiet], lengths[column][quiet])
 
 
-def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Ints:
-    """Return what `ends_finder` finds, from many rows: they are taken some at a time, to bound memory."""
-    find, ends = ends_finder(track), np.empty((len(horizons_m), len(starts)), np.int64)
-    for lo in range(0, len(starts), ROWS_AT_ONCE):
-        some = slice(lo, lo + ROWS_AT_ONCE)
-        ends[:, some] = find(horizons_m, starts[some]).T
-    return ends.T
+@njit
+def fill_ends(
+    distance: Floats, place_t: Floats, in_outage: Bools, gap_t: Floats, jumps: Ints, horizons_m: Floats, starts: Ints,
+    ends: Rows,
+) -> None:  # fmt: skip
+    """Fill `ends` (h, k) of `ends_from`; begins of gaps and rows of jumps are followed by one beyond all others."""
+    rows = len(distance)
+    for h in range(len(horizons_m)):
+        end, gap, jump = 0, 0, 0
+        for k in range(len(starts)):
+            start = starts[k]
+            while end < rows and distance[end] - distance[start] < horizons_m[h]:
+                end += 1
+            while gap_t[gap] < place_t[start]:
+                gap += 1
+            while jumps[jump] < start:
+                jump += 1
+            if end == rows:
+                ends[h, k] = SHORT
+            elif gap_t[gap] < place_t[end]:
+                ends[h, k] = GAP
+            elif in_outage[end]:
+                ends[h, k] = OUTAGE
+            elif jumps[jump] < end:
+                ends[h, k] = JUMP
+            else:
+                ends[h, k] = end
 
 
-def ends_finder(track: Track) -> Callable[[Floats, Ints], Ints]:
-    """Return a function that finds the row of the positions at which each distance ends.
+def ends_from(track: Track, horizons_m: Floats, starts: Ints) -> Rows:
+    """Return the rows of the positions at which distances end.
 
-    It takes the distances (h,) [m], in any order, and the rows (k,) from which to go, ascending, and returns int64
+    Parameters
+    ----------
+    horizons_m : (h,) distances [m], in any order
+    starts : (k,) rows from which to go, ascending
+
+    Returns
+    -------
     (k, h), one horizon contiguous: the first row j with ``distance[j] - distance[start] >= horizon``, or `SHORT`,
-    `GAP`, `OUTAGE`, `JUMP`. What does not depend on these is computed once.
+    `GAP`, `OUTAGE`, `JUMP`.
     """
-    distance, rows = np.asarray(track.distance, np.float64), len(track.distance)
-    gap_t, jumps = track.gap_t, np.flatnonzero(track.jump)
-
-    def find(horizons_m: Floats, starts: Ints) -> Ints:
-        ends = np.empty((len(horizons_m), len(starts)), np.int64)
-        begin, gaps = distance[starts], np.searchsorted(gap_t, track.place_t[starts])
-        for end, horizon in zip(ends, horizons_m, strict=True):
-            # the sum may be rounded up: begin the search a little before it
-            end[:] = np.searchsorted(distance, (begin + horizon) * BEFORE)
-            while True:
-                last, inside = np.minimum(end, rows - 1), end < rows
-                short = np.flatnonzero(inside & (distance[last] - begin < horizon))
-                if not len(short):
-                    break
-                end[short] = np.searchsorted(distance, distance[end[short]], side="right")
-            end[inside & track.in_outage[last]] = OUTAGE
-            if len(gap_t):
-                end[inside & (np.searchsorted(gap_t, track.place_t[last]) > gaps)] = GAP
-            end[~inside] = SHORT
-        if len(jumps):
-            ends[(ends >= 0) & (np.searchsorted(jumps, ends) > np.searchsorted(jumps, starts))] = JUMP
-        return ends.T
-
-    return find
+    ends = np.empty((len(horizons_m), len(starts)), np.int32)
+    columns = (track.distance, track.place_t, horizons_m)
+    distance, place_t, horizons_m = (np.require(one, np.float64, ["C", "A", "W"]) for one in columns)
+    gap_t, jumps = np.append(track.gap_t, np.inf), np.append(np.flatnonzero(track.jump), len(distance))
+    fill_ends(distance, place_t, track.in_outage, gap_t, jumps, horizons_m, starts, ends)
+    return ends.T
 
 
 class FrozenIcrs(NamedTuple):
@@ -310,12 +316,12 @@ class TrialCounts(NamedTuple):
     crosses_jump: Ints
 
 
-def trial_ends(track: Track, horizons_m: Floats, lo: int = 0, hi: int | None = None) -> Ints:
+def trial_ends(track: Track, horizons_m: Floats, lo: int = 0, hi: int | None = None) -> Rows:
     """Return `ends_from` of all starts in [lo, hi), by default of all states."""
     return ends_from(track, horizons_m, np.arange(lo, len(track.distance) if hi is None else hi))
 
 
-def count_trials(ends: Ints) -> TrialCounts:
+def count_trials(ends: Rows) -> TrialCounts:
     """Count trials and the kinds of no trial per horizon in `ends` (n_starts, n_horizons)."""
-    kinds = [(ends == kind).sum(axis=0, dtype=np.int64) for kind in (SHORT, GAP, OUTAGE, STANDING, JUMP)]
-    return TrialCounts(len(ends) - np.sum(kinds, axis=0), *kinds)
+    kinds = np.array([np.bincount(-column[column < 0], minlength=1 - JUMP) for column in ends.T]).T
+    return TrialCounts(len(ends) - kinds.sum(axis=0), *kinds[-np.array([SHORT, GAP, OUTAGE, STANDING, JUMP])])

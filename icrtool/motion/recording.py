@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats, Ints, rows_at_steps
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats, Ints, Rows, rows_at_steps
 from icrtool.kernels.robust import robust_least_squares
 from icrtool.kernels.track import Track, Windows, cut, ends_from
 from icrtool.kernels.window_residuals import OMEGA, path_at
@@ -198,7 +198,7 @@ class Trials(NamedTuple):
     """
 
     starts: Ints
-    ends: Ints
+    ends: Rows
 
 
 def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals | None = None) -> Trials:
@@ -247,7 +247,7 @@ PathAt = Callable[[Floats], tuple[Floats, Complexes]]
 call drives all of it."""
 
 
-def trial_errors(recording: Recording, start: Ints, end: Ints, path: PathAt) -> TrialErrors:
+def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> TrialErrors:
     """Return the errors (m,) at the ends of trials.
 
     Parameters
