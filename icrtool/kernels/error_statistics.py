@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from icrtool.kernels.arrays import Bools, Floats, Ints, rows_of_cells
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, rows_of_cells
 
 
 class Summary(NamedTuple):
@@ -235,6 +235,17 @@ CELLS = 1024
 """So many that few errors are in one."""
 
 
+def count_cells(errors_m: Floats, width_m: float) -> tuple[NDArray[np.int16], Ints]:
+    """Return the cell of each error (m,), of this width from zero on, and how many are in each up to the largest."""
+    cell = np.empty(len(errors_m), np.int16)
+    counts = np.zeros(int(errors_m.max() / width_m) + 1 if len(errors_m) else 0, np.int64)
+    for lo in range(0, len(errors_m), ROWS_AT_ONCE):
+        some = slice(lo, lo + ROWS_AT_ONCE)
+        cell[some] = errors_m[some] / width_m
+        counts += np.bincount(cell[some], minlength=len(counts))
+    return cell, counts
+
+
 class RankedTrials(NamedTuple):
     """The trials of one horizon, in which any rank is found without sorting: by cells of equal width.
 
@@ -253,9 +264,8 @@ class RankedTrials(NamedTuple):
     def of(cls, errors_m: Floats) -> RankedTrials:
         """Return the trials among errors (n,) [m], NaN where there was none."""
         trials = errors_m[~np.isnan(errors_m)]
-        width = trials.max(initial=0.0) / CELLS
-        cell = (trials / (width or 1.0)).astype(np.int16)
-        return cls(trials, cell, np.append(0, np.cumsum(np.bincount(cell))))
+        cell, counts = count_cells(trials, trials.max(initial=0.0) / CELLS or 1.0)
+        return cls(trials, cell, np.append(0, np.cumsum(counts)))
 
     def quantile(self, share: float) -> float:
         """Return numpy's 'linear' quantile of the errors, of which there are some."""
@@ -278,7 +288,7 @@ class RankedTrials(NamedTuple):
 
     def histogram(self, bin_width_m: float) -> Histogram:
         """Count the trials in bins of `bin_width_m` [m] from zero to the largest error (Figs. 28-30)."""
-        counts = np.bincount((self.errors_m / bin_width_m).astype(np.int32))
+        _, counts = count_cells(self.errors_m, bin_width_m)
         edges = bin_width_m * np.arange(len(counts) + 1, dtype=np.float64)
         return Histogram(edges[:-1], edges[1:], 100.0 * counts / max(len(self.errors_m), 1))
 
