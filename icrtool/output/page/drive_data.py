@@ -66,7 +66,8 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
     """
     table = run.table
     rows, joined = every_so_many(len(table), MOST_STEPS)
-    origin = float(np.round(table.north_m[0])), float(np.round(table.east_m[0]))
+    north, east = float(table.north_m[0]), float(table.east_m[0])
+    origin = (float(round(north)), float(round(east))) if coordinates else (north, east)
     half = None if run.track_width_m is None else run.track_width_m / 2
     # What the figure of the ICRs shows of each, and where no slip puts them.
     shown = [] if half is None else [half, -half]

@@ -10,7 +10,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import quote
 
 import msgspec
@@ -46,11 +46,11 @@ from icrtool.output.text_format import (
 )
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import GroupComparison
-from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument, TrialDocument
+from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
 from icrtool.records.places import is_regular
 from icrtool.records.run import ICR_WORDS, Run, check_type
-from icrtool.records.run_document import EventDocument, RunDocument
+from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text
 
 VENDOR = ("vendor/uPlot.iife.min.js", "vendor/d3.min.js")
@@ -92,12 +92,12 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     report : what report.json holds
     pictures : by name; those that the page is to show where no script draws
     """
+    summary, stated = run.document, report
     if not coordinates:
         # Coordinates relative to a datum that is left out show no place.
-        metric = run.document.gnss.datum is None
+        metric = summary.gnss.datum is None
         pictures = {name: one for name, one in pictures.items() if not (metric and one.with_place)}
-        run, report = without_place(run, report)
-    summary = run.document
+        summary, stated = without_place(run, report)
     compared = with_smoothed_reference(run) if report.smoothed else run
     begun = f"{datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     place, datum = "left out", summary.gnss.datum
@@ -118,7 +118,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     words = Section("ICR, no slip, whole model, trial, σ …", [Facts(list(WORDS.items()))], PAGE)
     blocks = [
         Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {about}"),
-        *page_blocks(summary, report),
+        *page_blocks(summary, stated),
         Section("Log and settings", [streams_section(summary), *_settings(summary), made_from], name="log"),
         Section("Words on this page", [words], name="words"),
     ]
@@ -215,23 +215,16 @@ def draw_pictures(run: Run) -> dict[str, Picture]:
     return drawn_pictures(figures_of("run", run))
 
 
-Placed = TypeVar("Placed", EventDocument, TrialDocument)
-
-
-def without_place(run: Run, report: DropoutDocument) -> tuple[Run, DropoutDocument]:
-    """Return a run and what report.json holds of it, with the first state as origin and without the datum.
+def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, DropoutDocument]:
+    """Return what a page states of a run and its report, without the datum and with the first state as origin.
 
     Notes
     -----
     Where a position reference is metric its coordinates may be those of a map grid, so the origin moves there too.
     Magnetic declination and grid convergence narrow the place down, and are left out with their name.
     """
-    table, sensors, document, changed = run.table, run.sensors, run.document, msgspec.structs.replace
-    north, east = float(table.north_m[0]), float(table.east_m[0])
-
-    def moved(one: Placed) -> Placed:
-        return changed(one, north_m=one.north_m - north, east_m=one.east_m - east)
-
+    document, changed = run.document, msgspec.structs.replace
+    north, east = float(run.table.north_m[0]), float(run.table.east_m[0])
     cause, datum = document.heading.offset_name, document.gnss.datum
     shown = changed(
         document,
@@ -239,18 +232,9 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[Run, DropoutDocume
         warnings=tuple(one.replace(cause, "its cause is left out") if cause else one for one in document.warnings),
         gnss=changed(document.gnss, datum=None if datum is None else (math.nan, math.nan, math.nan)),
         heading=changed(document.heading, offset_name=None, magnetic_declination_deg=None, utm_convergence_deg=None),
-        events=tuple(map(moved, document.events)),
     )
-    fixes = replace(sensors.fixes, north_m=sensors.fixes.north_m - north, east_m=sensors.fixes.east_m - east)
-    events = (one._replace(north_m=one.north_m - north, east_m=one.east_m - east) for one in sensors.events)
-    at_origin = replace(
-        run,
-        table=table.changed(north_m=table.north_m - north, east_m=table.east_m - east),
-        sensors=replace(sensors, fixes=fixes, events=tuple(events)),
-        document=shown,
-    )
-    worst, examples = tuple(map(moved, report.worst)), tuple(map(moved, report.examples))
-    return at_origin, changed(report, worst=worst, examples=examples)
+    moved = (changed(one, north_m=one.north_m - north, east_m=one.east_m - east) for one in report.worst)
+    return shown, changed(report, worst=tuple(moved))
 
 
 def fleet_page(document: FleetDocument, folder: Path) -> str:

@@ -263,6 +263,17 @@ def test_without_coordinates_no_place_is_on_the_page(run: Run, report: DropoutRe
     assert max(abs(steps[axis]["first"]) for axis in ("north", "east")) < 1.0
 
 
+def test_fixes_lie_by_the_smoothed_path_without_coordinates(run: Run, report: DropoutReport) -> None:
+    table, fixes = run.table, run.sensors.fixes
+    grid = replace(table, north_m=table.north_m + 4_440_123.0, east_m=table.east_m + 612_345.0)
+    fixes = replace(fixes, north_m=fixes.north_m + 4_440_123.0, east_m=fixes.east_m + 612_345.0)
+    there = replace(run, table=grid, smoothed=grid, sensors=replace(run.sensors, fixes=fixes))
+    document = msgspec.structs.replace(report.document, smoothed=True)
+    data = data_of(run_page(there, document, {}, coordinates=False))
+    for axis in ("north", "east"):
+        assert np.abs(numbers(data["fixes"]["used"][axis])).max() < 1000.0
+
+
 def test_a_picture_whose_axes_show_a_map_grid_is_left_out_without_coordinates(run: Run, report: DropoutReport) -> None:
     metric = with_summary(run, gnss={"datum": None})
     pictures = pictures_of([("worst", b"place"), ("summary", b"models")])
