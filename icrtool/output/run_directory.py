@@ -143,23 +143,19 @@ def new_run(
         # Not ".", which is the old run wherever it is moved.
         place = Path(os.path.realpath(directory))
         before = set(names_in(place))
-        states_name = f"states.{states}"
-        states_sum = pool.submit(run_columns.write_states, run.table, partial / states_name, states)
+        states_written = pool.submit(run_columns.write_states, run.table, partial / f"states.{states}", states)
         if plots:
             figure_catalogue.draw_figures("run", run, partial / "plots", plots, figures)
-        sums: dict[str, str] = {}
         if run.smoothed is not None:
-            sums[f"smoothed.{states}"] = run_columns.write_states(run.smoothed, partial / f"smoothed.{states}", states)
+            run_columns.write_states(run.smoothed, partial / f"smoothed.{states}", states)
         run_columns.write_measurements(run, partial / MEASUREMENTS_FILE)
         (partial / RUN_FILE).write_bytes(formats.json_bytes(run.document))
         sources = _Sources(tuple(os.path.realpath(file.path) for file in run.document.inputs))
         (partial / formats.SOURCES_FILE).write_bytes(formats.json_bytes(sources))
         (partial / EVENTS_FILE).write_bytes(events_csv(run.document.events))
-        pictures = [f"plots/{file.name}" for file in sorted((partial / "plots").glob("*"))]
-        others = (MEASUREMENTS_FILE, RUN_FILE, EVENTS_FILE, *pictures)
-        sums |= {name: formats.file_b2sum(partial / name) for name in others}
-        sums[states_name] = states_sum.result()
-        formats.write_sums(partial, sums)
+        states_written.result()
+        files = sorted(name for name in names_in(partial) if not name.endswith("/"))
+        formats.write_sums(partial, {name: formats.file_b2sum(partial / name) for name in files})
         yield partial
     if note is not None and (gone := before.difference(names_in(place))):
         # A folder stands for what was in it.

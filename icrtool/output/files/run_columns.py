@@ -7,7 +7,6 @@ others are columns of the states.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -27,7 +26,6 @@ from numpy.typing import NDArray
 from icrtool.errors import RunError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.chunk import LARGEST_RATIO
-from icrtool.output.files.formats import file_b2sum
 from icrtool.records.choices import StatesFormat
 from icrtool.records.measurements import Fixes, ReferenceJump, SensorData, SlipEvent
 from icrtool.records.places import open_regular
@@ -56,7 +54,7 @@ FREE_STATES_BYTES = 1 << 29
 """States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
 
 
-def write_states(table: States, path: Path, states: StatesFormat) -> str:
+def write_states(table: States, path: Path, states: StatesFormat) -> None:
     """Write the states to a new file.
 
     Parameters
@@ -64,11 +62,6 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
     table : the recorded states
     path : the file to make
     states : its format
-
-    Returns
-    -------
-    str
-        Sum of the file, as `file_b2sum`.
 
     Raises
     ------
@@ -98,14 +91,9 @@ def write_states(table: States, path: Path, states: StatesFormat) -> str:
                 pa.table(arrays), file, compression="zstd", row_group_size=PARQUET_ROWS,
                 use_dictionary=False, use_byte_stream_split=list(FLOAT_COLUMNS),
             )  # fmt: skip
-        return file_b2sum(path)
-    digest = hashlib.blake2b()
-    # A chunk is summed and written while it is in the processor's cache: a thread for that takes longer.
-    with path.open("xb") as file:
-        for chunk in _csv_chunks(table):
-            digest.update(chunk)
-            file.write(chunk)
-    return digest.hexdigest()
+    else:
+        with path.open("xb") as file:
+            file.writelines(_csv_chunks(table))
 
 
 def read_states(path: Path, states: StatesFormat, inside: Path | None = None, *, whole: bool = True) -> States:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,8 +33,7 @@ def assert_same_bits(one: States, other: States) -> None:
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 def test_every_bit_comes_back(tmp_path: Path, run: Run, form: StatesFormat) -> None:
     for number, table in enumerate((run.table, table_of(np.array(AWKWARD)))):
-        digest = write_states(table, tmp_path / str(number), form)
-        assert digest == hashlib.blake2b((tmp_path / str(number)).read_bytes()).hexdigest()
+        write_states(table, tmp_path / str(number), form)
         assert_same_bits(table, read_states(tmp_path / str(number), form))
 
 
