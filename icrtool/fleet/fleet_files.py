@@ -240,7 +240,7 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
     missing : logs of the baseline that the batch does not have
     """
     # Not at import: a process that fits logs needs none of it.
-    from icrtool.output.exports.acceptance import limit_sections
+    from icrtool.output.exports.acceptance import limit_section
 
     errors, changes = [], changes_of(rows, missing)
     for row in rows:
@@ -253,9 +253,9 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
         errors.append([row.log, *both, difference])
     return [
         Title(counted(len(rows), "log"), counts_text(rows)),
-        *limit_sections([one for row in rows for one in row.verdicts]),
+        limit_section([one for row in rows for one in row.verdicts]),
         Table("lr", errors, ("log", "95 % after 10 m", "baseline", "difference")),
-        *([Section("Since the baseline", [Items(changes)])] if changes else []),
+        Section("Since the baseline", [Items(changes)]),
     ]
 
 

@@ -1,6 +1,7 @@
 """Blocks: what a document states, once; laid out here as text and Markdown, by `icrtool.cli.printing`, and on a page.
 
 A document (a run, a report, a comparison) is a list of blocks. Whatever lays them out knows nothing of runs or reports.
+It lists all that may be stated: what is empty in it (`stated`) is not laid out.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class Table(NamedTuple):
 
 
 class Facts(NamedTuple):
-    """Labelled sentences; one without a label goes on with what is above it.
+    """Labelled sentences; one without a label goes on with what is above it, and an empty one is left out.
 
     Attributes
     ----------
@@ -191,6 +192,22 @@ Block = str | Title | Line | Table | Facts | Checks | Items | Figure | Section
 Printed = str | Line | Table
 
 
+def stated(blocks: Iterable[Block]) -> Iterator[Block]:
+    """Yield the blocks that state something: without empty sentences of facts, and without what is empty then."""
+    for block in blocks:
+        match block:
+            case Section():
+                if (inner := list(stated(block.blocks))) or block.lead:
+                    yield block._replace(blocks=inner)
+            case Facts():
+                if rows := [row for row in block.rows if row[1]]:
+                    yield block._replace(rows=rows)
+            case Line(text=content) | Table(rows=content) | Checks(rows=content) | Items(texts=content) if not content:
+                pass
+            case _:
+                yield block
+
+
 def format_blocks(blocks: Iterable[Block], *, verbose: bool = True) -> str:
     """Return a document as plain text, at most `TEXT_WIDTH` wide where it can be wrapped; no line end."""
     lines: list[str] = []
@@ -210,7 +227,7 @@ MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": ""}
 
 def printed(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:
     """Yield what is printed of a document: the brief answer in `BRIEF_WIDTH`, or all but what is for a page alone."""
-    for block in blocks:
+    for block in stated(blocks):
         if isinstance(block, str | Line):
             yield block
         elif isinstance(block, Title):

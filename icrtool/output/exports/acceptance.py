@@ -75,15 +75,14 @@ def _summary_blocks(report: DropoutReport) -> list[Block]:
     *blocks, _ = dropout_blocks(report)
     title = next(one for one in blocks if isinstance(one, Title))
     verdicts = suite_of("", report).verdicts
-    return [title, *limit_sections(verdicts), *(one for one in blocks if one is not title)]
+    return [title, limit_section(verdicts), *(one for one in blocks if one is not title)]
 
 
-def limit_sections(verdicts: Sequence[FleetVerdict]) -> list[Section]:
-    """Return the verdicts under what they come to, those that are not met first; nothing without any."""
+def limit_section(verdicts: Sequence[FleetVerdict]) -> Section:
+    """Return the verdicts under what they come to, those that are not met first; empty without any."""
     missed = sum(not one.passed for one in verdicts)
     title = f"Acceptance limits not met: {missed}" if missed else "All acceptance limits are met"
-    lines = [one.line for one in sorted(verdicts, key=lambda one: one.passed)]
-    return [Section(title, [Items(lines)])] if lines else []
+    return Section(title, [Items([one.line for one in sorted(verdicts, key=lambda one: one.passed)])])
 
 
 def _suite(one: Suite, command: str) -> ET.Element:

@@ -28,9 +28,9 @@ from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, ren
 from icrtool.output.run_directory import PAGE_FILE, check_sum, is_page
 from icrtool.output.tables.calibration import transfer_blocks
 from icrtool.output.tables.configuration import format_settings
-from icrtool.output.tables.dropout import answer_sections, model_sections, outage_blocks, verdict_lines, worst_section
+from icrtool.output.tables.dropout import answer_sections, model_section, outage_blocks, verdict_lines, worst_section
 from icrtool.output.tables.errors import errors_section, main_rows
-from icrtool.output.tables.run import advice_blocks, streams_section, unusable_lines
+from icrtool.output.tables.run import advice, streams_section, unusable_line
 from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import (
     MODEL_WORDS,
@@ -131,26 +131,27 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
 
 def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
-    drive: list[Block] = [
-        Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive", drive_charts(position_word(summary)))
-    ]
-    if events := summary.events:
-        rows = []
-        for one in events:
-            times = duration_text(one.begin_s), duration_text(one.end_s - one.begin_s)
-            rows.append((one.kind, *times, distance_text(one.distance_m), f"{100 * one.severity:.0f} %"))
-        head = ("kind", "from", "lasts", "distance", "missing motion")
-        caption = "Slip events: the robot did not move as its wheels did"
-        table = Table("lr", rows, head, caption, [one.begin_s for one in events])
-        drive.append(Section("", [table], PAGE))
-    drive += [*outage_blocks(report), Figure(("icr_clusters", "outages"))]
+    rows = [
+        (
+            one.kind, duration_text(one.begin_s), duration_text(one.end_s - one.begin_s),
+            distance_text(one.distance_m), f"{100 * one.severity:.0f} %",
+        )
+        for one in summary.events
+    ]  # fmt: skip
+    head = ("kind", "from", "lasts", "distance", "missing motion")
+    caption = "Slip events: the robot did not move as its wheels did"
+    events = Table("lr", rows, head, caption, [one.begin_s for one in summary.events])
+    drive = [
+        Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive", drive_charts(position_word(summary))),
+        Section("", [events], PAGE), *outage_blocks(report), Figure(("icr_clusters", "outages")),
+    ]  # fmt: skip
     warnings = [one.removeprefix(f"{summary.log}: ") for one in summary.warnings]
     return [
-        *unusable_lines(summary), *advice_blocks(summary),
+        unusable_line(summary), Facts([("next", advice(summary))]),
         Section("Answer", answer_sections(summary, report), name="answer"),
         Section("The drive", drive, name="drive"),
-        errors_section(report, summary), worst_section(summary, report), *model_sections(report),
-        *([Section("Acceptance limits", verdict_lines(report), name="limits")] if report.gates else []),
+        errors_section(report, summary), worst_section(summary, report), model_section(report),
+        Section("Acceptance limits", verdict_lines(report), name="limits"),
         Section("Warnings", [Items(warnings) if warnings else "None."], PAGE, name="warnings"),
     ]  # fmt: skip
 
@@ -162,9 +163,8 @@ def _settings(summary: RunDocument) -> list[Section]:
     for name, one in summary.alignment.items():
         value, applied = plus_minus(one.value, one.std, 4, ""), plus_minus(one.applied or None, None, 4, "")
         alignment.append((name, value, applied, one.why))
-    if alignment:
-        caption = "Alignment of the streams: what was found and corrected"
-        why.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
+    caption = "Alignment of the streams: what was found and corrected"
+    why.append(Table("lrrl", alignment, ("estimate", "value ± σ", "applied", "why"), caption))
     return [
         Section("Why these streams, and what was found of them", why, PAGE),
         Section("Configuration that the run was made with", [Line(format_settings(summary.config), "as is")], PAGE),
@@ -250,18 +250,17 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
     found = [f"{counts.done - unusable} can be used", f"{unusable} cannot", f"{counts.failed} failed{skipped}"]
     found += [f"acceptance limits not met: {document.gates_failed}"] if document.gates_failed else []
     about = f"{len(logs)} logs: {', '.join(found)}. Made with icrtool {document.tool_version}."
-    blocks: list[Block] = [Title(title, about)]
-    if document.calibrations:
-        table = _robots_table(document.calibrations)
-        blocks.append(Section("The robot, from all logs together", [table], name="robots"))
-    blocks.append(Section("Logs", [_logs_table(logs, folder)], name="logs"))
     # Reasons without what is particular to a log: the first part of ``why; advice``.
     reasons = Counter(log.reason.split(";")[0].split(" (tried")[0] for log in logs if log.status == "failed")
-    if reasons:
-        table = Table("lr", [(reason, f"{count}") for reason, count in reasons.most_common()], ("reason", "logs"))
-        blocks.append(Section("Why logs failed", [table], name="failed"))
-    if pictures := pictures_in(folder / "plots", folder):
-        blocks.append(Section("All logs together", [Figure(tuple(pictures), folded=False)], name="pictures"))
+    why = Table("lr", [(reason, f"{count}") for reason, count in reasons.most_common()], ("reason", "logs"))
+    pictures = pictures_in(folder / "plots", folder)
+    blocks: list[Block] = [
+        Title(title, about),
+        Section("The robot, from all logs together", [_robots_table(document.calibrations)], name="robots"),
+        Section("Logs", [_logs_table(logs, folder)], name="logs"),
+        Section("Why logs failed", [why], name="failed"),
+        Section("All logs together", [Figure(tuple(pictures), folded=False)] if pictures else [], name="pictures"),
+    ]
     kind = "Drive without GNSS: report of many logs"
     return render(("fleet.js",), None, title=title, kind=kind, blocks=blocks, pictures=pictures)
 

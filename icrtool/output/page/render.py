@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from icrtool import __version__
 from icrtool.errors import RunError
+from icrtool.output.text_blocks import Block, stated
 from icrtool.records.places import read_regular
 from icrtool.records.plain_data import plain
 from icrtool.records.text import escaped
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
     from matplotlib.figure import Figure
-
-    from icrtool.output.text_blocks import Block
 
 DOCUMENT_ERRORS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """What a page raises for a JSON document that was edited."""
@@ -77,7 +76,7 @@ def render(
         # Ours, not of a log: they stand in the page as they are.
         policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(one) for one in code[1:]],  # noqa: S704
         data=None if data is None else Markup(written),  # noqa: S704 - escaped for a script element
-        tool_version=__version__, title=title, kind=kind, blocks=blocks,
+        tool_version=__version__, title=title, kind=kind, blocks=list(stated(blocks)),
         **{"pictures": {}, **content},
     )  # fmt: skip
 

@@ -58,7 +58,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
         Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
         *numbers_of(calibration.controller, calibration.width_m, icrs),
         Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?"),
-        Facts([("not found", f"too small, or not driven; taken as usual: {unknown}")] if unknown else []),
+        Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
         Section(f"Motion model: {model_text(calibration.fitted)}", model, VERBOSE),
     ]
 

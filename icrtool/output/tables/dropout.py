@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import suppress
 
 from msgspec import UNSET
@@ -13,7 +12,7 @@ from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
 from icrtool.output.exports.controllers import format_export
 from icrtool.output.tables.errors import baseline_sections, errors_section, label_of, model_of
-from icrtool.output.tables.run import advice_blocks, number_blocks, run_checks, unusable_lines
+from icrtool.output.tables.run import advice, number_blocks, run_checks, unusable_line
 from icrtool.output.text_blocks import (
     PAGE,
     VERBOSE,
@@ -77,13 +76,13 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     row = min(report.trials, key=lambda one: (not one.trials, abs(one.horizon_m - CHOICE_HORIZON_M)))
     trials = f"{distance_text(report.run.drive.distance_m)}, {row.trials:,} trials of {row.horizon_m:g} m"
     return [
-        *unusable_lines(summary),
+        unusable_line(summary),
         Title(run_title(summary), trials),
-        *advice_blocks(summary),
+        Facts([("next", advice(summary))]),
         *answer_sections(summary, report),
         *outage_blocks(report),
         errors_section(report, summary),
-        *model_sections(report),
+        model_section(report),
         Section("", verdict_lines(report)),
     ]
 
@@ -149,8 +148,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
             text = f"within {budget_m:g} m (95 %), by wheel speeds alone with the {label}{more}"
         shown = [(shortened(label, 28), distance, note) for label, distance, note in rows]
         blocks.append(Table("lrl", shown, caption=f"How far within {budget_m:g} m (95 %)?"))
-        if others:
-            blocks.append(Section("Other models", [Table("lrl", others)], VERBOSE))
+        blocks.append(Section("Other models", [Table("lrl", others)], VERBOSE))
     if not blocks:
         blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
@@ -199,11 +197,10 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
         "overlap. What they share (a speed, a turn, a place) is where the model fails"
     )
     moments = [one.t_s for one in report.worst]
-    blocks: list[Block] = [Table("lrrrrrrrl", rows[:1], head, caption, moments[:1])]
-    if len(rows) > 1:
-        further = Table("lrrrrrrrl", rows[1:], head, "", moments[1:])
-        blocks.append(Section(f"The next {len(rows) - 1}", [further], PAGE))
-    return Section("Worst cases", [*blocks, Figure(("worst",))], PAGE, name="worst")
+    worst = Table("lrrrrrrrl", rows[:1], head, caption, moments[:1])
+    further = Table("lrrrrrrrl", rows[1:], head, "", moments[1:])
+    blocks: list[Block] = [worst, Section(f"The next {len(rows) - 1}", [further], PAGE), Figure(("worst",))]
+    return Section("Worst cases", blocks, PAGE, name="worst")
 
 
 def _meanwhile(one: TrialDocument, summary: RunDocument, report: DropoutDocument) -> str:
@@ -221,8 +218,8 @@ def _meanwhile(one: TrialDocument, summary: RunDocument, report: DropoutDocument
     return ", ".join(notes)
 
 
-def outage_blocks(report: DropoutDocument) -> Iterator[Block]:
-    """Yield the worst outage of each kind, and all of them in a table, beside p95 of trials over as much distance."""
+def outage_blocks(report: DropoutDocument) -> list[Block]:
+    """Return the worst outage of each kind, and all of them in a table, beside p95 of trials over as much distance."""
     parts = []
     for kind in ("forced", "real"):
         if ours := [one for one in report.outages if one.kind == kind]:
@@ -230,9 +227,6 @@ def outage_blocks(report: DropoutDocument) -> Iterator[Block]:
             parts.append(
                 f"{len(ours)} {kind}, the worst {error_text(worst.end_error_m)} after {distance_text(worst.distance_m)}"
             )
-    if not parts:
-        return
-    yield Facts([("Outages", "; ".join(parts))])
     rows = [
         (
             f"{number} {one.kind}", duration_text(one.begin_s), duration_text(one.end_s - one.begin_s),
@@ -243,7 +237,8 @@ def outage_blocks(report: DropoutDocument) -> Iterator[Block]:
     ]  # fmt: skip
     head = ("outage", "from", "length", "distance", "end error", "max error", "95 % of trials")
     caption = "How far the filter was off when position fixes returned"
-    yield Section("", [Table("lr", rows, head, caption, [one.begin_s for one in report.outages])], VERBOSE)
+    table = Table("lr", rows, head, caption, [one.begin_s for one in report.outages])
+    return [Facts([("Outages", "; ".join(parts))]), Section("", [table], VERBOSE)]
 
 
 def p95_at(report: DropoutDocument, model: str, distance_m: float) -> float | None:
@@ -254,15 +249,14 @@ def p95_at(report: DropoutDocument, model: str, distance_m: float) -> float | No
     return min(found.by_horizon, key=lambda row: abs(row.horizon_m - distance_m)).p95_m
 
 
-def model_sections(report: DropoutDocument) -> Iterator[Section]:
-    """Yield the parameters of the recommended motion model, and how the models were compared."""
-    blocks: list[Block] = []
+def model_section(report: DropoutDocument) -> Section:
+    """Return the parameters of the recommended motion model, and how the models were compared."""
+    parameters: list[Block] = []
     if (found := report.recommended) is not None:
-        parameters: list[Block] = [parameter_table(fitted_model(found.model, found)), *found.warnings]
-        blocks.append(Section("Parameters of the motion model", parameters, VERBOSE))
-    blocks += report.ladder.notes if report.ladder.notes is not UNSET else ()
-    if blocks:
-        yield Section("The motion model", blocks, VERBOSE, name="models")
+        parameters = [parameter_table(fitted_model(found.model, found)), *found.warnings]
+    notes = report.ladder.notes if report.ladder.notes is not UNSET else ()
+    blocks = [Section("Parameters of the motion model", parameters, VERBOSE), *notes]
+    return Section("The motion model", blocks, VERBOSE, name="models")
 
 
 def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:

@@ -86,9 +86,6 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     others = [_error_row(one, shown) for one in models if one.name not in main]
     rows.append(["trials", "", *(f"{row.trials:,}" for row in counts)])
     head = ("distance without GNSS", "", *(f"{row.horizon_m:g} m" for row in counts))
-    further: list[Block] = []
-    if others:
-        further.append(Section(f"Other models ({len(others)})", [Table("llr", others, head)], VERBOSE))
     sentences = [*_source_lines(report), *_count_lines(report, summary)]
     rests = [Table("llr", list(_other_rows(report, shown)), head), *sentences, *_learned_blocks(report, shown)]
     for split in report.by_turning:
@@ -103,7 +100,7 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
         [
             Figure(("summary",), "errors", (Chart("error-chart", FIGURES["summary"].title, caption),)),
             Table("llr", rows, head),
-            *further,
+            Section(f"Other models ({len(others)})", [Table("llr", others, head)], VERBOSE),
             Section("What the errors rest on", rests, VERBOSE),
             Figure(("histogram", "examples")),
         ],

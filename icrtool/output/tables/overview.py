@@ -68,8 +68,7 @@ def info_blocks(
     if survey is not None:
         size = sum(file.bytes for file in survey.inputs)
         topics, files = counted(len(survey.topics), "topic"), counted(len(survey.inputs), "file")
-        rows.append(("log", f"{names[0]}: {topics}, {size / 1e6:.3g} MB in {files}"))
-        rows += [("read", survey.transfer)] if survey.transfer else []
+        rows += [("log", f"{names[0]}: {topics}, {size / 1e6:.3g} MB in {files}"), ("read", survey.transfer or "")]
     elif log is not None:
         rows.append(("log", f"{log.name}: table"))
     rows += overview_rows(log, run) if log is not None else []
@@ -79,7 +78,7 @@ def info_blocks(
         rows.append((what, "; ".join((text, *more))))
     rows += _topic_rows(survey, log)
     warnings = run.warnings if run is not None else log.warnings if log is not None else ()
-    rows += [("warnings", gravest(warnings, names[0]))] if warnings else []
+    rows.append(("warnings", gravest(warnings, names[0])))
     if run is not None and config.robot.track_width_m is None:
         missing = (
             "robot.track_width_m (no multiplier, no no-slip odometry): --robot NAME (icrtool robots lists them), or "
@@ -87,8 +86,7 @@ def info_blocks(
         )
         rows.append(("missing", missing))
     answer = Section("", [], lead=decision, label="verdict", grade="good" if good else "bad")
-    last: list[Block] = [next_line(command)] if command is not None else []
-    return [answer, Facts(rows), *last, *_survey_sections(names[1], survey, log)]
+    return [answer, Facts(rows), next_line(command or ""), *_survey_sections(names[1], survey, log)]
 
 
 def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Row]:
@@ -139,8 +137,7 @@ def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | N
             jitter = f", jitter {stream.jitter_ms:.3g} ms" if stream.jitter_ms is not None else ""
             blocks += [f"  -> {stream.topic}: {stream.why}"]
             blocks += [f"     {stream.samples_text} by {stream.clock} stamps{jitter}"]
-        if blocks:
-            yield Section(f"{word} (key topics.{role}; * chosen)", blocks, VERBOSE)
+        yield Section(f"{word} (key topics.{role}; * chosen)", blocks, VERBOSE)
     if log is None:
         return
     if (gyro := log.gyro) is not None:

@@ -84,47 +84,44 @@ def run_blocks(summary: RunDocument) -> list[Block]:
     excitation = summary.excitation
     turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
     driven = f"{distance_text(summary.drive.distance_m)}, {duration_text(summary.drive.duration_s)}"
-    blocks: list[Block] = [*unusable_lines(summary), Title(run_title(summary), f"{driven}, turned {turned}")]
-    head = gravest(summary.warnings, summary.log)
-    if head or summary.usable:
-        line = f"{'USABLE' if summary.usable else '':12}{head}"
-        shown = line if len(line) <= BRIEF_WIDTH else f"{line[: BRIEF_WIDTH - 1].rstrip()}…"
-        blocks.append(Line(shown, "good" if summary.usable else "as is"))
-    if summary.usable:
-        blocks += number_blocks(summary)
+    line = f"{'USABLE' if summary.usable else '':12}{gravest(summary.warnings, summary.log)}".rstrip()
+    shown = line if len(line) <= BRIEF_WIDTH else f"{line[: BRIEF_WIDTH - 1].rstrip()}…"
     roles: dict[str, list[str]] = {}
     for stream in summary.streams:
         topics = shortened(topics_text(stream.topic), LONGEST_TOPIC)
         roles.setdefault(topics, []).append("position" if stream.role == "gnss" else stream.role)
     inputs = "; ".join(f"{topic} ({', '.join(taken)})" for topic, taken in roles.items())
-    found = [("corrected", "; ".join(corrections(summary))), ("inputs", inputs)]
     return [
-        *blocks, Checks(run_checks(summary)), Facts([(label, text) for label, text in found if text]),
+        unusable_line(summary),
+        Title(run_title(summary), f"{driven}, turned {turned}"),
+        Line(shown, "good" if summary.usable else "as is"),
+        *(number_blocks(summary) if summary.usable else ()),
+        Checks(run_checks(summary)),
+        Facts([("corrected", "; ".join(corrections(summary))), ("inputs", inputs)]),
         streams_section(summary),
-    ]  # fmt: skip
+    ]
 
 
 def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
     """Return where a run was written, and what to do next; `examine`: command that names what is wrong in its log."""
     command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
-    following = advice_blocks(summary) or [next_line(command)]
-    return [Section("", [Facts([("written to", place)]), *following])]
+    drive = advice(summary)
+    return [Section("", [Facts([("written to", place), ("next", drive)]), next_line("" if drive else command)])]
 
 
 def next_line(command: str) -> Line:
-    """Return the command to run next on one line, however long: it is copied."""
-    return Line(f"{'next':12}{command}", "as is")
+    """Return the command to run next on one line, however long: it is copied; empty without a command."""
+    return Line(f"{'next':12}{command}" if command else "", "as is")
 
 
-def advice_blocks(summary: RunDocument) -> list[Block]:
-    """Return what to drive next, of a run that is not usable for lack of turns."""
-    drive = "" if summary.usable else to_drive(summary)
-    return [Facts([("next", drive)])] if drive else []
+def advice(summary: RunDocument) -> str:
+    """Return what to drive next, of a run that is not usable for lack of turns; else empty."""
+    return "" if summary.usable else to_drive(summary)
 
 
-def unusable_lines(summary: RunDocument) -> list[Line]:
+def unusable_line(summary: RunDocument) -> Line:
     """Return why the ICRs of a run must not be used, by its summary; empty where they can be."""
-    return [] if summary.usable else [Line(f"Do not use: {summary.unusable_because}", "bad")]
+    return Line("" if summary.usable else f"Do not use: {summary.unusable_because}", "bad")
 
 
 def gravest(warnings: Sequence[str], log: str) -> str:
@@ -343,6 +340,5 @@ def _icr_tables(summary: RunDocument) -> Iterator[Table]:
         icrs = [(segment.mean[column], segment.std[column]) for column in ICR_COLUMNS]
         texts = (icr_text(*icr) if icr[0] is not None else "no states" for icr in icrs)
         segments.append((f"  {number}", f"{segment.begin_s:.1f} s", *texts))
-    if segments:
-        head = ("segment", "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
-        yield Table("lr", segments, head)
+    head = ("segment", "begins", *(f"{ICR_WORDS[column]} ± std [m]" for column in ICR_COLUMNS))
+    yield Table("lr", segments, head)

@@ -14,13 +14,16 @@ from icrtool.output.tables.run import run_blocks
 from icrtool.output.text_blocks import (
     TEXT_WIDTH,
     Block,
+    Checks,
     Facts,
+    Items,
     Line,
     Section,
     Table,
     fitted,
     format_blocks,
     format_markdown,
+    stated,
 )
 from icrtool.records.calibration_document import CALIBRATION_SCHEMA, SensorDocument, SensorDrive
 from icrtool.records.run import Run
@@ -56,6 +59,27 @@ def test_a_table_that_is_too_wide_cuts_no_number_of_a_run(run: Run, width: int) 
 def test_a_table_without_rows_is_nothing() -> None:
     assert format_blocks([Table("lr", [])]) == ""
     assert fitted(Table("lr", []), 60, 3) == (Table("", []), [])
+
+
+def test_what_is_empty_in_a_document_is_left_out() -> None:
+    empty: list[Block] = [
+        Line("", "bad"),
+        Facts([("next", "")]),
+        Table("lr", [], ("a", "b"), "caption"),
+        Items([]),
+        Checks([]),
+    ]
+    blocks: list[Block] = [
+        "before",
+        *empty,
+        Section("Part", [Section("Inner", empty)], name="part"),
+        Facts([("a", "1"), ("b", "")]),
+    ]
+    assert list(stated(blocks)) == ["before", Facts([("a", "1")])]
+    assert format_blocks(blocks).splitlines() == ["before", "a           1"]
+    assert "Part" not in format_markdown(blocks)
+    lead = Section("Answer", [], lead="yes", label="Trust?")
+    assert list(stated([lead])) == [lead]
 
 
 def test_markdown_has_a_heading_a_section_an_item_a_sentence_and_escapes_names() -> None:
