@@ -38,7 +38,7 @@ from icrtool.logs.messages.definitions import (
     ros_definitions,
     steps_of,
 )
-from icrtool.logs.messages.protobuf import ProtobufParser, definitions_in, descriptors_of, wanted_fields
+from icrtool.logs.messages.protobuf import definitions_in, descriptors_of, field_of, protobuf_parser
 from icrtool.records.text import LONGEST_TEXT
 
 LONGEST_MESSAGE_BYTES = 1 << 20
@@ -84,17 +84,18 @@ class ValueDecoder:
     ----------
     kinds : primitive type by column
     paths : by column, the field that it is made of
-    parse : returns a message's nested values (mappings by field name, sequences, numbers, texts), None where it is not
-        readable
+    parse : returns a message, None where it is not readable
+    field_of : returns what a message holds in a field: a message, a list, a number, a text; None for nothing
     """
 
     kinds: Mapping[str, str]
     paths: Mapping[str, str]
     parse: Callable[[bytes], object] = field(repr=False)
+    field_of: Callable[[Any, str], object] = field(repr=False)
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> DecodedValues:
         """Decode messages [start, end) (n,) of `data`."""
-        takers = {column: _taker(path, self.kinds[column]) for column, path in self.paths.items()}
+        takers = {column: _taker(path, self.kinds[column], self.field_of) for column, path in self.paths.items()}
         values: dict[str, list[Any]] = {column: [] for column in self.paths}
         readable = np.zeros(len(start), np.bool_)
         for place, (begin, stop) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
@@ -106,13 +107,13 @@ class ValueDecoder:
         return DecodedValues(self.kinds, values, readable)
 
 
-def _taker(path: str, kind: str) -> Callable[[object], Any]:
+def _taker(path: str, kind: str, field_of: Callable[[Any, str], object]) -> Callable[[object], Any]:
     """Return a function of a message that takes the value, or the list of values, at a path."""
     steps = steps_of(path)
     convert = _text if kind == "string" else _float if kind in _FLOATS else _integer
 
     def take(message: object) -> Any:  # noqa: ANN401 - a number, a text, or a list of either
-        value = value_at(message, steps)
+        value = value_at(message, steps, field_of)
         if "[*]" in path:
             return [convert(one) for one in value] if isinstance(value, list) else []
         return convert(value)
@@ -134,15 +135,20 @@ def parse_json(data: bytes) -> dict[str, Any] | None:
     return value if isinstance(value, dict) else None
 
 
-def value_at(value: object, steps: Sequence[Step]) -> object:
+def property_of(value: object, name: str) -> object:
+    """Return what a JSON value holds in a property, None where it is no object or lacks it."""
+    return value.get(name) if isinstance(value, dict) else None
+
+
+def value_at(value: object, steps: Sequence[Step], field_of: Callable[[Any, str], object]) -> object:
     """Return what a message holds at some steps, a list behind a step to all elements; None for nothing."""
     for done, step in enumerate(steps):
         if isinstance(step, str):
-            value = value.get(step) if isinstance(value, dict) else None
+            value = None if value is None else field_of(value, step)
         elif not isinstance(value, list):
             return None
         elif step is None:
-            return [value_at(one, steps[done + 1 :]) for one in value[:MOST_ELEMENTS]]
+            return [value_at(one, steps[done + 1 :], field_of) for one in value[:MOST_ELEMENTS]]
         else:
             value = value[step] if step < len(value) else None
     return value
@@ -164,7 +170,8 @@ def _integer(value: object) -> int:
 
 
 def _text(value: object) -> bytes:
-    return value.encode("utf-8", "replace")[:LONGEST_TEXT] if isinstance(value, str) else b""
+    value = value.encode("utf-8", "replace") if isinstance(value, str) else value
+    return value[:LONGEST_TEXT] if isinstance(value, bytes) else b""
 
 
 def _padded(rows: Sequence[Sequence[Any]], lacking: float, result: type[np.float64 | np.int64]) -> NDArray[Any]:
@@ -302,10 +309,10 @@ def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
                 paths[column], kinds[column] = path, kind
                 break
     if channel.encoding == "json":
-        return ValueDecoder(kinds, paths, parse_json)
+        return ValueDecoder(kinds, paths, parse_json, property_of)
     descriptors = descriptors_of(channel.definition, channel.message_type)
-    fields = wanted_fields(descriptors, channel.message_type, [steps_of(path) for path in paths.values()])
-    return ValueDecoder(kinds, paths, ProtobufParser(fields).parse)
+    parse = protobuf_parser(descriptors, channel.message_type, map(steps_of, paths.values()))
+    return ValueDecoder(kinds, paths, parse, field_of)
 
 
 @lru_cache(maxsize=64)

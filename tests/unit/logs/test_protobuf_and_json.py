@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import struct
+import subprocess
+import sys
 import time
 import tracemalloc
 from typing import Any
@@ -20,8 +22,8 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import LONGEST_MESSAGE_BYTES, number_fields
-from icrtool.logs.messages.definitions import DEEPEST
-from icrtool.logs.messages.protobuf import LONGEST_DESCRIPTORS, descriptors_of
+from icrtool.logs.messages.definitions import DEEPEST, steps_of
+from icrtool.logs.messages.protobuf import LONGEST_DESCRIPTORS, descriptors_of, protobuf_parser
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.records.text import LONGEST_TEXT, LogText
 from support.tables import collected
@@ -322,6 +324,70 @@ def test_a_message_made_to_take_time_takes_none(raw: bytes) -> None:
     table = table_of(channel_of(schema()), [raw] * 20, "double", "int32s[*]", "many[*].double")
     assert len(table) + table.unreadable == 20
     assert time.process_time() - begin < LONGEST_S
+
+
+def test_a_message_is_read_by_its_wanted_fields_alone() -> None:
+    """With all fields of a type that has thousands, each of a million empty messages in a list would take 40 kB."""
+    paths = [steps_of(path) for path in ("many[*].double", "again.again.sint32", "again.double")]
+    message = protobuf_parser(descriptors_of(channel_of(schema()).definition, "t.All"), "t.All", paths)(b"")
+    known: list[tuple[str, list[str]]] = []
+
+    def add(kind: Any) -> None:
+        known.append((kind.name, [one.name for one in kind.fields]))
+        for one in kind.fields:
+            if one.message_type is not None:
+                add(one.message_type)
+
+    add(message.DESCRIPTOR)
+    assert [names for _, names in known] == [["many", "again"], ["double"], ["double", "again"], ["sint32"]]
+    assert len({name for name, _ in known}) == 4
+
+
+def test_the_library_of_protobuf_is_loaded_for_protobuf_alone() -> None:
+    code = (
+        "import sys\n"
+        "from icrtool.logs.containers.container import Channel\n"
+        "from icrtool.logs.messages.topic_table import collector_for\n"
+        "collector_for(Channel(0, 't', 'T', 'json', ''), ('a',))\n"
+        "print('google.protobuf' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
+def test_a_text_that_is_no_utf_8_is_read_with_replacements() -> None:
+    raw = part(14, b"a\xff") + varint(1 << 3 | 1) + struct.pack("<d", 2.0)
+    table = table_of(channel_of(schema()), [raw], "double", "string")
+    assert (table.columns["double"].tolist(), table.texts["string"]) == ([2.0], ["a\ufffd"])
+
+
+def test_a_schema_is_read_without_the_files_that_it_imports() -> None:
+    file = schema()
+    file.dependency.append("google/protobuf/timestamp.proto")
+    time_of = file.message_type[0].field.add(name="time", number=300, type=11, label=FIELD.LABEL_OPTIONAL)
+    time_of.type_name = ".google.protobuf.Timestamp"
+    raw = class_of(schema())(double=2.0).SerializeToString() + part(300, b"\x08\x07")
+    table = table_of(channel_of(file), [raw], "double", "time.seconds")
+    assert {path: values.tolist() for path, values in table.columns.items()} == {"double": [2.0]}
+
+
+def test_an_enumeration_is_its_number_also_where_that_has_no_name() -> None:
+    file = schema(syntax="proto2")
+    file.enum_type.add(name="Quality").value.add(name="NONE", number=0)
+    quality = file.message_type[0].field.add(name="quality", number=300, type=14, label=FIELD.LABEL_OPTIONAL)
+    quality.type_name = ".t.Quality"
+    raw = varint(300 << 3) + varint(4)
+    assert table_of(channel_of(file), [raw], "quality").columns["quality"].tolist() == [4]
+
+
+@pytest.mark.parametrize("number", [0, 2], ids=["none that is allowed", "that of another"])
+def test_a_wanted_field_with_a_wrong_number_is_refused(number: int) -> None:
+    file = descriptor_pb2.FileDescriptorProto(name="o.proto", package="t", syntax="proto3")
+    kind = file.message_type.add(name="All")
+    for name, of_field in (("a", number), ("b", 2)):
+        kind.field.add(name=name, number=of_field, type=1, label=FIELD.LABEL_OPTIONAL)
+    with pytest.raises(DefinitionError, match="number"):
+        collector_for(channel_of(file), ("a", "b"))
 
 
 def test_the_schema_of_a_real_library_with_all_its_files_is_read() -> None:
