@@ -62,7 +62,7 @@ BATCH = options.together(
     option("--timeout timeout_s", "SECONDS", POSITIVE, "Stop a log that takes longer.", default=1800.0),
     flag("--redo", "Also process logs that are done."),
     flag("--overwrite", "Also replace runs of other recordings."),
-    options.REPORT,
+    options.reporting(),
     options.CONFIGURATION,
 )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, get_args
+from typing import TYPE_CHECKING, get_args
 
 import click
 
@@ -36,25 +36,6 @@ EPILOG_GATE = (
 )
 
 
-class Request(NamedTuple):
-    """The options, the same for every run.
-
-    Attributes
-    ----------
-    config : that of the options; logs are fitted with it
-    asked, baseline : of `icrtool.cli.options.REPORT`
-    further : what is asked beside that
-    """
-
-    config: Config
-    asked: one_log.ReportOptions
-    baseline: Baseline | None
-    further: one_log.TrialOptions
-    trials: bool
-    overwrite: bool
-    printer: Printer
-
-
 def distances(text: str) -> tuple[float, ...]:
     """Read the distances [m] of ``--horizons``."""
     found = options.numbers("M,M,...")(text)
@@ -63,9 +44,7 @@ def distances(text: str) -> tuple[float, ...]:
     return found
 
 
-FURTHER = options.together(
-    "further",
-    "icrtool.fleet.one_log:TrialOptions",
+REPORT = options.reporting(
     option("--horizons horizons_m", "M,M,...", distances, "Distances without GNSS [m], in place of the configured "
            "ones."),
     option("--calibration calibration_files", "CAL.json", FILE, "Also predict with a calibration that icrtool "
@@ -88,14 +67,12 @@ FURTHER = options.together(
 @click.command("dropout-report", epilog=EPILOG_GATE)
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
 @options.PLACES
-@FURTHER
-@options.REPORT
+@REPORT
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def dropout_report_command(
-    sources: tuple[Path, ...], place: ResultPlace, overwrite: bool, further: one_log.TrialOptions, trials: bool,
-    calibration_files: tuple[Path, ...], report: one_log.ReportOptions, baseline: Path | None, exports: Exports,
-    settings: ConfigSources, printer: Printer,
+    sources: tuple[Path, ...], place: ResultPlace, overwrite: bool, calibration_files: tuple[Path, ...],
+    report: one_log.ReportOptions, baseline: Path | None, exports: Exports, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Report how far off a robot is without GNSS: open loop from every recorded state, over 1 to 20 m.
 
@@ -111,8 +88,9 @@ def dropout_report_command(
     """  # noqa: D301 - click reads the escape
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)
-    further = further.configured(config, map(formats.open_calibration, calibration_files))
-    request = Request(config, report, compared, further, trials, overwrite, printer)
+    report = report.configured(config, map(formats.open_calibration, calibration_files))
+    # One result: where the report fails, an old run in this place stays, with its report.
+    fitting = one_log.FitOptions(overwrite, report.plots, report.figures, smooth=report.reference == "smoothed")
     sources, places = plan_sources(sources, place, config, printer)
     inputs = Inputs("source")
     reports: dict[str, DropoutReport] = {}
@@ -120,7 +98,8 @@ def dropout_report_command(
         if number:
             printer.text("")
         with inputs.each(source) as document:
-            reports[str(source)] = found = _report_one(source, places.get(source), request)
+            found = _report_one(source, places.get(source), config, fitting, report, compared, printer)
+            reports[str(source)] = found
             if printer.as_json:
                 document["report"] = found.document
     printer.json("dropout-report", {"reports": inputs.documents})
@@ -158,31 +137,28 @@ def plan_sources(
     return sources, {}
 
 
-def _report_one(source: Path, place: RunPlace | None, request: Request) -> DropoutReport:
+def _report_one(
+    source: Path, place: RunPlace | None, config: Config, fitting: one_log.FitOptions, asked: one_log.ReportOptions,
+    compared: Baseline | None, printer: Printer,
+) -> DropoutReport:  # fmt: skip
     """Report on one source; `place` is the run directory of a log, None for a run."""
-    printer, further = request.printer, request.further
     with ExitStack() as stack:
         if place is None:
             folder = stack.enter_context(remote_place.on_disk(source, needed=bool))
             run = run_directory.open_run(folder, whole=False)
         else:
-            # One result: where the report fails, an old run in this place stays, with its report.
-            asked = one_log.FitOptions(
-                request.overwrite, request.asked.plots, request.asked.figures, smooth=further.reference == "smoothed"
+            run, folder = stack.enter_context(
+                fitted_log(source, place.directory, config, fitting, printer, place.inside)
             )
-            fitting = fitted_log(source, place.directory, request.config, asked, printer, place.inside)
-            run, folder = stack.enter_context(fitting)
-        if further.outage_at_s and not dropout_report.forced_lengths_s(run, further.outage_s):
+        if asked.outage_at_s and not dropout_report.forced_lengths_s(run, asked.outage_s):
             raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-        baseline = request.baseline.find(run.name, run.document.content) if request.baseline is not None else None
+        baseline = compared.find(run.name, run.document.content) if compared is not None else None
         with printer.stages(LogText(run.name)) as stages:
-            report = one_log.report_and_write(
-                run, folder, request.asked, stages.begin, baseline=baseline, trials=request.trials, further=further
-            )
+            report = one_log.report_and_write(run, folder, asked, stages.begin, baseline=baseline)
     if report.baseline is not None:
         printer.warn(f"{run.name}: {change}" for change in report.baseline.changes(run.document))
     directory = source if place is None else place.directory
-    label, name = ("page", run_directory.PAGE_FILE) if request.asked.page else ("written to", "dropout")
+    label, name = ("page", run_directory.PAGE_FILE) if asked.page else ("written to", "dropout")
     where = text_blocks.Section("", [text_blocks.Facts([(label, escaped(str(directory / name)))])])
     printer.show([*dropout.dropout_blocks(report), where])
     if not printer.shows:

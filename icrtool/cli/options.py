@@ -296,27 +296,29 @@ class Exports(NamedTuple):
             atomic.write_file(self.markdown, text())
 
 
-REPORT = together("exports", Exports, together(
-    "report",
-    "icrtool.fleet.one_log:ReportOptions",
-    BUDGETS,
-    option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one a line: exit status 3 if one is not met; "
-           "repeatable.", multiple=True, callback=_lines),
-    option("--baseline", "REPORT.json|DIR", FILE, "Earlier report, run or batch to compare with; a limit may then read "
-           "\"icr.p95@10m <= 1.1 * baseline\"."),
-    flag("--strict-gates strict", "Compare limits relative to the baseline by their number alone, without the "
-         "confidence interval of the difference."),
-    flag("--ladder/--no-ladder", "Also test the motion model and the controller numbers, with a gyro too, on distance "
-         "that they were not fitted to.", default=True, show_default=True),
-    option("--junit", "FILE", NEW_FILE, "Write the verdicts on the limits as JUnit XML."),
-    option("--markdown", "FILE", NEW_FILE, "Write a summary for a pull request."),
-    ALLOW_UNUSABLE,
-    PLOTS,
-    FIGURES,
-    flag("--page/--no-page", "Also write report.html: pictures, tables and an interactive map in one file.",
-         default=True, show_default=True),
-))  # fmt: skip
-"""The options of a dropout report that are the same for one log and for many, as `report`, `exports` and `baseline`."""
+def reporting(*further: Option) -> Option:
+    """Add the options of a dropout report as `report`, `exports` and `baseline`; `further`: those of one log alone."""
+    return together("exports", Exports, together(
+        "report",
+        "icrtool.fleet.one_log:ReportOptions",
+        *further,
+        BUDGETS,
+        option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one a line: exit status 3 if one is not "
+               "met; repeatable.", multiple=True, callback=_lines),
+        option("--baseline", "REPORT.json|DIR", FILE, "Earlier report, run or batch to compare with; a limit may then "
+               "read \"icr.p95@10m <= 1.1 * baseline\"."),
+        flag("--strict-gates strict", "Compare limits relative to the baseline by their number alone, without the "
+             "confidence interval of the difference."),
+        flag("--ladder/--no-ladder", "Also test the motion model and the controller numbers, with a gyro too, on "
+             "distance that they were not fitted to.", default=True, show_default=True),
+        option("--junit", "FILE", NEW_FILE, "Write the verdicts on the limits as JUnit XML."),
+        option("--markdown", "FILE", NEW_FILE, "Write a summary for a pull request."),
+        ALLOW_UNUSABLE,
+        PLOTS,
+        FIGURES,
+        flag("--page/--no-page", "Also write report.html: pictures, tables and an interactive map in one file.",
+             default=True, show_default=True),
+    ))  # fmt: skip
 
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.Baseline | None:

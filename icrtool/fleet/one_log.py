@@ -11,7 +11,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import blake2b
 from pathlib import Path
@@ -21,6 +21,7 @@ import msgspec
 from msgspec.structs import replace
 
 from icrtool import __version__
+from icrtool.calibration.record import Calibration
 from icrtool.config import Config
 from icrtool.errors import IcrToolError, LogChangedError, OutputError
 from icrtool.fleet.recordings import as_text
@@ -39,7 +40,6 @@ from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
-    from icrtool.calibration.record import Calibration
     from icrtool.dropout_analysis.report import BaselineReport, DropoutReport
     from icrtool.dropout_analysis.trials import ErrorSink
     from icrtool.records.dropout_document import EarlierModel, ModelDocument
@@ -54,16 +54,15 @@ Stage = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class ReportOptions:
-    """What is asked of a dropout report, the same for one log and for many.
+    """What is asked of a dropout report.
 
     Attributes
     ----------
     plots : formats of the pictures
     figures : ``all``: those of the paper too
     ladder : compare all models on distance that they were not fitted to
-    strict : as in `icrtool.dropout_report`
     page : write report.html
-    allow_unusable : as in `icrtool.dropout_report`
+    trials : write every single trial to trials.parquet
     """
 
     plots: tuple[str, ...] = ("png",)
@@ -74,12 +73,7 @@ class ReportOptions:
     page: bool = True
     allow_unusable: bool = False
     figures: FigureSet = "default"
-
-
-@dataclass(frozen=True, slots=True)
-class TrialOptions:
-    """What is asked of the report of one log beside `ReportOptions`: arguments of `icrtool.dropout_report`."""
-
+    trials: bool = False
     horizons_m: tuple[float, ...] | None = None
     outage_s: tuple[float, ...] | None = None
     outage_at_s: tuple[float, ...] = ()
@@ -90,7 +84,7 @@ class TrialOptions:
     with_jumps: bool = False
     seed: int = DEFAULT_SEED
 
-    def configured(self, config: Config, calibrations: Iterable[Calibration]) -> TrialOptions:
+    def configured(self, config: Config, calibrations: Iterable[Calibration]) -> ReportOptions:
         """Return it with calibrations, and the configuration's horizons and outages if set and no others asked for."""
         dropout, given = config.dropout, config.given
         horizons_m = dropout.horizons_m if "dropout.horizons_m" in given else None
@@ -185,32 +179,24 @@ def report_and_write(
     begin: Stage,
     *,
     baseline: BaselineReport | None,
-    further: TrialOptions | None = None,
-    trials: bool = False,
 ) -> DropoutReport:
-    """Analyse a run and write its dropout report, and its page, into its directory.
-
-    Parameters
-    ----------
-    baseline : earlier report of the same log
-    further : what is asked of this report alone
-    trials : write every single trial to trials.parquet
-    """
+    """Analyse a run and write its dropout report, and its page, into its directory; `baseline`: of the same log."""
     from icrtool.dropout_analysis.dropout_report import dropout_report
     from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, write_report
-
-    of_trials = {} if further is None else {field.name: getattr(further, field.name) for field in fields(further)}
 
     def analysed(sink: ErrorSink | None) -> DropoutReport:
         begin("dropout analysis")
         report = dropout_report(
-            run, budgets_m=options.budgets_m, gates=options.gates, comparison=options.ladder, baseline=baseline,
-            strict=options.strict, allow_unusable=options.allow_unusable, sink=sink, **of_trials,
+            run, horizons_m=options.horizons_m, budgets_m=options.budgets_m, gates=options.gates,
+            outage_s=options.outage_s, outage_at_s=options.outage_at_s, starts=options.starts,
+            without_events=options.without_events, with_jumps=options.with_jumps, calibrations=options.calibrations,
+            comparison=options.ladder, reference=options.reference, baseline=baseline, strict=options.strict,
+            allow_unusable=options.allow_unusable, seed=options.seed, sink=sink,
         )  # fmt: skip
         begin("dropout report, pictures" if options.plots else "dropout report")
         return report
 
-    stamps = run.table.stamp_ns if trials else None
+    stamps = run.table.stamp_ns if options.trials else None
     report = write_report(
         analysed, directory / DROPOUT_DIRECTORY, plots=options.plots, figures=options.figures, stamp_ns=stamps,
         inside=directory,
