@@ -39,7 +39,7 @@ Noise = Annotated[float, msgspec.Meta(ge=0, le=1e4)]
 Place = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Delay = Annotated[float, msgspec.Meta(ge=-100, le=100)]
 Degrees = Annotated[float, msgspec.Meta(ge=-720, le=720)]
-Scale = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
+SideScale = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Width = Annotated[float, msgspec.Meta(gt=0, le=20)]
 Radius = Annotated[float, msgspec.Meta(gt=0, le=5)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
@@ -82,8 +82,8 @@ class WheelsConfig:
     right_joints: tuple[str, ...] = ()
     quantity: Literal["auto", "position", "velocity", "counts"] = "auto"
     twist_width_m: Width | None = None
-    left_scale: Literal["auto"] | Scale = "auto"
-    right_scale: Literal["auto"] | Scale = "auto"
+    left_scale: Literal["auto"] | SideScale = "auto"
+    right_scale: Literal["auto"] | SideScale = "auto"
 
     def __post_init__(self) -> None:
         for key in ("left_scale", "right_scale"):

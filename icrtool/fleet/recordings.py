@@ -299,7 +299,7 @@ class _Line(msgspec.Struct, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ManifestEntry:
     """One line of a manifest: the files and folders that its pattern matches, and what holds for them.
 
     `targets` are the places with links followed.
@@ -315,7 +315,7 @@ def is_manifest(path: Path) -> bool:
     return path.suffix.lower() in MANIFEST_SUFFIXES and path.is_file()
 
 
-def read_manifest(path: Path) -> list[Entry]:
+def read_manifest(path: Path) -> list[ManifestEntry]:
     """Read a manifest: CSV with the columns of `COLUMNS`, or TOML with a table ``[[logs]]`` each.
 
     Paths and patterns are relative to the manifest's folder. Tags in a CSV are separated by semicolons.
@@ -343,7 +343,7 @@ def read_manifest(path: Path) -> list[Entry]:
     return [_entry(path, row) for row in rows]
 
 
-def about(path: Path, entries: Sequence[Entry]) -> About:
+def about(path: Path, entries: Sequence[ManifestEntry]) -> About:
     """Return what a manifest states about a recording; a later line adds to and replaces an earlier one."""
     found = About()
     whole = _target(path)
@@ -373,7 +373,7 @@ def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
     return rows
 
 
-def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
+def _entry(path: Path, row: Mapping[str, Any]) -> ManifestEntry:
     try:
         line = msgspec.convert(row, _Line)
     except msgspec.ValidationError as err:
@@ -382,7 +382,7 @@ def _entry(path: Path, row: Mapping[str, Any]) -> Entry:
     config = path.parent / line.config.strip() if line.config.strip() else None
     about = About(line.robot.strip(), config, line.group.strip(), tuple(line.tags))
     places = _matching(path, line.log)
-    return Entry(places, about, frozenset(_target(place) for place in places))
+    return ManifestEntry(places, about, frozenset(_target(place) for place in places))
 
 
 def _matching(path: Path, pattern: str) -> tuple[Path, ...]:

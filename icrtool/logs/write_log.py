@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
     from icrtool.kernels.arrays import Ints
 
-Container = Literal["mcap", "bag", "db3"]
+ContainerKind = Literal["mcap", "bag", "db3"]
 Compression = Literal["none", "bz2", "lz4", "zstd", "zstd-file"]
 
-COMPRESSIONS: dict[Container, tuple[Compression, ...]] = {
+COMPRESSIONS: dict[ContainerKind, tuple[Compression, ...]] = {
     "mcap": ("none", "lz4", "zstd"),
     "bag": ("none", "bz2", "lz4"),
     "db3": ("none", "zstd", "zstd-file"),
@@ -56,7 +56,7 @@ class WriteOptions:
     heading_std_deg : written as the orientation's covariance
     """
 
-    container: Container = "mcap"
+    container: ContainerKind = "mcap"
     wheels: WheelMessages = "joint_states"
     heading: HeadingConvention = "enu"
     compression: Compression = "none"

@@ -20,7 +20,7 @@ FRAME = "x forward, y right, turn rate clockwise; wheel speeds at the configured
 WIDEST_M = 20.0
 """Bound of `robot.track_width_m` in a configuration."""
 
-Scale = Annotated[float, msgspec.Meta(gt=0, le=1000)]
+UpTo1000 = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
 
 
@@ -28,11 +28,11 @@ class CalibratedRobot(Record, frozen=True, kw_only=True):
     """The robot; `left_scale` and `right_scale`, as configured, stand in older files alone."""
 
     name: str | None = None
-    wheel_radius_m: Scale | None = None
+    wheel_radius_m: UpTo1000 | None = None
     encoder_counts_per_rev: Positive | UnsetType = UNSET
     twist_width_m: Positive | UnsetType = UNSET
-    left_scale: Scale | UnsetType = UNSET
-    right_scale: Scale | UnsetType = UNSET
+    left_scale: UpTo1000 | UnsetType = UNSET
+    right_scale: UpTo1000 | UnsetType = UNSET
     track_width_m: Annotated[float, msgspec.Meta(ge=0.001, le=WIDEST_M)]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.logs.containers.container import Block, Channel
+from icrtool.logs.containers.container import Channel, MessageBlock
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.sources import Source
@@ -18,12 +18,12 @@ from icrtool.records.text import LogText
 START_NS, STEP_NS = 1_760_000_000_000_000_000, 50_000_000
 
 
-def block_of(messages: Sequence[tuple[int, bytes]]) -> Block:
+def block_of(messages: Sequence[tuple[int, bytes]]) -> MessageBlock:
     """Return a block of messages of channel 0, each with its log time."""
     sizes = np.array([len(data) for _, data in messages])
     times, end = np.array([stamp for stamp, _ in messages]), np.cumsum(sizes)
     data = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
-    return Block(data, np.zeros(len(messages), np.int64), times, end - sizes, end)
+    return MessageBlock(data, np.zeros(len(messages), np.int64), times, end - sizes, end)
 
 
 def collected(channel: Channel, wanted: tuple[str, ...], *blocks: Sequence[tuple[int, bytes]]) -> TopicTable:

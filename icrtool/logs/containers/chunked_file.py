@@ -21,8 +21,8 @@ from icrtool.logs.containers.chunk import (
     Space,
     decompress,
 )
-from icrtool.logs.containers.container import Block, Channel, Container, Cut, ahead, made_ahead
-from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile, Source
+from icrtool.logs.containers.container import Channel, Container, Cut, MessageBlock, ahead, made_ahead
+from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile
 
 THREADS, BLOCKS_AHEAD = 2, 3
 """Threads that make blocks of chunks, and blocks that they make while one is used."""
@@ -112,10 +112,10 @@ class ChunkedFile(Container):
     _message_index: Callable[[bytes], tuple[Ints, Ints]]
     """Returns where in its records the messages of a chunk begin (n,), and their channels (n,); none where damaged."""
 
-    def __init__(self, path: Path, message_compression: str = "", source: Source | None = None) -> None:
+    def __init__(self, path: Path, message_compression: str = "", source: LocalFile | RemoteFile | None = None) -> None:
         super().__init__(path, message_compression)
         self._inflation = Inflation()
-        self._source: Source = source if source is not None else LocalFile(path)
+        self._source: LocalFile | RemoteFile = source if source is not None else LocalFile(path)
         self._remote = source if isinstance(source, RemoteFile) else None
         self._at = 0
         self._size = self._source.size
@@ -164,7 +164,7 @@ class ChunkedFile(Container):
         """
 
     @abstractmethod
-    def _read_in_order(self) -> Iterator[Block]:
+    def _read_in_order(self) -> Iterator[MessageBlock]:
         """Yield the messages by reading the records one after the other, as far as they can be read."""
 
     @abstractmethod
@@ -175,7 +175,7 @@ class ChunkedFile(Container):
         """Return a chunk of the index with what its own record states."""
         return chunk
 
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels, in the order of their chunks; the next are made meanwhile."""
         if self._chunks is None:
             yield from made_ahead(self._read_in_order())
@@ -242,7 +242,7 @@ class ChunkedFile(Container):
             records = self._remote.gather(behind - chunk.size, ranges)
         return Part(chunk, np.cumsum(sizes) - sizes, ranges, held, records)
 
-    def _joined(self, group: Sequence[Part], spaces: Spaces) -> tuple[Block, Inflation]:
+    def _joined(self, group: Sequence[Part], spaces: Spaces) -> tuple[MessageBlock, Inflation]:
         """Return the messages of some chunks, and how much less than allowed these inflate.
 
         Raises
@@ -265,7 +265,7 @@ class ChunkedFile(Container):
             if stop < len(data):
                 raise DecompressionError
             messages.append(found)
-        return Block(data, *np.concatenate(messages, axis=1)), inflation
+        return MessageBlock(data, *np.concatenate(messages, axis=1)), inflation
 
     def _unpack(self, part: Part, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
         """Decompress the wanted records of a chunk, and return how many bytes they have.
@@ -343,7 +343,7 @@ class ChunkedFile(Container):
         content = space.of(length)
         return content[: self._source.read_into(at, content)]
 
-    def _read_chunk(self, part: Part, spaces: Spaces) -> Generator[Block, None, bool]:
+    def _read_chunk(self, part: Part, spaces: Spaces) -> Generator[MessageBlock, None, bool]:
         """Yield the messages of a chunk, and return whether there are blocks, which then hold the memory."""
         chunk = part.chunk
         place = chunk.at - self._chunk_head
@@ -368,12 +368,12 @@ class ChunkedFile(Container):
             self.report(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
         return begin >= 0
 
-    def _scanned(self, data: Bytes, begin: int = 0) -> tuple[Block, int]:
+    def _scanned(self, data: Bytes, begin: int = 0) -> tuple[MessageBlock, int]:
         """Return the messages among the records from `begin`, and the first byte not consumed."""
         messages, others, stop = self._scan(data, begin, None)
         for record in others if self._learns else ():
             self._learn(data, record)
-        return self._with_possible_times(Block(data, *messages)), stop
+        return self._with_possible_times(MessageBlock(data, *messages)), stop
 
 
 def _spans(chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[tuple[list[Chunk], int, int]]:

@@ -53,7 +53,7 @@ class Channel:
     count: int | None = None
 
 
-class Block(NamedTuple):
+class MessageBlock(NamedTuple):
     """Messages that share one buffer. Valid until the next block is asked for.
 
     Attributes
@@ -70,12 +70,12 @@ class Block(NamedTuple):
     start: Ints
     end: Ints
 
-    def rows(self, chosen: Bools) -> Block:
+    def rows(self, chosen: Bools) -> MessageBlock:
         """Return the block of the chosen (n,) messages."""
         if chosen.all():
             return self
         _, *columns = self
-        return Block(self.data, *(column[chosen] for column in columns))
+        return MessageBlock(self.data, *(column[chosen] for column in columns))
 
 
 class Cut(NamedTuple):
@@ -99,7 +99,7 @@ class Cut(NamedTuple):
         outside = known and (end_ns < self.begin_ns or begin_ns >= self.end_ns)
         return not outside or (bool(self.whole) and (held is None or bool(held & self.whole)))
 
-    def of(self, block: Block) -> Block:
+    def of(self, block: MessageBlock) -> MessageBlock:
         """Return a block without the messages outside the cut."""
         if self == WHOLE:
             return block
@@ -137,7 +137,7 @@ def ahead(
                 made.cancel()
 
 
-def made_ahead(blocks: Iterator[Block], stop: Callable[[], object] | None = None) -> Generator[Block]:
+def made_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None = None) -> Generator[MessageBlock]:
     """Yield blocks; the next one is made in a thread while one is used.
 
     Parameters
@@ -158,8 +158,8 @@ def made_ahead(blocks: Iterator[Block], stop: Callable[[], object] | None = None
 
 
 def unpack_messages(
-    blocks: Iterator[Block], wanted: frozenset[int], compression: str, report: Callable[[str], None]
-) -> Iterator[Block]:
+    blocks: Iterator[MessageBlock], wanted: frozenset[int], compression: str, report: Callable[[str], None]
+) -> Iterator[MessageBlock]:
     """Decompress the wanted messages of a bag that was written with message compression.
 
     Parameters
@@ -198,7 +198,7 @@ def unpack_messages(
             if row == rows[-1] or held > PIECE_BYTES:
                 end = np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages)))
                 data = np.frombuffer(b"".join(messages), np.uint8)
-                yield Block(data, block.channel[kept], block.log_time_ns[kept], np.append(0, end)[:-1], end)
+                yield MessageBlock(data, block.channel[kept], block.log_time_ns[kept], np.append(0, end)[:-1], end)
                 kept, messages, held = [], [], 0
     if left_out:
         report(f"{left_out} compressed messages left out: {reason}")
@@ -278,7 +278,7 @@ class Container(ABC):
         why = "topics share compressed chunks, which are read whole" if self.mixed else ""
         return "; ".join(filter(None, [self.origin.transfer(), why]))
 
-    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[Block]:
+    def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[MessageBlock]:
         """Yield the messages of the channels in `wanted` in file order; others, and some outside the cut, among them.
 
         What an index shows to be outside the cut is not read.
@@ -290,7 +290,7 @@ class Container(ABC):
             yield from blocks
 
     @abstractmethod
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield what `blocks` does, each message as it is stored."""
 
     @abstractmethod
@@ -305,7 +305,7 @@ class Container(ABC):
         """Release files, and remove what was made for it."""
         self.origin.remove()
 
-    def _with_possible_times(self, block: Block) -> Block:
+    def _with_possible_times(self, block: MessageBlock) -> MessageBlock:
         """Return a block without the messages whose log time is negative or beyond `LATEST_NS`."""
         # Negative ones are above all others as unsigned numbers.
         possible = block.log_time_ns.view(np.uint64) < LATEST_NS

@@ -25,7 +25,7 @@ from icrtool.logs.containers.chunk import (
     unaligned,
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
-from icrtool.logs.containers.container import CUT_OFF, Block, Channel, ros_type_name
+from icrtool.logs.containers.container import CUT_OFF, Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -252,7 +252,7 @@ class McapFile(ChunkedFile):
         head = self._source.read_at(at, _HEAD_BYTES) if 0 <= at < self._size else b""
         return (head[0], int.from_bytes(head[1:], "little")) if len(head) == _HEAD_BYTES else (0, 0)
 
-    def _read_in_order(self) -> Iterator[Block]:
+    def _read_in_order(self) -> Iterator[MessageBlock]:
         """Yield the messages record by record, up to the first place that holds none."""
         at, spaces = len(MAGIC), reused_spaces()
         memory = next(spaces)
@@ -274,7 +274,7 @@ class McapFile(ChunkedFile):
             at += _HEAD_BYTES + length
         self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
 
-    def _read_loose(self, at: int, length: int) -> tuple[Block | None, int]:
+    def _read_loose(self, at: int, length: int) -> tuple[MessageBlock | None, int]:
         """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""
         stop = 0
         if length <= LARGEST_CHUNK_BYTES:

@@ -18,12 +18,12 @@ from icrtool.errors import LogChangedError, LogError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers import mcap_file, ros1_bag, sqlite_bag
 from icrtool.logs.containers.chunked_file import NotByRangesError
-from icrtool.logs.containers.container import Block, Channel, Container, Cut, Origin
+from icrtool.logs.containers.container import Channel, Container, Cut, MessageBlock, Origin
 from icrtool.logs.containers.mcap_file import McapFile
 from icrtool.logs.containers.recording_files import (
     STANDARD_INPUT,
     BagFiles,
-    Span,
+    FileTimes,
     bag_files,
     check_spans,
     file_sha256,
@@ -330,7 +330,7 @@ class BagDirectory(Container):
             return None
         return min(begin for begin, _ in known), max(end for _, end in known)
 
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels, file by file.
 
         Raises
@@ -353,7 +353,7 @@ class BagDirectory(Container):
                 yield block._replace(channel=np.where(own[place] == block.channel, merged[place], -1))
             self.mixed |= part.mixed
             if begins:
-                spans.append(Span(min(begins), max(ends), file.name))
+                spans.append(FileTimes(min(begins), max(ends), file.name))
         if self._by_name:
             for odd in check_spans(self.path, spans):
                 self.report(odd)

@@ -39,7 +39,7 @@ LEAST_OVERLAP_S = 1.0
 """The files of a split recording overlap by less than this: a recorder fills one buffer while it writes another."""
 
 
-class Span(NamedTuple):
+class FileTimes(NamedTuple):
     """First and last log time of a file's messages [ns]."""
 
     begin_ns: int
@@ -202,7 +202,7 @@ def is_bag_directory(folder: Path) -> bool:
     return len(files) > 1 and counted and min(numbers) >= 0
 
 
-def check_spans(directory: Path, spans: Sequence[Span]) -> list[str]:
+def check_spans(directory: Path, spans: Sequence[FileTimes]) -> list[str]:
     """Compare the log times of files that were found by name.
 
     Returns

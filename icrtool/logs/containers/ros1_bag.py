@@ -24,7 +24,7 @@ from icrtool.logs.containers.chunk import (
     unaligned,
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
-from icrtool.logs.containers.container import CUT_OFF, Block, Channel, ros_type_name
+from icrtool.logs.containers.container import CUT_OFF, Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -253,7 +253,7 @@ class Ros1Bag(ChunkedFile):
             for chunk, end in zip(ordered, ends, strict=False)
         ]
 
-    def _read_in_order(self) -> Iterator[Block]:
+    def _read_in_order(self) -> Iterator[MessageBlock]:
         at, spaces = len(MAGIC), reused_spaces()
         memory = next(spaces)
         while at < self._size:

@@ -274,9 +274,6 @@ class RemoteFile:
         self._last = _OfThread()
 
 
-Source = LocalFile | RemoteFile
-
-
 def read_by_ranges(files: Collection[RemoteFile]) -> str:
     """Return how much was read of some files."""
     # Ranges overlap a little: of a small file more comes than it has.

@@ -18,7 +18,16 @@ import numpy as np
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.chunk import ZSTD_MAGIC
-from icrtool.logs.containers.container import CUT_OFF, WHOLE, Block, Channel, Container, Cut, made_ahead, ros_type_name
+from icrtool.logs.containers.container import (
+    CUT_OFF,
+    WHOLE,
+    Channel,
+    Container,
+    Cut,
+    MessageBlock,
+    made_ahead,
+    ros_type_name,
+)
 from icrtool.records.text import LogText
 
 MAGIC = b"SQLite format 3\0"
@@ -102,14 +111,14 @@ class SqliteBag(Container):
         first, last = (self._first_row(query.format(which)) or (None,) for which in ("min", "max"))
         return (first[0], last[0]) if isinstance(first[0], int) and isinstance(last[0], int) else None
 
-    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+    def _stored(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted topics in the order they were stored."""
         self._interruption = None
 
         def end_query() -> None:
             self._interruption = GeneratorExit()
 
-        blocks: Iterator[Block] = made_ahead(self._in_order(wanted, cut), end_query)
+        blocks: Iterator[MessageBlock] = made_ahead(self._in_order(wanted, cut), end_query)
         if lost := self._cut_inside_page():
             blocks = _without_last(blocks, lost)
         yield from blocks
@@ -215,7 +224,7 @@ class SqliteBag(Container):
             )
         return channels
 
-    def _in_order(self, wanted: frozenset[int], cut: Cut) -> Iterator[Block]:
+    def _in_order(self, wanted: frozenset[int], cut: Cut) -> Iterator[MessageBlock]:
         """Yield the messages in the order they were stored, up to the first row that SQLite cannot read.
 
         Notes
@@ -271,7 +280,7 @@ class SqliteBag(Container):
             # ids, times and sizes, with commas between
             topics, times, sizes = (np.fromstring(text, np.int64, sep=",") for text in texts)
             end = np.cumsum(sizes)
-            block = Block(np.frombuffer(content, np.uint8), topics, times, end - sizes, end)
+            block = MessageBlock(np.frombuffer(content, np.uint8), topics, times, end - sizes, end)
             yield self._with_possible_times(block)
             by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
             count = max(1, min(4 * count, _MOST_ROWS, by_size))
@@ -296,9 +305,9 @@ def _allow(action: int, first: str | None, second: str | None, _: str | None, vi
     return sqlite3.SQLITE_OK if reads or calls or action == sqlite3.SQLITE_SELECT else sqlite3.SQLITE_DENY
 
 
-def _without_last(blocks: Iterable[Block], lost: int) -> Iterator[Block]:
+def _without_last(blocks: Iterable[MessageBlock], lost: int) -> Iterator[MessageBlock]:
     """Yield blocks without the messages in their last bytes: SQLite reads zeros behind the end of a page cut off."""
-    held: deque[Block] = deque()
+    held: deque[MessageBlock] = deque()
     size = 0
     for block in blocks:
         held.append(block)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Ints
-from icrtool.logs.containers.container import Block, Channel
+from icrtool.logs.containers.container import Channel, MessageBlock
 from icrtool.logs.messages.decoded_values import NMEA_SENTENCE, SentenceDecoder, ValueDecoder, value_decoder
 from icrtool.logs.messages.decoder import Decoded, Decoder, ros_decoder
 from icrtool.records.text import LogText
@@ -219,7 +219,7 @@ class TopicCollector:
     _texts: dict[str, dict[bytes, int]] = field(default_factory=dict)
     _unreadable: int = 0
 
-    def feed(self, block: Block, number: int) -> None:
+    def feed(self, block: MessageBlock, number: int) -> None:
         """Add the messages of a block whose channel is `number`."""
         decoder, expected = self.decoders[number], self.channel.count or 0
         left = np.flatnonzero(block.channel == number)

@@ -25,7 +25,7 @@ from icrtool.logs.streams.sources import (
     PositionSource,
     Source,
     StampedRows,
-    WheelMotion,
+    WheelSource,
     increasing,
 )
 from icrtool.logs.streams.wheel_pairs import topic_of_side
@@ -245,7 +245,7 @@ MOST_NOT_FINITE = 0.01
 """A larger share of wheel samples without a number is reported."""
 
 
-def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: str) -> tuple[WheelSamples, list[str]]:
+def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: str) -> tuple[WheelSamples, list[str]]:
     """Return wheel speeds held over each interval, in the unit of the log, and warnings.
 
     Returns
@@ -287,7 +287,7 @@ def wheel_samples(motion: WheelMotion, stamps: Ints, config: Config, log_name: s
     return WheelSamples(stamps, left, right, unit, is_position), notes
 
 
-def _pick(motion: WheelMotion, config: Config) -> tuple[Floats, Floats, WheelUnit, bool]:
+def _pick(motion: WheelSource, config: Config) -> tuple[Floats, Floats, WheelUnit, bool]:
     """Return left, right, their unit, and whether they are positions."""
     if motion.twist is not None:
         given = config.wheels.twist_width_m

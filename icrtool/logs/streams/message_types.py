@@ -27,7 +27,7 @@ class OwnRow:
     read: Callable[[TopicTable, Config], Source]
 
 
-Row = Fix | Bearing | Orientation | Joints | FixedWheels | Twist | OwnRow
+MessageRow = Fix | Bearing | Orientation | Joints | FixedWheels | Twist | OwnRow
 """What a message type carries for a role: the fields to take beside those of a header, and how they are read."""
 
 # Wheels: Drive.msg of jackal_msgs and of clearpath_platform_msgs has 0 for left, 1 for right.
@@ -178,7 +178,7 @@ _DUAL = Bearing(
 )
 _INSPVA = Bearing("NovAtel INS azimuth", 90.0, "azimuth < 720 * deg", valid=(f"status == {_INS_SOLVED}",))
 
-MESSAGE_TYPES: Mapping[Role, Mapping[str, Row]] = {
+MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
     "wheels": {
         "sensor_msgs/JointState": _JOINTS,
         "control_msgs/DynamicJointState": replace(_JOINTS, worth=95.0),

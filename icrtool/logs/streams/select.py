@@ -20,12 +20,12 @@ from icrtool.logs.streams.positions import (
     TRANSFORM_TYPES,
     is_static,
 )
-from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelMotion, of_topic
+from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelSource, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean, listed
 
-Kind = TypeVar("Kind", WheelMotion, PositionSource, HeadingSource)
+Kind = TypeVar("Kind", WheelSource, PositionSource, HeadingSource)
 
 NEEDS: dict[Role, str] = {
     "wheels": "wheel joints, encoders, motor feedback, wheel odometry or a twist; of messages of other types "
@@ -57,7 +57,7 @@ FUSED_WORDS = re.compile(r"ekf|ukf|fused|filtered|localization|global", re.IGNOR
 class Candidates:
     """All sources found, best first by role; `unread`: why other topics of known types cannot be sources."""
 
-    wheels: tuple[WheelMotion, ...]
+    wheels: tuple[WheelSource, ...]
     gnss: tuple[PositionSource, ...]
     heading: tuple[HeadingSource, ...]
     unread: dict[str, str] = field(default_factory=dict)
@@ -71,7 +71,7 @@ class Candidates:
 class Choice:
     """The source of each role, with the reason for the choice; `heading` is None where no topic holds one."""
 
-    wheels: WheelMotion
+    wheels: WheelSource
     gnss: PositionSource
     heading: HeadingSource | None
 
@@ -118,7 +118,7 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
     # the wheels first: they take most memory for a while, which is then free for the others
     wheels = pair_candidates(tables, config)
     if topics.wheel_left is None:
-        wheels = _read_all(tables, "wheels", config, WheelMotion) + wheels
+        wheels = _read_all(tables, "wheels", config, WheelSource) + wheels
     others_read = MESSAGE_TYPES["gnss"].keys() | MESSAGE_TYPES["heading"].keys()
     drop_used_columns([table for table in tables if table.message_type not in others_read])
     gnss = _read_all(tables, "gnss", config, PositionSource)
@@ -199,7 +199,7 @@ def _namespace(topic: str) -> str:
     return parts[0] if len(parts) > 1 else ""
 
 
-def _other_robots(wheels: Sequence[WheelMotion]) -> frozenset[str]:
+def _other_robots(wheels: Sequence[WheelSource]) -> frozenset[str]:
     """Return the namespaces in which another robot's wheels of the same type turn."""
     if not wheels:
         return frozenset()
@@ -334,7 +334,7 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
 JOINT_KEYS = ("left_joints", "right_joints")
 
 
-def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], config: Config) -> None:
+def check_joints(chosen: WheelSource | None, candidates: Sequence[WheelSource], config: Config) -> None:
     """Refuse a configured joint that no message of the wheels' topic lists: its side would be the mean of fewer wheels.
 
     Parameters
@@ -360,7 +360,7 @@ def check_joints(chosen: WheelMotion | None, candidates: Sequence[WheelMotion], 
         raise ConfigError(f"wheels.{key}", why, f"its joints are {advice}")
 
 
-def ignored_joints(chosen: WheelMotion, config: Config) -> list[str]:
+def ignored_joints(chosen: WheelSource, config: Config) -> list[str]:
     """Return a warning for every configured joint list that is not used, because the messages list no joints."""
     if chosen.joints:
         return []

@@ -233,7 +233,7 @@ Sides = tuple[Floats | None, Floats | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WheelMotion(Source):
+class WheelSource(Source):
     """The motion of the wheels in a topic, or in a pair of topics.
 
     Attributes
@@ -265,7 +265,7 @@ def motion_of(
     why: str = "",
     problem: str = "",
     **others: Any,
-) -> WheelMotion:
+) -> WheelSource:
     """Return the motion of what left and right recorded; without what one side lacks, or has no finite value of."""
     both: list[Pair | None] = [None, None]
     for place, (left, right) in enumerate((position, speed)):
@@ -277,7 +277,7 @@ def motion_of(
         problem = problem or "has neither position nor speed of both sides"
     elif not changes and not any(moves(values) for values in (*(speeds or ()), twist) if values is not None):
         score, why = score - NEVER_MOVES, f"{why}, never moves"
-    return WheelMotion(position=travelled, speed=speeds, twist=twist, score=score, why=why, problem=problem, **others)
+    return WheelSource(position=travelled, speed=speeds, twist=twist, score=score, why=why, problem=problem, **others)
 
 
 def moves(speeds: Floats) -> bool:

@@ -18,7 +18,7 @@ from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import number_fields
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.message_types import KNOWN_TYPES
-from icrtool.logs.streams.sources import StampedRows, WheelMotion, motion_of, of_topic, stamp_rows
+from icrtool.logs.streams.sources import StampedRows, WheelSource, motion_of, of_topic, stamp_rows
 from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTE, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import LogText
@@ -161,7 +161,7 @@ def _may_be_side(topic: str, message_type: str, path: str) -> bool:
     return only_side or any(words.search(path) for words in (_SPEED_WORDS, _PLACE_WORDS))
 
 
-def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelMotion]:
+def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelSource]:
     """Return the wheels made of two sides: the configured ones, or all that the names of topics and fields show."""
     topics = config.topics
     if topics.wheel_left is not None and topics.wheel_right is not None:
@@ -188,7 +188,7 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelM
     return motions + [_array_motion(table, config) for table in arrays]
 
 
-def _array_motion(table: TopicTable, config: Config) -> WheelMotion:
+def _array_motion(table: TopicTable, config: Config) -> WheelSource:
     """Return the motion of wheels in an array; the side of the first one is taken as left.
 
     What of a wheel's motion the mean of all does not have is the turning, which has opposite signs on the two sides.
@@ -200,12 +200,12 @@ def _array_motion(table: TopicTable, config: Config) -> WheelMotion:
     alike = turning @ turning[0] > 0.0
     if len(wheels) > 2 * MOST_WHEELS or not 0 < 2 * np.count_nonzero(alike) == len(wheels):
         advice = f"name them in topics.wheel_left and wheel_right, as {_name(table.topic, 'data[0]')}"
-        return WheelMotion(**of_topic(table), problem=f"its numbers do not show two sides of as many wheels; {advice}")
+        return WheelSource(**of_topic(table), problem=f"its numbers do not show two sides of as many wheels; {advice}")
     left, right = (f"data[{','.join(map(str, np.flatnonzero(side)))}]" for side in (alike, ~alike))
     return pair_motion(Side(table, left), Side(table, right), config)
 
 
-def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
+def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
     """Return the wheel motion of two sides, at the left one's stamps.
 
     Positions are interpolated, speeds are held.
@@ -225,7 +225,7 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelMotion:
         if not both.any():
             raise DefinitionError(topic, "the two sides were not recorded at the same time")
     except DefinitionError as err:
-        return WheelMotion(topic=topic, message_type=kind, stamps=stamps, score=score, problem=err.why)
+        return WheelSource(topic=topic, message_type=kind, stamps=stamps, score=score, problem=err.why)
     moments, first, integer = times[both], lefts[both].astype(np.float64), lefts.dtype.kind == "i"
     not_recorded = (None, None)
     position = speed = not_recorded

@@ -17,7 +17,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
-from icrtool.logs.streams.sources import Sides, WheelMotion, motion_of, moves, of_topic
+from icrtool.logs.streams.sources import Sides, WheelSource, motion_of, moves, of_topic
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import listed
 
@@ -32,7 +32,7 @@ MOST_WHEELS = 32
 
 def of_wheels(
     wheels: Callable[[Quantity], list[NDArray[Any]]], lefts: int, names: Sequence[str], unit: WheelUnit, **others: Any
-) -> WheelMotion:
+) -> WheelSource:
     """Return the mean over the wheels of each side, those left out that have no encoder, or a dead one.
 
     Parameters
@@ -113,7 +113,7 @@ class Joints:
         """The fields that are read."""
         return self.names, self.position, self.speed
 
-    def read(self, table: TopicTable, config: Config) -> WheelMotion:
+    def read(self, table: TopicTable, config: Config) -> WheelSource:
         """Return the motion of those joints that are wheels."""
         codes, texts = table.words(self.names)
         given = config.wheels.left_joints, config.wheels.right_joints
@@ -133,7 +133,7 @@ class Joints:
             places, alike = _places_of(left, right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
             problem = "" if alike.any() else "left and right wheels come in different messages"
         if problem:
-            return WheelMotion(**of_topic(table), joints=tuple(texts), problem=problem)
+            return WheelSource(**of_topic(table), joints=tuple(texts), problem=problem)
         if not alike.all():
             table, places = table.rows(alike), places[alike]
         why = f"{self.what}: left {listed(names[:lefts])}, right {listed(names[lefts:])}"
@@ -216,7 +216,7 @@ class FixedWheels:
         """The fields that are read."""
         return tuple(elements(path)[0] for path in (*self.position, *self.speed))
 
-    def read(self, table: TopicTable, _: Config) -> WheelMotion:
+    def read(self, table: TopicTable, _: Config) -> WheelSource:
         """Return the motion of both sides.
 
         Raises
@@ -250,7 +250,7 @@ TICK_FIELDS = (
 )
 
 
-def read_ticks(table: TopicTable, _: Config) -> WheelMotion:
+def read_ticks(table: TopicTable, _: Config) -> WheelSource:
     """Return the motion in xbot_msgs/WheelTick: counters that count up, with the direction of each wheel beside them.
 
     A step counts with the direction stated behind it, as in OpenMower's own xbot_positioning. Its driver leaves
@@ -316,7 +316,7 @@ class Twist:
         """The fields that are read."""
         return tuple(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn))
 
-    def read(self, table: TopicTable, _: Config) -> WheelMotion:
+    def read(self, table: TopicTable, _: Config) -> WheelSource:
         """Return the twist; that of a position reference, or in east and north, is refused."""
         forward, sideways, turn = self.fields
         twist = np.column_stack([table.column(forward), table.column(turn)]).astype(np.float64)

@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
 from icrtool.errors import LogError
-from icrtool.logs.containers.container import Block, made_ahead
+from icrtool.logs.containers.container import MessageBlock, made_ahead
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 
@@ -552,9 +552,9 @@ def test_links_that_lead_nowhere_are_refused(tmp_path):
 @pytest.mark.parametrize("leave", [GeneratorExit, KeyboardInterrupt])
 def test_the_block_that_is_being_made_is_ended_when_no_more_are_wanted(leave: type[BaseException]) -> None:
     begun, stopped, none = Event(), Event(), np.zeros(0, np.int64)
-    block = Block(np.zeros(0, np.uint8), none, none, none, none)
+    block = MessageBlock(np.zeros(0, np.uint8), none, none, none, none)
 
-    def slow() -> Iterator[Block]:
+    def slow() -> Iterator[MessageBlock]:
         yield block
         begun.set()
         stopped.wait(3.0)

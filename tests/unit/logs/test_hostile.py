@@ -18,7 +18,7 @@ from icrtool.config import Config, load_config
 from icrtool.errors import ConfigError, DefinitionError, IcrToolError, LogError
 from icrtool.estimation.fit import fit
 from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Packed, decompress
-from icrtool.logs.containers.container import Block, Channel, Cut, unpack_messages
+from icrtool.logs.containers.container import Channel, Cut, MessageBlock, unpack_messages
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
 from icrtool.logs.messages.decoder import MOST_TEXTS, Decoder
 from icrtool.logs.messages.definitions import ARRAY, BASE, NAME, SEQUENCE, compile_layout
@@ -368,7 +368,7 @@ def test_messages_that_each_inflate_a_thousand_times_are_left_out() -> None:
     bomb = np.frombuffer(zstandard.compress(bytes(1 << 24)), np.uint8)
     size, count = len(bomb), 200
     start = size * np.arange(count)
-    block = Block(np.tile(bomb, count), np.zeros(count, np.int64), np.arange(count), start, start + size)
+    block = MessageBlock(np.tile(bomb, count), np.zeros(count, np.int64), np.arange(count), start, start + size)
     said: list[str] = []
     held = sum(len(one.data) for one in unpack_messages(iter([block]), frozenset({0}), "zstd", said.append))
     assert held < 1.2 * LARGEST_CHUNK_BYTES
@@ -377,7 +377,10 @@ def test_messages_that_each_inflate_a_thousand_times_are_left_out() -> None:
 
 def test_of_blocks_without_a_wanted_message_the_reader_learns_too() -> None:
     none = np.empty(0, np.int64)
-    blocks = [Block(np.zeros(8, np.uint8), *([np.ones(1, np.int64)] * 4)), Block(np.empty(0, np.uint8), *([none] * 4))]
+    blocks = [
+        MessageBlock(np.zeros(8, np.uint8), *([np.ones(1, np.int64)] * 4)),
+        MessageBlock(np.empty(0, np.uint8), *([none] * 4)),
+    ]
     found = [*unpack_messages(iter(blocks), frozenset({0}), "zstd", pytest.fail)]
     assert [len(one.channel) for one in found] == [0, 0]
 

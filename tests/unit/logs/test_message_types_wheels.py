@@ -18,7 +18,7 @@ from icrtool.errors import ConfigError, DefinitionError
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
-from icrtool.logs.streams.sources import WheelMotion
+from icrtool.logs.streams.sources import WheelSource
 from icrtool.logs.streams.wheel_pairs import Side, pair_motion
 from icrtool.logs.streams.wheels import Twist
 from icrtool.records.samples import TWIST_TYPES, StreamChoice
@@ -78,11 +78,11 @@ def column_table(message_type: str, topic: str = "/topic", **columns: Any) -> To
     return table_of(message_type, {path.replace("__", "."): values for path, values in columns.items()}, topic)
 
 
-def read(table: TopicTable, config: Any = CONFIG) -> WheelMotion:
+def read(table: TopicTable, config: Any = CONFIG) -> WheelSource:
     return read_source("wheels", table, config)
 
 
-def wheels_of(path: Path, *sets: str) -> WheelMotion:
+def wheels_of(path: Path, *sets: str) -> WheelSource:
     return survey_log(path, load_config(sets=sets)).candidates.wheels[0]
 
 

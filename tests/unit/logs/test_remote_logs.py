@@ -27,7 +27,7 @@ from icrtool.errors import LogError
 from icrtool.fleet.fleet_files import _content
 from icrtool.fleet.recordings import find_recordings, read_manifest
 from icrtool.logs.containers import source
-from icrtool.logs.containers.container import Block
+from icrtool.logs.containers.container import MessageBlock
 from icrtool.logs.containers.open_log import open_log
 from icrtool.logs.containers.recording_files import log_name
 from icrtool.logs.containers.source import find
@@ -158,7 +158,7 @@ def small_ones(path: Path) -> tuple[list[bytes], str]:
     return found, words
 
 
-def texts_of(block: Block, number: int) -> list[bytes]:
+def texts_of(block: MessageBlock, number: int) -> list[bytes]:
     rows = np.flatnonzero(block.channel == number)
     return [block.data[block.start[row] : block.end[row]].tobytes() for row in rows]
 

@@ -15,7 +15,7 @@ from icrtool.config import load_config
 from icrtool.errors import ConfigError
 from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.assembly import Survey, assemble
-from icrtool.logs.streams.sources import WheelMotion
+from icrtool.logs.streams.sources import WheelSource
 
 START_NS, STEP_NS, COUNT = 1_760_000_000_000_000_000, 50_000_000, 400
 OWN_TYPES = {
@@ -60,7 +60,7 @@ def write(path: Path, publishers: Sequence[tuple[str, str, Sequence[Any]]]) -> P
     return path
 
 
-def wheels_of(path: Path, *sets: str) -> list[WheelMotion]:
+def wheels_of(path: Path, *sets: str) -> list[WheelSource]:
     return list(survey_log(path, load_config(sets=sets)).candidates.wheels)
 
 

@@ -10,7 +10,7 @@ from icrtool.config import load_config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.assembly import wheel_samples
-from icrtool.logs.streams.sources import StampedRows, WheelMotion, motion_of
+from icrtool.logs.streams.sources import StampedRows, WheelSource, motion_of
 from icrtool.records.samples import NO_HEADINGS, PositionFixes
 from icrtool.records.tables import RobotLog
 from support.tables import read_source
@@ -89,7 +89,7 @@ def test_a_dead_encoder_is_named_where_messages_do_not_name_wheels() -> None:
     assert motion.note.startswith("wheel 3 never turns")
 
 
-def joints_motion(positions: Floats) -> WheelMotion:
+def joints_motion(positions: Floats) -> WheelSource:
     names = ["front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel"]
     rows = len(positions)
     columns = {
