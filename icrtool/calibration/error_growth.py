@@ -16,7 +16,7 @@ from msgspec.structs import astuple
 
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
-from icrtool.kernels.arrays import Complexes, Floats, Ints
+from icrtool.kernels.arrays import Complexes, Floats, Ints, unwrapped
 from icrtool.kernels.track import Track, Windows
 from icrtool.kernels.window_residuals import OMEGA, VX, displacements, path_at
 from icrtool.motion.models import FittedModel, model_columns, wheel_motion
@@ -264,7 +264,7 @@ def forecast_plan(
     speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_MPS)
     # a corner of the plan is turned over the steps around it, not on the spot: means over a track width
     width = max(round(calibration.width_m / STEP_M), 1)
-    padded = np.pad(np.unwrap(np.angle(step * np.sign(speed))), (width // 2, width - 1 - width // 2), mode="edge")
+    padded = np.pad(unwrapped(np.angle(step * np.sign(speed))), (width // 2, width - 1 - width // 2), mode="edge")
     direction = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
     held = np.abs(step / speed)
     turn = np.append(np.diff(direction), 0.0) / held

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from icrtool.config import Config
-from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, turned_axis
+from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, turned_axis, unwrapped
 from icrtool.logs.messages.topic_table import FRAME, TopicTable
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
 from icrtool.logs.streams.sources import (
@@ -301,7 +301,7 @@ def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:
     """Return whether yaw changes correlate with the gyro's; True where there is no gyro or it does not turn."""
     if yaw_rate_radps is None or not np.isfinite(yaw_rate_radps).all() or np.ptp(yaw_rate_radps) == 0:
         return True
-    yaw = np.unwrap(_bearing(0, *unit.T))
+    yaw = unwrapped(_bearing(0, *unit.T))
     # Over many samples: from one to the next there is more noise than turning.
     edges = np.unique(np.linspace(0, len(yaw) - 1, STRETCHES + 1).astype(np.int64))
     turned, measured = np.diff(yaw[edges]), np.add.reduceat(yaw_rate_radps, edges[:-1])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.arrays import Bools, Floats, Ints, unwrapped
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
 from icrtool.logs.streams.sources import Sides, WheelSource, motion_of, moves, of_topic
@@ -88,7 +88,7 @@ def _unwound(position: Floats) -> Floats:
     if np.count_nonzero(wraps) < FEWEST_WRAPS or float(steps[wraps].min()) <= LEAST_WRAP_RAD:
         return position
     unwound = position.copy()
-    unwound[finite] = np.unwrap(position[finite])
+    unwound[finite] = unwrapped(position[finite])
     return unwound
 
 
