@@ -19,6 +19,7 @@ import msgspec
 
 from icrtool.errors import ConfigError
 from icrtool.records.places import read_regular
+from icrtool.records.presets import PRESETS, Preset
 from icrtool.records.text import LONGEST_NAME, did_you_mean, shortened
 
 LARGEST_FILE_BYTES = 1 << 20
@@ -128,6 +129,11 @@ class FilterConfig:
     heading_correlation_s: Noise = 0.5
     gate_probability: Probability = 0.9999
     wheel_gap_s: Duration = 0.5
+
+    @property
+    def rules(self) -> Preset:
+        """What the preset decides."""
+        return PRESETS[self.preset]
 
 
 @dataclass(frozen=True, slots=True)

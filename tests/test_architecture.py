@@ -167,6 +167,27 @@ def test_a_circle_of_types_is_found() -> None:
     assert circle_among({"icrtool.a.one": "from icrtool.a import two", "icrtool.a.two": types})
 
 
+def presets_compared(source: str) -> list[int]:
+    """Return the lines of comparisons of a preset with its name: what presets differ in is a field of their record."""
+    return [
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Compare)
+        and isinstance(node.comparators[0], ast.Constant)
+        and isinstance(node.comparators[0].value, str)
+        and ast.unparse(node.left).rpartition(".")[2].startswith("preset")
+    ]
+
+
+@pytest.mark.parametrize("module", MODULES, ids=str)
+def test_no_module_asks_for_the_name_of_the_preset(module: Path) -> None:
+    assert presets_compared((PACKAGE / module).read_text(encoding="utf-8")) == []
+
+
+def test_a_preset_compared_with_its_name_is_found() -> None:
+    assert presets_compared('x = 1\nif config.filter.preset != "paper":\n    x = 2') == [2]
+
+
 @pytest.mark.parametrize(
     ("module", "source", "sentence"),
     [

@@ -44,7 +44,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
     """
     log = with_wheel_speeds(log, config)
-    if config.filter.preset == "paper":
+    if not config.filter.rules.corrects:
         # it takes its wheels as they are
         return _align_once(log, config)
     log, width = without_frozen(log), width_or_usual_m(config.robot.track_width_m)
@@ -199,12 +199,12 @@ def _finding(value: float | None, std: float | None, applied: float, nothing: fl
 
 
 def start_icrs(findings: dict[str, Finding], config: Config) -> IcrStart | None:
-    """Return the ICRs to start the filter from; None in preset ``paper``.
+    """Return the ICRs to start the filter from; None where the preset states them.
 
     They are those of the alignment with an inflated standard deviation, where the drive shows them; else those of
     most skid-steer robots, as uncertain as those differ.
     """
-    if config.filter.preset == "paper":
+    if config.filter.rules.initial_icrs_m is not None:
         return None
     b = width_or_usual_m(config.robot.track_width_m)
     least = LEAST_START_STD * b
@@ -249,7 +249,7 @@ NONE = Agreement(math.inf, 0.0)
 
 def choose_reference(log: RobotLog, config: Config) -> RobotLog:
     """Return the log with the position reference that its wheels and headings support; preset ``paper``: as it is."""
-    if not log.other_references or config.filter.preset == "paper" or not len(log.heading.stamp_ns):
+    if not log.other_references or not config.filter.rules.corrects or not len(log.heading.stamp_ns):
         return log
     chosen = agreement(log, config)
     if chosen.residual_m <= POOR_M:

@@ -114,7 +114,7 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tupl
         heading, position = (one if one.std_s < 2 * LARGEST_STD_S else UNKNOWN for one in found)
         apart = Delay(*fit.estimate("position_after_heading"))
     together, notes, applied, lags = log.heading_is_of_position, list[str](), (0.0, 0.0), [0.0, 0.0]
-    if config.filter.preset == "field":
+    if config.filter.rules.corrects:
         if fit is not None and not fit.slips:
             applied = _clear_delays(heading, position, apart, together=together)
         given = config.frames.heading_delay_s, config.frames.reference_delay_s
@@ -215,7 +215,7 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
     DataError
         Streams that cannot be used together, an unexplained heading, wheels that turn while the robot stands.
     """
-    corrects, width = config.filter.preset == "field", width_or_usual_m(config.robot.track_width_m)
+    corrects, width = config.filter.rules.corrects, width_or_usual_m(config.robot.track_width_m)
     as_sent = log
     log, derived, decision, windows, notes, sound = _name_streams(log, config, width)
     refuse_standing(log, windows)
@@ -269,7 +269,7 @@ def _name_streams(
     log with the chosen convention, as sent in preset ``paper``; its heading where it was estimated; the convention;
     windows with it in any preset; what to report; whether no side is dead or a copy of the other
     """
-    corrects, derived, senses = config.filter.preset == "field", None, AS_NAMED
+    corrects, derived, senses = config.filter.rules.corrects, None, AS_NAMED
     log = scaled(log, *configured_scales(config))
     if not len(log.heading.stamp_ns) and corrects:
         if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) > 1:

@@ -78,7 +78,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
     ----------
     measured_m : as in `icrtool.alignment.sensor_noise.fixes_of`
     """
-    gnss, changes = log.gnss, config.filter.preset != "paper"
+    gnss, changes = log.gnss, config.filter.rules.measures_noise
     stated = np.sqrt((gnss.var_north_m2 + gnss.var_east_m2) / 2)
     kinds, misreported = _classes(log, stated, steps)
     fixed = kinds == FIXED_FIX

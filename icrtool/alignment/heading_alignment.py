@@ -186,7 +186,7 @@ def align_heading(
     -------
     what run.json states; how long the noise of a stated heading is correlated, where it was raised [s]; what to report
     """
-    corrects, mirrored = config.filter.preset == "field", convention.heading < 0
+    corrects, mirrored = config.filter.rules.corrects, convention.heading < 0
     offset, std, scatter, applied, correlation_s = math.nan, math.nan, math.nan, 0.0, 0.0
     attitude = None if derived is None or derived.attitude is None else derived.estimate.offset
     name, notes = NO_NAME, list[str]()
@@ -243,7 +243,7 @@ def _correction(
     found : offset and its standard deviation [rad]; fixed : what is subtracted by the configuration
     """
     offset, std = found
-    mirrored, corrects = convention.heading < 0, config.filter.preset == "field"
+    mirrored, corrects = convention.heading < 0, config.filter.rules.corrects
     pose_mirrored = mirrored and convention.position < 0 and fit.windows.track.same_clock
     text, name = _offset_in_words(log, offset, std, mirrored=mirrored and not pose_mirrored)
     significant = _significant(offset - fixed, std)

@@ -226,7 +226,7 @@ def _variance(
     """Return variances: what is measured, else in preset ``paper`` the usual, else what is stated, if that is sane."""
     if math.isfinite(measured):
         return np.full(stated.shape, max(measured, at_least) ** 2)
-    if settings.preset == "paper":
+    if not settings.rules.measures_noise:
         return np.full(stated.shape, usual**2)
     sane = np.isfinite(stated) & (stated > 0) & (stated < largest_sane**2)
     return np.maximum(np.where(sane, stated, usual**2), max(floor, at_least) ** 2)
@@ -245,7 +245,7 @@ def reference_noise(log: RobotLog, settings: FilterConfig, place: FixSteps, turn
     configured. A receiver's fixes and an attitude sensor's headings step by less than they err, because they err alike
     for seconds. Preset ``paper`` measures nothing.
     """
-    free = settings.preset != "paper" and settings.gnss_std_m == "auto" and log.datum is None
+    free = settings.rules.measures_noise and settings.gnss_std_m == "auto" and log.datum is None
     place_stated, turn_stated = (
         (np.isfinite(one) & (one > 0.0)).any() for one in (log.gnss.var_north_m2, log.heading.var_rad2)
     )

@@ -172,7 +172,7 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
         slip = f"over {fit.windows.length_m[0]:.0f} m {apart}, their turns by {100 * fit.turn_slip:.0f} %"
         return (1.0, 1.0), [f"the wheels slip: {slip}; no scale and no delay is corrected"]
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
-    may = config.filter.preset == "field" and sound and not given
+    may = config.filter.rules.corrects and sound and not given
     factor, notes = 1.0, list[str]()
     scale, std = fit.estimate("scale")
     error, kept = abs(scale - 1.0), USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)

@@ -92,8 +92,8 @@ def with_motion(run: Run) -> RunDocument:
         fits = fit_models([recording], (FIVE, RECOMMENDED))
     except DataError:
         fits = {}
-    paper, width = run.config.filter.preset == "paper", recording.width_m
-    if paper:
+    of_filter, width = run.config.filter.rules.final_of_filter, recording.width_m
+    if of_filter:
         # The filter's final ICRs, with radii as configured.
         right, left, x = run.table.icrs_at(-1)
         geometry = TrackGeometry(right, left, x, (right - left) / width, 1.0, 1.0)
@@ -114,7 +114,7 @@ def with_motion(run: Run) -> RunDocument:
     largest = WEAK_SHARE * abs(geometry.y_icr_right_m - geometry.y_icr_left_m)
     shown: dict[str, float] = {}
     for name, value, std in zip(ICR_COLUMNS, geometry, np.sqrt(np.diag(covariance)).tolist(), strict=False):
-        if paper or (verdicts[name] != "not shown" and std <= largest):
+        if of_filter or (verdicts[name] != "not shown" and std <= largest):
             shown |= {name: float(value), f"{name}_std": std}
     return msgspec.structs.replace(
         run.document,

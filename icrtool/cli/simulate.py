@@ -14,7 +14,7 @@ from icrtool.cli import options, when_used
 from icrtool.cli.inputs import RUNS
 from icrtool.cli.options import FILE, NOT_NEGATIVE, POSITIVE, Change, Option, choice, flag, numbers, option, together
 from icrtool.cli.printing import Printer
-from icrtool.records.choices import HeadingConvention, PathKind, Preset, StudyName, WheelMessages
+from icrtool.records.choices import HeadingConvention, PathKind, PresetName, StudyName, WheelMessages
 
 with when_used():
     from icrtool import errors
@@ -252,7 +252,7 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
     option("--values", "V,V,...", numbers("V,V,..."), "Values of the quantity that the study varies, in its unit."),
     change=True,
 )
-@choice("--preset", get_args(Preset), "Study this preset alone; default: both; initial: paper; convergence: paper, "
+@choice("--preset", get_args(PresetName), "Study this preset alone; default: both; initial: paper; convergence: paper, "
         "or field with --robot.")  # fmt: skip
 @drive_options(
     choice("--wheels", ("ideal", "encoder"), "Wheel speeds without error, or counted travel."),
@@ -263,7 +263,7 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
 @options.CONFIGURATION
 @options.printing(options.QUIET, options.VERBOSE)
 def study_command(
-    name: str, output: Path | None, request: Change[StudyRequest], preset: Preset | None,
+    name: str, output: Path | None, request: Change[StudyRequest], preset: PresetName | None,
     path: Change[PathPlan], plan: Change[DrivePlan], sensors: Change[Sensors], encoder_counts: float | None,
     rate: float | None, plots: tuple[str, ...], settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip

@@ -1,4 +1,4 @@
-"""From aligned sensors and a configuration to what the kernel needs: times, noises, the start, the presets."""
+"""From aligned sensors and a configuration to what the kernel needs: times, noises, the start."""
 
 from __future__ import annotations
 
@@ -13,26 +13,8 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.filter_records import REFERENCE_STEP_S, FilterInputs, FilterParameters
 from icrtool.records.measurements import RESPONSE_S, IcrStart, SensorData, intervals_in
+from icrtool.records.presets import FIELD, ProcessNoise
 from icrtool.records.run import WarmStart, width_or_usual_m
-
-
-class ProcessNoise(NamedTuple):
-    """Process noise of the pose: square roots of the first and third entry of Q (Pentzer 2014, Eq. 30)."""
-
-    position_mps: float
-    heading_degps: float
-
-
-PAPER_NOISE = ProcessNoise(0.2, 5.0)
-"""Pentzer 2014, Eq. 30; 0.1 m/s in its text, 0.2 squared in its matrix: the matrix is used."""
-
-FIELD_NOISE = ProcessNoise(0.3, 7.0)
-"""Preset ``field``: with the paper's 0.2 and 5 the 2-sigma bands hold only 83 % (position) and 86 % (heading) of the
-truth on rigid-body simulated robots, with these 90 % and more."""
-
-PAPER_INITIAL_ICRS_M = (1.0, -1.0, 1.0)
-PAPER_INITIAL_ICR_STD_M = 1.0
-"""Pentzer 2014, Section 6.1: the filter starts at (1, -1, 1) m."""
 
 FARTHEST_START_M, LARGEST_START_STD_M = 1000.0, 10_000.0
 """Bounds of a warm start: those that a configured start has."""
@@ -54,10 +36,6 @@ RECOVERY_COUNT = 10
 RECOVERY_S = 1.0
 """The filter accepts rejected measurements again when so many agree with each other for this long."""
 
-MIDDLE_OF_THE_TURN = 0.5
-"""Preset ``field``: an Euler step drives straight on for dt, which looks like an x_icr of -v dt/2 (5 cm at 10 Hz and
-1 m/s); a robot that turns while its track speeds are held moves along the heading of the middle of its turn."""
-
 TURN_WANDER_RAD = math.radians(1.2)
 """How far a body turns more or less than its wheels show, a random walk [rad/sqrt(s)]: the errors of an attitude
 sensor hide it, estimated headings of 0.1 deg do not, and the ICRs would follow it."""
@@ -69,10 +47,6 @@ MEMORY_S = 0.5
 """Estimated headings of 0.1 deg are averaged over this time: followed sample by sample, they teach the ICRs of the
 shortest turns. Tracked robots turn by 2 % more in those than over some metres, wheels of few counts show no turn in
 them."""
-
-PAPER_TERRAIN_ICR_STD_M = 10.0
-"""Pentzer 2014, Section 5.2: ICR variance of 100 m^2 after a change of terrain. Preset ``field`` takes the robot's
-width: 10 m is far beyond what a linearised filter of ICRs a metre apart bears, and some drives end with wrong ones."""
 
 
 class FilterSetup(NamedTuple):
@@ -91,7 +65,7 @@ class FilterSetup(NamedTuple):
 
 
 def check_start(config: Config) -> None:
-    """Refuse, in preset ``field``, ICRs configured to start on the other side.
+    """Refuse ICRs configured to start on the other side, where the preset keeps the sides.
 
     Raises
     ------
@@ -99,7 +73,7 @@ def check_start(config: Config) -> None:
         They are; the key is named.
     """
     settings = config.filter
-    if settings.preset == "paper":
+    if not settings.rules.keeps_sides:
         return
     sides = (("right", 1.0, settings.initial_y_icr_right_m), ("left", -1.0, settings.initial_y_icr_left_m))
     for side, sign, value in sides:
@@ -230,17 +204,17 @@ def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Float
     from which the filter finds back in reasonable time. A start far from the tracks is taken to be as uncertain as far.
     """
     settings, half = config.filter, width_or_usual_m(config.robot.track_width_m) / 2
-    paper = settings.preset == "paper"
+    rules = settings.rules
     given = (settings.initial_y_icr_right_m, settings.initial_y_icr_left_m, settings.initial_x_icr_m)
     std = settings.initial_icr_std_m
-    if found is not None and not paper and given == (None, None, None):
+    if found is not None and rules.initial_icrs_m is None and given == (None, None, None):
         return np.array(found.icrs_m), np.array(found.std_m) if std is None else np.full(3, std)
-    preset = PAPER_INITIAL_ICRS_M if paper else (half, -half, 0.0)
+    preset = rules.initial_icrs_m or (half, -half, 0.0)
     right, left, x = (value if value is not None else default for value, default in zip(given, preset, strict=True))
-    if not paper:
+    if rules.keeps_sides:
         right, left = max(right, half), min(left, -half)
     away = max(abs(right - half), abs(left + half), abs(x))
-    default_std = PAPER_INITIAL_ICR_STD_M if paper else max(half, away)
+    default_std = rules.initial_icr_std_m or max(half, away)
     return np.array([right, left, x]), np.full(3, std if std is not None else default_std)
 
 
@@ -252,17 +226,12 @@ def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
 def configured_noise(config: Config) -> ProcessNoise:
     """Return the process noise of the pose that a run starts with: as configured, else the preset's."""
     settings = config.filter
-    preset = PAPER_NOISE if settings.preset == "paper" else FIELD_NOISE
+    preset = settings.rules.process_noise
     position, heading = settings.process_position_mps, settings.process_heading_degps
     return ProcessNoise(
         position if position != "auto" else preset.position_mps,
         heading if heading is not None else preset.heading_degps,
     )
-
-
-def rate_invariant(config: Config) -> bool:
-    """Return whether the process noise of a time does not depend on the number of steps, as in `FilterParameters`."""
-    return config.filter.preset != "paper"
 
 
 def process_variance(config: Config, noise: ProcessNoise) -> tuple[float, float, float, float, float, float]:
@@ -285,7 +254,8 @@ def _samples_that_err_alike(sensors: SensorData, noise: ProcessNoise) -> float:
     tau_s, stamps = sensors.heading_correlation_s, sensors.headings.stamp_ns
     if sensors.headings_are_precise:
         density, usual = (
-            math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2 for one in (noise, FIELD_NOISE)
+            math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
+            for one in (noise, FIELD.process_noise)
         )
         variance = float(np.median(sensors.headings.var_rad2))
         tau_s = max(variance / (2.0 * density), MEMORY_S**2 * usual / (2.0 * variance))
@@ -309,24 +279,22 @@ def _response_variance(data: FilterInputs, width_m: float) -> Floats:
 
 def _parameters(config: Config, data: FilterInputs, sensors: SensorData, noise: ProcessNoise) -> FilterParameters:
     settings, width_m = config.filter, width_or_usual_m(config.robot.track_width_m)
-    paper = settings.preset == "paper"
-    terrain_m = settings.terrain_icr_std_m
-    if terrain_m is None:
-        terrain_m = PAPER_TERRAIN_ICR_STD_M if paper else width_m
+    rules = settings.rules
+    gates = [chi2_gate(settings.gate_probability, degrees) if rules.gates else math.inf for degrees in (2, 1)]
     return FilterParameters(
         process_variance=process_variance(config, noise),
-        rate_invariant=rate_invariant(config),
-        step_heading=0.0 if paper else MIDDLE_OF_THE_TURN,
-        gnss_gate=math.inf if paper else chi2_gate(settings.gate_probability, 2),
-        heading_gate=math.inf if paper else chi2_gate(settings.gate_probability, 1),
-        heading_correlation=1.0 if paper else _samples_that_err_alike(sensors, noise),
-        antenna_forward=0.0 if paper else sensors.antenna_m[0],
-        antenna_right=0.0 if paper else sensors.antenna_m[1],
-        wheel_gap_s=math.inf if paper else wheel_gap_s(config, data.wheel_t),
+        rate_invariant=rules.rate_invariant,
+        step_heading=rules.step_heading,
+        gnss_gate=gates[0],
+        heading_gate=gates[1],
+        heading_correlation=_samples_that_err_alike(sensors, noise) if rules.measures_noise else 1.0,
+        antenna_forward=sensors.antenna_m[0] if rules.corrects else 0.0,
+        antenna_right=sensors.antenna_m[1] if rules.corrects else 0.0,
+        wheel_gap_s=wheel_gap_s(config, data.wheel_t) if rules.corrects else math.inf,
         gap_speed_variance=GAP_SPEED_STD_MPS**2,
         gap_turn_variance=GAP_TURN_STD_RADPS**2,
         recovery_count=RECOVERY_COUNT,
         recovery_s=RECOVERY_S,
-        icr_inflation_m2=terrain_m**2,
-        least_icr=-math.inf if paper else LEAST_ICR_IN_HALF_WIDTHS * width_m / 2,
+        icr_inflation_m2=(settings.terrain_icr_std_m or rules.terrain_icr_std_m or width_m) ** 2,
+        least_icr=LEAST_ICR_IN_HALF_WIDTHS * width_m / 2 if rules.keeps_sides else -math.inf,
     )

@@ -18,7 +18,6 @@ from icrtool.errors import DataError
 from icrtool.estimation.filter_setup import (
     TURN_WANDER_RAD,
     FilterSetup,
-    ProcessNoise,
     check_start,
     configured_noise,
     set_up_filter,
@@ -29,6 +28,7 @@ from icrtool.kernels.ekf import run_ekf, run_smoother
 from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutput, FilterParameters
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import SensorData
+from icrtool.records.presets import ProcessNoise
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
 from icrtool.records.samples import WheelSamples
@@ -203,7 +203,7 @@ def run_adaptively(
 
     noise, settings = configured_noise(config), config.filter
     parameters, output = run(sensors, noise)
-    if settings.preset != "field":
+    if not settings.rules.measures_noise:
         return parameters, output, noise
     moving = sensors.moving()
     # mean NIS per degree of freedom, each counted up to its gate

@@ -9,11 +9,12 @@ import numpy as np
 
 from icrtool.alignment.wheel_alignment import LARGEST_SCALE_CORRECTION, LARGEST_SCALE_STD
 from icrtool.config import Config
-from icrtool.estimation.filter_setup import ProcessNoise, configured_noise
+from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.run_filter import LARGEST_POSITION_MPS, STEP
 from icrtool.kernels.arrays import Bytes, Floats
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.records.measurements import Finding
+from icrtool.records.presets import ProcessNoise
 from icrtool.records.run import ICR_WORDS
 from icrtool.records.run_document import ExcitationDocument
 from icrtool.records.tables import States

@@ -92,8 +92,8 @@ def summarise(
     give_back_freed()
     multiplier = None if width is None else (separation_multiplier(table, width), multiplier_std(covariance, width))
     inverted = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1])
-    field = config.filter.preset == "field"
-    scale = measurements.findings["wheel_scale"] if field else None
+    rules = config.filter.rules
+    scale = measurements.findings["wheel_scale"] if rules.corrects else None
     of_twist = are_twist(measurements.streams) and config.wheels.twist_width_m is None
     # while the robot was in use
     of_fixes, of_headings = sensors.moving()
@@ -103,11 +103,11 @@ def summarise(
     }
     unusable = unusable_reasons(
         excitation, rejected, filtered.noise, scale, multiplier[0] if of_twist and multiplier is not None else None,
-        contradicts_windows(table, covariance, measurements.findings) if field and not changes_s else "",
-        measurements.wheels.filtered or "" if field else "",
+        contradicts_windows(table, covariance, measurements.findings) if rules.corrects and not changes_s else "",
+        measurements.wheels.filtered or "" if rules.corrects else "",
         inverted=inverted,
     )  # fmt: skip
-    hidden = () if config.filter.preset == "paper" else excitation.verdict.not_shown
+    hidden = () if rules.final_of_filter else excitation.verdict.not_shown
     lag = measurements.findings["heading_delay_s"]
     start_ns = int(table.stamp_ns[0])
     return RunDocument(
@@ -230,7 +230,7 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
     table, width = filtered.table, config.robot.track_width_m
     track = track_of_states(table, filtered.in_gap, filtered.outages_ns)
     windows, own = cut_states(table, track, width), filtered.covariance[3:, 3:]
-    if config.filter.preset == "paper":
+    if config.filter.rules.final_of_filter:
         return own, find_excitation(windows, {}), 0.0
     covariance = final_covariance(
         windows,

@@ -16,7 +16,7 @@ Starts = Literal["moving", "all"]
 """``moving``: each standstill gives one start, the state from which the robot drives on; ``all``: every state."""
 
 Reference = Literal["filter", "smoothed"]
-Preset = Literal["paper", "field"]
+PresetName = Literal["paper", "field"]
 HeadingConvention = Literal["enu", "ned"]
 
 PathKind = Literal["circle", "curved", "lawnmower", "figure-eight", "spins", "straight"]

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.kernels.arrays import Floats, Ints
-from icrtool.records.choices import PathKind, Preset
+from icrtool.records.choices import PathKind, PresetName
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
 from icrtool.simulation.study_runs import ICR_NAMES, STATES, Measure, Scenario
 
@@ -41,7 +41,7 @@ class StudyRequest:
     plan: DrivePlan
     sensors: Sensors
     config: Config
-    presets: tuple[Preset, ...]
+    presets: tuple[PresetName, ...]
     runs: int
     values: tuple[float, ...]
     paths: tuple[PathKind, ...]
@@ -240,7 +240,7 @@ class Study:
     changes_s: tuple[float, ...] = ()
     plan: DrivePlan = PLAN
     sensors: Sensors = IDEAL
-    presets: tuple[Preset, ...] = ("paper", "field")
+    presets: tuple[PresetName, ...] = ("paper", "field")
     runs: int = 40
     values: tuple[float, ...] = ()
     paths: tuple[PathKind, ...] = ()

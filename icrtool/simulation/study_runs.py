@@ -16,7 +16,7 @@ import numpy as np
 
 from icrtool.alignment.align import sensors_as_sent
 from icrtool.config import Config
-from icrtool.estimation.filter_setup import configured_noise, process_variance, rate_invariant, set_up_filter
+from icrtool.estimation.filter_setup import configured_noise, process_variance, set_up_filter
 from icrtool.kernels.arrays import Floats, Ints, wrapped
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GUARDED
@@ -200,7 +200,7 @@ def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readi
     x0 = np.array([0.0, 0.0, plan.start_heading_rad, *icrs])
     variance = np.array(process_variance(scenario.config, configured_noise(scenario.config)))
     noise = rng.normal(0.0, 1.0, (len(t), 6))
-    states = model_states(x0, t, *speeds, np.sqrt(variance), rate_invariant(scenario.config), noise)
+    states = model_states(x0, t, *speeds, np.sqrt(variance), scenario.config.filter.rules.rate_invariant, noise)
     # States are measured at the wheel stamps that fall together with a fix or a heading.
     fix, sample = (
         np.arange(0, len(t), max(1, round(sensors.wheel_rate_hz / rate)))

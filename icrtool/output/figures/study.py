@@ -16,6 +16,7 @@ from icrtool.output.figures import style
 from icrtool.output.series import BLUE, GREEN, ORANGE, RED
 from icrtool.output.tables.study import finding_text, runs_text
 from icrtool.output.text_format import signed
+from icrtool.records.presets import PRESETS
 from icrtool.simulation.studies import shown_path
 from icrtool.simulation.study_records import Level, StudyResult, chi2_band, consistency_of
 from icrtool.simulation.study_runs import FATES, STATES
@@ -85,7 +86,7 @@ def study_figure(result: StudyResult) -> Figure:
     for column, levels in enumerate(columns):
         name = levels[0].setting.series
         if len(columns) > 1:
-            panels[0][column].set_title(f"preset {name}" if name in ("paper", "field") else name, loc="left")
+            panels[0][column].set_title(f"preset {name}" if name in PRESETS else name, loc="left")
         for row, (label, draw) in enumerate(rows):
             draw(panels[row][column], result, levels)
             panels[row][0].set_ylabel(label)

@@ -9,8 +9,8 @@ from icrtool.calibration.run_models import models_of
 from icrtool.config import parse_config
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.starts import with_smoothed_reference
-from icrtool.estimation.filter_setup import MIDDLE_OF_THE_TURN
 from icrtool.estimation.fit import fit
+from icrtool.records.presets import FIELD
 from icrtool.records.run import Run
 from support.drives import ICRS, make_log
 from support.matrix_filter import step_state
@@ -30,7 +30,7 @@ def true_places(run: Run) -> np.ndarray:
     x = np.array([10.0, -5.0, 0.3, *ICRS])
     places = [x[:2]]
     for k, dt in enumerate(np.diff(wheels.stamp_ns) / 1e9):
-        x = step_state(x, wheels.v_left_mps[k], wheels.v_right_mps[k], dt, MIDDLE_OF_THE_TURN)
+        x = step_state(x, wheels.v_left_mps[k], wheels.v_right_mps[k], dt, FIELD.step_heading)
         places.append(x[:2])
     first = len(places) - len(run.table)
     return np.array(places[first:])

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from icrtool.config import load_config
-from icrtool.estimation.filter_setup import FIELD_NOISE, PAPER_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
 from icrtool.estimation.run_filter import find_noise, innovation_cost, noise_of, set_up_again
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GATED
+from icrtool.records.presets import FIELD, PAPER, ProcessNoise
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum
 from icrtool.records.tables import RobotLog
@@ -26,7 +26,7 @@ WIDTH = "robot.track_width_m=0.6"
 def bowl(best: ProcessNoise, tried: list[ProcessNoise], plateau: float = 0.0) -> float:
     """Cost that is flat up to `plateau` doublings from the start and falls towards `best` from there."""
     one = tried[-1]
-    up = math.log2(one.position_mps / FIELD_NOISE.position_mps)
+    up = math.log2(one.position_mps / FIELD.process_noise.position_mps)
     off = math.log2(one.position_mps / best.position_mps), math.log2(one.heading_degps / best.heading_degps)
     return 50.0 - 0.01 * up if up < plateau else off[0] ** 2 + off[1] ** 2
 
@@ -39,18 +39,18 @@ def test_the_search_passes_over_doublings_that_change_nothing(plateau: float) ->
         tried.append(noise)
         return bowl(best, tried, plateau)
 
-    assert find_noise(cost, FIELD_NOISE, positions=True, headings=True) == pytest.approx(best)
+    assert find_noise(cost, FIELD.process_noise, positions=True, headings=True) == pytest.approx(best)
     assert len(tried) == len(set(tried)) <= 20
 
 
 def test_of_noises_that_are_as_good_the_smallest_is_taken() -> None:
-    assert find_noise(lambda noise: 3.0, FIELD_NOISE, positions=True, headings=True) == FIELD_NOISE
+    assert find_noise(lambda noise: 3.0, FIELD.process_noise, positions=True, headings=True) == FIELD.process_noise
 
 
 def test_what_is_configured_is_not_searched_for() -> None:
     best = ProcessNoise(4.8, 28.0)
-    found = find_noise(lambda noise: bowl(best, [noise]), FIELD_NOISE, positions=False, headings=True)
-    assert found == pytest.approx((FIELD_NOISE.position_mps, 28.0))
+    found = find_noise(lambda noise: bowl(best, [noise]), FIELD.process_noise, positions=False, headings=True)
+    assert found == pytest.approx((FIELD.process_noise.position_mps, 28.0))
 
 
 def cost_of(run: Run, noise: ProcessNoise) -> float:
@@ -77,7 +77,7 @@ def test_gross_errors_of_a_few_fixes_do_not_raise_the_noise() -> None:
     gnss = replace(log.gnss, north_m=log.gnss.north_m + wrong * rng.normal(0.0, 5.0, len(wrong)))
     run = fit(replace(log, gnss=gnss), load_config(sets=[WIDTH]))
     assert run.summary["gnss"]["rejected_by_gate"] > 0.1 * len(wrong)
-    assert noise_of(run) == FIELD_NOISE
+    assert noise_of(run) == FIELD.process_noise
 
 
 def turning_errors(log: RobotLog, std_degps: float, lasts_s: float = 0.5) -> RobotLog:
@@ -96,8 +96,8 @@ def test_the_heading_noise_follows_a_robot_whose_turns_are_not_its_wheels() -> N
     log = turning_errors(make_log(seed=2), 40.0)
     run = fit(log, load_config(sets=[WIDTH]))
     fixed = fit(log, load_config(sets=[WIDTH, "filter.process_heading_degps=7", "filter.process_position_mps=0.3"]))
-    assert noise_of(run).heading_degps > FIELD_NOISE.heading_degps
-    assert noise_of(fixed) == FIELD_NOISE
+    assert noise_of(run).heading_degps > FIELD.process_noise.heading_degps
+    assert noise_of(fixed) == FIELD.process_noise
     rejected = [float(np.mean(one.heading.code == GATED)) for one in (run, fixed)]
     assert rejected[0] < 0.02
     assert rejected[1] > 0.04
@@ -120,7 +120,7 @@ def test_a_clean_drive_takes_one_pass(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_preset_paper_keeps_the_paper_s_noise() -> None:
     run = fit(turning_errors(make_log(seed=2), 40.0), load_config(sets=[WIDTH, "filter.preset=paper"]))
-    assert noise_of(run) == PAPER_NOISE
+    assert noise_of(run) == PAPER.process_noise
 
 
 def test_headings_are_as_noisy_as_the_wheels_turns_show_however_the_fixes_sway() -> None:
@@ -134,7 +134,7 @@ def test_headings_are_as_noisy_as_the_wheels_turns_show_however_the_fixes_sway()
     log = replace(log, gnss=gnss, heading=replace(log.heading, var_rad2=stated), datum=Datum(40.8, -77.9, 350.0))
     run = fit(log, load_config(sets=["robot.track_width_m=0.8"]))
     assert run.usable
-    assert noise_of(run).heading_degps <= 2.0 * FIELD_NOISE.heading_degps
+    assert noise_of(run).heading_degps <= 2.0 * FIELD.process_noise.heading_degps
     final = run.summary["icr"]["final"]
     assert final["y_icr_right_m"] == pytest.approx(ICRS[0], abs=0.03)
     assert final["y_icr_left_m"] == pytest.approx(ICRS[1], abs=0.03)

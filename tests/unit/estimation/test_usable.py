@@ -11,13 +11,13 @@ import pytest
 
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout
-from icrtool.estimation.filter_setup import FIELD_NOISE, ProcessNoise
 from icrtool.estimation.fit import fit
 from icrtool.estimation.run_filter import LARGEST_POSITION_MPS
 from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
 from icrtool.kernels.filter_records import GATED, UNSEEN, USED
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
+from icrtool.records.presets import FIELD, ProcessNoise
 from icrtool.records.run import Run
 from icrtool.records.run_document import ExcitationDocument, VerdictByIcr
 from support.drives import make_log
@@ -66,9 +66,9 @@ def test_a_run_that_rejected_a_tenth_is_usable(stream: str) -> None:
 @pytest.mark.parametrize(
     ("noise", "words"),
     [
-        (ProcessNoise(LARGEST_POSITION_MPS, FIELD_NOISE.heading_degps), "of the motion"),
-        (ProcessNoise(FIELD_NOISE.position_mps, 8 * FIELD_NOISE.heading_degps), "of the turns"),
-        (ProcessNoise(LARGEST_POSITION_MPS / 4, 4 * FIELD_NOISE.heading_degps), ""),
+        (ProcessNoise(LARGEST_POSITION_MPS, FIELD.process_noise.heading_degps), "of the motion"),
+        (ProcessNoise(FIELD.process_noise.position_mps, 8 * FIELD.process_noise.heading_degps), "of the turns"),
+        (ProcessNoise(LARGEST_POSITION_MPS / 4, 4 * FIELD.process_noise.heading_degps), ""),
     ],
 )
 def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, words: str) -> None:
