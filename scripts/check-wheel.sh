@@ -36,5 +36,11 @@ sed -E -e '/^ +--hash/d' -e 's/ *\\$//' constraints.txt >"$scratch/pins.txt"
 
 echo "check-wheel: run"
 "$UV_TOOL_DIR/icrtool/bin/python" -I -c 'import icrtool, sys; sys.exit(not icrtool.__file__.startswith(sys.prefix))'
+echo "check-wheel: types"
+sed -n '/^```python/,/^```/p' README.md | sed '/^```/d' >"$scratch/readme.py"
+cp tests/data/typed_use.py "$scratch/"
+(cd "$scratch" && "$OLDPWD/$tools/mypy" --strict --no-incremental --python-executable "$UV_TOOL_DIR/icrtool/bin/python" \
+    --disable-error-code no-untyped-call typed_use.py readme.py)
+(cd "$scratch" && "$UV_TOOL_BIN_DIR/icrtool" demo >demo.txt && [[ -s icrtool-runs/demo/report.html ]])
 scripts/try-command.sh "$UV_TOOL_BIN_DIR/icrtool" "$demo_log" ${demo_options[@]+"${demo_options[@]}"}
 echo "check-wheel: the wheel works"

@@ -1,7 +1,7 @@
-"""Print what of constraints.txt icrtool needs to be built and used, with hashes: pinned_requirements.py [EXTRA...].
+"""Print the pins that icrtool needs to be built and used, with hashes: pinned_requirements.py [EXTRA...].
 
 With ``--only PACKAGE...`` it is what these packages need. pip finds out which packages that is on this system; it
-takes hashes only for a whole list.
+takes hashes only for a whole list. With ``--rest FILE`` it is what FILE pins and constraints.txt does not.
 """
 
 from __future__ import annotations
@@ -41,12 +41,22 @@ def resolved(requirements: list[str], pins: str) -> set[str]:
     return {re.sub(r"[-_.]+", "-", one["metadata"]["name"]).lower() for one in found}
 
 
+def by_name(pins: str) -> dict[str, str]:
+    """Return the lines of each package, by its name."""
+    return {one.split("==")[0]: one for one in re.split(r"\n(?=\S)", pins.strip())}
+
+
 def main() -> None:
     """Print a line for each package, with its hashes."""
-    pins = (ROOT / "constraints.txt").read_text(encoding="utf-8")
     words = sys.argv[1:]
-    names = resolved(words[1:] if words[:1] == ["--only"] else needed(words), pins)
-    print("\n".join(one for one in re.split(r"\n(?=\S)", pins.strip()) if one.split("==")[0] in names))
+    of_use, of_development = ((ROOT / f"constraints{part}.txt").read_text(encoding="utf-8") for part in ("", "-dev"))
+    if words[:1] == ["--rest"]:
+        found = by_name(Path(words[1]).read_text(encoding="utf-8"))
+        names = set(found) - set(by_name(of_use))
+    else:
+        found = by_name(of_use) | by_name(of_development)
+        names = resolved(words[1:] if words[:1] == ["--only"] else needed(words), "\n".join(found.values()))
+    print("\n".join(lines for name, lines in found.items() if name in names))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import pytest
 import icrtool
 
 ROOT = Path(__file__).resolve().parents[1]
+PINS = ROOT / "constraints.txt", ROOT / "constraints-dev.txt"
 
 # Written in pieces, so that this file does not hold what it looks for.
 PRIVATE = {
@@ -39,7 +40,7 @@ def _is_text(path: Path) -> bool:
 
 
 def pinned() -> dict[str, str]:
-    text = (ROOT / "constraints.txt").read_text(encoding="utf-8")
+    text = "\n".join(path.read_text(encoding="utf-8") for path in PINS)
     return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", text, re.MULTILINE))
 
 
@@ -95,9 +96,16 @@ def test_every_dependency_is_pinned_within_its_bounds() -> None:
         )
 
 
+def test_a_package_is_pinned_once() -> None:
+    names = [re.findall(r"^([a-z0-9-]+)==", path.read_text(encoding="utf-8"), re.MULTILINE) for path in PINS]
+    assert not set(names[0]) & set(names[1])
+    assert {"numba", "hatchling"} <= set(names[0])
+    assert {"pytest", "mujoco", "sphinx"} <= set(names[1])
+
+
 def test_constraints_hold_names_versions_and_hashes_only() -> None:
     allowed = re.compile(r"[a-z0-9-]+==[\w.]+(?: ; [\w .<>=!'\"()]+)? \\|    --hash=sha256:[0-9a-f]{64}(?: \\)?")
-    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    lines = [line for path in PINS for line in path.read_text(encoding="utf-8").splitlines()]
     assert [line for line in lines if not allowed.fullmatch(line)] == []
 
 

@@ -10,6 +10,7 @@ from icrtool import __version__
 from icrtool.records.text import did_you_mean
 
 _COMMANDS = {
+    "demo": "Fit a sample log of the package, and report on it: to see what icrtool gives.",
     "info": "List what logs hold, which topics would be used, and the problems found.",
     "fit": "Learn the track ICRs of a robot from its logs.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",

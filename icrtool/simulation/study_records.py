@@ -6,6 +6,7 @@ import fnmatch
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from statistics import NormalDist
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -100,11 +101,18 @@ class Level(NamedTuple):
 
 
 def chi2_band(degrees: int, runs: int) -> tuple[float, float]:
-    """Return the 95 % band of the mean of `runs` chi-squared values that together have `degrees` degrees of freedom."""
-    from scipy.stats import chi2
+    """Return the 95 % band of the mean of `runs` chi-squared values that together have `degrees` degrees of freedom.
 
-    low, high = chi2.ppf([0.025, 0.975], degrees)
-    return float(low) / runs, float(high) / runs
+    Notes
+    -----
+    The cube root of a chi-squared variable is nearly normal (Wilson and Hilferty 1931). The band of one run with 6
+    degrees of freedom is accurate to 3 %, the band of 10 runs and more to 0.1 %.
+    """
+    variance = 2.0 / (9.0 * degrees)
+    low, high = (
+        degrees * (1.0 - variance + math.sqrt(variance) * NormalDist().inv_cdf(level)) ** 3 for level in (0.025, 0.975)
+    )
+    return low / runs, high / runs
 
 
 def consistency_of(found: Mapping[str, Floats]) -> dict[str, Any]:

@@ -164,6 +164,11 @@ def test_the_chi_squared_band_is_the_textbooks() -> None:
     assert (low, high) == pytest.approx((1.48, 2.59), abs=0.01)
 
 
+@pytest.mark.parametrize(("runs", "accuracy"), [(1, 0.03), (10, 1e-3), (1000, 1e-6)])
+def test_the_chi_squared_band_is_that_of_scipy(runs: int, accuracy: float) -> None:
+    assert chi2_band(6 * runs, runs) == pytest.approx(chi2.ppf([0.025, 0.975], 6 * runs) / runs, rel=accuracy)
+
+
 def test_errors_over_std_of_a_known_gaussian_are_chi_squared() -> None:
     rng = np.random.default_rng(5)
     A = np.diag([1.0, 2.0, 0.01, 0.1, 0.1, 0.2]) @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6)))
