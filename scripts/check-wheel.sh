@@ -29,7 +29,7 @@ git ls-files --cached --others --exclude-standard icrtool | while read -r file; 
     [[ ! -e $file ]] || grep -qF "$file " "$scratch/contents" || { echo "check-wheel: $file is not in the wheel" >&2; exit 1; }
 done
 
-# Constraints hold no hashes for a local wheel's dependencies; the same files passed that test in `make setup`.
+# Constraints hold no hashes for a local wheel's dependencies; the same files passed that test in `make setup-dev`.
 echo "check-wheel: install"
 sed -E -e '/^ +--hash/d' -e 's/ *\\$//' constraints.txt >"$scratch/pins.txt"
 "$tools/uv" tool install --quiet --python "$python" --constraints "$scratch/pins.txt" "$wheel"
