@@ -47,8 +47,8 @@ SHORTEST_BLOCK_M, FEWEST_BLOCKS, MOST_BLOCKS = 25.0, 3, 5
 STRIP_M, MOST_STRIPS = 5.0, 2
 """Trials from one strip of distance to another are predicted by one fit: strips at least so long, so many a block."""
 
-ROWS = {NO_SLIP: "no slip", CONTROLLER: "controller numbers", RECOMMENDED: MODELS[RECOMMENDED].label}
-"""The rows of a held-out table and their labels; each may come again with a gyro, ``_gyro`` behind its name."""
+HELD_OUT = (NO_SLIP, CONTROLLER, RECOMMENDED)
+"""The rows of a held-out table; each may come again with a gyro, ``_gyro`` behind its name."""
 
 GYRO = "_gyro"
 
@@ -85,14 +85,13 @@ class HeldOutRow:
     """
 
     name: str
-    label: str
     folds: tuple[Summary, ...]
     together: Summary
 
     def within(self, horizons_m: Sequence[float], budget_m: float) -> BudgetDistance | None:
         """Return how far p95 of all trials stays within a budget [m]; None without trials."""
         reached = within_budget(np.array(horizons_m), self.together.p95, budget_m)
-        return None if reached is None else BudgetDistance(self.name, self.label, budget_m, *reached)
+        return None if reached is None else BudgetDistance(self.name, budget_m, *reached)
 
     def worst(self, column: str, h: int) -> float:
         """Return the largest ``p95`` or ``expected`` over folds at a horizon; NaN without trials."""
@@ -129,10 +128,10 @@ class HeldOut:
             fold_of.append(mine[0].number + np.searchsorted(edges, at_m, side="right"))
         first = np.searchsorted(np.concatenate(fold_of), np.arange(1, len(self.folds)))
         scores = []
-        for name, label in self.rows.items():
+        for name in self.rows:
             errors = np.concatenate([self.errors(name, i, one).position for i, one in enumerate(self.trials)])
             by_fold = tuple(error_summary(some) for some in np.split(errors, first))
-            scores.append(HeldOutRow(name, label, by_fold, error_summary(errors)))
+            scores.append(HeldOutRow(name, by_fold, error_summary(errors)))
         return tuple(scores)
 
     @cached_property
@@ -150,10 +149,10 @@ class HeldOut:
         return f"{RECOMMENDED}{GYRO}" in self.fits
 
     @property
-    def rows(self) -> dict[str, str]:
-        """The rows of the table and their labels."""
-        turned = {f"{name}{GYRO}": f"{label} + gyro" for name, label in ROWS.items()} if self.has_gyro else {}
-        return ROWS | turned
+    def rows(self) -> tuple[str, ...]:
+        """The names of the rows of the table."""
+        turned = [f"{name}{GYRO}" for name in HELD_OUT] if self.has_gyro else []
+        return (*HELD_OUT, *turned)
 
     def score(self, name: str) -> HeldOutRow:
         """Return a row."""

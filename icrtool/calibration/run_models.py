@@ -31,12 +31,6 @@ from icrtool.records.run import ICR_COLUMNS, Run, WarmStart, check_type, no_slip
 from icrtool.records.run_document import GeometryDocument, RunDocument
 from icrtool.records.tables import RobotLog
 
-FITTED_TO = {"icr": "up to the start", "icr_final": "in sample", NO_SLIP: "not fitted"}
-"""What a row's numbers were learned from; those of the others are held out."""
-
-REST_OF_DRIVE = "the rest of the drive"
-"""What the numbers of a row that is held out were learned from."""
-
 
 def fit(
     log: RobotLog,
@@ -127,17 +121,10 @@ def with_motion(run: Run) -> RunDocument:
 
 
 class Model(NamedTuple):
-    """What predicts motion from wheel speeds: ICRs per start, or one triple.
-
-    Attributes
-    ----------
-    knows : what its ICRs were learned from
-    """
+    """What predicts motion from wheel speeds: ICRs per start, or one triple."""
 
     name: str
-    label: str
     icrs: FrozenIcrs
-    knows: str = REST_OF_DRIVE
 
 
 class ComparedRow(NamedTuple):
@@ -147,14 +134,13 @@ class ComparedRow(NamedTuple):
     ----------
     errors_of : its errors in trials, NaN where it has none; path : its path from one state to another, None where it
         has none
-    knows : what its numbers were learned from
+    knows : what its numbers were learned from, where that is not what `icrtool.records.rows` states of the row
     """
 
     name: str
-    label: str
     errors_of: ErrorsOf
     path: Callable[[int, int], OpenLoopPath | None] | None = None
-    knows: str = REST_OF_DRIVE
+    knows: str = ""
 
 
 class ComparedModels(NamedTuple):
@@ -199,7 +185,7 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     parts = {"ahead of": recording.lever.ahead, "to the right of": recording.lever.aside}
     if unknown := " and ".join(word for word, known in parts.items() if not known):
         what = f"how far {unknown} the body's origin the position is measured is not known"
-        lever = "in the row of the controller numbers it is a constant of this log"
+        lever = "in the row `controller` it is a constant of this log"
         notes.append(f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it")
     found = hold_out([recording])
     give_back_freed()
@@ -228,28 +214,28 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
 
 def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
     """Yield the held-out rows, those of the filter's ICRs with a measured heading last."""
-    for name, label in found.rows.items():
+    for name in found.rows:
         if name == NO_SLIP:
             continue
-        public, shown = name.replace(GYRO, f"_{kind}"), label.replace("gyro", kind)
-        yield ComparedRow(public, shown, partial(found.errors, name, 0), partial(found.path, name, 0))
+        public = name.replace(GYRO, f"_{kind}")
+        yield ComparedRow(public, partial(found.errors, name, 0), partial(found.path, name, 0))
     if found.has_gyro:
         (recording,) = found.recordings
         for one in models_of(run):
             if one.name != NO_SLIP:
                 errors_of = partial(_errors_turned, run, recording, one.icrs)
-                yield ComparedRow(f"{one.name}_{kind}", f"{one.label} + {kind}", errors_of)
+                yield ComparedRow(f"{one.name}_{kind}", errors_of)
 
 
 def models_of(run: Run) -> tuple[Model, ...]:
     """Return the filter's models: momentary ICRs, no slip where b is known, the run's final ICRs."""
     table = run.table
     momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    models = [Model("icr", "ICR, momentary", momentary, "the distance up to each start")]
+    models = [Model("icr", momentary)]
     if (width := run.track_width_m) is not None:
-        models.append(Model("no_slip", "no slip", FrozenIcrs.constant(*no_slip_icrs(width)), "the track width"))
+        models.append(Model(NO_SLIP, FrozenIcrs.constant(*no_slip_icrs(width))))
     final = FrozenIcrs.constant(*table.icrs_at(-1))
-    return (*models, Model("icr_final", "ICR, final", final, "all of the drive, the trial too"))
+    return (*models, Model("icr_final", final))
 
 
 def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:

@@ -14,7 +14,7 @@ from msgspec.structs import astuple
 from icrtool import __version__
 from icrtool.calibration.pooled import predictor, turning_recording_of
 from icrtool.calibration.record import Calibration
-from icrtool.calibration.run_models import FITTED_TO, ComparedModels, ComparedRow, Model, compare_models
+from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, compare_models
 from icrtool.dropout_analysis import report, shown_paths
 from icrtool.dropout_analysis.starts import split_by_turning, with_smoothed_reference
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
@@ -314,11 +314,10 @@ def _ladder(
     for one in errors.results:
         if one.name not in given:
             with_heading = bool(found.heading) and one.name.endswith(turned)
-            fitted = FITTED_TO.get(one.name.removesuffix(turned) if with_heading else one.name, "held out")
             rows = [astuple(row)[1:ERRORS] for row in one.document.by_horizon]
             heading = found.heading if with_heading else "wheels"
             models.append(
-                documents.ScoreDocument(one.name, one.label, fitted, heading, *map(list, zip(*rows, strict=True)))
+                documents.ScoreDocument(one.name, one.document.knows, heading, *map(list, zip(*rows, strict=True)))
             )
     table, fits = found.table, {}
     for name, fit in table.fits.items():
@@ -350,22 +349,22 @@ def _calibration_rows(
         return (), []
     recording = turning_recording_of(run)
     for number, one in enumerate(calibrations, start=1):
-        name = label = "calibration"
+        name = "calibration"
         if len(calibrations) > 1:
-            label = one.name or str(number)
+            stem = one.name or str(number)
             if one.name and sum(other.name == one.name for other in calibrations) > 1:
-                label = f"{label}-{number}"
-            name = f"calibration:{label}"
+                stem = f"{stem}-{number}"
+            name = f"calibration:{stem}"
         created = one.created or ""
         of_sensors = dict.fromkeys(CalibrationFile.__struct_fields__[1:], UNSET)
         kept = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
         seen = one.fitted_to(recording.sha256)
         fitted = "fitted to this log" if seen else "not fitted to this log"
-        rows = [(name, label, one.recommended, False)]
+        rows = [(name, one.recommended, False)]
         if one.gyro is not None and recording.track.gyro is not None:
-            rows.append((f"{name}_gyro", f"{label} + gyro", one.gyro.model, True))
-        for name, label, model, with_gyro in rows:
+            rows.append((f"{name}_gyro", one.gyro.model, True))
+        for name, model, with_gyro in rows:
             errors_of = predictor(one, recording, with_gyro=with_gyro)
-            models.append(ComparedRow(name, label, errors_of, knows=fitted))
-            used.append(UsedCalibration(name, label, model, len(one.logs), seen, created, with_gyro, kept, fitted))
+            models.append(ComparedRow(name, errors_of, knows=fitted))
+            used.append(UsedCalibration(name, model, len(one.logs), seen, created, with_gyro, kept, fitted))
     return tuple(used), models

@@ -270,7 +270,7 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
             quiet = documents.column_of(result.without_events, "p95_m")
             free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
             without = (None, False) if free is None else free[:2]
-            found.append(BudgetDistance(result.name, result.label, budget_m, *reached, low, high, *without))
+            found.append(BudgetDistance(result.name, budget_m, *reached, low, high, *without))
     return tuple(found)
 
 

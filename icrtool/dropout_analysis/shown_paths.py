@@ -20,6 +20,7 @@ from icrtool.motion.recording import Trials
 from icrtool.records.choices import Starts
 from icrtool.records.dropout_document import ExampleTrial, Outage, OutageDocument, TrialDocument
 from icrtool.records.plain_data import known
+from icrtool.records.rows import row_of
 from icrtool.records.run import Run, track_of
 
 WORST_COUNT = 10
@@ -29,7 +30,6 @@ ALIKE_RAD = np.radians(10.0)
 STRAIGHT_SHARE, LONGEST_CHORD = 0.05, 1.1
 TYPICAL_OF = 30
 """Trials enough to find the median error."""
-PICTURED = ("icr", "no_slip", "recommended", "controller")
 
 LONGEST_SHARE = 0.5
 """Spaced outages leave at least this share of the time between them to learn."""
@@ -113,11 +113,11 @@ def _example(
 ) -> ExampleTrial:  # fmt: skip
     paths: dict[str, OpenLoopPath] = {}
     for model in models:
-        if model.name in PICTURED:
+        if row_of(model.name).pictured:
             right, left, x = (float(column[start if len(column) > 1 else 0]) for column in model.icrs)
             paths[model.name] = open_loop_path(track, right, left, x, start, end)
     for row in rows:
-        if row.name in PICTURED and row.path is not None and (path := row.path(start, end)) is not None:
+        if row_of(row.name).pictured and row.path is not None and (path := row.path(start, end)) is not None:
             paths[row.name] = path
     errors = {
         name: known(float(np.hypot(path.north[-1] - track.north[end], path.east[-1] - track.east[end])))

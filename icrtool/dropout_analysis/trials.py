@@ -36,6 +36,7 @@ from icrtool.records import dropout_document as documents
 from icrtool.records.choices import Starts
 from icrtool.records.plain_data import known, plain
 from icrtool.records.process_resources import give_back_freed
+from icrtool.records.rows import row_of
 from icrtool.records.run import Run, track_of
 from icrtool.records.text import counted
 
@@ -279,5 +280,7 @@ def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> document
         if one is not None:
             errors_m = [float(f"{error:.6g}") for error in one.errors_m]
             blocks.append(documents.BlocksDocument(row.horizon_m, **plain(one._asdict() | {"errors_m": errors_m})))
-    document = documents.ModelDocument(model.name, model.label, model.knows, list(rows), blocks)
+    of_name = row_of(model.name)
+    knows = (isinstance(model, ComparedRow) and model.knows) or of_name.knows
+    document = documents.ModelDocument(model.name, of_name.words, knows, list(rows), blocks)
     return documents.ModelResult(document, bins, sums, tuple(row for row in free if row is not None))

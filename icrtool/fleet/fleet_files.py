@@ -24,11 +24,11 @@ from icrtool.output.files import formats
 from icrtool.output.files.atomic import atomic_file, check_place, make_folders, write_file
 from icrtool.output.run_directory import PAGE_FILE, is_page, open_run
 from icrtool.output.text_blocks import Block, Items, Section, Table, Title
-from icrtool.output.text_format import MODEL_WORDS
 from icrtool.records import fleet_document as documents
 from icrtool.records.fleet_document import FLEET_FILE, ROWS, RUNS, FleetCalibration, FleetDocument, FleetFile, FleetLog
 from icrtool.records.places import is_regular
 from icrtool.records.process_resources import remove
+from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.text import LogText, counted, escaped
 
@@ -54,7 +54,7 @@ FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
 
-SHOWN_ERRORS = {MODEL_WORDS["recommended"]: documents.SHOWN_ERROR, MODEL_WORDS["icr"]: documents.SHOWN_WITHOUT}
+SHOWN_ERRORS = {MOST_USEFUL: documents.SHOWN_ERROR, WITHOUT_IT: documents.SHOWN_WITHOUT}
 """By whose errors the picture shows: the first that a log has."""
 
 

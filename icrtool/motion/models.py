@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
+from icrtool.records.rows import REPORT_ROWS
 
 
 class WheelMotion(NamedTuple):
@@ -171,9 +172,14 @@ _EIGHT = (*_FIVE, "vy_vw", "omega_sw", "omega_vw")
 MODELS: dict[str, MotionModel] = {
     model.name: model
     for model in (
-        MotionModel(NO_SLIP, "no slip", (), "Pentzer 2014, Eqs. 38-39"),
+        MotionModel(NO_SLIP, REPORT_ROWS[NO_SLIP].words, (), "Pentzer 2014, Eqs. 38-39"),
         MotionModel(FIVE, "ICRs, wheel scales", _FIVE, "Mandow 2007, five parameters"),
-        MotionModel(RECOMMENDED, "whole model", _EIGHT, "with Seegmiller 2014, and gains of curvature and speed"),
+        MotionModel(
+            RECOMMENDED,
+            REPORT_ROWS[RECOMMENDED].words,
+            _EIGHT,
+            "with Seegmiller 2014, and gains of curvature and speed",
+        ),
     )
 }
 """The models that are fitted, by name."""

@@ -28,6 +28,7 @@ from icrtool.records.choices import FigureSet
 from icrtool.records.dropout_document import DropoutDocument, EarlierReport, SummaryRow
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
+from icrtool.records.rows import IN_CSV
 from icrtool.records.run_document import known_content
 from icrtool.records.text import escaped
 
@@ -36,8 +37,6 @@ TRIALS_FILE = "trials.parquet"
 DROPOUT_DIRECTORY = "dropout"
 """Where a report stands in its run directory."""
 SCHEMA_FAMILY = "icrtool/dropout/"
-
-ERROR_COLUMNS = ("icr", "no_slip", "recommended", "controller")
 
 
 def write_report(
@@ -110,7 +109,7 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
     worst: list[tuple[Any, ...]] = []
     for rank, trial in enumerate(document.worst, start=1):
         *columns, errors = msgspec.structs.astuple(trial)
-        worst.append((rank, *columns, *(errors.get(model) for model in ERROR_COLUMNS)))
+        worst.append((rank, *columns, *(errors.get(model) for model in IN_CSV)))
     (directory / "worst.csv").write_bytes(csv_bytes(WORST_COLUMNS, worst))
     if document.ladder.models:
         (directory / "ladder.csv").write_bytes(csv_bytes(COMPARISON_COLUMNS, comparison_rows(document)))
@@ -121,7 +120,7 @@ HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent
 
 WORST_COLUMNS = (
     "rank", "model", "stamp_ns", "t_s", "north_m", "east_m", "horizon_m", "heading_change_deg", "speed_mean_mps",
-    *(f"{model}_error_m" for model in ERROR_COLUMNS),
+    *(f"{model}_error_m" for model in IN_CSV),
 )  # fmt: skip
 
 

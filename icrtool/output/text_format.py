@@ -18,34 +18,20 @@ if TYPE_CHECKING:
 
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-MODEL_WORDS = {"recommended": "whole model", "controller": "controller numbers", "icr": "ICR", "no_slip": "no slip"}
-
 PATH_WORDS = {"filter": "filter", "smoothed": "smoother", "icr": "ICR odometry", "no_slip": "no-slip odometry"}
 
 WORDS = {
     "ICR": "Instantaneous centre of rotation of a track: the point of the ground, seen from the robot, about which it "
     "turns. A robot that slips turns about points further out than its tracks.",
-    "momentary, final": "The estimate at the start of a trial; the estimate at the end of the log.",
-    "no slip": "The model of a robot whose wheels never slide sideways: what odometry uses where nothing was "
-    "calibrated.",
-    "whole model": "The recommended one: constant parameters, fitted to many windows of the drive, each trial "
-    "predicted without the distance that it drives.",
-    "controller numbers": "What a differential-drive controller makes of the multiplier and the radius factors above, "
-    "tested like the others.",
     "trial": "From one recorded state, drive on with wheel speeds alone. The error is the distance to the reference "
     "at the end.",
     "95 %, expected": "19 of 20 trials end nearer than the first; the second is the mean over all trials.",
     "σ": "One standard deviation.",
 }
-"""What the words of a run's page mean."""
+"""What the words of a run's page mean; those of its rows are in `icrtool.records.rows`."""
 
 MOST_LINES = 50
 """Jumps of the reference that are printed, the largest decided ones first."""
-
-
-def model_word(name: str, label: str) -> str:
-    """Return what a model is called where there is little space: by its word, else by its label."""
-    return MODEL_WORDS.get(name, label)
 
 
 def run_title(summary: RunDocument) -> str:
@@ -135,12 +121,12 @@ def model_text(fitted: FittedModel) -> str:
 
 
 def controller_error_text(errors: ControllerErrors | None) -> str:
-    """Return the held-out error of a controller beside that of the whole model; empty where it was not measured."""
+    """Return the held-out error of a controller and of the row `recommended`; empty where it was not measured."""
     if errors is None or errors.p95_m is None or errors.full_p95_m is None:
         return ""
     return (
         f"with these numbers alone the error after {CHOICE_HORIZON_M:g} m is {error_text(errors.p95_m)} (95 %, held "
-        f"out of the fit), with the whole model {error_text(errors.full_p95_m)}"
+        f"out of the fit), with `recommended` {error_text(errors.full_p95_m)}"
     )
 
 

@@ -35,7 +35,6 @@ class BudgetDistance(Record, frozen=True):
     """
 
     model: str
-    label: str
     budget_m: float
     distance_m: float
     beyond: bool

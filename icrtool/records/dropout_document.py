@@ -91,10 +91,10 @@ class BlocksDocument(Record, frozen=True):
 
 
 class ModelDocument(Record, frozen=True):
-    """A model's errors; `knows`: what its numbers were learned from."""
+    """A model's errors; `words`: what predicts its motion; `knows`: what its numbers were learned from."""
 
     name: str
-    label: str
+    words: str
     knows: str
     by_horizon: list[SummaryRow]
     blocks: list[BlocksDocument]
@@ -155,7 +155,6 @@ class ScoreDocument(Record, frozen=True):
     """A model of the comparison: what it was fitted to, and its errors by horizon."""
 
     name: str
-    label: str
     fitted: str
     heading: str
     trials: list[int]
@@ -191,7 +190,7 @@ class UsedCalibration(Record, frozen=True):
 
     Attributes
     ----------
-    name, label : of its row
+    name : of its row
     model : of the calibration
     logs : how many it was fitted to; fitted_to_this : this log is among them
     created : date and time, UTC
@@ -202,7 +201,6 @@ class UsedCalibration(Record, frozen=True):
     """
 
     name: str
-    label: str
     model: str
     logs: int
     fitted_to_this: bool
@@ -284,11 +282,6 @@ class ModelResult(NamedTuple):
     def name(self) -> str:
         """Name of the model."""
         return self.document.name
-
-    @property
-    def label(self) -> str:
-        """Its label in tables and pictures."""
-        return self.document.label
 
     def column(self, name: str) -> Floats:
         """Return a number at each horizon (h,), NaN where there is none."""

@@ -8,6 +8,7 @@ from msgspec import UNSET, UnsetType, field
 
 from icrtool.records.acceptance import Verdict
 from icrtool.records.plain_data import Record
+from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT
 
 FLEET_SCHEMA: Literal["icrtool/fleet/1"] = "icrtool/fleet/1"
 """Version of what fleet.json holds."""
@@ -24,7 +25,7 @@ RUNS, ROWS = "runs", ".rows"
 BUDGET_M = 0.5
 """Error within which the distance of a pooled calibration counts."""
 
-SHOWN_ERROR, SHOWN_WITHOUT = "recommended_p95_10m_m", "icr_p95_10m_m"
+SHOWN_ERROR, SHOWN_WITHOUT = f"{MOST_USEFUL}_p95_10m_m", f"{WITHOUT_IT}_p95_10m_m"
 """The error of each log that is printed, drawn, and compared with the baseline; without a held-out one the second."""
 
 Status = Literal["done", "failed"]

@@ -10,15 +10,15 @@ import numpy as np
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
-from icrtool.output.text_format import error_text, model_word, run_title
+from icrtool.output.text_format import error_text, run_title
 from icrtool.records.acceptance import BudgetDistance
 from icrtool.records.dropout_document import ModelResult, column_of
+from icrtool.records.rows import row_of, rows_of, shown_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-OF_THE_FILTER = ("icr", "no_slip")
 PANEL_HEIGHT_IN, LOW_PANEL_IN = 2.0, 1.45
 
 P95 = style.line("black", width=1.2)
@@ -49,10 +49,9 @@ MOSTLY_BEYOND_PCT = 90.0
 def dropout_summary(report: DropoutReport) -> Figure:
     """Return 95 % and expected error [m] over distance without GNSS [m]: how far each model stays within the budget.
 
-    The recommended model, what a controller makes of its numbers, and calibrations that were given; no slip for
-    comparison. Where there is no recommended model, the momentary ICRs.
+    The rows that are shown and pictured; those for comparison are thin lines.
     """
-    models = [*_held_out(report), *(one for one in report.results if one.name == "no_slip")]
+    models = [*_models(report), *(one for one in _pictured(report) if row_of(one.name).compared)]
     budgets_m = list(dict.fromkeys(one.budget_m for one in report.document.budgets))
     reached = [one for one in report.document.budgets if one.model in {model.name for model in models}]
     best = next((one for one in reached if one.model == models[0].name), None)
@@ -72,7 +71,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
     figure = style.new_figure(title, subtitle, height_in=4.6 + keys_in, margins_in=margins_in)
     axes = figure.subplots()
     # A line begins where trials do, or where its model has used up the budget.
-    first_m = min([report.horizons_m[0], *(one.distance_m for one in reached if one.model != "no_slip")])
+    first_m = min([report.horizons_m[0], *(one.distance_m for one in reached if not row_of(one.model).compared)])
     for one in models:
         _draw_model(axes, one, report.horizons_m, first_m, pens[one.name], first=one is models[0])
     outages = [one for one in report.document.outages if one.kind == "real" and one.distance_m <= report.horizons_m[-1]]
@@ -93,7 +92,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
     label = f"budget {' and '.join(f'{one:g}' for one in budgets_m)} m"
     for budget in budgets_m:
         axes.axhline(budget, label=label, **style.BUDGET)
-        marked = [one for one in reached if one.budget_m == budget and one.model != "no_slip" and not one.beyond]
+        marked = [one for one in reached if one.budget_m == budget and not (one.beyond or row_of(one.model).compared)]
         _mark_reaches(axes, marked, pens, low)
     style.add_legend(figure, ncols=KEY_COLUMNS)
     return figure
@@ -104,14 +103,14 @@ def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
     """Return the percent of the trials by error [m] of the recommended model, a panel a horizon, and the budget."""
     asked = [_place(report, metres) for metres in horizons_m]
     of_models = (
-        (one, [h for h in asked if len(one.histograms[h].left)]) for one in (*_held_out(report), *report.results)
+        (one, [h for h in asked if len(one.histograms[h].left)]) for one in (*_models(report), *report.results)
     )
     model, places = next(found for found in of_models if found[1])
     budgets_m = dict.fromkeys(one.budget_m for one in report.document.budgets)
     errors = ", ".join(error_text(model.document.by_horizon[h].p95_m).removesuffix(" m") for h in places)
     distances = ", ".join(f"{report.horizons_m[h]:g}" for h in places)
     title = f"95 % of the trials end within {errors} m after {distances} m"
-    subtitle = f"{run_title(report.run_document)}: open-loop error, {model_word(model.name, model.label)}"
+    subtitle = f"{run_title(report.run_document)}: open-loop error of {model.name} ({model.document.words})"
     height_in, margins_in = 1.55 + LOW_PANEL_IN * len(places), (0.75, 0.25, 0.85, 0.9)
     figure = style.new_figure(title, subtitle, height_in=height_in, margins_in=margins_in, hspace=0.38)
     panels = figure.subplots(len(places), 1, squeeze=False, sharex=True)[:, 0]
@@ -137,10 +136,8 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
         The report has no such horizon.
     """
     h = _place(report, horizon_m)
-    of_the_filter = [one for name in OF_THE_FILTER if (one := report.result(name)) is not None]
-    found = [*of_the_filter, *(one for one in _held_out(report) if one.name != "icr")]
     # A model of constant parameters may have no trial of a length that others have.
-    results = [result for result in found if len(result.histograms[h].left)]
+    results = [result for result in _pictured(report) if len(result.histograms[h].left)]
     p95 = [float(result.column("p95_m")[h]) for result in results]
     least, most = map(error_text, (min(p95), max(p95)))
     title = f"After {horizon_m:g} m 95 % of the trials end within {least.removesuffix(' m')} to {most}, by model"
@@ -150,24 +147,27 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
     panels = figure.subplots(len(results), 1, squeeze=False)[:, 0]
     end = min(LEAST_HISTOGRAM_IN_P95 * max(p95), MOST_HISTOGRAM_IN_P95 * p95[0])
     for axes, result in zip(panels, results, strict=True):
-        color, word = _pens(report)[result.name]["color"], model_word(result.name, result.label)
-        _draw_bins(axes, result, h, color, end, word)
+        _draw_bins(axes, result, h, _pens(report)[result.name]["color"], end, result.name)
     panels[-1].set_xlabel("Error [m]")
     style.add_legend(figure, columnspacing=3.0)
     return figure
 
 
-def _held_out(report: DropoutReport) -> list[ModelResult]:
-    """Return the recommended model, its numbers in a controller, and calibrations; else the momentary ICRs."""
-    found = [one for name in _pens(report) if name not in OF_THE_FILTER and (one := report.result(name)) is not None]
-    return found or [one for one in report.results if one.name == "icr"] or list(report.results[:1])
+def _pictured(report: DropoutReport) -> list[ModelResult]:
+    """Return the rows that pictures show, in order."""
+    by_name = {one.name: one for one in report.results}
+    return [by_name[name] for name, row in rows_of(by_name).items() if row.pictured] or list(report.results[:1])
+
+
+def _models(report: DropoutReport) -> list[ModelResult]:
+    """Return the rows that pictures of distance show, in order, without those for comparison."""
+    shown = shown_rows([one.name for one in report.results])
+    found = [one for one in _pictured(report) if one.name in shown and not row_of(one.name).compared]
+    return found or list(report.results[:1])
 
 
 def _pens(report: DropoutReport) -> dict[str, style.Look]:
-    """Return how the models are drawn that pictures show; final ICRs and rows with a gyro are in the tables alone."""
-    own = ("icr_final", "icr_gyro", "icr_final_gyro", "no_slip_gyro", "recommended_gyro", "controller_gyro")
-    left_out = {*own, *(one.name for one in report.document.calibrations if one.with_gyro)}
-    return style.model_pens([one.name for one in report.results if one.name not in left_out])
+    return style.row_pens(one.name for one in report.results)
 
 
 def _place(report: DropoutReport, horizon_m: float) -> int:
@@ -181,9 +181,9 @@ def _draw_model(
 ) -> None:  # fmt: skip
     """Draw the 95 % error of a model with its interval; of the `first` one also the expected error.
 
-    No slip is a thin line. Between horizons lines are as `budget_distances` has them, from no error at no distance.
+    A row for comparison has no interval. Between horizons lines are as `budget_distances` has them, from no error at
+    no distance.
     """
-    label = model_word(result.name, result.label)
     x = np.linspace(first_m, horizons_m[-1], CURVE_POINTS)
     known = np.isfinite(result.column("p95_m"))
     at = np.append(0.0, horizons_m[known])
@@ -191,13 +191,12 @@ def _draw_model(
         np.where(x <= at[-1], np.interp(x, at, np.append(0.0, result.column(name)[known])), np.nan)
         for name in ("p95_m", "p95_low_m", "p95_high_m", "expected_error_m")
     )
-    thin = result.name == "no_slip"
-    look = pen | ({"linewidth": THIN} if thin else {}) | {"zorder": 2.6 if first else 2.4}
-    axes.plot(x, p95, label=f"{label}, 95 %", **look)
-    if not thin:
+    look = pen | {"zorder": 2.6 if first else 2.4}
+    axes.plot(x, p95, label=f"{result.name}, 95 %", **look)
+    if not row_of(result.name).compared:
         axes.fill_between(x, low, high, color=pen["color"], alpha=BAND_ALPHA, linewidth=0)
     if first:
-        axes.plot(x, mean, label=f"{label}, mean", **look | {"linewidth": THIN})
+        axes.plot(x, mean, label=f"{result.name}, mean", **look | {"linewidth": THIN})
 
 
 def _mark_reaches(

@@ -15,8 +15,9 @@ from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
 from icrtool.output.figures.trajectory import CELLS, JUMP_LOOK, draw_path, fitted_box_in, look_down, name_directions
 from icrtool.output.series import places, round_steps
-from icrtool.output.text_format import duration_text, error_text, model_word, run_title, turn_text
+from icrtool.output.text_format import duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout_document import ExampleTrial, Outage, TrialDocument
+from icrtool.records.rows import row_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,8 +28,6 @@ WORST_CELL_IN = 2.15
 WORST_LAYOUT: Any = {"width_in": 9.6, "margins_in": (0.15, 0.15, 0.98, 0.5), "wspace": 0.12, "hspace": 0.27}
 CELL_TITLE: style.Look = {"loc": "left", "pad": 4.0, "fontsize": 8.0}
 
-PICTURED = ("no_slip",)
-"""Drawn beside the model that trials were chosen by."""
 OUTAGES = {"forced": style.line(style.BAD_FIX_COLOR, width=1.8), "real": style.line("black", (0, (2.0, 1.2)), 1.8)}
 PATH = style.line(style.FIX_COLOR, width=1.4)
 
@@ -72,7 +71,7 @@ def dropout_examples(report: DropoutReport) -> Figure:
         _draw_drive(axes, report, drive, shape=3.0 / 2.75)
         turn = turn_text(trial.heading_change_deg)
         facts = f"at {trial.t_s:.0f} s, turns {turn} at {trial.speed_mean_mps:.2f} m/s"
-        errors = ",  ".join(f"{_word(report, name)} {error_text(error)}" for name, error in trial.errors_m.items())
+        errors = ",  ".join(f"{name} {error_text(error)}" for name, error in trial.errors_m.items())
         axes.set_title(f"{facts}\nend error: {errors}", loc="left", pad=5.0)
         axes.set_xlabel("East of start [m]")
         axes.set_ylabel("North of start [m]")
@@ -92,7 +91,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
     worst = _needed(report, report.worst, "worst trials")[: WORST_COLUMNS * WORST_ROWS - 1]
     first = worst[0].document
     rows, model = -(-(len(worst) + 1) // WORST_COLUMNS), first.model
-    which = f"{_word(report, model)}, the {len(worst)} worst trials, none overlapping"
+    which = f"{model}, the {len(worst)} worst trials, none overlapping"
     title = f"The worst trial of {first.horizon_m:g} m ends {error_text(first.errors_m[model])} off"
     subtitle, height_in = f"{run_title(report.run_document)}: {which}", 1.0 + rows * (WORST_CELL_IN + 0.5)
     figure = style.new_figure(title, subtitle, height_in=height_in, **WORST_LAYOUT)
@@ -111,11 +110,6 @@ def dropout_worst(report: DropoutReport) -> Figure:
         axes.set_axis_off()
     style.add_legend(figure)
     return figure
-
-
-def _word(report: DropoutReport, model: str) -> str:
-    result = report.result(model)
-    return model_word(model, result.label if result is not None else model)
 
 
 def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, east_m: Floats) -> None:
@@ -211,10 +205,10 @@ def _needed(report: DropoutReport, content: tuple[Content, ...], what: str) -> t
 
 def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: float, ticks: int = 5) -> None:
     """Draw one trial about its start in axes `shape` times as wide as high."""
-    trial, pens = drive.document, style.model_pens(list(drive.paths))
+    trial, pens = drive.document, style.row_pens(drive.paths)
     lines = [(drive.reference_north_m, drive.reference_east_m, style.FILTER, "filter")]
-    drawn = {name: path for name, path in drive.paths.items() if name in (*PICTURED, trial.model)}
-    lines += [(path.north, path.east, pens[name], _word(report, name)) for name, path in drawn.items()]
+    drawn = {name: path for name, path in drive.paths.items() if row_of(name).compared or name == trial.model}
+    lines += [(path.north, path.east, pens[name], name) for name, path in drawn.items()]
     lines = [(north - trial.north_m, east - trial.east_m, pen, label) for north, east, pen, label in lines]
     norths, easts = (np.concatenate([line[column] for line in lines]) for column in (0, 1))
     cell = look_down(axes, norths, easts, shape, ticks=ticks)

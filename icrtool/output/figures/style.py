@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from io import BytesIO
@@ -20,6 +20,7 @@ from PIL import Image
 
 from icrtool.kernels.arrays import Floats
 from icrtool.output.series import BLUE, GREEN, ORANGE, PURPLE, RED
+from icrtool.records.rows import Color, Dash, rows_of
 from icrtool.records.text import LONGEST_MESSAGE, escaped, shortened
 
 if TYPE_CHECKING:
@@ -107,16 +108,18 @@ HALF_WIDTH = line("0.35", (0, (1.5, 2.0)), 1.1)
 CHANGE = line(RED, (0, (3, 1.5)), 1.1)
 MEAN = line("black", (0, (5, 2)), 1.1)
 BUDGET = line(RED, (0, (1.5, 2.0)), 1.2)
-MODEL_PENS = {
-    "recommended": line(GREEN, "-", 1.8), "controller": line(PURPLE, (0, (6, 1.5)), 1.5), "icr": ICR,
-    "no_slip": NO_SLIP,
+COLORS: dict[Color, str] = {
+    "green": GREEN, "purple": PURPLE, "blue": BLUE, "orange": ORANGE, "grey": "#666666", "brown": "#8c510a",
+    "pink": "#c51b7d", "teal": "#01665e", "olive": "#7a7a00", "slate": "#5c6f8a",
 }  # fmt: skip
-OTHER_PENS = (
-    line("#8c510a", (0, (3, 1.2)), 1.4),
-    line("#01665e", (0, (6, 1.5, 2, 1.5)), 1.4),
-    line("#c51b7d", "-", 1.2),
-)
-"""Of calibrations, in the order of the report."""
+"""The colours of rows on paper; on pages they are those of page.css."""
+
+DASHES: dict[Dash, str | tuple[float, tuple[float, ...]]] = {
+    "solid": "-", "dashed": (0, (6, 2)), "dotted": (0, (1.5, 1.5)), "dashdot": (0, (6, 1.5, 1.2, 1.5)),
+}  # fmt: skip
+
+ROW_WIDTH = 1.45
+"""Width of the line of most rows, in points."""
 
 ICR_LOOKS: dict[str, Look] = {
     "y_icr_right": {"label": "y right", "color": BLUE, "linestyle": "-", "marker": "o", "markersize": 3.5},
@@ -251,10 +254,10 @@ def fill_bins(axes: Axes, edges: Floats, heights: Floats, **look: Any) -> None:
     filled.sticky_edges.y.append(0.0)
 
 
-def model_pens(names: Sequence[str]) -> dict[str, Look]:
-    """Return how the models of a report are drawn, by name; calibrations in their order."""
-    others = [name for name in names if name not in MODEL_PENS]
-    return MODEL_PENS | {name: OTHER_PENS[number % len(OTHER_PENS)] for number, name in enumerate(others)}
+def row_pens(names: Iterable[str]) -> dict[str, Look]:
+    """Return how the rows of a report are drawn, by name, in their order."""
+    rows = rows_of(names).items()
+    return {name: line(COLORS[row.color], DASHES[row.dash], ROW_WIDTH * row.width) for name, row in rows}
 
 
 def logarithmic_errors(axes: Axes, of: Literal["x", "y"] = "x") -> None:

@@ -35,9 +35,10 @@ from icrtool.output.series import (
     scale_end_m,
     scale_of,
 )
-from icrtool.output.tables.errors import in_order, main_rows
+from icrtool.output.tables.errors import ordered
 from icrtool.records.dropout_document import DropoutDocument, FitDocument
 from icrtool.records.plain_data import Record
+from icrtool.records.rows import REST_OF_DRIVE, Row, rows_of, shown_rows
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, Run, track_of, width_or_usual_m
 
 MOST_STEPS = 150_000
@@ -93,17 +94,24 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
 
 def errors_data(report: DropoutDocument) -> dict[str, object]:
     """Return the errors over distance by model, and those of the reference alone."""
-    models, main = in_order(report.models), main_rows(report)
+    models = ordered(report.models)
+    rows = rows_of(one.name for one in models)
+    shown = shown_rows(list(rows))
     reference = report.reference_error
     return {
         "horizons_m": [row.horizon_m for row in models[0].by_horizon] if models else [],
         "models": [
-            {"name": one.name, "label": one.label, "main": one.name in main}
+            {"name": one.name, "label": one.name, "shown": one.name in shown, **row_look(rows[one.name])}
             | {key: [getattr(row, column) for row in one.by_horizon] for key, column in ERROR_KEYS.items()}
             for one in models
         ],
         "reference": {"p95": [row.p95_m for row in reference], "expected": [row.expected_m for row in reference]},
     }
+
+
+def row_look(row: Row) -> dict[str, object]:
+    """Return how the scripts of a page draw a row; the colour is a name of page.css, the width in pixels."""
+    return {"color": row.color, "dash": row.dash, "width": 2.0 * row.width}
 
 
 def _steps_data(run: Run, rows: Ints, origin: tuple[float, float]) -> dict[str, object]:
@@ -178,7 +186,6 @@ def _models_data(
     ----------
     steps, joined : rows of the states, and every how many-th they are
     """
-    labels = {one.name: one.label for one in report.models}
     recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(run.track_width_m)))
     paths = {
         **dict(_odometry(run, joined, origin)),
@@ -195,8 +202,13 @@ def _models_data(
         }
         for name, (heading, place) in paths.items()
     }
-    names = [name for name in (RECOMMENDED, "icr", "no_slip", *paths) if name in paths or name == "icr"]
-    models = [{"name": name, "label": labels[name]} for name in dict.fromkeys(names) if name in labels]
+    known = rows_of(one.name for one in report.models)
+    driven = {name: row for name, row in known.items() if name in paths or name == "icr"}
+    shown = shown_rows(list(known))
+    models = [
+        {"name": name, "label": name, "shown": name in shown, "held_out": row.knows == REST_OF_DRIVE, **row_look(row)}
+        for name, row in driven.items()
+    ]
     return {"models": models, "paths": packed_paths}
 
 

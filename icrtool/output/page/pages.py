@@ -23,17 +23,16 @@ from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
 from icrtool.output.figure_catalogue import drive_charts
 from icrtool.output.files.atomic import write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums, schema_of
-from icrtool.output.page.drive_data import ERROR_KEYS, drive_data
+from icrtool.output.page.drive_data import ERROR_KEYS, drive_data, row_look
 from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
 from icrtool.output.run_directory import PAGE_FILE, check_sum, is_page
 from icrtool.output.tables.calibration import transfer_blocks
 from icrtool.output.tables.configuration import format_settings
 from icrtool.output.tables.dropout import answer_sections, model_section, outage_blocks, verdict_lines, worst_section
-from icrtool.output.tables.errors import errors_section, main_rows
+from icrtool.output.tables.errors import errors_section
 from icrtool.output.tables.run import advice, streams_section, unusable_line
 from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import (
-    MODEL_WORDS,
     WORDS,
     driven_text,
     duration_text,
@@ -49,6 +48,7 @@ from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
 from icrtool.records.places import is_regular
+from icrtool.records.rows import IN_CSV, rows_of, shown_rows
 from icrtool.records.run import ICR_WORDS, Run, check_type
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text
@@ -115,7 +115,9 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
         "From this drive icrtool learned how the robot slips when it turns, and then tested how far wheel speeds alone "
         "keep its position."
     )
-    words = Section("ICR, no slip, whole model, trial, σ …", [Facts(list(WORDS.items()))], PAGE)
+    rows = rows_of(one.name for one in report.models)
+    meanings = {name: f"{row.words}; learned from {row.knows}" for name, row in rows.items()}
+    words = Section("ICR, recommended, no_slip, trial, σ …", [Facts(list((meanings | WORDS).items()))], PAGE)
     blocks = [
         Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {about}"),
         *page_blocks(summary, stated),
@@ -125,7 +127,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     return render(
         SCRIPTS, drive_data(compared, report, coordinates=coordinates), title=summary.log,
         kind="Drive without GNSS: report of one log", blocks=blocks, pictures=pictures,
-        duration_s=summary.drive.duration_s, groups=(), folded_models=len(report.models) - len(main_rows(report)),
+        duration_s=summary.drive.duration_s, groups=(), folded_models=len(rows) - len(shown_rows(list(rows))),
     )  # fmt: skip
 
 
@@ -291,7 +293,7 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
     named = [key for key in ("robot", "group") if len({getattr(log, key) for log in logs} - {""}) > 1]
     # Distances within a budget are those of the best model that some log has.
     distances = dict.fromkeys(name for log in logs for name in log.errors if "_within_" in name)
-    by_model = ([name for name in distances if name.startswith(f"{model}_within_")] for model in MODEL_WORDS)
+    by_model = ([name for name in distances if name.startswith(f"{model}_within_")] for model in IN_CSV)
     budgets = next(filter(None, by_model), [])
     numbers_of = [_columns(log, budgets) for log in logs]
     rows, search = [], []
@@ -319,8 +321,8 @@ def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
     for name in budgets:
         bound, budget = "> " if name in log.bounds else "", name.rpartition("_within_")[2].removesuffix("m_m")
         columns[f"within {budget} m for"] = _cell(log.errors.get(name), partial("{}{:.1f} m".format, bound))
-    for model, label in MODEL_WORDS.items():
-        columns[f"error, {label}"] = _cell(log.errors.get(f"{model}_p95_{CHOICE_HORIZON_M:g}m_m"), error_text)
+    for model in IN_CSV:
+        columns[f"error, {model}"] = _cell(log.errors.get(f"{model}_p95_{CHOICE_HORIZON_M:g}m_m"), error_text)
     columns["multiplier"] = _with_std(log.multiplier, log.multiplier_std, "")
     for name, word in ICR_WORDS.items():
         columns[f"ICR {word}"] = _with_std(log.icr.get(name), log.icr.get(f"std_{name}"), "+")
@@ -357,11 +359,17 @@ def comparison_page(found: GroupComparison, title: str) -> str:
     )
     # The errors in the runs of each group over distance, by the group of the calibration.
     by_group: list[dict[str, object]] = []
+    looks = rows_of(f"calibration:{name}" for name in names)
     for tested_on in names:
         rows = {(one.calibrated_on, one.horizon_m): one for one in found.transfer if one.tested_on == tested_on}
         horizons = sorted({horizon_m for _, horizon_m in rows})
         models = [
-            {"name": f"of {name}", "label": f"calibration of {name}{' (held out)' if name == tested_on else ''}"}
+            {
+                "name": f"of {name}",
+                "label": f"calibration of {name}{' (held out)' if name == tested_on else ''}",
+                "shown": True,
+                **row_look(looks[f"calibration:{name}"]),
+            }
             | {key: [getattr(rows.get((name, h)), f"{key}_m", None) for h in horizons] for key in ERROR_KEYS}
             for name in names
         ]

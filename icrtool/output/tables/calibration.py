@@ -18,13 +18,14 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS
 from icrtool.output.files.formats import csv_bytes
-from icrtool.output.tables.dropout import REACH_ROWS, parameter_table, reach_row
+from icrtool.output.tables.dropout import parameter_table, reach_row
 from icrtool.output.tables.run import numbers_of
 from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import model_text, plus_minus
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
+from icrtool.records.rows import shown_rows
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.text import counted, distance_text, with_interval, with_std
 
@@ -45,8 +46,8 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
     what = "log" if table.folds[0].whole else "block of distance"
     rows = [
         reach_row(reached)
-        for row in sorted(table.scores, key=lambda row: (*REACH_ROWS, row.name).index(row.name))
-        if row.name in REACH_ROWS and (reached := row.within(table.horizons_m, BUDGET_M)) is not None
+        for name in shown_rows(table.rows)
+        if (reached := table.score(name).within(table.horizons_m, BUDGET_M)) is not None
     ]
     unknown = "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown)
     model = [
@@ -74,7 +75,7 @@ def held_out_blocks(table: HeldOut) -> list[Block]:
         for h, trials in enumerate(of_all.trials):
             worst = f"{row.worst('p95', h):.2f}/{row.worst('expected', h):.2f}" if trials else ""
             cells.append(f"{of_all.p95[h]:.2f}/{of_all.expected[h]:.2f} ({worst})" if trials else "–")
-        rows.append((row.label, *cells))
+        rows.append((row.name, *cells))
     return [
         f"{tested} ({len(table.folds)} {what}s): 95 % / expected error [m] of all trials (of the worst {what})",
         Table("lr", rows, ("model", *(f"{horizon:g} m" for horizon in table.horizons_m))),

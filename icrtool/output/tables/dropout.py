@@ -11,7 +11,7 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
 from icrtool.output.exports.controllers import format_export
-from icrtool.output.tables.errors import baseline_sections, errors_section, label_of, model_of
+from icrtool.output.tables.errors import baseline_sections, errors_section, model_of
 from icrtool.output.tables.run import advice, number_blocks, run_checks, unusable_line
 from icrtool.output.text_blocks import (
     PAGE,
@@ -38,19 +38,11 @@ from icrtool.output.text_format import (
 )
 from icrtool.records.acceptance import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
+from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT, base_of, in_order, row_of, shown_rows
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
-REACH_ROWS = ("controller", "recommended", "recommended_gyro", "recommended_heading", "icr", "no_slip")
-"""Models whose distance is stated first, as far as they are there; the momentary ICRs where nothing is held out."""
-
-REACH_LABELS = {"recommended_gyro": "with the gyro", "recommended_heading": "with the heading"}
-
-REACH_NOTES = {"controller": "in any diff_drive_controller"}
-"""What stands beside a distance."""
-
-
-Row = tuple[str, str, str]
+ReachRow = tuple[str, str, str]
 
 
 def format_dropout(report: DropoutReport) -> str:
@@ -97,43 +89,41 @@ def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Secti
         note = _meanwhile(one, summary, report)
         driven = f"{one.horizon_m:g} m from {duration_text(one.t_s)} on"
         turned = f"turning {turn_text(one.heading_change_deg)} at {one.speed_mean_mps:.2f} m/s"
-        by = f"with the {label_of(report, one.model)}{f'; meanwhile: {note}' if note else ''}"
+        by = f"with {one.model}{f'; meanwhile: {note}' if note else ''}"
         error = error_text(one.errors_m[one.model])
         text = f"after {driven}, {turned}, {by}"
         cards.append(Section("Where was it worst?", [], lead=error, text=text, label="Worst"))
     return cards
 
 
-def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[list[Row], list[Row]]:
-    """Return label, distance and note of each model within a budget: those of calibrations and `REACH_ROWS`, others.
+def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[list[ReachRow], list[ReachRow]]:
+    """Return name, distance and note of each row within a budget: those that are shown first, others.
 
     Parameters
     ----------
     events : slip events of the run; the last row is the distance without them, where that is known
     """
     by_model = {one.model: one for one in report.budgets if one.budget_m == budget_m}
-    rows = []
-    for one in report.calibrations:
-        if found := by_model.pop(one.name, None):
-            label = one.label if one.label.startswith("calibration") else f"calibration {one.label}"
-            rows.append((label, found.short_text, one.fitted))
-    best = by_model.get("recommended") or by_model.get("icr")
-    first = [name for name in REACH_ROWS if name in by_model and (name != "icr" or best is by_model["icr"])]
-    rows += [reach_row(by_model.pop(name)) for name in first]
+    best = by_model.get(MOST_USEFUL) or by_model.get(WITHOUT_IT)
+    order = in_order(by_model)
+    first = shown_rows(order)
+    fitted = {one.name: one.fitted for one in report.calibrations}
+    rows = [reach_row(by_model[name], fitted.get(name, "")) for name in first]
     if report.run.config.robot.track_width_m is None:
-        rows.append(("no slip", "not known", "needs robot.track_width_m (--robot, --set)"))
+        rows.append(("no_slip", "not known", "needs robot.track_width_m (--robot, --set)"))
     if events and best is not None and (quiet := best.without_events_text):
-        rows.append((f"without its {counted(events, 'slip event')}", quiet, best.label))
-    return rows, [reach_row(one, first=False) for one in by_model.values()]
+        rows.append((f"without its {counted(events, 'slip event')}", quiet, best.model))
+    return rows, [reach_row(by_model[name], by_model[name].interval_text) for name in order if name not in first]
 
 
-def reach_row(one: BudgetDistance, *, first: bool = True) -> Row:
-    """Return label, distance and note of a model; an interval stands `first` beside the whole model alone."""
-    low, high = one.between_m
-    note = one.interval_text if one.model.startswith("recommended") or not first else ""
+def reach_row(one: BudgetDistance, note: str = "") -> ReachRow:
+    """Return name, distance and note of a row of a report; without a `note` what it is."""
+    (low, high), row = one.between_m, row_of(one.model)
+    if not note and base_of(one.model) == MOST_USEFUL:
+        note = one.interval_text
     if not note and high - low > NEAR_HORIZONS_M and not one.beyond:
         note = f"between {low:g} and {high:g} m"
-    return REACH_LABELS.get(one.model, one.label), one.short_text, REACH_NOTES.get(one.model, note)
+    return one.model, one.short_text, note or row.words
 
 
 def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
@@ -143,16 +133,15 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows, others = reach_rows(report, budget_m, len(summary.events))
         if rows and not lead:
-            label, lead, note = rows[0]
-            more = f" ({note})" if note else ""
-            text = f"within {budget_m:g} m (95 %), by wheel speeds alone with the {label}{more}"
-        shown = [(shortened(label, 28), distance, note) for label, distance, note in rows]
+            name, lead, note = rows[0]
+            text = f"within {budget_m:g} m (95 %), by wheel speeds alone with {name} ({note})"
+        shown = [(shortened(name, 28), distance, note) for name, distance, note in rows]
         blocks.append(Table("lrl", shown, caption=f"How far within {budget_m:g} m (95 %)?"))
         blocks.append(Section("Other models", [Table("lrl", others)], VERBOSE))
     if not blocks:
         blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
-        blocks.append(Facts([("left out", f"whole model, controller numbers: {report.ladder.left_out}")]))
+        blocks.append(Facts([("left out", f"recommended, controller: {report.ladder.left_out}")]))
     return Section("How far without GNSS?", blocks, lead=lead, text=text)
 
 
@@ -191,9 +180,9 @@ def worst_section(summary: RunDocument, report: DropoutDocument) -> Section:
         )
         for rank, one in enumerate(report.worst, start=1)
     ]  # fmt: skip
-    head = ("", "from", "error", "no slip", "turn", "mean speed", "north", "east", "meanwhile")
+    head = ("", "from", "error", "no_slip", "turn", "mean speed", "north", "east", "meanwhile")
     caption = (
-        f"Trials of {first.horizon_m:g} m with the largest error of the {label_of(report, first.model)} that do not "
+        f"Trials of {first.horizon_m:g} m with the largest error of {first.model} that do not "
         "overlap. What they share (a speed, a turn, a place) is where the model fails"
     )
     moments = [one.t_s for one in report.worst]

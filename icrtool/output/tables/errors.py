@@ -13,13 +13,14 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import difference_half_width
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.text_blocks import VERBOSE, Block, Cell, Chart, Figure, Items, Section, Table
-from icrtool.output.text_format import MODEL_WORDS, duration_text, error_text
+from icrtool.output.text_format import duration_text, error_text
 from icrtool.records.acceptance import CHOICE_HORIZON_M, METRICS
 from icrtool.records.dropout_document import DropoutDocument, ModelDocument, column_of
+from icrtool.records.rows import in_order, shown_rows
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
-LONGEST_LABEL = 26
+LONGEST_NAME = 26
 """Characters of a model's name that are printed."""
 
 LISTED_HORIZONS = 4
@@ -29,12 +30,6 @@ NOTED_STANDING = 0.05
 """From this share of standing states on, they are mentioned."""
 
 SHOWN_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
-
-MAIN_ROWS = ("recommended", "controller", "recommended_gyro", "recommended_heading", "no_slip")
-"""Models whose errors stand first, beside calibrations."""
-
-FILTER_ROWS = ("icr", "no_slip")
-"""The same where there is no whole model."""
 
 NO_TRIAL = {
     "too_little_way_left": "not counted: log ends", "across_wheel_gap": "  across a wheel gap",
@@ -57,31 +52,17 @@ def model_of(report: DropoutDocument, name: str) -> ModelDocument | None:
     return next((one for one in report.models if one.name == name), None)
 
 
-def label_of(report: DropoutDocument, name: str) -> str:
-    """Return what a model of a report is called: its name where it was not computed."""
-    found = model_of(report, name)
-    return name if found is None else found.label
-
-
-def main_rows(report: DropoutDocument) -> set[str]:
-    """Return the models whose errors stand first: calibrations and `MAIN_ROWS`; without a whole model, the filter's."""
-    names, given = {one.name for one in report.models}, {one.name for one in report.calibrations}
-    return given.union(MAIN_ROWS if MAIN_ROWS[0] in names else FILTER_ROWS) & names
-
-
-def in_order(models: Sequence[ModelDocument]) -> list[ModelDocument]:
-    """Return models of a report, those of `MAIN_ROWS` first and in its order, after calibrations."""
-    places = {name: place for place, name in enumerate(MAIN_ROWS)}
-    return sorted(
-        models, key=lambda one: -1 if one.name.startswith("calibration") else places.get(one.name, len(places))
-    )
+def ordered(models: Sequence[ModelDocument]) -> list[ModelDocument]:
+    """Return models of a report in the order of `icrtool.records.rows`."""
+    by_name = {one.name: one for one in models}
+    return [by_name[name] for name in in_order(by_name)]
 
 
 def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     """Return the errors over distance: what counts first, then all of them, and what they rest on."""
     shown = shown_horizons(np.array([row.horizon_m for row in report.trials]))
     counts = [report.trials[h] for h in shown]
-    main, models = main_rows(report), in_order(report.models)
+    main, models = shown_rows([one.name for one in report.models]), ordered(report.models)
     rows = [_error_row(one, shown) for one in models if one.name in main]
     others = [_error_row(one, shown) for one in models if one.name not in main]
     rows.append(["trials", "", *(f"{row.trials:,}" for row in counts)])
@@ -90,7 +71,7 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     rests = [Table("llr", list(_other_rows(report, shown)), head), *sentences, *_learned_blocks(report, shown)]
     for split in report.by_turning:
         kind = "straight" if split.straight else "turning"
-        errors = ", ".join(f"{MODEL_WORDS[name]} {error_text(error)}" for name, error in split.expected_m.items())
+        errors = ", ".join(f"{name} {error_text(error)}" for name, error in split.expected_m.items())
         rests.append(f"{kind} over {split.horizon_m:g} m, expected error: {errors} ({split.trials:,} trials)")
     caption = (
         f"{FIGURES['summary'].caption} The budget is the dashed red line. Bands: 95 % interval of the number itself."
@@ -115,7 +96,7 @@ def _error_row(model: ModelDocument, shown: Sequence[int]) -> list[str | Cell]:
         low, high = row.p95_low_m, row.p95_high_m
         interval = "too short" if low is None else f"{error_text(low).removesuffix(' m')}-{error_text(high)}"
         cells.append(_error_cell(row.horizon_m, row.p95_m, row.expected_error_m, interval))
-    return [shortened(model.label, LONGEST_LABEL), Cell("95 %", more=("interval", "expected")), *cells]
+    return [shortened(model.name, LONGEST_NAME), Cell("95 %", more=("interval", "expected")), *cells]
 
 
 def _error_cell(horizon_m: float, p95_m: float | None, expected_m: float | None, *interval: str) -> Cell:
@@ -136,7 +117,7 @@ def _other_rows(report: DropoutDocument, shown: Sequence[int]) -> Iterator[list[
             pairs = (theirs.p95_m, ours.p95_m), (theirs.expected_error_m, ours.expected_error_m)
             p95, expected = (f"{over / under:.1f} x" if over is not None and under else "-" for over, under in pairs)
             cells.append(Cell(p95, more=(expected,)))
-        yield ["no slip / ICR", kinds, *cells]
+        yield ["no_slip / icr", kinds, *cells]
     for key, label in NO_TRIAL.items():
         counts = [report.trials[h].no_trial.get(key, 0) for h in shown]
         if any(counts):
@@ -147,15 +128,15 @@ def _source_lines(report: DropoutDocument) -> Iterator[str]:
     """Yield what the numbers of each model were learned from, and how much can be the reference's own error."""
     learned: dict[str, list[str]] = {}
     for one in report.models:
-        learned.setdefault(one.knows, []).append(one.label)
-    yield from (f"learned from {knows}: {'; '.join(labels)}" for knows, labels in learned.items())
+        learned.setdefault(one.knows, []).append(one.name)
+    yield from (f"learned from {knows}: {', '.join(names)}" for knows, names in learned.items())
     for used in report.calibrations:
-        yield f"{used.label}: {used.model} from {counted(used.logs, 'log')}, {used.created[:10]}, {used.fitted}"
+        yield f"{used.name}: {used.model} from {counted(used.logs, 'log')}, {used.created[:10]}, {used.fitted}"
     known, icr = [row for row in report.reference_error if row.p95_m is not None], model_of(report, "icr")
     if known and icr is not None:
         own = min(known, key=lambda row: abs(row.horizon_m - CHOICE_HORIZON_M))
         whole = next(row.p95_m for row in icr.by_horizon if row.horizon_m == own.horizon_m)
-        what = f"the {error_text(whole)} of the momentary ICRs (95 %, {own.horizon_m:g} m)"
+        what = f"the {error_text(whole)} of icr (95 %, {own.horizon_m:g} m)"
         yield f"up to {error_text(own.p95_m)} of {what} can be the error of the position reference"
 
 
@@ -165,7 +146,7 @@ def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]
     moving = "moving " if report.starts_counted == "moving" else ""
     yield f"a trial from each {moving}state of {report.starts:,}, by wheel speeds alone{reference}"
     if model_of(report, "no_slip") is None:
-        yield "no slip is left out: robot.track_width_m is not known"
+        yield "no_slip is left out: robot.track_width_m is not known"
     if report.starts_standing > NOTED_STANDING * report.starts:
         share = 100 * report.starts_standing / report.starts
         each = "each standstill is one start" if moving else "each is a start (--starts all)"
@@ -200,7 +181,7 @@ def _event_lines(report: DropoutDocument, summary: RunDocument) -> list[str]:
     after, before, counts = both[-1]
     errors = f"{error_text(after.p95_m)} instead of {error_text(before.p95_m)}"
     crossing = counts.no_trial["across_slip_event"]
-    return [f"{left_out}: ICR after {after.horizon_m:g} m 95 % {errors} ({crossing:,} trials cross one)"]
+    return [f"{left_out}: icr after {after.horizon_m:g} m 95 % {errors} ({crossing:,} trials cross one)"]
 
 
 def _learned_blocks(report: DropoutDocument, shown: Sequence[int]) -> Iterator[Block]:
@@ -219,7 +200,7 @@ def _learned_blocks(report: DropoutDocument, shown: Sequence[int]) -> Iterator[B
         cells = [" / ".join(error.removesuffix(" m") for error in pair) for pair in errors]
         rows.append([name, *(cell if part[h].trials else "-" for cell, h in zip(cells, shown, strict=True))])
     when = f"{duration_text(split.learned_s)}, {distance_text(split.learned_at_distance_m)}"
-    caption = f"ICR, momentary, before and after the ICRs were first learned ({when}): 95 % / expected [m]"
+    caption = f"icr before and after the ICRs were first learned ({when}): 95 % / expected [m]"
     yield Table("lr", rows, ("", *(f"{report.trials[h].horizon_m:g} m" for h in shown)), caption)
 
 
@@ -240,7 +221,7 @@ def baseline_sections(report: DropoutReport) -> Iterator[Section]:
             half = difference_half_width(sums, theirs, metric, 1.0, paired=same)
             interval = f" ± {error_text(half)}" if math.isfinite(half) else ""
             cells.append(f"{difference:+z.3f} m{interval}" if math.isfinite(difference) else "-")
-        rows.append([f"{result.label}, {label}", *cells])
+        rows.append([f"{result.name}, {label}", *cells])
     table = Table("lr", rows, ("difference to the baseline", *(f"{horizon_m:g} m" for _, horizon_m in shown)))
     title = f"Against the baseline ({baseline.log}, icrtool {baseline.tool_version})"
     yield Section(title, [table, Items(baseline.changes(report.run_document))], VERBOSE)

@@ -268,30 +268,13 @@ const icrtoolCharts = (() => {
     return [Number((Math.floor(low / unit) * unit).toPrecision(1)), high * 1.3];
   }
 
-  const LOOKS = {
-    recommended: { color: "recommended", width: 2.6 }, icr: { color: "icr", dash: "dashed", width: 2 },
-    no_slip: { color: "no-slip", dash: "dashdot", width: 2 }, icr_final: { color: "final", dash: "dotted", width: 2 },
-    controller: { color: "other", dash: "dashed", width: 2 },
-  };
-  const OTHERS = [["other", "solid"], ["icr", "dotted"], ["no-slip", "solid"], ["final", "dashdot"], ["other", "dashed"],
-    ["icr", "dashdot"], ["no-slip", "dotted"], ["recommended", "dotted"]].map(([color, dash]) => ({ color, dash, width: 2 }));
-  const met = new Map();
-
-  /** Return how a model is drawn: the same in every chart, thin with a measured turn rate; others take turns. */
-  function lookOf(name) {
-    const wheels = name.replace(/_(gyro|heading)$/, "");
-    if (LOOKS[wheels]) return wheels === name ? LOOKS[name] : { ...LOOKS[wheels], width: 1.2 };
-    if (!met.has(name)) met.set(name, met.size);
-    return OTHERS[met.get(name) % OTHERS.length];
-  }
-
   /** Make the chart of errors over distance; gives a function that destroys it. */
   function errorChart(data) {
     const element = document.getElementById("error-chart");
     const { horizons_m: horizons, models, reference } = data.errors;
     if (!element || !horizons.length) return () => {};
     let chart = null;
-    const folded = models.filter((model) => model.main === false), hidden = new Set(folded.map((model) => model.name));
+    const folded = models.filter((model) => !model.shown), hidden = new Set(folded.map((model) => model.name));
 
     function draw() {
       const measure = document.querySelector("input[name=measure]:checked").value, log = document.getElementById("log").checked;
@@ -299,11 +282,11 @@ const icrtoolCharts = (() => {
       // A logarithm has no place for zero.
       const known = (values) => values.map((value) => (value === null || (log && value <= 0) ? null : value));
       for (const model of models) {
-        const look = lookOf(model.name), show = !hidden.has(model.name), first = columns.length;
+        const show = !hidden.has(model.name), first = columns.length;
         columns.push(known(model[`${measure}_high`]), known(model[measure]), known(model[`${measure}_low`]));
         const edge = { stroke: "transparent", width: 0, points: { show: false }, show };
-        series.push(edge, { ...line({ ...look, label: model.label }), show, points: { show: true, size: 5, fill: color(look.color) } }, { ...edge });
-        if (show) bands.push({ series: [first, first + 2], fill: faint(look.color, 0.16) });
+        series.push(edge, { ...line(model), show, points: { show: true, size: 5, fill: color(model.color) } }, { ...edge });
+        if (show) bands.push({ series: [first, first + 2], fill: faint(model.color, 0.16) });
       }
       if (reference[measure].length) {
         columns.push(known(reference[measure]));
@@ -327,14 +310,13 @@ const icrtoolCharts = (() => {
       }, columns, element);
     }
 
-    const modelKeys = (of) => of.map((model) => ({ ...lookOf(model.name), label: model.label, name: model.name }));
-    const entries = [...modelKeys(models.filter((model) => !folded.includes(model))),
+    const entries = [...models.filter((model) => model.shown),
       ...(reference.p95.length ? [{ color: "reference", dash: "dotted", label: "position reference alone" }] : []),
       ...data.budgets_m.map((budget) => ({ color: "budget", dash: "dashed", label: `budget ${budget} m` }))];
     const isShown = (one) => !hidden.has(one.name);
     const change = (one, shown) => { hidden[shown ? "delete" : "add"](one.name); draw(); };
     keys(document.getElementById("error-keys"), entries, isShown, change);
-    if (folded.length) keys(document.getElementById("error-others"), modelKeys(folded), isShown, change);
+    if (folded.length) keys(document.getElementById("error-others"), folded, isShown, change);
     const inputs = [...document.querySelectorAll("input[name=measure], #log")];
     for (const input of inputs) input.addEventListener("change", draw);
     draw();
@@ -347,5 +329,5 @@ const icrtoolCharts = (() => {
     };
   }
 
-  return { timeCharts, errorChart, color, clock, lookOf, toggle, keys, onChange };
+  return { timeCharts, errorChart, color, clock, toggle, keys, onChange };
 })();

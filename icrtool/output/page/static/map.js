@@ -7,15 +7,14 @@ const icrtoolMap = (() => {
 
   /** Make the map; onMoment(row) is called where a pointer is near the drive, onPick(row) where it was clicked. */
   function make(data, { onMoment, onPick }) {
-    const { color, lookOf, keys } = icrtoolCharts, d3 = window.d3;
+    const { color, keys } = icrtoolCharts, d3 = window.d3;
     const element = document.getElementById("map"), s = data.series, steps = data.steps;
     const origin = data.origin || [0, 0];
     const { north, east } = steps, odometry = Object.fromEntries(["icr_final", "no_slip"].filter((name) => data.paths[name]).map((name) => [name, data.paths[name]]));
     const rowNorth = Float64Array.from(s.step, (step) => north[step]), rowEast = Float64Array.from(s.step, (step) => east[step]);
     const tree = d3.quadtree(d3.range(s.step.length), (row) => rowEast[row], (row) => rowNorth[row]);
     // At first: what answers a question. The rest is a click away.
-    const SHOWN = ["recommended", "controller", "no_slip"], known = data.models.some((model) => model.name === SHOWN[0]);
-    const hidden = new Set(["rejected", ...data.models.filter((model) => known && !SHOWN.includes(model.name)).map((model) => `loop ${model.name}`)]);
+    const hidden = new Set(["rejected", ...data.models.filter((model) => !model.shown).map((model) => `loop ${model.name}`)]);
     let loop = null, span = [-Infinity, Infinity], moment = 0, transform = d3.zoomIdentity, width = 0, height = 0;
 
     const svg = d3.select(element).html("").append("svg").attr("role", "img")
@@ -153,8 +152,8 @@ const icrtoolMap = (() => {
         lines.push({ d: line(north, east, x, y, start, end), color: color("filter"), width: 3.5, dash: null, end: [east[end], north[end]] });
         for (const model of loop.models) {
           if (hidden.has(`loop ${model.name}`)) continue;
-          const look = lookOf(model.name), norths = model.path.north.map((v) => v + north[start]), easts = model.path.east.map((v) => v + east[start]);
-          lines.push({ d: line(norths, easts, x, y), color: color(look.color), width: 1.3 * look.width, dash: { dashed: "7 4", dotted: "2 4", dashdot: "8 3 2 3" }[look.dash] || null,
+          const norths = model.path.north.map((v) => v + north[start]), easts = model.path.east.map((v) => v + east[start]);
+          lines.push({ d: line(norths, easts, x, y), color: color(model.color), width: 1.3 * model.width, dash: { dashed: "7 4", dotted: "2 4", dashdot: "8 3 2 3" }[model.dash] || null,
             end: [easts[easts.length - 1], norths[norths.length - 1]] });
         }
       }
@@ -218,7 +217,7 @@ const icrtoolMap = (() => {
         { name: "icr_final", label: "ICR odometry (final ICRs, from the start)", color: "icr", dash: "dashed" },
         ...(odometry.no_slip ? [{ name: "no_slip", label: "no-slip odometry", color: "no-slip", dash: "dashdot" }] : []),
         ...(data.events.length ? [{ name: "events", label: "slip events", color: "slip", width: 5 }] : []),
-        ...(data.outages.length ? [{ name: "outages", label: "outages", color: "final", width: 5 }] : []),
+        ...(data.outages.length ? [{ name: "outages", label: "outages", color: "grey", width: 5 }] : []),
       ];
       keys(document.getElementById("layers"), entries, (one) => !hidden.has(one.name), (one, shown) => hide(one.name, !shown));
     }

@@ -65,7 +65,7 @@ const icrtoolOpenLoop = (() => {
         return Math.hypot(path.north[k] - (steps.north[step] - steps.north[start]),
           path.east[k] - (steps.east[step] - steps.east[start]));
       });
-      return { name: model.name, label: model.label, path, errors };
+      return { ...model, path, errors };
     });
     return { start, end, why, lengths, models };
   }

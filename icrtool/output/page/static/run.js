@@ -67,15 +67,15 @@ const icrtoolPage = (() => {
     const body = table.createTBody();
     for (const model of result.models) {
       const line = text("tr", "", body), name = text("th", "", line, { scope: "row" });
-      const look = { ...icrtoolCharts.lookOf(model.name), label: model.label };
-      name.append(icrtoolCharts.toggle(look, !map.hidesModel(model.name), (shown) => map.hideModel(model.name, !shown)));
+      name.append(icrtoolCharts.toggle(model, !map.hidesModel(model.name), (shown) => map.hideModel(model.name, !shown)));
       for (const error of model.errors) text("td", error === null ? "–" : metres(error), line);
     }
     box.replaceChildren(table);
     const notes = [];
     if (result.why) notes.push(`The paths end before ${LENGTHS_M[LENGTHS_M.length - 1]} m: ${result.why}.`);
     else if (result.models.some((model) => model.errors.includes(null))) notes.push("–: no GNSS at the end of that path.");
-    if (result.models.some((model) => model.name === "recommended")) notes.push("Here the whole model is fitted to the whole drive; in the tables it is tested on distance it was not fitted to.");
+    const heldOut = result.models.filter((model) => model.held_out).map((model) => model.name);
+    if (heldOut.length) notes.push(`Fitted to the whole drive here: ${heldOut.join(", ")}. The tables test them on distance they were not fitted to.`);
     if (notes.length) text("p", notes.join(" "), box);
     return result;
   }

@@ -1,0 +1,172 @@
+"""The rows of a dropout report: the one table of their names, words, order, looks and places.
+
+A row is named as in the files, everywhere. A new row is an entry here, the code that computes it, and a test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+Color = Literal["green", "purple", "blue", "orange", "grey", "brown", "pink", "teal", "olive", "slate"]
+"""Name of a colour; `icrtool.output.figures.style` and page.css say which it is on paper and on a screen."""
+
+Dash = Literal["solid", "dashed", "dotted", "dashdot"]
+
+TURNED_BY = ("gyro", "heading")
+"""What a row can turn by in place of the wheels alone; the row's name then ends with it, as ``icr_gyro``."""
+
+REST_OF_DRIVE = "the rest of the drive"
+"""What the numbers of a row were learned from that is tested on distance it was not fitted to."""
+
+WHOLE_DRIVE = "the whole drive, its trials too"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One row of a report.
+
+    Attributes
+    ----------
+    name : as in summary.csv, in limits and in every output
+    words : what predicts the motion, in a few words
+    knows : what its numbers were learned from
+    color, dash, width : its line, in pictures and on pages; width 1 is that of most
+    shown : stands in the first table and is drawn on a page from the start; the others are a click or ``-v`` away
+    pictured : drawn in pictures, and its path is made for single trials
+    in_csv : has a column where a table has one column a row: worst.csv, the page of a batch
+    on_robot : a user can run it on a robot; the others analyse a log
+    compared : stands for comparison: a thin line without interval, beside every other row in pictures of paths
+    turned_shown : `shown` of the row with a gyro or heading
+    turned_knows : `knows` of the row with a gyro or heading
+    """
+
+    name: str
+    words: str
+    knows: str
+    color: Color = "slate"
+    dash: Dash = "solid"
+    width: float = 1.0
+    shown: bool = False
+    pictured: bool = False
+    in_csv: bool = False
+    on_robot: bool = False
+    compared: bool = False
+    turned_shown: bool = False
+    turned_knows: str = REST_OF_DRIVE
+
+
+REPORT_ROWS: dict[str, Row] = {
+    row.name: row
+    for row in (
+        Row(
+            "calibration", "the calibration that was given", "other logs", "teal", "dashdot",
+            shown=True, pictured=True, on_robot=True, turned_shown=True, turned_knows="other logs",
+        ),
+        Row(
+            "controller", "multiplier and radius factors alone", REST_OF_DRIVE, "purple", "dashed",
+            shown=True, pictured=True, in_csv=True, on_robot=True,
+        ),
+        Row(
+            "recommended", "motion model of eight terms", REST_OF_DRIVE, "green", width=1.3,
+            shown=True, pictured=True, in_csv=True, on_robot=True, turned_shown=True,
+        ),
+        Row(
+            "adaptive", "motion model, learning on while it drives", "other logs, and the drive before each start",
+            "pink", shown=True, pictured=True, in_csv=True, on_robot=True,
+            turned_shown=True, turned_knows="other logs, and the drive before each start",
+        ),
+        Row(
+            "vendor", "published skid factor, not fitted", "the published factor", "brown", "dotted", 0.6,
+            shown=True, pictured=True, in_csv=True, on_robot=True, compared=True,
+        ),
+        Row(
+            "no_slip", "track width alone, not fitted", "the track width", "orange", "dashdot", 0.6,
+            shown=True, pictured=True, in_csv=True, on_robot=True, compared=True,
+        ),
+        Row(
+            "icr", "ICRs as estimated at each start", "the drive before each start", "blue", "dashed",
+            pictured=True, in_csv=True,
+            turned_knows="the drive before each start, scale and bias of the gyro from the whole drive",
+        ),
+        Row("icr_final", "ICRs at the end of the log", WHOLE_DRIVE, "grey", "dotted", turned_knows=WHOLE_DRIVE),
+        Row(
+            "topic", "pose or odometry recorded in the log", "not known: computed on the robot", "olive", "dashed",
+            shown=True, pictured=True, on_robot=True,
+        ),
+    )
+}  # fmt: skip
+"""The rows by name, in the order in which they are shown. ``calibration:STEM`` and ``topic:/its/name`` are kinds of
+the rows ``calibration`` and ``topic``."""
+
+MOST_USEFUL, WITHOUT_IT = "recommended", "icr"
+"""The row that stands for a log, and the one that does where a report has no held-out rows."""
+
+FURTHER_LOOKS: tuple[tuple[Color, Dash], ...] = (
+    ("teal", "dashdot"), ("olive", "dashed"), ("slate", "solid"), ("teal", "dotted"), ("olive", "solid"),
+    ("slate", "dashdot"), ("teal", "dashed"), ("olive", "dotted"), ("slate", "dotted"),
+)  # fmt: skip
+"""Looks of rows of one kind (calibrations, topics) and of those of a caller, in turn."""
+
+
+def turned_by(name: str) -> str:
+    """Return ``gyro`` or ``heading`` where a row turns by it, empty where it turns by the wheels alone."""
+    return next((one for one in TURNED_BY if name.endswith(f"_{one}")), "")
+
+
+def base_of(name: str) -> str:
+    """Return the name of a row without what it turns by."""
+    by = turned_by(name)
+    return name.removesuffix(f"_{by}") if by else name
+
+
+def kind_of(name: str) -> str:
+    """Return the name of a row's entry in `REPORT_ROWS`; of a row that is in none, its own without what it turns by."""
+    return base_of(name).partition(":")[0]
+
+
+def row_of(name: str) -> Row:
+    """Return the row of a name, also of one with a gyro, of one of several calibrations, and of a caller's model."""
+    row = replace(REPORT_ROWS.get(kind_of(name)) or Row(name, "given by the caller", "not known"), name=name)
+    if not (by := turned_by(name)):
+        return row
+    return replace(
+        row, words=f"{row.words}, with the {by}", knows=row.turned_knows, width=min(row.width, 0.6),
+        shown=row.turned_shown, pictured=False, in_csv=False, compared=False,
+    )  # fmt: skip
+
+
+def rows_of(names: Iterable[str]) -> dict[str, Row]:
+    """Return rows by name in the order in which they are shown; rows of one kind have looks in turn."""
+    places = {kind: place for place, kind in enumerate(REPORT_ROWS)}
+    given = list(dict.fromkeys(names))
+    bases = list(dict.fromkeys(map(base_of, given)))
+
+    def place(name: str) -> tuple[int, int, str]:
+        return places.get(kind_of(name), len(places)), bases.index(base_of(name)), turned_by(name)
+
+    looks: dict[str, tuple[Color, Dash]] = {}
+    found: dict[str, Row] = {}
+    for name in sorted(given, key=place):
+        row, base = row_of(name), base_of(name)
+        if base not in REPORT_ROWS:
+            color, dash = looks.setdefault(base, FURTHER_LOOKS[len(looks) % len(FURTHER_LOOKS)])
+            row = replace(row, color=color, dash=dash)
+        found[name] = row
+    return found
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names of rows in the order in which they are shown, those with a gyro behind those without."""
+    return list(rows_of(names))
+
+
+def shown_rows(names: Sequence[str]) -> list[str]:
+    """Return the names of the rows that are shown first, in order: `WITHOUT_IT` too where `MOST_USEFUL` is missing."""
+    instead = () if MOST_USEFUL in names else (WITHOUT_IT,)
+    return [name for name, row in rows_of(names).items() if row.shown or name in instead]
+
+
+IN_CSV = tuple(name for name, row in REPORT_ROWS.items() if row.in_csv)
+"""Names of the rows that have a column where a table has one column a row, in order."""
