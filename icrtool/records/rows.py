@@ -78,19 +78,19 @@ REPORT_ROWS: dict[str, Row] = {
             turned_shown=True, turned_knows="other logs, and the drive before each start",
         ),
         Row(
-            "vendor", "published skid factor, not fitted", "the published factor", "brown", "dotted", 0.6,
-            shown=True, pictured=True, in_csv=True, on_robot=True, compared=True,
-        ),
-        Row(
-            "no_slip", "track width alone, not fitted", "the track width", "orange", "dashdot", 0.6,
-            shown=True, pictured=True, in_csv=True, on_robot=True, compared=True,
-        ),
-        Row(
             "icr", "ICRs as estimated at each start", "the drive before each start", "blue", "dashed",
             pictured=True, in_csv=True,
             turned_knows="the drive before each start, scale and bias of the gyro from the whole drive",
         ),
         Row("icr_final", "ICRs at the end of the log", WHOLE_DRIVE, "grey", "dotted", turned_knows=WHOLE_DRIVE),
+        Row(
+            "vendor", "published skid factor, not fitted", "the published factor", "brown", "dotted", 0.6,
+            shown=True, pictured=True, in_csv=True, on_robot=True, compared=True,
+        ),
+        Row(
+            "no_slip", "track width alone", "the track width", "orange", "dashdot", 0.6,
+            shown=True, pictured=True, in_csv=True, on_robot=True, compared=True,
+        ),
         Row(
             "topic", "pose or odometry recorded in the log", "not known: computed on the robot", "olive", "dashed",
             shown=True, pictured=True, on_robot=True,

@@ -41,7 +41,7 @@ from support.documents import with_summary
 from support.recordings import table_errors
 
 HOSTILE = "</script><script>window.hostile=1</script><img src=x onerror='window.hostile=1'>\"'"
-DRAWN_AT_FIRST = ["whole model", "no slip", "controller numbers"]
+DRAWN_AT_FIRST = ["recommended", "no_slip", "controller"]
 LENGTHS_M = (5.0, 10.0, 20.0)
 AXE = Path(sys.prefix) / "axe-core" / "axe.min.js"
 
@@ -271,11 +271,11 @@ def test_the_chart_of_errors_draws_the_main_models_and_folds_the_others(chrome: 
     page.open(file)
     names = "[...document.querySelectorAll('#{} input:checked')].map((one) => one.closest('li').textContent.trim())"
     drawn = page.evaluate(names.format("error-keys"))
-    assert {*DRAWN_AT_FIRST} <= {*drawn} <= {*DRAWN_AT_FIRST, "whole model + gyro", "whole model + heading"}
+    assert {*DRAWN_AT_FIRST} <= {*drawn} <= {*DRAWN_AT_FIRST, "recommended_gyro", "recommended_heading"}
     assert page.evaluate(names.format("error-others")) == []
-    assert drawn[0] == "whole model"
-    assert drawn[-1] == "no slip"
-    folded = page.evaluate("icrtoolPage.data.errors.models.filter((one) => !one.main).map((one) => one.label)")
+    assert drawn[0] == "controller"
+    assert drawn[-1] == "no_slip"
+    folded = page.evaluate("icrtoolPage.data.errors.models.filter((one) => !one.shown).map((one) => one.label)")
     others = "[...document.querySelectorAll('#error-others li')].map((one) => one.textContent.trim())"
     assert page.evaluate(others) == folded != []
     assert page.evaluate("document.getElementById('error-others').closest('details').open") is False

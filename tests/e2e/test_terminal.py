@@ -80,7 +80,7 @@ def test_a_good_drive_is_answered_on_one_screen(screen: Screen) -> None:
     check_fits(lines)
     text = "\n".join(lines)
     assert status == 0
-    for question in ("How far within 0.5 m (95 %)?", "controller numbers", "whole model", "Trust?", "Worst", "20 m"):
+    for question in ("How far within 0.5 m (95 %)?", "controller  ", "recommended  ", "Trust?", "Worst", "20 m"):
         assert question in text
     assert lines[-1].endswith("report.html")
 
@@ -111,12 +111,12 @@ def test_a_drive_with_turns_to_one_side_names_the_other(screen: Screen) -> None:
     assert re.fullmatch("! excitation y right.* weak: drive two full turns on the spot, or circles, to the left", row)
 
 
-def test_a_short_drive_states_why_the_whole_model_is_left_out(screen: Screen) -> None:
+def test_a_short_drive_states_why_the_recommended_model_is_left_out(screen: Screen) -> None:
     assert screen("simulate", "-o", "short.mcap", "--path", "curved", "--duration", "40", "-q", *ROBOT)[0] == 0
     status, lines = screen("dropout-report", "short.mcap", *ROBOT, "--plots", "none")
     check_fits(lines)
     assert status == 0
-    assert any(line.startswith("left out    whole model, controller numbers: ") for line in lines), "\n".join(lines)
+    assert any(line.startswith("left out    recommended, controller: ") for line in lines), "\n".join(lines)
 
 
 def test_without_a_track_width_no_slip_is_not_known(screen: Screen) -> None:
@@ -124,7 +124,7 @@ def test_without_a_track_width_no_slip_is_not_known(screen: Screen) -> None:
     check_fits(lines)
     text = " ".join(" ".join(lines).split())
     assert status == 0
-    assert re.search(r"no slip not known needs robot\.track_width_m", text)
+    assert re.search(r"no_slip not known needs robot\.track_width_m", text)
 
 
 def test_all_is_printed_on_request(screen: Screen) -> None:

@@ -16,7 +16,7 @@ from support.barn import ICRS_M, RATE_HZ
 from support.documents import with_summary
 
 HORIZONS_M = [1.0, 5.0, 20.0]
-PERFECT = [Model("icr", "true ICRs", FrozenIcrs.constant(*ICRS_M))]
+PERFECT = [Model("icr", FrozenIcrs.constant(*ICRS_M))]
 STDS = [(0.05, 0.05, 0.0), (0.0, 0.0, 0.01), (0.02, 0.10, 0.02)]
 """North and east [m], heading [rad]."""
 
@@ -66,7 +66,7 @@ def test_a_perfect_model_shows_the_references_error_and_nothing_else(
 
 def test_a_worse_model_shows_more(clean: Run) -> None:
     noisy = with_noise(clean, STDS[0])
-    wrong = [Model("icr", "wrong ICRs", FrozenIcrs.constant(0.6, -0.6, 0.0))]
+    wrong = [Model("icr", FrozenIcrs.constant(0.6, -0.6, 0.0))]
     report = dropout(noisy, [20.0], models=wrong)
     assert report.results[0].column("p95_m")[0] > 2 * report.document.reference_error[0].p95_m
 

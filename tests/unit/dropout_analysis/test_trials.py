@@ -112,7 +112,7 @@ def test_a_run_without_track_width_has_no_no_slip(make_run: Callable[..., Run]) 
 
 
 def test_a_model_is_data(run: Run) -> None:
-    models = [Model("mine", "my own", FrozenIcrs.constant(0.3, -0.3, 0.0))]
+    models = [Model("mine", FrozenIcrs.constant(0.3, -0.3, 0.0))]
     mine, known = dropout(run, [5.0], models=models).result("mine"), dropout(run, [5.0]).result("no_slip")
     assert mine is not None
     assert known is not None

@@ -104,12 +104,12 @@ def test_axes_have_units_and_no_text_lies_on_another(
 def test_the_summary_draws_the_numbers_of_both_models(report: DropoutReport, outages: tuple[Outage, ...]) -> None:
     (axes,) = drawn(lambda: dropout_summary(with_outages(report, outages))).axes
     found = {str(line.get_label()): line.get_xydata().T for line in axes.lines}
-    for name, label in (("icr", "ICR"), ("no_slip", "no slip")):
+    for name in ("icr", "no_slip"):
         result = report.result(name)
         assert result is not None
         for metric, values in (("95 %", result.column("p95_m")), ("mean", result.column("expected_error_m"))):
             if (name, metric) != ("no_slip", "mean"):
-                assert np.allclose(np.interp(HORIZONS_M, *found[f"{label}, {metric}"]), values, rtol=0.02)
+                assert np.allclose(np.interp(HORIZONS_M, *found[f"{name}, {metric}"]), values, rtol=0.02)
     assert found["real outage"][1].tolist() == [outages[-1].document.end_error_m]
     low, high = axes.get_ylim()
     assert low < min(outages[-1].document.end_error_m, float(report.results[0].column("expected_error_m")[0]))
@@ -204,7 +204,7 @@ def test_pictures_stand_without_the_no_slip_model(make_run: Callable[..., Run]) 
     without = figures(run, dropout(run, HORIZONS_M), ())
     for name in ("summary", "histogram", "examples", "worst"):
         draw = without[name]
-        assert "no slip" not in " ".join(texts_of(drawn(draw)))
+        assert "no_slip" not in " ".join(texts_of(drawn(draw)))
 
 
 def test_a_report_draws_what_it_holds(

@@ -53,10 +53,10 @@ def test_the_table_has_every_model_in_metres_and_percent_and_the_ratio(content: 
     assert icr is not None
     assert no_slip is not None
     p95 = float(icr.column("p95_m")[1])
-    assert row_of(text, "ICR, momentary  95 %")[:4] == [f"{p95:.3f}", "m", f"{100 * p95:.1f}", "%"]
+    assert row_of(text, "icr             95 %")[:4] == [f"{p95:.3f}", "m", f"{100 * p95:.1f}", "%"]
     ratio = float(no_slip.column("p95_m")[1]) / p95
-    assert row_of(text, "no slip / ICR   95 %")[:2] == [f"{ratio:.1f}", "x"]
-    assert "ICR, final" in text
+    assert row_of(text, "no_slip / icr   95 %")[:2] == [f"{ratio:.1f}", "x"]
+    assert "icr_final" in text
     assert max(len(line) for line in text.splitlines()) <= 100
     assert not any(line != line.rstrip() for line in text.splitlines())
 
@@ -113,20 +113,20 @@ def test_verdicts_are_lines_of_the_table(content: DropoutReport) -> None:
 
 def test_a_budget_is_a_table_a_field_engineer_can_act_on(content: DropoutReport) -> None:
     budgets = (
-        BudgetDistance("icr", "ICR, momentary", 0.5, 7.34, beyond=False, between_m=(7.0, 8.0)),
-        BudgetDistance("no_slip", "no slip", 0.5, 2.1, beyond=False, between_m=(1.0, 20.0)),
-        BudgetDistance("icr_final", "ICR, final", 0.5, 20.0, beyond=True, between_m=(20.0, 20.0)),
+        BudgetDistance("icr", 0.5, 7.34, beyond=False, between_m=(7.0, 8.0)),
+        BudgetDistance("no_slip", 0.5, 2.1, beyond=False, between_m=(1.0, 20.0)),
+        BudgetDistance("icr_final", 0.5, 20.0, beyond=True, between_m=(20.0, 20.0)),
     )
     report = msgspec.structs.replace(content.document, budgets=budgets)
     assert reach_rows(report, 0.5, 0) == (
-        [("ICR, momentary", "7.3 m", ""), ("no slip", "about 2 m", "between 1 and 20 m")],
-        [("ICR, final", "more than 20 m", "")],
+        [("icr", "7.3 m", "ICRs as estimated at each start"), ("no_slip", "about 2 m", "between 1 and 20 m")],
+        [("icr_final", "more than 20 m", "ICRs at the end of the log")],
     )
     assert reach_rows(report, 9.0, 0) == ([], [])
 
 
 def test_a_distance_below_a_metre_between_far_horizons_is_not_zero() -> None:
-    short = BudgetDistance("no_slip", "no slip", 0.5, 0.3, beyond=False, between_m=(0.0, 10.0))
+    short = BudgetDistance("no_slip", 0.5, 0.3, beyond=False, between_m=(0.0, 10.0))
     assert short.short_text == "less than 1 m"
     assert msgspec.structs.replace(short, distance_m=1.4).short_text == "about 1 m"
     assert msgspec.structs.replace(short, between_m=(0.0, 1.0)).short_text == "0.3 m"
