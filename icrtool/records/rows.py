@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 Color = Literal["green", "purple", "blue", "orange", "grey", "brown", "pink", "teal", "olive", "slate"]
-"""Name of a colour; `icrtool.output.figures.style` and page.css say which it is on paper and on a screen."""
+"""Name of a colour; `icrtool.output.figures.style` and page.css state which it is on paper and on a screen."""
 
 Dash = Literal["solid", "dashed", "dotted", "dashdot"]
 

@@ -41,5 +41,5 @@ def with_numbers(result: ModelResult, name: str | None = None, **columns: Sequen
         msgspec.structs.replace(row, **dict(zip(columns, map(known, map(float, values)), strict=True)))
         for row, *values in zip(result.document.by_horizon, *columns.values(), strict=True)
     ]
-    named = {} if name is None else {"name": name, "label": name}
+    named = {} if name is None else {"name": name}
     return result._replace(document=msgspec.structs.replace(result.document, by_horizon=rows, **named))

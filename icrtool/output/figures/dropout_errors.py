@@ -100,7 +100,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
 
 @style.styled
 def dropout_histograms(report: DropoutReport, *horizons_m: float) -> Figure:
-    """Return the percent of the trials by error [m] of the recommended model, a panel a horizon, and the budget."""
+    """Return the percent of the trials by error [m] of the first row, a panel a horizon, and the budget."""
     asked = [_place(report, metres) for metres in horizons_m]
     of_models = (
         (one, [h for h in asked if len(one.histograms[h].left)]) for one in (*_models(report), *report.results)

@@ -146,7 +146,7 @@ def test_the_summary_marks_the_distances_that_the_report_states(report: DropoutR
     written = [text.get_text() for text in figure.axes[0].texts]
     shown = ("recommended", "controller", "calibration:season")
     assert sorted(written) == sorted(f"{reaches[name].distance_m:.1f} m" for name in shown)
-    assert reaches["recommended"].reach_text in figure.texts[0].get_text()
+    assert reaches["calibration:season"].reach_text in figure.texts[0].get_text()
     marks = [line.get_xydata()[0].tolist() for line in figure.axes[0].lines if line.get_marker() == "o"]
     assert sorted(marks) == sorted([reaches[name].distance_m, 0.1] for name in shown)
 
@@ -157,7 +157,7 @@ def test_the_summary_has_a_handful_of_entries_and_none_of_the_tables_alone(
     entries = texts_of(drawn(lambda: dropout_summary(with_outages(with_rows(report), outages))))
     entries = [text for text in entries if text]
     assert len(entries) <= 7
-    assert not any(text.startswith(("ICR", "icr", "recommended_gyro", "final")) for text in entries)
+    assert not any(text.startswith(("icr", "recommended_gyro", "icr_final")) for text in entries)
 
 
 def test_a_run_that_is_not_usable_is_named_so_in_the_title(report: DropoutReport) -> None:
@@ -172,9 +172,9 @@ def test_a_distance_beyond_all_trials_is_not_marked(report: DropoutReport) -> No
     assert "more than 10 m" in figure.texts[0].get_text()
 
 
-def test_the_histogram_shows_the_recommended_model_at_three_distances_with_the_budget(report: DropoutReport) -> None:
+def test_the_histogram_shows_the_first_row_at_three_distances_with_the_budget(report: DropoutReport) -> None:
     whole = with_rows(report)
-    model = whole.result("recommended")
+    model = whole.result("calibration:season")
     assert model is not None
     figure = drawn(lambda: dropout_histograms(whole, 2.0, 5.0, 10.0))
     assert len(figure.axes) == 3
