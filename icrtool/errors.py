@@ -22,16 +22,17 @@ class IcrToolError(Exception):
         self.what = what
         self.why = why
         self.advice = advice
-        super().__init__(_line(f"{what}: {self._reason}"))
+        super().__init__(_line(f"{what}: {self.reason}"))
 
     @property
-    def _reason(self) -> str:
+    def reason(self) -> str:
+        """Why it cannot be used, and the advice."""
         return f"{self.why}; {self.advice}" if self.advice else self.why
 
     def beside(self, *names: str) -> str:
         """Return the line as it is read beside one of some names: without that name."""
         what = shortened(str(self.what), LONGEST_NAME)
-        return _line(self._reason) if what in (shortened(str(one), LONGEST_NAME) for one in names) else str(self)
+        return _line(self.reason) if what in (shortened(str(one), LONGEST_NAME) for one in names) else str(self)
 
 
 def _line(text: str) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -21,9 +21,10 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError, LogError
-from icrtool.logs.containers.container import LATEST_NS, WHOLE, Container, Cut
+from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED, log_name
+from icrtool.logs.messages.definitions import definition_note
 from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, collector_for
 from icrtool.logs.streams.assembly import Survey, assemble, longest_part
 from icrtool.logs.streams.positions import TRANSFORM_TYPES, is_static, transform_pose
@@ -162,6 +163,7 @@ def _collect(
                     unread[by_id[number].topic] = str(err)
             if progress is not None:
                 progress(container.share_read())
+    _report_definitions(container, [by_id[number] for number, one in collectors.items() if one is not None])
     for number in wanted.keys() - collectors.keys():
         by_topic.setdefault(topics[number], TopicCollector(by_id[number]))
     in_order = dict.fromkeys(topics[number] for number in wanted)
@@ -175,6 +177,13 @@ def _collect(
             except DefinitionError as err:
                 unread[table.topic] = err.why
     return tables, unread
+
+
+def _report_definitions(container: Container, channels: Sequence[Channel]) -> None:
+    """Report the channels that are read with a bundled definition, because that of the log is damaged."""
+    for channel in channels:
+        if note := definition_note(channel):
+            container.report(f"{channel.topic}: {note}; the bundled definition is used")
 
 
 def moment(given: Moment | None, key: str) -> float | datetime | None:

@@ -23,6 +23,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoder import Decoder, text_numbers
+from icrtool.logs.messages.definition_text import full_name
 from icrtool.logs.messages.definitions import (
     BASE,
     DEEPEST,
@@ -33,7 +34,6 @@ from icrtool.logs.messages.definitions import (
     SIZES,
     Definitions,
     Step,
-    full_name,
     kind_at,
     ros_definitions,
     steps_of,

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.container import Channel
-from icrtool.records.text import LONGEST_NAME, shortened
+from icrtool.logs.messages.definition_text import LONGEST_DEFINITION, full_name, parse_definition, plain_definition
 
 NUMBERS, TEXT, LOOP = range(3)
 """Kinds of operations."""
@@ -53,24 +53,6 @@ COUNTED = -1
 """In place of a number of elements: the message states it before them."""
 
 
-_SEPARATOR = "=" * 80 + "\n"
-LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
-"""Limits for a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
-LONGEST_IDL, MOST_IDL_NUMBERS = 1 << 16, 512
-"""Characters and lengths, bounds and constants of a definition in IDL; the parser takes 5 ms for each number."""
-
-_COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
-_ANNOTATION = re.compile(r"@\s*[\w:]+(?:\s*\([^()]*\))?")
-_VALUE = re.compile(r"=(?!\s*\w+\s*;)[^;=]*")
-_EXPRESSION = re.compile(r"[()+\-*/%|^&~]|<[^<>]*<[^<>]*<")
-
-_TIME: Definitions = {
-    f"builtin_interfaces/msg/{name}": ([], [("sec", (BASE, ("int32", 0))), ("nanosec", (BASE, ("uint32", 0)))])
-    for name in ("Time", "Duration")
-}
-"""Time and duration: ROS 1 has no definitions of them; in ROS 2 a definition text may leave them out."""
-
-
 def ros_definitions(channel: Channel) -> Definitions:
     """Return the definitions that the type of a channel of ROS messages needs.
 
@@ -79,23 +61,86 @@ def ros_definitions(channel: Channel) -> Definitions:
     DefinitionError
         Neither the log nor the bundle knows the type, or the log's text cannot be parsed.
     """
-    if channel.definition:
-        types = {**_TIME, **_parse(channel.definition, channel.definition_format, channel.message_type)}
-        for _, fields in types.values():
-            for _, (node, detail) in fields:
-                inner = detail[0] if int(node) > NAME else (node, detail)
-                if int(inner[0]) == NAME and inner[1] not in types:
-                    return {**standard_definitions(), **types}
-        return types
-    name = full_name(channel.message_type)
-    if channel.encoding == "ros1":
-        raise DefinitionError(channel.message_type, "its connection carries no definition")
-    known = bundled_definitions()
-    if name in known:
-        return {**standard_definitions(), **known}
-    if name in standard_definitions():
-        return standard_definitions()
-    raise DefinitionError(channel.message_type, "its definition is not in the log and not bundled")
+    return _known_definitions(channel.message_type, channel.definition, channel.definition_format, channel.encoding)[0]
+
+
+def definition_note(channel: Channel) -> str:
+    """Return in words why the log's own definition of a channel's type is not used; empty where it is, or none is."""
+    known = channel.message_type, channel.definition, channel.definition_format, channel.encoding
+    return _known_definitions(*known)[1] if channel.encoding in ("cdr", "ros1") else ""
+
+
+@lru_cache(maxsize=256)
+def _known_definitions(
+    message_type: str, text: str, written: Literal["msg", "idl"], encoding: str
+) -> tuple[Definitions, str]:
+    """Return the definitions that a type needs, and why the log's own are not used where they are not.
+
+    Raises
+    ------
+    DefinitionError
+        As `ros_definitions`.
+    """
+    name, known = full_name(message_type), bundled_for(encoding)
+    has_text = bool(text.strip("\0\ufeff \t\r\n"))
+    if not has_text:
+        if name not in known:
+            why = "its connection carries no definition" if encoding == "ros1" else "its definition is not in the log"
+            raise DefinitionError(message_type, f"{why} and not bundled")
+        return known, ""
+    types: Definitions
+    try:
+        types, problem = parse_definition(text, written, message_type), ""
+    except DefinitionError as err:
+        types, problem = _without_last_line(text, written, message_type), err.reason
+    if types and (missing := _missing({**known, **types}, name)):
+        types = {}
+        problem = f"the definition in the log contains {missing}, which is not defined there and not bundled"
+    if types:
+        *_, last = types
+        is_begun = last in standard_definitions() and _is_begun(types[last][1], known[last][1])
+        if is_begun:
+            return {**known, **types, last: known[last]}, f"the definition in the log ends within {last}"
+        if not problem:
+            return {**known, **types}, ""
+    if name not in known:
+        raise DefinitionError(message_type, problem)
+    return known, problem
+
+
+def _without_last_line(text: str, written: Literal["msg", "idl"], message_type: str) -> Definitions:
+    """Return the types of a definition text before its last line, where the log may end it; empty where unreadable."""
+    before = plain_definition(text[: LONGEST_DEFINITION + 1], message_type).rstrip("\n").rpartition("\n")[0]
+    try:
+        return parse_definition(before, written, message_type) if written == "msg" and before else {}
+    except DefinitionError:
+        return {}
+
+
+def _missing(definitions: Definitions, name: str) -> str:
+    """Return a type that another one contains and that is not defined; empty where all are."""
+    left, seen = [name], {name}
+    while left:
+        name = left.pop()
+        if name not in definitions:
+            return name
+        for _, (node, detail) in definitions[name][1]:
+            inner = detail[0] if int(node) > NAME else (node, detail)
+            if int(inner[0]) == NAME and inner[1] not in seen:
+                seen.add(inner[1])
+                left.append(inner[1])
+    return ""
+
+
+def _is_begun(fields: Sequence[Any], whole: Sequence[Any]) -> bool:
+    """Return whether fields are the first ones of a type that has more; the name of the last one may be incomplete."""
+    if not fields:
+        return bool(whole)
+    *before, (last, kind) = fields
+    if before != list(whole[: len(before)]) or len(before) == len(whole):
+        return last.isupper() and before == list(whole)  # a constant of which the value is missing
+    known, known_kind = whole[len(before)]
+    return last.isupper() or (known_kind == kind and known.startswith(last) and list(fields) != list(whole))
 
 
 def kind_at(definitions: Definitions, name: str, steps: Sequence[Step]) -> str | None:
@@ -113,48 +158,6 @@ def kind_at(definitions: Definitions, name: str, steps: Sequence[Step]) -> str |
         else:
             return None
     return str(detail[0]) if node == BASE else None
-
-
-def full_name(message_type: str) -> str:
-    """Return ``package/msg/Name`` for ``package/Name``; a name without a package, as Protobuf's, as it is."""
-    package, _, name = message_type.partition("/")
-    return f"{package}/msg/{name}" if name else message_type
-
-
-@lru_cache(maxsize=64)
-def _parse(text: str, written: Literal["msg", "idl"], message_type: str) -> Definitions:
-    """Parse a definition text; the topics of a log share few."""
-    from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
-
-    if len(text) > LONGEST_DEFINITION or text.count(_SEPARATOR) > MOST_TYPES:
-        why = f"the definition in the log is longer than {LONGEST_DEFINITION} characters or {MOST_TYPES} types"
-        raise DefinitionError(message_type, why, "this type is not read")
-    try:
-        if written == "msg":
-            return get_types_from_msg(text, full_name(message_type))
-        parts = text.split(_SEPARATOR)[1:] if text.startswith(f"{_SEPARATOR}IDL: ") else [f"\n{text}"]
-        plain = [_plain_idl(part.split("\n", 1)[1]) for part in parts]
-        numbers = sum(part.count(sign) for part in plain for sign in "[<=")
-        if numbers > MOST_IDL_NUMBERS or sum(map(len, plain)) > LONGEST_IDL or any(map(_EXPRESSION.search, plain)):
-            why = f"expressions, {MOST_IDL_NUMBERS} numbers, or {LONGEST_IDL} characters without comments"
-            raise DefinitionError(message_type, f"its definition has {why}", "this type is not read")
-        types: dict[str, Any] = {}
-        for part in plain:
-            types.update(get_types_from_idl(part))
-    except (TypesysError, ValueError, IndexError, KeyError, RecursionError) as err:
-        first = shortened(str(err).partition("\n")[0], LONGEST_NAME)
-        raise DefinitionError(message_type, "the definition in the log cannot be parsed", first) from err
-    return types
-
-
-def _plain_idl(text: str) -> str:
-    """Return an IDL text without comments, annotations, and constants that are no number or name.
-
-    The parser of rosbags reads each number 128 times, and again for each pair of parentheses: three take hours. It
-    reads the inner one of two sequences twice.
-    """
-    text = _COMMENT_OR_STRING.sub(lambda found: '""' if found[0].startswith('"') else " ", text)
-    return _VALUE.sub("= 0", _ANNOTATION.sub(" ", text))
 
 
 @cache
@@ -177,6 +180,18 @@ def standard_definitions() -> Definitions:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE).fielddefs
+
+
+@cache
+def bundled_for(encoding: str) -> Definitions:
+    """Return all types that do not need a definition in the log, with the fields of ROS 1 Noetic or ROS 2 Humble."""
+    from rosbags.typesys import Stores, get_typestore
+
+    known = {**standard_definitions(), **bundled_definitions()}
+    if encoding == "ros1":
+        known |= get_typestore(Stores.ROS1_NOETIC).fielddefs
+        known["tf/msg/tfMessage"] = known["tf2_msgs/msg/TFMessage"]
+    return known
 
 
 class Operation(NamedTuple):

@@ -1,0 +1,133 @@
+"""Texts of message definitions as recorders write them: brought into one form, and parsed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, Literal
+
+from icrtool.errors import DefinitionError
+from icrtool.records.text import LONGEST_NAME, shortened
+
+SEPARATOR = "=" * 80
+"""The line between the types of a definition."""
+
+_FEWEST_SIGNS = 20
+"""A line before the name of a type that ends in this many ``=`` ends in a separator."""
+
+_HEAD = re.compile(r"\s*(MSG|IDL)\s*:\s*([\w/]*)\s*")
+_NAMED = re.compile(r"\s*Definition of\b\s*([\w/]*).*", re.IGNORECASE)
+"""A line such as ``Definition of sensor_msgs/JointState:``, which some recorders write before a type."""
+
+_SEPARATOR = f"{SEPARATOR}\n"
+LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
+"""Limits for a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
+LONGEST_IDL, MOST_IDL_NUMBERS = 1 << 16, 512
+"""Characters and lengths, bounds and constants of a definition in IDL; the parser takes 5 ms for each number."""
+
+_COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
+_ANNOTATION = re.compile(r"@\s*[\w:]+(?:\s*\([^()]*\))?")
+_VALUE = re.compile(r"=(?!\s*\w+\s*;)[^;=]*")
+_EXPRESSION = re.compile(r"[()+\-*/%|^&~]|<[^<>]*<[^<>]*<")
+
+
+def full_name(message_type: str) -> str:
+    """Return ``package/msg/Name`` for ``package/Name``; a name without a package, as Protobuf's, as it is."""
+    package, _, name = message_type.partition("/")
+    return f"{package}/msg/{name}" if name else message_type
+
+
+def plain_definition(text: str, own_name: str) -> str:
+    """Return a definition whose line ends, separators and names of types are those that rosbags reads.
+
+    Lines end with LF, there is no byte order mark, and a separator and the name of a type are lines of their own.
+
+    Parameters
+    ----------
+    own_name : ``package/Name`` of the type that is defined first; a heading with its name is left out
+    """
+    text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\0", "").replace("\xa0", " ")
+    own = own_name.replace("/msg/", "/")
+    lines: list[str] = []
+    for line in text.removeprefix("\ufeff").removeprefix("\xef\xbb\xbf").split("\n"):
+        head, named = _HEAD.fullmatch(line), _NAMED.fullmatch(line)
+        if head is None and named is None:
+            lines.append(line.rstrip())
+            continue
+        kind, name = head.groups() if head is not None else ("MSG", named[1] if named is not None else "")
+        _end_type(lines)
+        if kind == "MSG" and name.replace("/msg/", "/") == own and not _states(lines):
+            lines.clear()
+        elif name.count("/") and f"{kind}: {name}" not in lines[-1:]:
+            lines += [SEPARATOR, f"{kind}: {name}"]
+    _end_type(lines)
+    return "\n".join([*lines, ""])
+
+
+def _end_type(lines: list[str]) -> None:
+    """Remove the empty lines and the separator at the end of the lines of a type."""
+    while lines and not lines[-1].strip("= \t"):
+        lines.pop()
+    if lines and len(lines[-1]) - len(without := lines[-1].rstrip("=")) >= _FEWEST_SIGNS:
+        lines[-1] = without.rstrip()
+
+
+def _states(lines: Sequence[str]) -> bool:
+    """Return whether some line states a field, a constant or a name: it is not empty and no comment."""
+    return any(line.strip() and not line.lstrip().startswith("#") for line in lines)
+
+
+@lru_cache(maxsize=64)
+def parse_definition(text: str, written: Literal["msg", "idl"], message_type: str) -> dict[str, tuple[Any, Any]]:
+    """Return the types of a definition text, in their order: ``package/msg/Name`` to (constants, fields).
+
+    Raises
+    ------
+    DefinitionError
+        It is too long, or cannot be parsed.
+    """
+    from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+
+    long = f"the definition in the log is longer than {LONGEST_DEFINITION} characters or {MOST_TYPES} types"
+    if len(text) > LONGEST_DEFINITION:
+        raise DefinitionError(message_type, long, "this type is not read")
+    text = plain_definition(text, message_type)
+    if text.count(_SEPARATOR) > MOST_TYPES:
+        raise DefinitionError(message_type, long, "this type is not read")
+    try:
+        if written == "msg":
+            return get_types_from_msg(text, full_name(message_type))
+        parts = text.split(_SEPARATOR)[1:] if text.startswith(f"{_SEPARATOR}IDL: ") else [f"\n{text}"]
+        plain = [_plain_idl(part.split("\n", 1)[1]) for part in parts]
+        numbers = sum(part.count(sign) for part in plain for sign in "[<=")
+        if numbers > MOST_IDL_NUMBERS or sum(map(len, plain)) > LONGEST_IDL or any(map(_EXPRESSION.search, plain)):
+            why = f"expressions, {MOST_IDL_NUMBERS} numbers, or {LONGEST_IDL} characters without comments"
+            raise DefinitionError(message_type, f"its definition has {why}", "this type is not read")
+        types: dict[str, Any] = {}
+        for part in plain:
+            types.update(get_types_from_idl(part))
+    except (TypesysError, ValueError, IndexError, KeyError, RecursionError) as err:
+        first = shortened(_where(str(err)), LONGEST_NAME)
+        raise DefinitionError(message_type, f"the definition in the log cannot be parsed: {first}") from err
+    return types
+
+
+def _where(reason: str) -> str:
+    """Return the line that the parser of rosbags did not read, else its reason: it repeats the whole text first."""
+    first, *others = reason.split("\n")
+    if not first.startswith("Could not parse") or len(others) < 2:
+        return first
+    place = others[1]
+    line = next((line.strip() for line in others[2:] if line.strip()), "")
+    return f"at {line!r}" if line else f"at character {place}"
+
+
+def _plain_idl(text: str) -> str:
+    """Return an IDL text without comments, annotations, and constants that are no number or name.
+
+    The parser of rosbags reads each number 128 times, and again for each pair of parentheses: three take hours. It
+    reads the inner one of two sequences twice.
+    """
+    text = _COMMENT_OR_STRING.sub(lambda found: '""' if found[0].startswith('"') else " ", text)
+    return _VALUE.sub("= 0", _ANNOTATION.sub(" ", text))
