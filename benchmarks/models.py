@@ -23,7 +23,6 @@ from unseen_logs import draw_case, make_log
 
 from icrtool.calibration.held_out import HORIZONS_M, errors_without, plan_folds
 from icrtool.calibration.pooled import recording_of
-from icrtool.calibration.run_models import fit
 from icrtool.config import Config, load_config
 from icrtool.errors import IcrToolError
 from icrtool.fleet.recordings import find_recordings
@@ -42,6 +41,7 @@ from icrtool.motion.models import (
 from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_trials, cut_windows, totals_of
 from icrtool.motion.window_fit import Fold, Pool, PooledFit, Prediction
 from icrtool.output.run_directory import RUN_FILE, is_run_directory, open_run
+from icrtool.pipeline import fit
 
 SLIP_TERMS = ("vy_vw", "omega_sw", "omega_vw")
 WIDE, WIDTHS = 10.0, np.geomspace(0.003, 1.0, 60)

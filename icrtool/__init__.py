@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from icrtool import figures
     from icrtool.calibration.pooled import calibrate
     from icrtool.calibration.record import Calibration
-    from icrtool.calibration.run_models import fit
     from icrtool.config import Config, load_config
     from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
     from icrtool.dropout_analysis.report import DropoutReport
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from icrtool.output.files.formats import open_calibration
     from icrtool.output.page.pages import write_page
     from icrtool.output.run_directory import open_run
+    from icrtool.pipeline import fit
     from icrtool.records.run import Run, WarmStart
     from icrtool.records.tables import RobotLog
 
@@ -78,7 +78,7 @@ _HOMES = {
     "calibrate": "icrtool.calibration.pooled",
     "dropout": "icrtool.dropout_analysis.dropout_report",
     "dropout_report": "icrtool.dropout_analysis.dropout_report",
-    "fit": "icrtool.calibration.run_models",
+    "fit": "icrtool.pipeline",
     "load_config": "icrtool.config",
     "open_calibration": "icrtool.output.files.formats",
     "open_run": "icrtool.output.run_directory",

@@ -46,12 +46,13 @@ LONGEST_LINE = 5000
 def made(folder: Path) -> Path:
     """Return a folder with a run of a short drive, its report, and a calibration."""
     import icrtool
-    from icrtool.fleet.one_log import ReportOptions, report_and_write
+    from icrtool.pipeline import report_into
+    from icrtool.records.requests import ReportRequest, ResultFiles
     from support.barn import configured, simulate
 
     run = icrtool.fit(simulate(duration_s=40.0), configured())
     run.write(folder / "run")
-    report_and_write(run, folder / "run", ReportOptions(ladder=False), lambda _: None, baseline=None)
+    report_into(folder / "run", run, ReportRequest(ladder=False), ResultFiles(), lambda _: None)
     icrtool.calibrate([run]).write(folder / "calibration.json")
     return folder
 

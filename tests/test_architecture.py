@@ -18,6 +18,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "icrtool"
 LAYERS = (
     ("cli",),
     ("fleet",),
+    ("pipeline",),
     ("output",),
     ("dropout_analysis", "simulation"),
     ("calibration",),

@@ -17,10 +17,10 @@ from icrtool.calibration.pooled import calibrate, recording_of
 from icrtool.calibration.transfer import compare_groups
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import parse_gate, verdict_on
-from icrtool.estimation.fit import fit
 from icrtool.fleet.fleet_files import fleet_document
 from icrtool.output.files.formats import json_bytes
 from icrtool.output.tables.calibration import forecast_document
+from icrtool.pipeline import fit
 from icrtool.records.fleet_document import FleetCalibration, FleetFile, FleetLog, fleet_verdict
 from icrtool.records.text import LogText
 from support.barn import configured, simulate

@@ -1,4 +1,4 @@
-"""The motion models of one run: fitted (`icrtool.fit`), and each tested on distance it was not fitted to.
+"""The motion models of one run: fitted (for `icrtool.fit`), and each tested on distance it was not fitted to.
 
 What is fitted is fitted on windows that keep clear of the trials that it is tested in (`icrtool.calibration.held_out`);
 the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn by it and by the wheels.
@@ -7,7 +7,6 @@ the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -17,9 +16,7 @@ import numpy as np
 from icrtool.calibration import pooled
 from icrtool.calibration.held_out import GYRO, HeldOut, fit_models, hold_out
 from icrtool.calibration.record import Calibration, controller_numbers, fitted_document
-from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.estimation.fit import fit as fit_filter
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
@@ -27,50 +24,8 @@ from icrtool.motion.models import FIVE, ICRS, NO_SLIP, RECOMMENDED, TrackGeometr
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.run import ICR_COLUMNS, Run, WarmStart, check_type, no_slip_icrs, width_or_usual_m
+from icrtool.records.run import ICR_COLUMNS, Run, no_slip_icrs, width_or_usual_m
 from icrtool.records.run_document import GeometryDocument, RunDocument
-from icrtool.records.tables import RobotLog
-
-
-def fit(
-    log: RobotLog,
-    config: Config | None = None,
-    *,
-    warm_start: WarmStart | None = None,
-    changes_s: tuple[float, ...] = (),
-    smooth: bool = False,
-    watch: Callable[[str], None] | None = None,
-) -> Run:
-    """Learn a robot's track ICRs from a log, and its motion model.
-
-    Parameters
-    ----------
-    log : as `icrtool.read_log` returns it
-    config : default: all defaults
-    warm_start : ICRs and covariance that another run ended with (Fig. 18), in place of the preset's start
-    changes_s : terrain changes, seconds since the first recorded state: the ICR covariance is inflated there (Fig. 9)
-    smooth : also make the states of the RTS smoother
-    watch : called with the name of each stage when it begins
-
-    Returns
-    -------
-    Run
-        No file is touched. `document` holds the motion model, as `icrtool.calibrate` fits it, the ICRs and what a
-        controller is given.
-
-    Raises
-    ------
-    DataError
-        Streams that cannot be used together, or hold values that are not finite numbers.
-    ConfigError
-        A start that preset ``field`` does not take.
-    """
-    check_type(log, RobotLog, "icrtool.read_log(path, config) reads one")
-    # The callee alone holds the log, and frees what it needs no longer.
-    logs = [log]
-    del log
-    run = fit_filter(logs.pop(), config, warm_start=warm_start, changes_s=changes_s, smooth=smooth, watch=watch)
-    return replace(run, document=with_motion(run))
 
 
 def with_motion(run: Run) -> RunDocument:

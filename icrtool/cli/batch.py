@@ -29,9 +29,8 @@ with when_used():
     from icrtool.output.files import remote_place
 
 if TYPE_CHECKING:
-    from icrtool.fleet.batch import BatchOptions
-    from icrtool.fleet.one_log import Request
     from icrtool.records.fleet_document import FleetLog
+    from icrtool.records.requests import BatchRequest, LogRequest
 
 LONGEST_STAGE, LEAST_NAME = 28, 12
 """Characters of the live line for the stage of a log with its separators, and for its name at least."""
@@ -58,11 +57,10 @@ WORKERS = options.together(
 
 BATCH = options.together(
     "batch",
-    "icrtool.fleet.batch:BatchOptions",
+    f"{options.REQUESTS}:BatchRequest",
     option("--timeout timeout_s", "SECONDS", POSITIVE, "Stop a log that takes longer.", default=1800.0),
     flag("--redo", "Also process logs that are done."),
-    flag("--overwrite", "Also replace runs of other recordings."),
-    options.reporting(),
+    options.reporting(flag("--overwrite", "Also replace runs of other recordings.")),
     options.CONFIGURATION,
 )
 
@@ -75,7 +73,7 @@ BATCH = options.together(
 @BATCH
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def batch_command(
-    places: tuple[Path, ...], output: Path, workers: Workers, batch: BatchOptions, exports: Exports, printer: Printer
+    places: tuple[Path, ...], output: Path, workers: Workers, batch: BatchRequest, exports: Exports, printer: Printer
 ) -> None:
     """Fit and report on many logs, in several processes, and collect a table with a row per log.
 
@@ -105,8 +103,8 @@ def batch_command(
             pooled = fleet_files.pooled_calibrations(rows, folder, output, allow_unusable=asked.allow_unusable)
             calibrations = list(pooled)
         new = any((row.status, row.this_time) == ("done", "processed") for row in rows)
-        plots = asked.plots if new or not (folder / fleet_files.PLOTS).is_dir() else ()
-        document = fleet_files.write_fleet(rows, folder, calibrations, plots, page=asked.page)
+        plots = batch.files.plots if new or not (folder / fleet_files.PLOTS).is_dir() else ()
+        document = fleet_files.write_fleet(rows, folder, calibrations, plots, page=batch.files.page)
         results = ("fleet.csv", "failures.csv", "calibrations", "calibrations.txt", "plots", "report.html", "runs")
         there = [name for name in results if (folder / name).exists()]
         written = ", ".join(f"{name}/" if (folder / name).is_dir() else name for name in there)
@@ -128,7 +126,7 @@ def batch_command(
 
 
 def run_all(
-    requests: Sequence[Request], workers: Workers, batch: BatchOptions, view: View, folder: Path
+    requests: Sequence[LogRequest], workers: Workers, batch: BatchRequest, view: View, folder: Path
 ) -> list[FleetLog]:
     """Process all logs, and return a row of each, in the order of the requests.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import click
 
@@ -17,18 +17,19 @@ from icrtool.records.choices import Reference, Starts
 from icrtool.records.text import LogText, escaped
 
 with when_used():
-    from icrtool import errors
+    from icrtool import errors, pipeline
     from icrtool.dropout_analysis import dropout_report
-    from icrtool.fleet import one_log
     from icrtool.output import run_directory, text_blocks
     from icrtool.output.exports import acceptance
     from icrtool.output.files import formats, remote_place
     from icrtool.output.tables import dropout
 
 if TYPE_CHECKING:
+    from icrtool.calibration.record import Calibration
     from icrtool.config import Config, ConfigSources
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.output.dropout_directory import Baseline
+    from icrtool.records.requests import ReportRequest, ResultFiles
 
 EPILOG_GATE = (
     'A limit of --gate reads "MODEL.p50|p95|expected|max@HORIZONm <= METRES", for example "recommended.p95@10m <= 1.2"'
@@ -45,6 +46,7 @@ def distances(text: str) -> tuple[float, ...]:
 
 
 REPORT = options.reporting(
+    options.PLACES,
     option("--horizons horizons_m", "M,M,...", distances, "Distances without GNSS [m], in place of the configured "
            "ones."),
     option("--calibration calibration_files", "CAL.json", FILE, "Also predict with a calibration that icrtool "
@@ -66,13 +68,12 @@ REPORT = options.reporting(
 
 @click.command("dropout-report", epilog=EPILOG_GATE)
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
-@options.PLACES
 @REPORT
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def dropout_report_command(
-    sources: tuple[Path, ...], place: ResultPlace, overwrite: bool, calibration_files: tuple[Path, ...],
-    report: one_log.ReportOptions, baseline: Path | None, exports: Exports, settings: ConfigSources, printer: Printer,
+    sources: tuple[Path, ...], place: ResultPlace, calibration_files: tuple[Path, ...], report: ReportRequest,
+    files: ResultFiles, baseline: Path | None, exports: Exports, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Report how far off a robot is without GNSS: open loop from every recorded state, over 1 to 20 m.
 
@@ -88,9 +89,8 @@ def dropout_report_command(
     """  # noqa: D301 - click reads the escape
     config = settings.load()
     compared = options.baseline_of(baseline, report.gates)
-    report = report.configured(config, map(formats.open_calibration, calibration_files))
-    # One result: where the report fails, an old run in this place stays, with its report.
-    fitting = one_log.FitOptions(overwrite, report.plots, report.figures, smooth=report.reference == "smoothed")
+    report = report.configured(config)
+    given = Given(tuple(map(formats.open_calibration, calibration_files)), compared)
     sources, places = plan_sources(sources, place, config, printer)
     inputs = Inputs("source")
     reports: dict[str, DropoutReport] = {}
@@ -98,7 +98,7 @@ def dropout_report_command(
         if number:
             printer.text("")
         with inputs.each(source) as document:
-            found = _report_one(source, places.get(source), config, fitting, report, compared, printer)
+            found = _report_one(source, places.get(source), config, report, files, given, printer)
             reports[str(source)] = found
             if printer.as_json:
                 document["report"] = found.document
@@ -137,9 +137,16 @@ def plan_sources(
     return sources, {}
 
 
+class Given(NamedTuple):
+    """What the reports are given: calibrations, and the reports of an earlier version."""
+
+    calibrations: tuple[Calibration, ...]
+    baseline: Baseline | None
+
+
 def _report_one(
-    source: Path, place: RunPlace | None, config: Config, fitting: one_log.FitOptions, asked: one_log.ReportOptions,
-    compared: Baseline | None, printer: Printer,
+    source: Path, place: RunPlace | None, config: Config, request: ReportRequest, files: ResultFiles, given: Given,
+    printer: Printer,
 ) -> DropoutReport:  # fmt: skip
     """Report on one source; `place` is the run directory of a log, None for a run."""
     with ExitStack() as stack:
@@ -147,18 +154,19 @@ def _report_one(
             folder = stack.enter_context(remote_place.on_disk(source, needed=bool))
             run = run_directory.open_run(folder, whole=False)
         else:
-            run, folder = stack.enter_context(
-                fitted_log(source, place.directory, config, fitting, printer, place.inside)
-            )
-        if asked.outage_at_s and not dropout_report.forced_lengths_s(run, asked.outage_s):
+            # One result: where the report fails, an old run in this place stays, with its report.
+            run, folder = stack.enter_context(fitted_log(source, place, config, request.fit, files, printer))
+        if request.outage_at_s and not dropout_report.forced_lengths_s(run, request):
             raise click.UsageError("--outage-at gives the begin of an outage, and needs --outage for its length")
-        baseline = compared.find(run.name, run.document.content) if compared is not None else None
+        baseline = given.baseline.find(run.name, run.document.content) if given.baseline is not None else None
         with printer.stages(LogText(run.name)) as stages:
-            report = one_log.report_and_write(run, folder, asked, stages.begin, baseline=baseline)
+            report = pipeline.report_into(
+                folder, run, request, files, stages.begin, calibrations=given.calibrations, baseline=baseline
+            )
     if report.baseline is not None:
         printer.warn(f"{run.name}: {change}" for change in report.baseline.changes(run.document))
     directory = source if place is None else place.directory
-    label, name = ("page", run_directory.PAGE_FILE) if asked.page else ("written to", "dropout")
+    label, name = ("page", run_directory.PAGE_FILE) if files.page else ("written to", "dropout")
     where = text_blocks.Section("", [text_blocks.Facts([(label, escaped(str(directory / name)))])])
     printer.show([*dropout.dropout_blocks(report), where])
     if not printer.shows:

@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from icrtool.cli import options, when_used
-from icrtool.cli.inputs import ResultPlace, logs_of, run_directories
-from icrtool.cli.options import PLACE, Span, choice, flag, option
+from icrtool.cli.inputs import ResultPlace, RunPlace, logs_of, run_directories
+from icrtool.cli.options import PLACE, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.choices import StatesFormat
 from icrtool.records.text import LogText, escaped
 
 with when_used():
-    from icrtool import errors
+    from icrtool import errors, pipeline
     from icrtool.alignment import wheel_units
-    from icrtool.calibration import run_models
-    from icrtool.fleet import one_log
     from icrtool.logs import read_log
     from icrtool.logs.streams import assembly
     from icrtool.output import text_format
@@ -32,11 +30,12 @@ with when_used():
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
+    from icrtool.records.requests import FitRequest, ResultFiles
     from icrtool.records.run import Run
 
-ASKED = options.together(
-    "asked",
-    "icrtool.fleet.one_log:FitOptions",
+REQUEST = options.together("request", f"{options.REQUESTS}:FitRequest", options.together(
+    "files",
+    f"{options.REQUESTS}:ResultFiles",
     options.PLACES,
     choice("--states", get_args(StatesFormat), "Format of the states; default: csv, parquet for over a million "
            "states."),
@@ -48,17 +47,18 @@ ASKED = options.together(
            "ground changes after T seconds: inflate the ICR covariance there; repeatable.", multiple=True),
     flag("--smooth", "Also write the RTS smoother's states (smoothed.csv)."),
     options.CUT,
-)  # fmt: skip
+))  # fmt: skip
 
 
 @click.command("fit")
 @options.LOGS
-@ASKED
+@REQUEST
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
 def fit_command(
-    logs: tuple[Path, ...], place: ResultPlace, asked: one_log.FitOptions, settings: ConfigSources, printer: Printer
-) -> None:
+    logs: tuple[Path, ...], place: ResultPlace, warm_start: Path | None, request: FitRequest, files: ResultFiles,
+    settings: ConfigSources, printer: Printer,
+) -> None:  # fmt: skip
     """Learn the track ICRs of a robot from its logs, and write a run directory per log.
 
     Without options the topics are found by type and content. --robot or --set robot.track_width_m=… and
@@ -74,12 +74,12 @@ def fit_command(
     inputs = Inputs("log")
     for log, (directory, inside) in zip(logs, run_directories(logs, place), strict=True):
         with inputs.each(log) as document:
-            with fitted_log(log, directory, config, asked, printer, inside) as (run, _):
+            with fitted_log(log, RunPlace(directory, inside), config, request, files, printer, warm_start) as (run, _):
                 pass
             where = escaped(str(directory))
             document |= {"directory": where, "run": run.summary}
             # The command that names what is wrong in the log.
-            examine = shlex.join(["icrtool", "info", escaped(str(log)), "-v", *options.given(settings, asked.span)])
+            examine = shlex.join(["icrtool", "info", escaped(str(log)), "-v", *options.given(settings, request)])
             printer.show([*run_tables.run_blocks(run.document), *run_tables.next_blocks(run.document, where, examine)])
     printer.json("fit", {"logs": inputs.documents})
     inputs.leave("logs")
@@ -87,15 +87,25 @@ def fit_command(
 
 @contextmanager
 def fitted_log(
-    log: Path, directory: Path, config: Config, asked: one_log.FitOptions, printer: Printer, inside: Path | None
-) -> Iterator[tuple[Run, Path]]:
-    """Fit a log, and give as `icrtool.fleet.one_log.fitted` does; print warnings and chosen streams on stderr."""
+    log: Path, place: RunPlace, config: Config, request: FitRequest, files: ResultFiles, printer: Printer,
+    warm_start: Path | None = None,
+) -> Iterator[tuple[Run, Path]]:  # fmt: skip
+    """Fit a log, and give as `icrtool.pipeline.fit_into` does; print warnings and chosen streams on stderr."""
     notes: list[str] = []
     with (
         printer.stages(LogText(log.name)) as stages,
-        one_log.fitted(
-            log, directory, config, asked, stages.begin, share=stages.share, note=notes.append, inside=inside
-        ) as found,
+        pipeline.fit_into(
+            place.directory,
+            log,
+            config,
+            request,
+            files,
+            stages.begin,
+            warm_start=warm_start,
+            share=stages.share,
+            note=notes.append,
+            inside=place.inside,
+        ) as found,  # fmt: skip
     ):
         yield found
     printer.warn_of(found[0], *notes)
@@ -105,10 +115,10 @@ def fitted_log(
 
 @click.command("info")
 @options.LOGS
-@options.CUT
+@options.together("request", f"{options.REQUESTS}:FitRequest", options.CUT)
 @options.CONFIGURATION
 @options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
-def info_command(logs: tuple[Path, ...], span: Span, settings: ConfigSources, printer: Printer) -> None:
+def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSources, printer: Printer) -> None:
     """List what each log holds, which topics are used for wheels, position and heading, and the problems found.
 
     The filter runs too, but nothing is written. The report names the ICRs that the drive shows and, where
@@ -116,17 +126,17 @@ def info_command(logs: tuple[Path, ...], span: Span, settings: ConfigSources, pr
 
     Exit status 1 when `icrtool fit` could not run on a log.
     """
-    config, given = settings.load(), options.given(settings, span)
+    config, given = settings.load(), options.given(settings, request)
     inputs = Inputs("log")
     for log in logs_of(logs, printer):
         with inputs.each(log) as document:
-            _examine(log, config, span, given, document, printer)
+            _examine(log, config, request, given, document, printer)
     printer.json("info", {"logs": inputs.documents})
     inputs.leave("logs")
 
 
 def _examine(
-    log: Path, config: Config, span: Span, given: list[str], document: dict[str, Any], printer: Printer
+    log: Path, config: Config, request: FitRequest, given: list[str], document: dict[str, Any], printer: Printer
 ) -> None:
     """Read and fit a log, and print whether it can be fitted, what it holds, and the command to run next.
 
@@ -143,12 +153,12 @@ def _examine(
         with printer.stages(LogText(log.name)) as stages:
             stages.begin("reading")
             if read_log.is_table(log):
-                measured = read_log.read_log(log, config, start=span.start, end=span.end)
+                measured = read_log.read_log(log, config, start=request.start, end=request.end)
             else:
-                survey = read_log.survey_log(log, config, stages.share, start=span.start, end=span.end)
+                survey = read_log.survey_log(log, config, stages.share, start=request.start, end=request.end)
                 measured = assembly.assemble(survey, config)
             measured = wheel_units.with_wheel_speeds(measured, config)
-            run = run_models.fit(measured, config, watch=stages.begin)
+            run = pipeline.fit_log(measured, config, request, watch=stages.begin)
     except errors.IcrToolError as err:
         problem = err
     holds = read_log.survey_document(survey) if survey is not None else None

@@ -21,6 +21,7 @@ with when_used():
     from icrtool.logs import read_log
     from icrtool.output import run_directory
     from icrtool.output.files import formats
+    from icrtool.records import requests
 
 if TYPE_CHECKING:
     from icrtool.calibration.record import Calibration
@@ -59,7 +60,7 @@ def runs_of(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run
             if run_directory.is_run_directory(path):
                 found.append(run_directory.open_run(path))
             else:
-                found.append(fit.fit(read_log.read_log(path, config), config))
+                found.append(fit.fit_filter(read_log.read_log(path, config), config, requests.FitRequest()))
             progress(len(found) / len(paths))
     return found
 

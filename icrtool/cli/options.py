@@ -38,11 +38,15 @@ if TYPE_CHECKING:
     from icrtool.config import ConfigSources
     from icrtool.records.acceptance import Verdict
     from icrtool.records.fleet_document import FleetVerdict
+    from icrtool.records.requests import FitRequest
 
 Command = Callable[..., Any]
 Option = Callable[[Command], Command]
 Record = TypeVar("Record")
 Change = Callable[[Record], Record]
+
+REQUESTS = "icrtool.records.requests"
+"""Where the records are that options make, imported when a command is called."""
 
 POSITIVE = click.FloatRange(min=0, min_open=True)
 NOT_NEGATIVE = click.FloatRange(min=0)
@@ -105,6 +109,11 @@ def add_options(command: Command, *options: Option) -> Command:
     for one in reversed(options):
         command = one(command)
     return command
+
+
+def add_all(*options: Option) -> Option:
+    """Return several options as one."""
+    return lambda command: add_options(command, *options)
 
 
 class _Path(click.Path):
@@ -224,21 +233,12 @@ PLACES = together(
 """-o and --into as `place`, and --overwrite."""
 
 
-class Span(NamedTuple):
-    """From when to when a log is read, by --from and --to."""
-
-    start: str | None = None
-    end: str | None = None
-
-
-CUT = together(
-    "span",
-    Span,
+CUT = add_all(
     option("--from start", "TIME", None, "Read the log from here: seconds since the log's first message, or a time in "
            "ISO 8601 (UTC without a zone)."),
     option("--to end", "TIME", None, "Read the log up to here."),
 )  # fmt: skip
-"""--from and --to, as `span`."""
+"""--from and --to, as `start` and `end`."""
 
 AS_JSON = flag("--json as_json", "Print one JSON document on standard output, and nothing else there.")
 QUIET_RESULTS = flag("-q --quiet", "Print no results.")
@@ -297,17 +297,17 @@ class Exports(NamedTuple):
 
 
 def reporting(*further: Option) -> Option:
-    """Add the options of a dropout report as `report`, `exports` and `baseline`; `further`: those of one log alone."""
-    return together("exports", Exports, together(
+    """Add the options of a report as `report`, `files`, `exports` and `baseline`; `further`: those of one command."""
+    return together("exports", Exports, together("files", f"{REQUESTS}:ResultFiles", together(
         "report",
-        "icrtool.fleet.one_log:ReportOptions",
+        f"{REQUESTS}:ReportRequest",
         *further,
         BUDGETS,
         option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one a line: exit status 3 if one is not "
                "met; repeatable.", multiple=True, callback=_lines),
         option("--baseline", "REPORT.json|DIR", FILE, "Earlier report, run or batch to compare with; a limit may then "
                "read \"icr.p95@10m <= 1.1 * baseline\"."),
-        flag("--strict-gates strict", "Compare limits relative to the baseline by their number alone, without the "
+        flag("--strict-gates", "Compare limits relative to the baseline by their number alone, without the "
              "confidence interval of the difference."),
         flag("--ladder/--no-ladder", "Also test the motion model and the controller numbers, with a gyro too, on "
              "distance that they were not fitted to.", default=True, show_default=True),
@@ -318,7 +318,7 @@ def reporting(*further: Option) -> Option:
         FIGURES,
         flag("--page/--no-page", "Also write report.html: pictures, tables and an interactive map in one file.",
              default=True, show_default=True),
-    ))  # fmt: skip
+    )))  # fmt: skip
 
 
 def baseline_of(place: Path | None, gates: Sequence[str]) -> dropout_directory.Baseline | None:
@@ -340,8 +340,8 @@ def check_compared(verdicts: Iterable[Verdict | FleetVerdict]) -> None:
         raise errors.ConfigError("--baseline", "none of these logs is in it", advice)
 
 
-def given(settings: ConfigSources, span: tuple[str | None, str | None]) -> list[str]:
+def given(settings: ConfigSources, request: FitRequest) -> list[str]:
     """Return the options of a call that the next command takes too."""
     pairs = [("--config", settings.file), ("--robot", settings.robot), *(("--set", one) for one in settings.sets)]
-    pairs += [("--from", span[0]), ("--to", span[1])]
+    pairs += [("--from", request.start), ("--to", request.end)]
     return [escaped(str(part)) for name, value in pairs if value is not None for part in (name, value)]

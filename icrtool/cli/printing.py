@@ -18,7 +18,6 @@ import click
 from icrtool import __version__
 from icrtool.cli import when_used
 from icrtool.output.text_blocks import Block, Line, Table, fitted, format_blocks, printed
-from icrtool.records.process_resources import give_back_freed
 from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
 
 with when_used():
@@ -251,7 +250,6 @@ class Stages(LiveLine):
 
     def begin(self, stage: str) -> None:
         """Begin a stage: what is being done, for example ``reading``."""
-        give_back_freed()
         self._title = f"{self.name}: {stage}" if stage else self.name
         self._shown_s = time.monotonic()
         self.rewrite(f"{self._title} …")

@@ -29,6 +29,7 @@ from icrtool.records.choices import Reference, Starts
 from icrtool.records.dropout_document import TurningSplit, UsedCalibration
 from icrtool.records.plain_data import plain
 from icrtool.records.process_resources import give_back_freed
+from icrtool.records.requests import ReportRequest
 from icrtool.records.run import MAKE_RUN, Run, check_type
 from icrtool.records.text import distance_text
 
@@ -79,11 +80,13 @@ def dropout(
     intervals come from blocks of path of at least four horizons (`icrtool.kernels.error_statistics`).
     """
     check_type(run, Run, MAKE_RUN)
-    errors = measure_errors(
-        run, horizons_m if horizons_m is not None else run.config.dropout.horizons_m, starts=starts, seed=seed,
-        models=models, sink=sink,
+    request = ReportRequest(
+        horizons_m=None if horizons_m is None else tuple(horizons_m), budgets_m=(), starts=starts, ladder=False,
+        seed=seed,
     )  # fmt: skip
-    return _report(run, errors, starts=starts, seed=seed)
+    horizons_m = request.horizons_m if request.horizons_m is not None else run.config.dropout.horizons_m
+    errors = measure_errors(run, horizons_m, starts=starts, seed=seed, models=models, sink=sink)
+    return _report(run, errors, request)
 
 
 def dropout_report(
@@ -92,18 +95,18 @@ def dropout_report(
     horizons_m: Sequence[float] | None = None,
     budgets_m: Sequence[float] = (0.5,),
     gates: Sequence[str | Gate] = (),
+    strict_gates: bool = False,
+    allow_unusable: bool = False,
     outage_s: Sequence[float] | None = None,
     outage_at_s: Sequence[float] = (),
     starts: Starts = "moving",
+    reference: Reference = "filter",
     without_events: bool = False,
     with_jumps: bool = False,
-    calibrations: Sequence[Calibration] = (),
-    comparison: bool = True,
-    reference: Reference = "filter",
-    baseline: report.BaselineReport | None = None,
-    strict: bool = False,
-    allow_unusable: bool = False,
+    ladder: bool = True,
     seed: int = DEFAULT_SEED,
+    calibrations: Sequence[Calibration] = (),
+    baseline: report.BaselineReport | None = None,
     sink: ErrorSink | None = None,
 ) -> report.DropoutReport:
     """Return how far a robot can drive without GNSS, with all that ``icrtool dropout-report`` gives.
@@ -111,23 +114,48 @@ def dropout_report(
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
-    horizons_m : distances without GNSS; default those of the run's configuration. Horizons of `gates` are added
-    budgets_m : for each, the distance over which 95 % of the trials stay within it
-    gates : acceptance limits, for example ``"icr.p95@10m <= 3.8"``
-    outage_s : lengths of outages to force on the filter; default those of the run's configuration
-    outage_at_s : their begins, seconds since the first state; default: spaced over the time the robot moves
-    starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
-    without_events : leave out trials that cross a slip event; ``event_cost`` of the report holds the difference
-    with_jumps : count trials across jumps of the reference too, and fit across them
+    horizons_m to seed : the fields of `icrtool.records.requests.ReportRequest`
+    calibrations, baseline, sink : as in `report_on`
+
+    Raises
+    ------
+    ConfigError, DataError, RunError
+        As of `report_on`.
+    """
+    request = ReportRequest(
+        horizons_m=None if horizons_m is None else tuple(horizons_m),
+        budgets_m=tuple(budgets_m),
+        gates=tuple(gate.text if isinstance(gate, Gate) else gate for gate in gates),
+        strict_gates=strict_gates,
+        allow_unusable=allow_unusable,
+        outage_s=None if outage_s is None else tuple(outage_s),
+        outage_at_s=tuple(outage_at_s),
+        starts=starts,
+        reference=reference,
+        without_events=without_events,
+        with_jumps=with_jumps,
+        ladder=ladder,
+        seed=seed,
+    )
+    return report_on(run, request, calibrations=calibrations, baseline=baseline, sink=sink)
+
+
+def report_on(
+    run: Run,
+    request: ReportRequest,
+    *,
+    calibrations: Sequence[Calibration] = (),
+    baseline: report.BaselineReport | None = None,
+    sink: ErrorSink | None = None,
+) -> report.DropoutReport:
+    """Return the dropout report that is asked for.
+
+    Parameters
+    ----------
+    run : of `icrtool.fit` or `icrtool.open_run`
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
         ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro
-    comparison : also test models on distance they were not fitted to; without it the rows are the filter's and no slip
-    reference : what trials are compared with: the filter's states or the smoother's
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
-    strict : compare such limits by the number alone, without the confidence interval of the difference
-    allow_unusable : report on a run that is not usable as on any other; else it has the rows of the filter and of no
-        slip alone, no distance, and every limit fails
-    seed : of what the reference's own error is drawn from
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
     Raises
@@ -137,66 +165,64 @@ def dropout_report(
     DataError
         The run has fewer than two states.
     RunError
-        `reference` is ``smoothed`` and the run has no smoothed states.
+        The reference is ``smoothed`` and the run has no smoothed states.
     """
     check_type(run, Run, MAKE_RUN)
-    if with_jumps:
+    if request.with_jumps:
         run = replace(run, sensors=replace(run.sensors, jumps=()))
     whole = run
-    if without_events:
+    if request.without_events:
         # A gap in place of each slip event: no trial, window or forced outage crosses a gap.
         run = replace(run, in_gap=run.in_gap | run.slipping)
-    limits = [gate if isinstance(gate, Gate) else report.parse_gate(gate) for gate in gates]
-    lengths_s = forced_lengths_s(run, outage_s)
-    if outage_at_s and not lengths_s:
+    limits = [report.parse_gate(gate) for gate in request.gates]
+    lengths_s = forced_lengths_s(run, request)
+    if request.outage_at_s and not lengths_s:
         raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
-    plans = [shown_paths.plan_outages(run, length, outage_at_s) for length in lengths_s]
+    plans = [shown_paths.plan_outages(run, length, request.outage_at_s) for length in lengths_s]
     forced = [outage for plan in plans for outage in shown_paths.force_outages(run, plan)]
-    compared = with_smoothed_reference(run) if reference == "smoothed" else run
-    unusable = "" if run.usable or allow_unusable else str(run.document.unusable_because)
+    compared = with_smoothed_reference(run) if request.reference == "smoothed" else run
+    unusable = "" if run.usable or request.allow_unusable else str(run.document.unusable_because)
     # Before the comparison, whose columns of a long log are as large as theirs.
-    examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, starts)
+    examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, request.starts)
     give_back_freed()
     used, further = _calibration_rows(compared, () if unusable else calibrations)
     found, why = None, unusable
-    if comparison and not unusable:
+    if request.ladder and not unusable:
         try:
             found = compare_models(compared, measured_headings(run))
         except DataError as err:
             why = f"{err.why}, {err.advice}"
     give_back_freed()
-    horizons = list(horizons_m if horizons_m is not None else run.config.dropout.horizons_m)
+    horizons = list(request.horizons_m if request.horizons_m is not None else run.config.dropout.horizons_m)
     for at_m in (gate.horizon_m for gate in limits):
         if at_m is not None and not any(math.isclose(at_m, horizon, rel_tol=1e-9) for horizon in horizons):
             horizons.append(at_m)
-    budgets_m = () if unusable else budgets_m
     rows = () if found is None else found.rows
     track, sparse = (None, None) if found is None else (found.track, found.table.trials[0].starts)
     errors = measure_errors(
-        compared, horizons, further=[*rows, *further], starts=starts, seed=seed, sink=sink,
+        compared, horizons, further=[*rows, *further], starts=request.starts, seed=request.seed, sink=sink,
         starts_of_further=sparse, track=track,
     )  # fmt: skip
     give_back_freed()
     cost = None
-    if without_events:
+    if request.without_events:
         crossed = replace(compared, in_gap=whole.in_gap)
-        cost = measure_errors(crossed, horizons, starts=starts, seed=seed)
+        cost = measure_errors(crossed, horizons, starts=request.starts, seed=request.seed)
+    budgets_m = () if unusable else request.budgets_m
     return _report(
-        compared, errors, starts=starts, seed=seed,
+        compared, errors, request,
         with_events=cost,
-        compared_models=found,
-        no_comparison=why,
+        found=found,
+        left_out=why,
         calibrations=used,
-        smoothed=reference == "smoothed",
-        with_jumps=with_jumps,
         examples=examples,
-        worst=shown_paths.worst_trials(compared, found, starts=starts),
+        worst=shown_paths.worst_trials(compared, found, starts=request.starts),
         outages=(*forced, *shown_paths.real_outages(compared)),
         budgets=tuple(one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)),
         gates=tuple(
             report.verdict_on(gate, run.name, passed=False, unusable=unusable)
             if unusable
-            else report.check_gate(gate, errors, baseline, strict=strict)
+            else report.check_gate(gate, errors, baseline, strict=request.strict_gates)
             for gate in limits
         ),
         usable=not unusable,
@@ -206,11 +232,10 @@ def dropout_report(
 
 
 def _report(
-    run: Run, errors: report.OpenLoopErrors, *, starts: Starts, seed: int, smoothed: bool = False,
-    with_jumps: bool = False, with_events: report.OpenLoopErrors | None = None,
-    calibrations: tuple[UsedCalibration, ...] = (), budgets: tuple[BudgetDistance, ...] = (),
-    gates: tuple[Verdict, ...] = (), by_turning: tuple[TurningSplit, ...] = (),
-    compared_models: ComparedModels | None = None, no_comparison: str = "",
+    run: Run, errors: report.OpenLoopErrors, request: ReportRequest, *,
+    with_events: report.OpenLoopErrors | None = None, calibrations: tuple[UsedCalibration, ...] = (),
+    budgets: tuple[BudgetDistance, ...] = (), gates: tuple[Verdict, ...] = (),
+    by_turning: tuple[TurningSplit, ...] = (), found: ComparedModels | None = None, left_out: str = "",
     worst: tuple[documents.ExampleTrial, ...] = (), examples: tuple[documents.ExampleTrial, ...] = (),
     outages: tuple[documents.Outage, ...] = (), baseline: report.BaselineReport | None = None, usable: bool = True,
 ) -> report.DropoutReport:  # fmt: skip
@@ -221,7 +246,7 @@ def _report(
     errors : of its models
     with_events : errors of all trials, where those of `errors` cross no slip event
     """
-    made = None if compared_models is None else compared_models.calibration
+    made = None if found is None else found.calibration
     cost = None
     if with_events is not None:
         all_rows = {one.name: one.document.by_horizon for one in with_events.results}
@@ -239,12 +264,9 @@ def _report(
         run=documents.RunOfReport(*(getattr(run.document, key) for key in documents.RunOfReport.__struct_fields__)),
         usable=run.usable,
         unusable_because=run.document.unusable_because,
-        reference=f"the {'smoother' if smoothed else 'filter'}'s estimate at the end of the trial",
-        smoothed=smoothed,
+        request=request,
         starts=errors.states,
-        starts_counted=starts,
         starts_standing=errors.standing,
-        with_jumps=with_jumps,
         without_events=cost,
         tolerance_m=TOLERANCE_M,
         # the key and its parts keep their names; nothing is resampled
@@ -253,7 +275,7 @@ def _report(
             block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",
             resamples=0,
             level=LEVEL,
-            seed=seed,
+            seed=request.seed,
         ),
         models=tuple(one.document for one in errors.results),
         trials=tuple(_counts(errors, with_events)),
@@ -264,7 +286,7 @@ def _report(
         recommended=None if made is None else msgspec.structs.replace(made, created=UNSET),
         budgets=budgets,
         by_turning=by_turning,
-        ladder=_ladder(errors, calibrations, compared_models, no_comparison),
+        ladder=_ladder(errors, calibrations, found, left_out),
         gates=gates,
         passed=all(one.passed for one in gates),
         baseline=earlier,
@@ -335,9 +357,9 @@ def _ladder(
     )
 
 
-def forced_lengths_s(run: Run, outage_s: Sequence[float] | None) -> Sequence[float]:
-    """Return the lengths of outages to force: those given, else those of the run's configuration."""
-    return outage_s if outage_s is not None else run.config.dropout.forced_outage_s
+def forced_lengths_s(run: Run, request: ReportRequest) -> Sequence[float]:
+    """Return the lengths of outages to force: those asked for, else those of the run's configuration."""
+    return request.outage_s if request.outage_s is not None else run.config.dropout.forced_outage_s
 
 
 def _calibration_rows(

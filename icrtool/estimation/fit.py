@@ -18,30 +18,28 @@ from icrtool.estimation.run_filter import smooth as smooth_run
 from icrtool.estimation.summary import summarise
 from icrtool.kernels.arrays import Ints
 from icrtool.records.measurements import ReferenceJump, SensorData
-from icrtool.records.process_resources import give_back_freed
+from icrtool.records.requests import FitRequest
 from icrtool.records.run import MeasurementOutcome, Run, WarmStart
 from icrtool.records.tables import RobotLog
 
 
-def fit(
+def fit_filter(
     log: RobotLog,
-    config: Config | None = None,
+    config: Config,
+    request: FitRequest,
     *,
     warm_start: WarmStart | None = None,
-    changes_s: tuple[float, ...] = (),
-    smooth: bool = False,
     watch: Callable[[str], None] | None = None,
 ) -> Run:
-    """Align the sensors of a log, run the filter, summarise: `icrtool.fit` without its recommendation.
+    """Return the run of a log without its motion model: align the sensors, run the filter, summarise.
 
-    Parameters, return value and errors are those of `icrtool.calibration.run_models.fit`.
+    Parameters, errors and the other stage are those of `icrtool.pipeline.fit_log`.
 
     Notes
     -----
     The EKF of Pentzer 2014, Eqs. 13-25, event by event; ``filter.preset`` chooses between the paper's constants and
     start (``paper``) and those made for field logs (``field``).
     """
-    config = config if config is not None else Config()
     begin = watch if watch is not None else lambda _: None
     begin("aligning")
     log = choose_reference(log, config)
@@ -50,13 +48,14 @@ def fit(
     # Its columns that the filter does not use take as much memory as half of the states.
     del log
     begin("filter")
-    filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=changes_s)
-    give_back_freed()
+    filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=request.changes_s)
     jumps = followed_jumps(filtered.sensors, filtered.gnss, filtered.heading)
     filtered = filtered._replace(sensors=replace(filtered.sensors, jumps=jumps))
     begin("summary")
     run = Run(
-        document=summarise(measurements, filtered, config, inputs=inputs, datum=datum, rejected_fixes=rejected),
+        document=summarise(
+            measurements, filtered, config, request, inputs=inputs, datum=datum, rejected_fixes=rejected
+        ),
         table=filtered.table,
         in_gap=filtered.in_gap,
         outages_ns=filtered.outages_ns,
@@ -65,8 +64,10 @@ def fit(
         heading=filtered.heading,
         smoothed=None,
     )
-    give_back_freed()
-    return replace(run, smoothed=smooth_run(run)) if smooth else run
+    if not request.smooth:
+        return run
+    begin("smoother")
+    return replace(run, smoothed=smooth_run(run))
 
 
 NEAR_NS = 10**9

@@ -84,7 +84,7 @@ def run_filter(
     warm_start: WarmStart | None = None,
     changes_s: tuple[float, ...] = (),
 ) -> Filtered:
-    """Run the filter over the sensors of a log; parameters as in `icrtool.estimation.fit.fit`.
+    """Run the filter over the sensors of a log; parameters as in `icrtool.pipeline.fit_log`.
 
     Raises
     ------

@@ -34,6 +34,7 @@ from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
 from icrtool.records.plain_data import known
 from icrtool.records.process_resources import give_back_freed
+from icrtool.records.requests import FitRequest
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, no_slip_icrs, track_of_states
 from icrtool.records.run_document import (
     RUN_SCHEMA,
@@ -71,6 +72,7 @@ def summarise(
     measurements: Measurements,
     filtered: Filtered,
     config: Config,
+    request: FitRequest,
     *,
     inputs: tuple[InputFile, ...],
     datum: Datum | None,
@@ -83,6 +85,7 @@ def summarise(
     measurements : what the alignment made of a log
     filtered : what the filter made of that
     config : the effective configuration
+    request : what was asked of the fit
     inputs, datum, rejected_fixes : of the log
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
@@ -116,6 +119,7 @@ def summarise(
         log=sensors.name,
         inputs=inputs,
         config=config,
+        request=request,
         streams=measurements.streams,
         warnings=_warnings(
             measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance,

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -15,11 +13,11 @@ import msgspec
 from msgspec.structs import replace
 
 from icrtool import __version__
-from icrtool.config import ConfigSources, builtin_robots
+from icrtool.config import builtin_robots
 from icrtool.dropout_analysis.report import parse_gate
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
-from icrtool.fleet.one_log import ReportOptions, Request, failed, files_of, path_of
+from icrtool.fleet.one_log import failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
 from icrtool.fleet.recordings import about, as_text, find_recordings, is_manifest, logs_among, read_manifest
 from icrtool.logs.containers.recording_files import files_of_log
@@ -28,6 +26,7 @@ from icrtool.output.files.formats import CHECKSUM_FILE
 from icrtool.output.run_directory import PAGE_FILE, RUN_FILE
 from icrtool.records.fleet_document import RUNS, FleetFile, FleetLog
 from icrtool.records.places import UrlPath, read_regular
+from icrtool.records.requests import BatchRequest, LogRequest
 
 POLL_S = 1.0
 """Time between two looks at a cluster."""
@@ -36,28 +35,7 @@ Watch = Callable[[str, str], None]
 """Called with the name of a log and its stage."""
 
 
-@dataclass(frozen=True, slots=True)
-class BatchOptions:
-    """What is asked of every log.
-
-    Attributes
-    ----------
-    settings : a manifest's line comes before its file and robot
-    redo : process logs again that are done
-    timeout_s : a log that takes longer is ended
-    overwrite : the run of another recording may be replaced
-    baseline : earlier report, run or batch to compare with
-    """
-
-    settings: ConfigSources = field(default_factory=ConfigSources)
-    report: ReportOptions = field(default_factory=ReportOptions)
-    redo: bool = False
-    timeout_s: float = 1800.0
-    overwrite: bool = False
-    baseline: Path | None = None
-
-
-def plan(places: Sequence[Path], output: Path, options: BatchOptions, folder: Path | None = None) -> list[Request]:
+def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path | None = None) -> list[LogRequest]:
     """Return a request for each recording among logs, folders and manifests.
 
     Parameters
@@ -74,14 +52,14 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions, folder: Pa
     OutputError
         `output` is a run, or something else than a directory, or holds somebody's own file of the name of a result.
     """
-    for gate in options.report.gates:
+    for gate in batch.report.gates:
         parse_gate(gate)
     folder = folder or output
     if (folder / RUN_FILE).is_file():
         raise OutputError(output, "is a run itself", "name another place for the batch")
     if folder.exists() and not folder.is_dir():
         raise OutputError(output, "a file is there", "name another place for the batch")
-    check_tables(folder, page=options.report.page)
+    check_tables(folder, page=batch.files.page)
     # A table of simulated truth beside its log, from a pattern of the shell, is no manifest.
     beside = logs_among([place for place in places if place.is_file()])[1]
     places = [place for place in places if place not in beside]
@@ -89,15 +67,15 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions, folder: Pa
     searched = [place for place in places if not is_manifest(place)]
     searched += [place for entry in entries for place in entry.places]
     baseline = ""
-    if options.baseline is not None:
+    if batch.baseline is not None:
         from icrtool.output.dropout_directory import open_baseline
 
-        if options.baseline.resolve() == output.resolve():
+        if batch.baseline.resolve() == output.resolve():
             raise ConfigError(f"--baseline {output}", "is the folder that the batch writes", "copy it, or name another")
-        baseline = open_baseline(options.baseline).digest
+        baseline = open_baseline(batch.baseline).digest
     requests = []
     for one in find_recordings(searched):
-        known, settings, report = about(one.path, entries), options.settings, options.report
+        known, settings = about(one.path, entries), batch.settings
         builtin = known.robot in builtin_robots()
         # A robot that is not built in is a name, which needs a configuration of its own.
         if known.robot and not builtin and known.config is None and settings.file is None:
@@ -106,22 +84,23 @@ def plan(places: Sequence[Path], output: Path, options: BatchOptions, folder: Pa
         robot = known.robot if builtin else settings.robot if not known.robot else None
         config = settings._replace(file=known.config or settings.file, robot=robot).load()
         # Whether the page is there is seen by its file.
-        asked = [config.effective(), __version__, dataclasses.replace(report, page=True), known.robot, baseline]
+        files = replace(batch.files, page=True, overwrite=False)
+        asked = [config.effective(), __version__, batch.report, files, known.robot, baseline]
         row = FleetLog(
             one.log, f"{RUNS}/{one.name}", "failed", robot=known.robot or config.robot.name or "", group=known.group,
             tags=known.tags, key=sha256(msgspec.json.encode(asked, order="sorted")).hexdigest(),
         )  # fmt: skip
         # Workers of a cluster may have another working directory.
-        request = Request(
+        request = LogRequest(
             path=os.fsencode(one.path.absolute()), known=row, folder=os.fsencode(output.absolute()),
-            config=config, report=report, overwrite=options.overwrite,
-            baseline=os.fsencode(options.baseline.absolute()) if options.baseline is not None else b"",
+            config=config, report=batch.report, files=batch.files,
+            baseline=os.fsencode(batch.baseline.absolute()) if batch.baseline is not None else b"",
         )  # fmt: skip
         requests.append(request)
     return requests
 
 
-def finished(request: Request, folder: Path) -> FleetLog | None:
+def finished(request: LogRequest, folder: Path) -> FleetLog | None:
     """Return the row of a log that an earlier batch processed with the same input, configuration and version.
 
     A log that failed for a reason of its own, and would fail again, counts as processed.
@@ -137,14 +116,14 @@ def finished(request: Request, folder: Path) -> FleetLog | None:
     if row.key != request.known.key or not row.repeatable or not _same_files(row.inputs, path_of(request.path)):
         return None
     if row.status != "failed":
-        needed = ["run.json", "dropout", CHECKSUM_FILE, *([PAGE_FILE] if request.report.page else [])]
+        needed = ["run.json", "dropout", CHECKSUM_FILE, *([PAGE_FILE] if request.files.page else [])]
         if not all((folder / request.known.run / name).exists() for name in needed):
             return None
     return replace(row, this_time="skipped", log=request.known.log, group=request.known.group, tags=request.known.tags)
 
 
 def run_batch(
-    requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None = None,
+    requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: Watch | None = None,
     lost: Lost = str, folder: Path | None = None,
 ) -> Generator[FleetLog, None, None]:  # fmt: skip
     """Yield the row of each log as it comes; what died or hung is tried once more when all others are done.
@@ -156,15 +135,15 @@ def run_batch(
     lost : of the executor
     folder : on disk, that stands for the place of the results where that is an address
     """
-    todo: list[Request] = []
+    todo: list[LogRequest] = []
     for request in requests:
-        done = finished(request, folder or path_of(request.folder)) if not options.redo else None
+        done = finished(request, folder or path_of(request.folder)) if not batch.redo else None
         if done is not None:
             yield done
         else:
             todo.append(request)
-    again: list[Request] = []
-    for request, row in _all_of(todo, executor, options, watch, lost):
+    again: list[LogRequest] = []
+    for request, row in _all_of(todo, executor, batch, watch, lost):
         if row.status == "failed" and not row.repeatable:
             again.append(request)
             if watch is not None:
@@ -173,21 +152,21 @@ def run_batch(
             yield row
     for request in again:
         # One at a time: what wanted too much memory beside others may find enough alone.
-        for _, row in _all_of([request], executor, options, watch, lost):
+        for _, row in _all_of([request], executor, batch, watch, lost):
             yield replace(row, reason=f"{row.reason} (tried twice)") if row.status == "failed" else row
 
 
 def _all_of(
-    requests: Sequence[Request], executor: Executor, options: BatchOptions, watch: Watch | None, lost: Lost
-) -> Generator[tuple[Request, FleetLog], None, None]:
-    pending: dict[Future[FleetLog], Request] = {}
+    requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: Watch | None, lost: Lost
+) -> Generator[tuple[LogRequest, FleetLog], None, None]:
+    pending: dict[Future[FleetLog], LogRequest] = {}
     try:
         for request in requests:
             if why := lost():
                 yield request, failed(request, why, repeatable=False)
                 continue
             extra = (partial(watch, request.known.log),) if watch and isinstance(executor, ThreadPoolExecutor) else ()
-            pending[executor.submit(process_apart, request.encode(), options.timeout_s, *extra)] = request
+            pending[executor.submit(process_apart, request.encode(), batch.timeout_s, *extra)] = request
         waiting = set(pending)
         while waiting:
             done, waiting = wait(waiting, POLL_S, FIRST_COMPLETED)

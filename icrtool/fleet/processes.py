@@ -30,10 +30,12 @@ import msgspec
 from msgspec.structs import replace
 
 from icrtool.errors import ConfigError
-from icrtool.fleet.one_log import Request, Stage, decode_request, failed, process
+from icrtool.fleet.one_log import failed, process
 from icrtool.logs.containers.recording_files import files_of_log
+from icrtool.pipeline import Stage
 from icrtool.records.fleet_document import FleetLog
 from icrtool.records.process_resources import give_back_freed, remove_unfinished
+from icrtool.records.requests import LogRequest, decode_request
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -80,7 +82,7 @@ def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) 
 
     Parameters
     ----------
-    request : of `Request.encode`
+    request : of `LogRequest.encode`
     timeout_s : after which the process is killed
     stage : called with what is done next, where the caller is on the same machine
     """
@@ -214,7 +216,7 @@ class Worker:
         self._answers = _lines_of(self._process.stdout, lambda lines: lines.put(b""))
         _all.add(self)
 
-    def run(self, request: Request, timeout_s: float, stage: Stage | None) -> FleetLog:
+    def run(self, request: LogRequest, timeout_s: float, stage: Stage | None) -> FleetLog:
         """Process a log, as `process_apart`."""
         begun, begin_of_errors = time.monotonic(), self._errors.seek(0, os.SEEK_END)
         why = details = ""

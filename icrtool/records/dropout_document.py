@@ -16,8 +16,8 @@ from icrtool.kernels.error_statistics import BlockSums, Histogram
 from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.acceptance import BudgetDistance, Verdict
 from icrtool.records.calibration_document import CalibrationDocument
-from icrtool.records.choices import Starts
 from icrtool.records.plain_data import Record
+from icrtool.records.requests import ReportRequest
 from icrtool.records.run_document import DriveDocument, IcrDocument
 from icrtool.records.samples import InputFile
 
@@ -339,12 +339,9 @@ class DropoutDocument(Record, frozen=True, kw_only=True):
     run: RunOfReport
     usable: bool
     unusable_because: str | None
-    reference: str
-    smoothed: bool = False
+    request: ReportRequest
     starts: int
-    starts_counted: Starts
     starts_standing: int
-    with_jumps: bool
     without_events: EventCostDocument | None
     tolerance_m: float
     bootstrap: IntervalsDocument

@@ -13,6 +13,7 @@ import msgspec
 from icrtool.config import Config
 from icrtool.records.measurements import Finding, HeadingFacts, IcrStart, ReferenceJump, SlipKind, Triple, WheelFacts
 from icrtool.records.plain_data import Record
+from icrtool.records.requests import FitRequest
 from icrtool.records.samples import InputFile, StreamChoice
 
 RUN_SCHEMA: Literal["icrtool/run/1"] = "icrtool/run/1"
@@ -330,6 +331,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
     log: str
     inputs: tuple[InputFile, ...]
     config: Config
+    request: FitRequest
     streams: tuple[StreamChoice, ...]
     warnings: tuple[str, ...]
     alignment: dict[str, Finding]

@@ -25,9 +25,9 @@ from icrtool.cli import main
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.errors import DataError
-from icrtool.estimation.fit import fit
 from icrtool.logs.read_log import read_log
 from icrtool.logs.write_log import SensorColumns, WriteOptions, write_log
+from icrtool.pipeline import fit
 
 START_NS = 1_760_000_000_000_000_000
 ROBOT = ("--set", "robot.track_width_m=0.55", "--set", "robot.wheel_radius_m=0.165")

@@ -15,8 +15,9 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from icrtool.cli import main
-from icrtool.fleet.one_log import decode_request, process
+from icrtool.fleet.one_log import process
 from icrtool.records.fleet_document import FleetLog
+from icrtool.records.requests import decode_request
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^ *icrtool ((?!cache warm|batch s3:).*)$", PAGE, re.MULTILINE)

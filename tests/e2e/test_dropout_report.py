@@ -254,5 +254,5 @@ def test_a_standstill_counts_once_unless_every_start_is_asked_for(folder: Path, 
     moving, every = (documents[starts]["trials"][0] for starts in ("moving", "all"))
     assert every["no_trial"]["from_standstill"] == 0
     assert every["trials"] - moving["trials"] == moving["no_trial"]["from_standstill"]
-    assert documents["all"]["starts_counted"] == "all"
+    assert documents["all"]["request"]["starts"] == "all"
     assert documents["all"]["trials"][2]["why_none"]

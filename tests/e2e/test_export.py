@@ -17,9 +17,9 @@ LOG = ROOT / "sample_logs" / "wheeled_lawnmower.mcap"
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from icrtool.estimation.fit import fit
     from icrtool.logs.read_log import read_log
     from icrtool.output.run_directory import write_run
+    from icrtool.pipeline import fit
 
     config = __import__("icrtool").load_config(robot="segway-rmp400")
     folder = tmp_path_factory.mktemp("runs")

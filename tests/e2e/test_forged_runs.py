@@ -13,8 +13,8 @@ from random import Random
 
 import pytest
 
-from icrtool.estimation.fit import fit
-from icrtool.fleet.one_log import ReportOptions, report_and_write
+from icrtool.pipeline import fit, report_into
+from icrtool.records.requests import ReportRequest, ResultFiles
 from support.barn import configured, simulate
 from support.forged import Home, forge, remove
 
@@ -41,7 +41,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs") / "barn"
     run = fit(simulate(duration_s=60.0), configured())
     run.write(directory)
-    report_and_write(run, directory, ReportOptions(ladder=False), lambda _: None, baseline=None)
+    report_into(directory, run, ReportRequest(ladder=False), ResultFiles(), lambda _: None)
     return directory
 
 

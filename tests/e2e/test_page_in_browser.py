@@ -18,7 +18,6 @@ from icrtool.calibration.pooled import calibrate, predictor, recording_of, turni
 from icrtool.calibration.run_models import compare_models
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.estimation.fit import fit
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.open_loop import open_loop_path
 from icrtool.kernels.track import trial_ends
@@ -29,6 +28,7 @@ from icrtool.output.files.formats import json_bytes
 from icrtool.output.page import drive_data
 from icrtool.output.page.pages import comparison_page, fleet_page, run_page
 from icrtool.output.page.render import pictures_of
+from icrtool.pipeline import fit
 from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout_document import DropoutDocument
 from icrtool.records.fleet_document import FleetDocument

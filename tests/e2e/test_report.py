@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from support.barn import configured, simulate
 
 Command = Callable[..., tuple[int, str, str]]

@@ -13,8 +13,8 @@ from click.testing import CliRunner
 
 from icrtool.cli.simulate import simulate_command as command
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
 from icrtool.logs.read_log import read_log
+from icrtool.pipeline import fit
 from icrtool.records.choices import PathKind, WheelMessages
 from icrtool.records.run import Run
 

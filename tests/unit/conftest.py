@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from icrtool.calibration.run_models import fit
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from support.barn import TRACK_WIDTH_M, configured, simulate
 

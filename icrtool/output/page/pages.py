@@ -98,7 +98,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
         metric = summary.gnss.datum is None
         pictures = {name: one for name, one in pictures.items() if not (metric and one.with_place)}
         summary, stated = without_place(run, report)
-    compared = with_smoothed_reference(run) if report.smoothed else run
+    compared = with_smoothed_reference(run) if report.request.reference == "smoothed" else run
     begun = f"{datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
     place, datum = "left out", summary.gnss.datum
     if coordinates:

@@ -142,8 +142,8 @@ def _source_lines(report: DropoutDocument) -> Iterator[str]:
 
 def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]:
     """Yield which trials count, what slip events cost, and why horizons are empty."""
-    reference = "; compared with the smoothed trajectory" if report.smoothed else ""
-    moving = "moving " if report.starts_counted == "moving" else ""
+    reference = "; compared with the smoothed trajectory" if report.request.reference == "smoothed" else ""
+    moving = "moving " if report.request.starts == "moving" else ""
     yield f"a trial from each {moving}state of {report.starts:,}, by wheel speeds alone{reference}"
     if model_of(report, "no_slip") is None:
         yield "no_slip is left out: robot.track_width_m is not known"
@@ -151,7 +151,7 @@ def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]
         share = 100 * report.starts_standing / report.starts
         each = "each standstill is one start" if moving else "each is a start (--starts all)"
         yield f"the robot stood at {share:.0f} % of the states: {each}"
-    if summary.reference_jumps and report.with_jumps:
+    if summary.reference_jumps and report.request.with_jumps:
         yield "trials across jumps of the reference count"
     yield from _event_lines(report, summary)
     horizons: dict[str, list[str]] = {}

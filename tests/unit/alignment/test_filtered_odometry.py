@@ -10,8 +10,8 @@ import pytest
 from scipy.signal import lfilter
 
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Floats
+from icrtool.pipeline import fit
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog
 from support.drives import EPOCH_NS

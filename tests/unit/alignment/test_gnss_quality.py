@@ -13,11 +13,11 @@ from icrtool.alignment.gnss_quality import grade_fixes
 from icrtool.alignment.sensor_noise import without_frozen
 from icrtool.config import load_config
 from icrtool.dropout_analysis.shown_paths import real_outages
-from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Bools
 from icrtool.kernels.filter_records import GATED
 from icrtool.logs.read_log import read_log
 from icrtool.logs.write_log import WriteOptions, write_log
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import (
     FIXED_FIX,

@@ -17,7 +17,7 @@ from icrtool.alignment.heading_choice import DerivedHeading, derive_heading, fus
 from icrtool.alignment.log_track import track_of_log
 from icrtool.alignment.turn_rates import TurnRate
 from icrtool.alignment.wheel_units import with_wheel_speeds
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.samples import NO_HEADINGS, GyroAxes, HeadingSamples, OtherReceiver
 from icrtool.records.tables import RobotLog
 from support.exact_drives import CONFIG, simulate

@@ -12,8 +12,8 @@ import pytest
 from icrtool.alignment.corrections import align_streams
 from icrtool.config import load_config
 from icrtool.errors import DataError
-from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Floats
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog

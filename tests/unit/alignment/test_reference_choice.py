@@ -9,7 +9,7 @@ import pytest
 
 from icrtool.alignment.align import agreement, choose_reference
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.samples import StreamChoice
 from icrtool.records.tables import RobotLog
 from support.drives import make_log

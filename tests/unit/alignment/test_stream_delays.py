@@ -13,7 +13,7 @@ from icrtool.alignment.corrections import Delay, StreamDelays, _clear_delays
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.log_track import cut_windows, track_of_log
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog

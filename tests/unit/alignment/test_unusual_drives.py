@@ -11,7 +11,7 @@ from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.wheel_units import reference_scale
 from icrtool.config import load_config
 from icrtool.errors import DataError
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.samples import NO_HEADINGS, HeadingSamples, PositionFixes
 from support.drives import make_log
 from support.exact_drives import CONFIG as EXACT

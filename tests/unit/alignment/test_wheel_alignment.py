@@ -13,7 +13,7 @@ from icrtool.alignment.wheel_alignment import bridged
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import DataError
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.samples import GyroSamples, HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense

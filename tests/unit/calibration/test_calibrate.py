@@ -9,7 +9,7 @@ import pytest
 from icrtool.calibration.sensor_findings import calibrate_log
 from icrtool.config import Config
 from icrtool.errors import DataError
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.calibration_document import SensorDocument
 from icrtool.records.tables import RobotLog
 from support.exact_drives import CONFIG, ICRS, simulate

@@ -13,11 +13,11 @@ from icrtool.calibration.pooled import recording_of
 from icrtool.calibration.run_models import ComparedModels, _errors_turned, compare_models
 from icrtool.config import parse_config
 from icrtool.errors import DataError
-from icrtool.estimation.fit import fit
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import FrozenIcrs
 from icrtool.motion.recording import cut_trials
+from icrtool.pipeline import fit
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.run import Run, track_of
 from support.drives import make_log

@@ -22,7 +22,6 @@ from icrtool.calibration.pooled import (
 )
 from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
-from icrtool.estimation.fit import fit
 from icrtool.kernels.arrays import Bools
 from icrtool.kernels.track import Windows
 from icrtool.motion.models import FAMILY, MODELS
@@ -31,6 +30,7 @@ from icrtool.motion.window_fit import Pool, own_constants
 from icrtool.output.files.formats import open_calibration, write_calibration
 from icrtool.output.tables.calibration import calibration_blocks
 from icrtool.output.text_blocks import format_blocks
+from icrtool.pipeline import fit
 from icrtool.records.calibration_document import CalibratedRobot
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.samples import TWIST_TYPES

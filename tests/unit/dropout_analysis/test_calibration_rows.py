@@ -137,10 +137,10 @@ def test_files_and_figures_hold_every_row(report: DropoutReport, tmp_path: Path)
 
 
 def test_one_calibration_has_the_plain_name_and_no_comparison_no_recommended_row(drive: Run, own: Calibration) -> None:
-    report = dropout_report(drive, horizons_m=[5.0], calibrations=[own], comparison=False)
+    report = dropout_report(drive, horizons_m=[5.0], calibrations=[own], ladder=False)
     assert [result.name for result in report.results] == ["icr", "no_slip", "icr_final", "calibration"]
     wide = msgspec.structs.replace(own.robot, track_width_m=1.0)
     with pytest.raises(ConfigError, match="width"):
         dropout_report(drive, calibrations=[msgspec.structs.replace(own, robot=wide)])
     with pytest.raises(ConfigError, match="recommended"):
-        dropout_report(drive, horizons_m=[5.0], comparison=False, gates=["recommended.p95@5m < 1"])
+        dropout_report(drive, horizons_m=[5.0], ladder=False, gates=["recommended.p95@5m < 1"])

@@ -13,9 +13,9 @@ import pytest
 from icrtool.config import load_config
 from icrtool.dropout_analysis.shown_paths import force_outages, plan_outages, real_outages
 from icrtool.errors import ConfigError, DataError
-from icrtool.estimation.fit import fit
 from icrtool.kernels.filter_records import GATED, RECOVERED, USED
 from icrtool.logs.read_log import read_log
+from icrtool.pipeline import fit
 from icrtool.records.run import STATE_COLUMNS, Run, WarmStart, track_of
 from support.barn import OUTAGE_S, START_NS, configured, simulate
 from support.documents import with_summary

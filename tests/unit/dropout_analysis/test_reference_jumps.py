@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from icrtool.calibration.pooled import recording_of
-from icrtool.calibration.run_models import fit
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
@@ -17,6 +16,7 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import JUMP, trial_ends
 from icrtool.motion.recording import cut_trials, cut_windows
 from icrtool.output.run_directory import open_run
+from icrtool.pipeline import fit
 from icrtool.records.run import Run, track_of
 from icrtool.records.samples import GyroSamples, HeadingSamples
 from support.drives import make_log
@@ -79,7 +79,7 @@ def test_left_out_trials_are_counted_and_all_starts_add_up(report: DropoutReport
 
 
 def test_with_jumps_brings_them_back_and_shows_their_size(jumping: Run, report: DropoutReport) -> None:
-    whole = dropout_report(jumping, horizons_m=HORIZONS_M, comparison=False, with_jumps=True)
+    whole = dropout_report(jumping, horizons_m=HORIZONS_M, ladder=False, with_jumps=True)
     assert not whole.counts.crosses_jump.any()
     assert (whole.counts.trials >= report.counts.trials + report.counts.crosses_jump - whole.counts.standing).all()
     icr = whole.result("icr")

@@ -9,7 +9,7 @@ from icrtool.calibration.run_models import models_of
 from icrtool.config import parse_config
 from icrtool.dropout_analysis.dropout_report import dropout
 from icrtool.dropout_analysis.starts import with_smoothed_reference
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.presets import FIELD
 from icrtool.records.run import Run
 from support.drives import ICRS, make_log

@@ -10,9 +10,9 @@ import pytest
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.trials import errors_from_states
-from icrtool.estimation.fit import fit
 from icrtool.kernels.track import trial_ends
 from icrtool.output.tables.dropout import format_dropout
+from icrtool.pipeline import fit
 from icrtool.records.dropout_document import column_of
 from icrtool.records.measurements import SlipEvent
 from icrtool.records.run import Run, track_of
@@ -33,8 +33,8 @@ def run() -> Run:
 
 
 def test_only_trials_across_an_event_are_left_out(run: Run) -> None:
-    whole = dropout_report(run, horizons_m=HORIZONS_M, comparison=False)
-    report = dropout_report(run, horizons_m=HORIZONS_M, comparison=False, without_events=True)
+    whole = dropout_report(run, horizons_m=HORIZONS_M, ladder=False)
+    report = dropout_report(run, horizons_m=HORIZONS_M, ladder=False, without_events=True)
     cost = report.document.without_events
     assert cost is not None
     assert cost.events == 1
@@ -58,10 +58,10 @@ def test_only_trials_across_an_event_are_left_out(run: Run) -> None:
 
 
 def test_the_distance_within_a_budget_is_given_with_and_without_events_from_the_same_trials(run: Run) -> None:
-    whole = dropout_report(run, horizons_m=HORIZONS_M, comparison=False, budgets_m=(0.4,))
-    without = dropout_report(run, horizons_m=HORIZONS_M, comparison=False, budgets_m=(0.4,), without_events=True)
+    whole = dropout_report(run, horizons_m=HORIZONS_M, ladder=False, budgets_m=(0.4,))
+    without = dropout_report(run, horizons_m=HORIZONS_M, ladder=False, budgets_m=(0.4,), without_events=True)
     quiet = dropout_report(
-        replace(run, sensors=replace(run.sensors, events=())), horizons_m=HORIZONS_M, comparison=False, budgets_m=(0.4,)
+        replace(run, sensors=replace(run.sensors, events=())), horizons_m=HORIZONS_M, ladder=False, budgets_m=(0.4,)
     )
     for one, free, unknown in zip(
         whole.document.budgets, without.document.budgets, quiet.document.budgets, strict=True
@@ -81,11 +81,11 @@ def test_the_distance_within_a_budget_is_given_with_and_without_events_from_the_
 
 
 def test_the_cost_is_printed_and_a_log_without_events_says_so(run: Run) -> None:
-    text = format_dropout(dropout_report(run, horizons_m=HORIZONS_M, comparison=False, without_events=True))
+    text = format_dropout(dropout_report(run, horizons_m=HORIZONS_M, ladder=False, without_events=True))
     assert "1 slip event left out: ICR after 10 m" in text
     assert "across a slip event" in text
     quiet = replace(run, sensors=replace(run.sensors, events=()))
-    report = dropout_report(quiet, horizons_m=HORIZONS_M, comparison=False, without_events=True)
+    report = dropout_report(quiet, horizons_m=HORIZONS_M, ladder=False, without_events=True)
     assert report.document.without_events is not None
     assert not any(row.no_trial["across_slip_event"] for row in report.document.trials)
     assert "none in this log" in format_dropout(report)

@@ -12,8 +12,8 @@ import pytest
 from icrtool.config import load_config
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.filter_setup import chi2_gate
-from icrtool.estimation.fit import fit
 from icrtool.kernels.filter_records import GATED
+from icrtool.pipeline import fit
 from icrtool.records.run import WarmStart
 from icrtool.records.samples import PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
 from icrtool.estimation.observability import multiplier_std
+from icrtool.pipeline import fit
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import RobotLog
 from support.drives import ICRS, make_log

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
 from icrtool.estimation.run_filter import find_noise, innovation_cost, noise_of, set_up_again
 from icrtool.kernels.ekf import run_ekf
 from icrtool.kernels.filter_records import GATED
+from icrtool.pipeline import fit
 from icrtool.records.presets import FIELD, PAPER, ProcessNoise
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import astuple
 
-from icrtool.estimation.fit import fit
 from icrtool.estimation.observability import cut_states, find_excitation
+from icrtool.pipeline import fit
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 from icrtool.records.run_document import ExcitationDocument
 from support.exact_drives import CONFIG, simulate

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog

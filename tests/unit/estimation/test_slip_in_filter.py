@@ -12,10 +12,10 @@ from icrtool.alignment.slip_events import Disagreements
 from icrtool.calibration.pooled import recording_of
 from icrtool.config import Config, parse_config
 from icrtool.estimation.filter_setup import EVENT_MARGIN_S, set_up_filter
-from icrtool.estimation.fit import fit
 from icrtool.kernels.ekf import run_ekf, run_smoother
 from icrtool.kernels.filter_records import GATED, FilterInputs
 from icrtool.motion.recording import cut_windows
+from icrtool.pipeline import fit
 from icrtool.records.measurements import SensorData, SlipEvent
 from icrtool.records.tables import RobotLog
 from support.drives import EPOCH_NS, ICRS, make_log

@@ -7,7 +7,7 @@ import pytest
 
 from icrtool.calibration.run_models import with_motion
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from support.drives import make_pose_log
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from icrtool.config import parse_config
-from icrtool.estimation.fit import fit
 from icrtool.estimation.run_filter import smooth
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.tables import States
 from support.drives import ICRS, make_log

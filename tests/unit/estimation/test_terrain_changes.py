@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from icrtool.config import parse_config
-from icrtool.estimation.fit import fit
 from icrtool.output.figures.filter_estimates import icr_estimates
 from icrtool.output.tables.run import format_run
+from icrtool.pipeline import fit
 from icrtool.records.run import ICR_COLUMNS, Run
 from icrtool.records.tables import Icrs, RobotLog
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import icrtool
-from icrtool.estimation.fit import fit
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog

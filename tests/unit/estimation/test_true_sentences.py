@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from icrtool.config import load_config
-from icrtool.estimation.fit import fit
 from icrtool.output.tables.overview import next_command, verdict
 from icrtool.output.tables.run import format_run
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import NO_HEADINGS, Datum, GyroAxes
 from icrtool.records.tables import RobotLog

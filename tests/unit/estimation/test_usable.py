@@ -11,12 +11,12 @@ import pytest
 
 from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout
-from icrtool.estimation.fit import fit
 from icrtool.estimation.run_filter import LARGEST_POSITION_MPS
 from icrtool.estimation.run_warnings import rejected_share, unusable_reasons
 from icrtool.kernels.filter_records import GATED, UNSEEN, USED
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
+from icrtool.pipeline import fit
 from icrtool.records.presets import FIELD, ProcessNoise
 from icrtool.records.run import Run
 from icrtool.records.run_document import ExcitationDocument, VerdictByIcr

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -17,11 +16,11 @@ import pytest
 from icrtool.config import ConfigSources
 from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet import processes
-from icrtool.fleet.batch import BatchOptions, finished, plan, run_batch
+from icrtool.fleet.batch import finished, plan, run_batch
 from icrtool.fleet.fleet_files import write_fleet
-from icrtool.fleet.one_log import ReportOptions, Request
 from icrtool.fleet.processes import default_jobs
 from icrtool.records.fleet_document import FleetLog
+from icrtool.records.requests import BatchRequest, LogRequest, ReportRequest, ResultFiles
 
 # A worker whose logs behave as they are named; the row is kept as `icrtool.fleet.one_log.process` keeps it.
 SCRIPT = """
@@ -53,7 +52,7 @@ def results(request, stage):
     (directory / "dropout").mkdir(parents=True, exist_ok=True)
     (directory / "run.json").write_text("{}")
     (directory / "B2SUMS").touch()
-    if request.report.page:
+    if request.files.page:
         (directory / "report.html").touch()
     return replace(request.known, status="done", distance_m=7.0, errors={"icr_p95_10m_m": 0.25},
                    inputs=one_log.files_of(path))
@@ -80,8 +79,8 @@ def add(season: Path, *names: str) -> None:
 def run(
     season: Path, jobs: int = 2, robot: str | None = None, sets: tuple[str, ...] = (), **options: object
 ) -> dict[str, FleetLog]:
-    report = ReportOptions(page=bool(options.pop("page", True)))
-    asked = BatchOptions(ConfigSources(None, robot, sets), report, timeout_s=20.0, **options)  # type: ignore[arg-type]
+    files = ResultFiles(page=bool(options.pop("page", True)))
+    asked = BatchRequest(ConfigSources(None, robot, sets), files=files, timeout_s=20.0, **options)  # type: ignore[arg-type]
     requests = plan([season], season.parent / "out", asked)
     with ThreadPoolExecutor(jobs) as executor:
         rows = list(run_batch(requests, executor, asked))
@@ -109,10 +108,10 @@ def test_a_log_that_fails_hangs_or_dies_costs_only_itself(season: Path) -> None:
 
 def test_a_log_that_hangs_is_ended(season: Path) -> None:
     add(season, "hang", "a")
-    requests = plan([season], season.parent / "out", BatchOptions())
+    requests = plan([season], season.parent / "out", BatchRequest())
     begun = time.monotonic()
     with ThreadPoolExecutor(2) as executor:
-        rows = list(run_batch(requests, executor, BatchOptions(timeout_s=4.0)))
+        rows = list(run_batch(requests, executor, BatchRequest(timeout_s=4.0)))
     assert time.monotonic() - begun < 40
     assert {row.log: row.status for row in rows} == {"hang.mcap": "failed", "a.mcap": "done"}
     assert {row.log: row.usable for row in rows} == {"hang.mcap": False, "a.mcap": True}
@@ -165,7 +164,7 @@ def test_a_finished_log_without_a_page_is_processed_again_where_one_is_asked_for
 
 def test_an_interrupted_batch_ends_its_processes_and_is_continued(season: Path) -> None:
     add(season, "a", "hang1", "hang2", "hang3")
-    asked = BatchOptions(timeout_s=50)
+    asked = BatchRequest(timeout_s=50)
     requests = plan([season], season.parent / "out", asked)
     begun = time.monotonic()
     with ThreadPoolExecutor(2) as executor:
@@ -182,7 +181,7 @@ def test_an_interrupted_batch_ends_its_processes_and_is_continued(season: Path) 
 
 def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
     add(season, "hang")
-    request = plan([season], season.parent / "out", BatchOptions())[0]
+    request = plan([season], season.parent / "out", BatchRequest())[0]
     process = subprocess.Popen(
         processes.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
@@ -200,8 +199,8 @@ def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
 def test_a_request_survives_its_journey_whatever_its_path(season: Path) -> None:
     name = os.fsdecode(b"\xff\n.mcap")
     (season / name).write_bytes(b"\x89MCAP0\r\n")
-    request = plan([season], season.parent / "out", BatchOptions(ConfigSources(sets=("robot.track_width_m=0.5",))))[0]
-    from icrtool.fleet.one_log import decode_request
+    request = plan([season], season.parent / "out", BatchRequest(ConfigSources(sets=("robot.track_width_m=0.5",))))[0]
+    from icrtool.records.requests import decode_request
 
     again = decode_request(request.encode())
     assert again == request
@@ -217,28 +216,28 @@ def test_the_manifest_gives_robot_group_and_tags(season: Path) -> None:
     (season / "m.csv").write_text(
         "log,robot,config,group,tags\na.mcap,husky-a200,,grass,wet\nb.mcap,mule,own.toml,ice,\n"
     )
-    requests = plan([season / "m.csv"], season.parent / "out", BatchOptions())
+    requests = plan([season / "m.csv"], season.parent / "out", BatchRequest())
     first, second = requests
     assert (first.known.robot, first.known.group, first.known.tags) == ("husky-a200", "grass", ("wet",))
     assert first.config.robot.name == "husky-a200"
     assert (second.known.robot, second.config.robot.track_width_m) == ("mule", 0.9)
     (season / "m.csv").write_text("log,robot\na.mcap,husky-a20\n")
     with pytest.raises(ConfigError, match="husky-a20"):
-        plan([season / "m.csv"], season.parent / "out", BatchOptions())
+        plan([season / "m.csv"], season.parent / "out", BatchRequest())
 
 
 def test_what_cannot_be_planned_is_refused_at_once(season: Path, tmp_path: Path) -> None:
     with pytest.raises(LogError, match="no recording"):
-        plan([season], tmp_path / "out", BatchOptions())
+        plan([season], tmp_path / "out", BatchRequest())
     add(season, "a")
     with pytest.raises(ConfigError, match="gate"):
-        plan([season], tmp_path / "out", BatchOptions(report=ReportOptions(gates=("nonsense",))))
+        plan([season], tmp_path / "out", BatchRequest(report=ReportRequest(gates=("nonsense",))))
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="a file is there"):
-        plan([season], tmp_path / "file", BatchOptions())
+        plan([season], tmp_path / "file", BatchRequest())
     (tmp_path / "run.json").touch()
     with pytest.raises(OutputError, match="is a run itself"):
-        plan([season], tmp_path, BatchOptions())
+        plan([season], tmp_path, BatchRequest())
 
 
 def test_memory_bounds_how_many_logs_run_at_once(season: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,10 +282,9 @@ def test_a_finished_log_of_a_moved_folder_is_found_by_content(season: Path, tmp_
     run(season)
     moved = tmp_path / "moved"
     season.rename(moved)
-    request = plan([moved], tmp_path / "out", BatchOptions())[0]
-    assert isinstance(request, Request)
+    request = plan([moved], tmp_path / "out", BatchRequest())[0]
+    assert isinstance(request, LogRequest)
     found = finished(request, tmp_path / "out")
     assert found is not None
-    assert (
-        finished(replace(request, known=msgspec.structs.replace(request.known, key="other")), tmp_path / "out") is None
-    )
+    other = msgspec.structs.replace(request.known, key="other")
+    assert finished(msgspec.structs.replace(request, known=other), tmp_path / "out") is None

@@ -17,7 +17,6 @@ from mcap.writer import CompressionType, Writer
 
 from icrtool.config import Config, load_config
 from icrtool.errors import ConfigError, DefinitionError, IcrToolError, LogError
-from icrtool.estimation.fit import fit
 from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, DecompressionError, Inflation, Packed, decompress
 from icrtool.logs.containers.container import Channel, Cut, MessageBlock, unpack_messages
 from icrtool.logs.containers.open_log import MOST_CHANNELS, open_log
@@ -27,6 +26,7 @@ from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.logs.read_log import LONGEST_HEAD_BYTES, moment, read_log, survey_log
 from icrtool.logs.streams.sources import stamp_rows
 from icrtool.logs.streams.wheel_pairs import MOST_PAIRS
+from icrtool.pipeline import fit
 from icrtool.records.text import LogText
 from support.tables import block_of, channel_of, collected, read_source
 

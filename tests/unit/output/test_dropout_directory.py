@@ -35,7 +35,7 @@ GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001", "icr.max@900m <= 1")
 
 def content_of(run: Run, horizons_m: list[float] | None = None, gates: tuple[str, ...] = GATES) -> DropoutReport:
     return dropout_report(
-        run, horizons_m=horizons_m or HORIZONS_M, gates=gates, outage_s=(4.0,), outage_at_s=(15.0,), comparison=False
+        run, horizons_m=horizons_m or HORIZONS_M, gates=gates, outage_s=(4.0,), outage_at_s=(15.0,), ladder=False
     )
 
 

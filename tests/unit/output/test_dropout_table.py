@@ -27,9 +27,7 @@ GATES = ("icr.p95@5m <= 100", "icr.p95@5m <= 0.001")
 
 
 def content_of(run: Run, horizons_m: list[float], gates: tuple[str, ...] = ()) -> DropoutReport:
-    return dropout_report(
-        run, horizons_m=horizons_m, gates=gates, budgets_m=(0.05, 50.0), outage_s=(), comparison=False
-    )
+    return dropout_report(run, horizons_m=horizons_m, gates=gates, budgets_m=(0.05, 50.0), outage_s=(), ladder=False)
 
 
 @pytest.fixture(scope="module")

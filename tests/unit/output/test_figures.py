@@ -9,7 +9,6 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from icrtool.estimation.fit import fit
 from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.filter_records import GATED
 from icrtool.output.figure_catalogue import FIGURES
@@ -17,6 +16,7 @@ from icrtool.output.figures.calibrations import transfer
 from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.figures.style import new_figure, save, style
 from icrtool.output.page.render import drawn_pictures
+from icrtool.pipeline import fit
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import COMPARE_SCHEMA, ComparedGroup, GroupComparison, TransferCell
 from icrtool.records.measurements import ReferenceJump

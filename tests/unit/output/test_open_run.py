@@ -18,13 +18,13 @@ import pytest
 import icrtool
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import RunError
-from icrtool.estimation.fit import fit
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.style import picture_bytes
 from icrtool.output.files.formats import file_b2sum, json_bytes
 from icrtool.output.run_directory import log_of, newest_run, open_run, write_run
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
+from icrtool.pipeline import fit
 from icrtool.records.run import Run
 from icrtool.records.samples import GyroSamples
 from support.barn import configured, simulate

@@ -19,13 +19,13 @@ import pytest
 
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.dropout_analysis.report import DropoutReport
-from icrtool.estimation.fit import fit
 from icrtool.output.figures.filter_estimates import gnss_difference
 from icrtool.output.page.drive_data import drive_data, packed, packed_levels, packed_sums
 from icrtool.output.page.pages import draw_pictures, run_page, write_page
 from icrtool.output.page.render import pictures_of
 from icrtool.output.tables.dropout import reach_rows, report_blocks
 from icrtool.output.text_blocks import format_blocks
+from icrtool.pipeline import fit
 from icrtool.records.measurements import ReferenceJump
 from icrtool.records.plain_data import plain
 from icrtool.records.run import Run
@@ -177,7 +177,7 @@ def test_page_and_picture_of_the_fixes_have_one_scale_and_one_kind_of_breaks(pag
 def test_a_report_on_the_smoothed_trajectory_is_drawn_along_it() -> None:
     smoothed = fit(simulate(), configured(), smooth=True)
     assert smoothed.smoothed is not None
-    found = dropout_report(smoothed, reference="smoothed", comparison=False)
+    found = dropout_report(smoothed, reference="smoothed", ladder=False)
     data = data_of(run_page(smoothed, found.document, {}))
     north = numbers(data["steps"]["north"]) + data["origin"][0]
     np.testing.assert_allclose(north, smoothed.smoothed.north_m, atol=1e-5)
