@@ -42,6 +42,7 @@ Delay = Annotated[float, msgspec.Meta(ge=-100, le=100)]
 Degrees = Annotated[float, msgspec.Meta(ge=-720, le=720)]
 SideScale = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 Width = Annotated[float, msgspec.Meta(gt=0, le=20)]
+SkidFactor = Annotated[float, msgspec.Meta(gt=0, le=100)]
 Radius = Annotated[float, msgspec.Meta(gt=0, le=5)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Latitude = Annotated[float, msgspec.Meta(ge=-90, le=90)]
@@ -50,12 +51,13 @@ Longitude = Annotated[float, msgspec.Meta(ge=-180, le=360)]
 
 @dataclass(frozen=True, slots=True)
 class RobotConfig:
-    """The robot: `track_width_m` is b of Eqs. 38-39."""
+    """The robot: `track_width_m` is b of Eqs. 38-39, `skid_factor` the published multiplier of b."""
 
     name: str | None = None
     track_width_m: Width | None = None
     wheel_radius_m: Radius | None = None
     encoder_counts_per_rev: Positive | None = None
+    skid_factor: SkidFactor | None = None
 
 
 @dataclass(frozen=True, slots=True)

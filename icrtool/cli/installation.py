@@ -35,17 +35,18 @@ def robots_command(printer: Printer) -> None:
     prints one to fill in.
     """
     robots = config.builtin_robots()
-    keys = ("track_width_m", "wheel_radius_m", "encoder_counts_per_rev", "source")
+    keys = ("track_width_m", "wheel_radius_m", "encoder_counts_per_rev", "skid_factor", "source")
     listed = [{"name": name} | {key: robot.get(key) for key in keys} for name, robot in robots.items()]
     printer.json("robots", {"robots": listed})
     rows = [
         (
             name, f"{robot['track_width_m']:.3f} m", f"{robot['wheel_radius_m']:.4f} m",
             f"{robot['encoder_counts_per_rev']:,}" if "encoder_counts_per_rev" in robot else "-",
+            f"{robot['skid_factor']:g}" if "skid_factor" in robot else "-",
         )
         for name, robot in robots.items()
     ]  # fmt: skip
-    head = ("robot", "track width", "wheel radius", "counts per turn")
+    head = ("robot", "track width", "wheel radius", "counts per turn", "skid factor")
     sources = Table("l", [(f"  {name}", robot["source"]) for name, robot in robots.items()])
     printer.show([Table("lr", rows, head), "", Line("Sources", "title"), sources])
 

@@ -126,7 +126,7 @@ def controller_error_text(errors: ControllerErrors | None) -> str:
         return ""
     return (
         f"with these numbers alone the error after {CHOICE_HORIZON_M:g} m is {error_text(errors.p95_m)} (95 %, held "
-        f"out of the fit), with `recommended` {error_text(errors.full_p95_m)}"
+        f"out of the fit), with recommended {error_text(errors.full_p95_m)}"
     )
 
 

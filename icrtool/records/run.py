@@ -17,6 +17,7 @@ from icrtool.kernels.track import Track
 from icrtool.records.choices import FigureSet, StatesFormat
 from icrtool.records.measurements import SensorData, intervals_in
 from icrtool.records.plain_data import plain
+from icrtool.records.samples import are_twist
 from icrtool.records.tables import Icrs, States
 
 if TYPE_CHECKING:
@@ -259,6 +260,34 @@ def width_or_usual_m(track_width_m: float | None) -> float:
 def no_slip_icrs(track_width_m: float) -> Icrs:
     """Return the ICRs of a robot that does not slip (Pentzer 2014, Eqs. 38-39): in the middle of its tracks."""
     return track_width_m / 2, -track_width_m / 2, 0.0
+
+
+def why_no_vendor(document: RunDocument) -> str:
+    """Return why a run has no row ``vendor``; empty where it has one."""
+    robot = document.config.robot
+    if robot.skid_factor is None:
+        return "no skid factor is published for the robot (robot.skid_factor)"
+    if robot.track_width_m is None:
+        return "robot.track_width_m is not known"
+    if are_twist(document.streams) and document.config.wheels.twist_width_m is None:
+        return (
+            "the wheels were read from body twists, in which the robot's controller has used the factor already: "
+            "set wheels.twist_width_m"
+        )
+    return ""
+
+
+def vendor_icrs(document: RunDocument) -> Icrs | None:
+    """Return the ICRs of the skid factor m that is published for a robot; None as `why_no_vendor` states.
+
+    Notes
+    -----
+    The robot turns as if it were m times as wide: these are the ICRs of no slip with a track width of m b.
+    """
+    robot = document.config.robot
+    if robot.skid_factor is None or robot.track_width_m is None or why_no_vendor(document):
+        return None
+    return no_slip_icrs(robot.skid_factor * robot.track_width_m)
 
 
 def track_of(run: Run) -> Track:

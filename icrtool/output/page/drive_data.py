@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from icrtool.calibration.pooled import calibrated, turning_recording_of
 from icrtool.calibration.record import stored_calibration
+from icrtool.calibration.run_models import models_of
 from icrtool.errors import DataError
-from icrtool.estimation.odometry import drive_wheels, odometry_icrs
+from icrtool.estimation.odometry import drive_wheels
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints, wrapped
 from icrtool.motion.models import CONTROLLER, FIVE, RECOMMENDED, FittedModel, controller_model, find_model
 from icrtool.motion.recording import Recording, cut_windows, predicted_path
@@ -213,11 +214,13 @@ def _models_data(
 
 
 def _odometry(run: Run, every: int, origin: tuple[float, float]) -> Paths:
-    """Yield the odometries of the run, which the figure of the trajectory draws too."""
-    for name, icrs in odometry_icrs(run).items():
-        path = drive_wheels(run.table, run.in_gap, icrs, every)
-        model = "icr_final" if name == "icr" else name
-        yield model, (path.heading_rad, path.north_m + 1j * path.east_m - complex(*origin))
+    """Yield the paths of the rows of constant ICRs."""
+    for model in models_of(run):
+        if len(model.icrs.x_icr) > 1:
+            continue
+        right, left, x = (float(column[0]) for column in model.icrs)
+        path = drive_wheels(run.table, run.in_gap, (right, left, x), every)
+        yield model.name, (path.heading_rad, path.north_m + 1j * path.east_m - complex(*origin))
 
 
 def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument, rows: Ints) -> Paths:

@@ -17,6 +17,7 @@ from icrtool.output.text_format import duration_text, error_text
 from icrtool.records.acceptance import CHOICE_HORIZON_M, METRICS
 from icrtool.records.dropout_document import DropoutDocument, ModelDocument, column_of
 from icrtool.records.rows import in_order, shown_rows
+from icrtool.records.run import why_no_vendor
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
@@ -147,6 +148,8 @@ def _count_lines(report: DropoutDocument, summary: RunDocument) -> Iterator[str]
     yield f"a trial from each {moving}state of {report.starts:,}, by wheel speeds alone{reference}"
     if model_of(report, "no_slip") is None:
         yield "no_slip is left out: robot.track_width_m is not known"
+    if summary.config.robot.skid_factor is not None and model_of(report, "vendor") is None:
+        yield f"vendor is left out: {why_no_vendor(summary)}"
     if report.starts_standing > NOTED_STANDING * report.starts:
         share = 100 * report.starts_standing / report.starts
         each = "each standstill is one start" if moving else "each is a start (--starts all)"
