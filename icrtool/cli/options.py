@@ -309,7 +309,7 @@ def reporting(*further: Option) -> Option:
                "read \"icr.p95@10m <= 1.1 * baseline\"."),
         flag("--strict-gates", "Compare limits relative to the baseline by their number alone, without the "
              "confidence interval of the difference."),
-        flag("--ladder/--no-ladder", "Also test the motion model and the controller numbers, with a gyro too, on "
+        flag("--ladder/--no-ladder", "Also test the rows recommended and controller, with a gyro too, on "
              "distance that they were not fitted to.", default=True, show_default=True),
         option("--junit", "FILE", NEW_FILE, "Write the verdicts on the limits as JUnit XML."),
         option("--markdown", "FILE", NEW_FILE, "Write a summary for a pull request."),

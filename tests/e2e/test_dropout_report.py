@@ -229,7 +229,7 @@ def test_the_ladder_holds_the_rows_of_the_summary(fitted: Path) -> None:
     assert list(rows.model.unique()) == names
     for name in ("trials", "expected_error_m", "p95_m"):
         assert list(rows[name]) == list(summary[name])
-    assert set(rows[rows.model == "recommended"].fitted) == {"held out"}
+    assert set(rows[rows.model == "recommended"].fitted) == {"the rest of the drive"}
 
 
 def test_a_finished_run_has_the_ladder_of_its_log(folder: Path, report_here) -> None:

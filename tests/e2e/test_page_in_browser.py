@@ -315,7 +315,7 @@ def test_hostile_names_stay_text(chrome: Browser, run: Run, report: DropoutRepor
     streams = [{**one, "topic": HOSTILE, "why": HOSTILE} for one in run.summary["streams"]]
     hostile = with_summary(run, log=HOSTILE, warnings=[HOSTILE], streams=streams)
     made = report.document
-    models = tuple(msgspec.structs.replace(one, label=HOSTILE) for one in made.models)
+    models = (*made.models, msgspec.structs.replace(made.models[0], name=f"calibration:{HOSTILE}", words=HOSTILE))
     document = msgspec.structs.replace(made, models=models)
     file = tmp_path / "hostile.html"
     file.write_text(run_page(hostile, document, {}), encoding="utf-8")

@@ -52,12 +52,12 @@ def test_every_robot_of_a_fleet_has_its_name_in_the_key(tmp_path: Path) -> None:
 
 def test_every_log_of_a_fleet_has_its_name_and_its_error() -> None:
     logs = {"barn": {"monday.bag": 0.31, "tuesday.bag": 0.62}, "yard": {"friday.bag": 1.25}}
-    (axes,) = fleet_errors(FleetNumbers("3 logs", [], logs, "whole model")).axes
+    (axes,) = fleet_errors(FleetNumbers("3 logs", [], logs, "recommended")).axes
     names = [text.get_text() for text in axes.get_yticklabels()]
     assert names == ["tuesday.bag", "monday.bag", "friday.bag"]
     assert [text.get_text() for text in axes.texts] == ["0.620 m", "0.310 m", "1.25 m"]
     many = {"barn": {f"{number}.bag": 0.01 * (1 + number) for number in range(100)}}
-    (axes,) = fleet_errors(FleetNumbers("100 logs", [], many, "whole model")).axes
+    (axes,) = fleet_errors(FleetNumbers("100 logs", [], many, "recommended")).axes
     names = [text.get_text() for text in axes.get_yticklabels()]
     assert names == [f"{number}.bag" for number in range(99, 59, -1)]
 

@@ -111,7 +111,6 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
     assert {outage["kind"] for outage in document["outages"]} == {"forced", "real"}
     assert document["budgets"][0].keys() == {
         "model",
-        "label",
         "budget_m",
         "distance_m",
         "beyond",

@@ -24,7 +24,11 @@ def test_rows_are_those_of_the_summary(report: DropoutReport) -> None:
     for name in ("horizon_m", "trials", "p95_m", "expected_error_m", "expected_pct"):
         assert [row[name] for row in rows] == pytest.approx(list(summary[name]), nan_ok=True)
     assert {row["heading"] for row in rows} == {"wheels", "heading"}
-    assert {row["fitted"] for row in rows} == {"not fitted", "up to the start", "in sample", "held out"}
+    learned = {row["model"]: row["fitted"] for row in rows}
+    assert learned["icr"] == "the drive before each start"
+    assert learned["no_slip"] == "the track width"
+    assert learned["recommended"] == learned["controller"] == "the rest of the drive"
+    assert "whole drive" in learned["icr_final"]
 
 
 def test_the_document_is_json(report: DropoutReport) -> None:
