@@ -8,12 +8,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from icrtool.calibration.run_models import fit
 from icrtool.config import load_config, parse_config
 from icrtool.dropout_analysis.dropout_report import dropout, dropout_report
 from icrtool.kernels.open_loop import open_loop_errors_direct
 from icrtool.kernels.track import FrozenIcrs, trial_ends
 from icrtool.output.tables.dropout import format_dropout
+from icrtool.pipeline import fit
 from icrtool.records.run import Run, track_of, vendor_icrs, why_no_vendor
 from icrtool.records.run_document import RunDocument
 from support.barn import ICRS_M, TRACK_WIDTH_M, simulate
