@@ -30,11 +30,12 @@ from icrtool.kernels.arrays import Floats
 from icrtool.logs.read_log import read_log
 from icrtool.motion.models import (
     CONTROLLER,
-    FAMILY,
     FIVE,
+    MODELS,
     NO_SLIP,
     RECOMMENDED,
     TERMS,
+    MotionModel,
     Term,
     controller_model,
 )  # fmt: skip
@@ -42,6 +43,16 @@ from icrtool.motion.recording import NO_CONSTANTS, Recording, cut_trials, cut_wi
 from icrtool.motion.window_fit import Fold, Pool, PooledFit, Prediction
 from icrtool.output.run_directory import RUN_FILE, is_run_directory, open_run
 from icrtool.pipeline import fit
+
+FAMILY: dict[str, MotionModel] = MODELS | {
+    model.name: model
+    for model in (
+        MotionModel("multiplier", "one multiplier", ("omega_w",), "wheel_separation_multiplier"),
+        MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005"),
+        MotionModel("six", "ICRs, scales, side slip", (*MODELS[FIVE].terms, "vy_vw"), "with Seegmiller 2014"),
+    )
+}
+"""The models that are fitted, and simpler and older ones that they are compared with, by name."""
 
 SLIP_TERMS = ("vy_vw", "omega_sw", "omega_vw")
 WIDE, WIDTHS = 10.0, np.geomspace(0.003, 1.0, 60)

@@ -6,6 +6,7 @@ the configured wheel radius.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,7 +58,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     gyro : the recommended model with a gyro, None where a log has none
     logs : what it was fitted to
     held_out : scores by model, horizon and log, each predicted without that log, or block of a single one
-    held_out_pooled : scores of all these trials together; empty in files of earlier versions
+    held_out_pooled : scores of all these trials together
     geometry, geometry_std : ICRs [m], multiplier and radius factors, from one fit
     controller : what a controller is given, and the errors of that, where the drive is long enough to measure them
     error_sources : variances of what the model leaves out, for wheels alone; None where the drive is too short
@@ -117,15 +118,11 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         return names if len(self.logs) == 1 else f"{len(self.logs)} logs ({names})"
 
     def held_out_m(self, model: str, horizon_m: float) -> tuple[float, float]:
-        """Return p95 and expected error [m] of all held-out trials of a model together, NaN without one.
-
-        A file of an earlier version has them by log or block alone: then the median over these.
-        """
-        scores: tuple[documents.PooledScore | documents.HeldOutScore, ...] = self.held_out_pooled or self.held_out
-        rows = [one for one in scores if one.model == model and one.horizon_m == horizon_m]
-        if not rows:
-            return float("nan"), float("nan")
-        return float(np.median([one.p95_m for one in rows])), float(np.median([one.expected_m for one in rows]))
+        """Return p95 and expected error [m] of all held-out trials of a model together, NaN without one."""
+        for one in self.held_out_pooled:
+            if one.model == model and one.horizon_m == horizon_m:
+                return one.p95_m, one.expected_m
+        return math.nan, math.nan
 
     def twist(self, v_left: Floats | float, v_right: Floats | float) -> Floats:
         """Return the body twist v_x, v_y [m/s], omega [rad/s] of wheel speeds [m/s], (3,) or (3, n).

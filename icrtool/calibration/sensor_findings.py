@@ -85,8 +85,8 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.Sensor
     wheels, found = run.document.wheels, run.document.alignment
     if not {kind.finding or key for key, kind in KINDS.items()} <= found.keys():
         metres = run.document.drive.distance_m
-        why = f"{metres:.0f} m of driven distance are too few windows, or an older version made the run"
-        raise DataError(run.name, why, "drive longer, or fit the log again")
+        why = f"{metres:.0f} m of driven distance are too few windows"
+        raise DataError(run.name, why, "drive longer")
     driven, parameters = _drive(run), {}
     for key, kind in KINDS.items():
         value, std = _numbers(found[kind.finding or key])

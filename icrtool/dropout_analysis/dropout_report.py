@@ -269,11 +269,9 @@ def _report(
         starts_standing=errors.standing,
         without_events=cost,
         tolerance_m=TOLERANCE_M,
-        # the key and its parts keep their names; nothing is resampled
-        bootstrap=documents.IntervalsDocument(
+        intervals=documents.IntervalsDocument(
             method="Student's t over blocks of path",
             block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",
-            resamples=0,
             level=LEVEL,
             seed=request.seed,
         ),

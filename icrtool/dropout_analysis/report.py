@@ -23,7 +23,6 @@ from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import BlockSums, difference_half_width, within_budget
 from icrtool.kernels.track import TrialCounts
-from icrtool.motion.models import FAMILY
 from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.choices import FigureSet
@@ -46,9 +45,6 @@ _FORM = re.compile(
 _RELATIONS: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
 }  # fmt: skip
-
-FORMER_ROWS = {"multiplier", "window", "extended", *FAMILY} - {"no_slip", "controller", "recommended", "icr"}
-"""Rows that reports of earlier versions had."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +169,7 @@ class BaselineReport:
 
     log: str
     path: str
-    document: documents.EarlierReport
+    document: documents.DropoutDocument
 
     @property
     def sha256(self) -> tuple[str, ...]:
@@ -227,7 +223,7 @@ class BaselineReport:
         found = []
         if not self.is_of(run_document):
             found.append(f"another recording than in the baseline ({self.log}): the difference has a wider interval")
-        keys = sorted(_different_keys(self.document.run.config, run_document.config.effective()))
+        keys = sorted(_different_keys(self.document.run.config.effective(), run_document.config.effective()))
         if keys:
             found.append(f"another configuration than in the baseline: {listed(keys, 5)}")
         if self.tool_version != __version__:
@@ -314,8 +310,6 @@ def check_gate(
         A model or horizon that the report, or the baseline, does not have.
     """
     if (result := report.result(gate.model)) is None:
-        if gate.model.removesuffix("_gyro") in FORMER_ROWS:
-            raise ConfigError(f"gate {gate.text!r}", "no such row", "use recommended")
         found = ", ".join(one.name for one in report.results)
         advice = f"this run has {found}; no_slip needs robot.track_width_m"
         raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)

@@ -29,7 +29,7 @@ from icrtool.records.samples import InputFile
 from icrtool.records.text import escaped
 
 if TYPE_CHECKING:
-    from icrtool.records.dropout_document import EarlierModel, ModelDocument
+    from icrtool.records.dropout_document import ModelDocument
 
 HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 """Distances whose errors a batch collects."""
@@ -141,7 +141,7 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
     )
 
 
-def _errors(models: Iterable[ModelDocument | EarlierModel]) -> dict[str, float | None]:
+def _errors(models: Iterable[ModelDocument]) -> dict[str, float | None]:
     """Return p95 and expected errors of the models of a report, by the names of columns."""
     return {
         f"{one.name}_{metric}_{row.horizon_m:g}m_m": number

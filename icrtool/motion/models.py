@@ -91,7 +91,6 @@ TERMS: dict[str, Term] = {
         Term("omega_vw", OMEGA, lambda m: np.abs(m.v) * m.w, "abs(v) * w", 0.006, "change of the turn gain with speed",
              wide=0.2),
         Term("vy_v", VY, lambda m: m.v, "v", 0.02, "sideways while driving ahead (Anousaki 2004)"),
-        Term("vx_absw", VX, lambda m: np.abs(m.w) * m.b / 2, "abs(w) * b / 2", 0.1, "drag in turns (Seegmiller 2014)"),
         Term("gyro_scale", OMEGA, lambda m: m.gyro, "gyro", 0.02, "scale error of the gyro"),
         Term("wheels_weight", OMEGA, lambda m: m.turn - m.gyro, "turn - gyro", 0.15, "weight of the wheels' turn rate"),
     )
@@ -184,20 +183,8 @@ MODELS: dict[str, MotionModel] = {
 }
 """The models that are fitted, by name."""
 
-FAMILY: dict[str, MotionModel] = MODELS | {
-    model.name: model
-    for model in (
-        MotionModel("multiplier", "one multiplier", ("omega_w",), "wheel_separation_multiplier"),
-        MotionModel("symmetric", "symmetric", ("vx_v", "omega_w"), "Mandow 2007"),
-        MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005"),
-        MotionModel(CONTROLLER, "separation and radii", ("vx_v", "omega_w", "omega_v"), "diff_drive_controller"),
-        MotionModel("six", "ICRs, scales, side slip", (*_FIVE, "vy_vw"), "with Seegmiller 2014"),
-        MotionModel("eight", "scales, slip, turn gain", _EIGHT, "with gains of curvature and speed"),
-        MotionModel("full_linear", "full linear", (*_FIVE, "vy_v"), "Anousaki 2004"),
-        MotionModel("slip", "slip regression", (*_FIVE, "vx_absw", "vy_vw"), "Seegmiller 2014, Baril 2024"),
-    )
-}
-"""Every model that a calibration of an earlier version may hold, and that `benchmarks/models.py` compares."""
+FULL_LINEAR = MotionModel("full_linear", "full linear", (*_FIVE, "vy_v"), "Anousaki 2004")
+"""Model that is linear in both wheel speeds; the filter's ICRs are stated in its terms, and it is not fitted."""
 
 
 def model_columns(model: MotionModel, motion: WheelMotion) -> tuple[Floats, Ints, Floats]:
@@ -260,9 +247,6 @@ def track_geometry(model: MotionModel, parameters: NDArray[Any], width_m: float)
         ).tolist()
     separation = y_right - y_left
     return TrackGeometry(y_right, y_left, x, separation / width_m, separation * turn_left, -separation * turn_right)
-
-
-FULL_LINEAR = FAMILY["full_linear"]
 
 
 def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
@@ -403,4 +387,4 @@ def find_model(name: str) -> MotionModel:
         There is none.
     """
     base = name.removesuffix("_gyro")
-    return FAMILY[base].with_gyro() if base != name else FAMILY[base]
+    return MODELS[base].with_gyro() if base != name else MODELS[base]

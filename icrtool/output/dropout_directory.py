@@ -25,7 +25,7 @@ from icrtool.output.files.atomic import Kind, atomic_directory
 from icrtool.output.files.formats import csv_bytes, json_bytes, list_anew, logs_of_fleet, read_document, schema_of
 from icrtool.output.run_directory import REPORT_FILES, is_run_directory
 from icrtool.records.choices import FigureSet
-from icrtool.records.dropout_document import DropoutDocument, EarlierReport, SummaryRow
+from icrtool.records.dropout_document import DropoutDocument, SummaryRow
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, is_regular, is_special, read_regular
 from icrtool.records.rows import IN_CSV
@@ -78,7 +78,7 @@ def write_report(
 
 
 def is_dropout_directory(directory: Path) -> bool:
-    """Return whether a directory is a dropout report of ours, of whatever version."""
+    """Return whether a directory is a dropout report of ours."""
     return schema_of(directory / REPORT_FILE, directory).startswith(SCHEMA_FAMILY)
 
 
@@ -283,7 +283,7 @@ def read_report(path: Path, log: str = "", inside: Path | None = None) -> Baseli
         It is not a dropout report.
     """
     try:
-        document = read_document(path, EarlierReport, inside, escape=False)
+        document = read_document(path, DropoutDocument, inside, escape=False)
         if not document.schema.startswith(SCHEMA_FAMILY):
             raise ValueError(document.schema)
         return BaselineReport(escaped(log or document.run.log), str(path), document)

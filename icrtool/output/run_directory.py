@@ -43,14 +43,14 @@ MOST_CSV_STATES = 1_000_000
 
 SCHEMA_FAMILY = "icrtool/run/"
 
-_FIGURES = "|".join(f"{name}[0-9]+m" if name.endswith("_") else name for name in (*FIGURES, "examples", "ladder"))
+_FIGURES = "|".join(f"{name}[0-9]+m" if name.endswith("_") else name for name in FIGURES)
 PICTURES = rf"plots/(({_FIGURES})\.(png|svg|pdf))?"
 REPORT_FILES = rf"report\.json|(summary|histogram|worst|ladder)\.csv|trials\.parquet|{PICTURES}"
 RUN_FILES = (
-    r"run\.json|events\.csv|measurements\.npz|headings\.(npz|parquet)|(states|smoothed)\.(csv|parquet)|B2SUMS"
+    r"run\.json|events\.csv|measurements\.npz|(states|smoothed)\.(csv|parquet)|B2SUMS"
     rf"|report\.html|{PICTURES}|dropout/({REPORT_FILES})?"
 )
-"""All names that any version wrote: what has another is of somebody, and is not replaced."""
+"""Names of the files in a run directory; a directory with a file of another name is not replaced."""
 
 
 def check_target(
@@ -187,7 +187,7 @@ def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
 
 
 def is_run_directory(directory: Path) -> bool:
-    """Return whether a directory, or an address, is a run of ours, of whatever version."""
+    """Return whether a directory, or an address, is a run of ours."""
     if isinstance(directory, UrlPath):
         return lies_there(directory, RUN_FILE)
     return formats.schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
@@ -244,7 +244,7 @@ def _run_in(directory: Path, place: Path, *, whole: bool) -> Run:
     sums = formats.read_sums(directory)
     check_sum(directory, RUN_FILE, sums)
     if MEASUREMENTS_FILE not in sums:
-        raise RunError(directory, "made by an older version of icrtool", FIT_AGAIN)
+        raise RunError(directory, f"{formats.CHECKSUM_FILE} names no {MEASUREMENTS_FILE}", FIT_AGAIN)
     try:
         config = parse_config(msgspec.convert(stored.get("config"), dict[str, Any]))
         document = msgspec.convert(stored | {"config": config}, RunDocument)

@@ -218,7 +218,7 @@ class CalibrationDocument(CalibrationFile, frozen=True, kw_only=True):
     """A calibration file.
 
     `created`: date and time, UTC, ISO 8601; not in a report's ``recommended``, which is the same whenever it is made.
-    `held_out_pooled`, `error_sources`: empty and null in files of earlier versions.
+    `held_out_pooled`: scores of all held-out trials together. `error_sources`: null where the drive is too short.
     """
 
     tool_version: str
@@ -238,8 +238,8 @@ class CalibrationDocument(CalibrationFile, frozen=True, kw_only=True):
     models: dict[str, FittedDocument]
     logs: tuple[CalibrationLog, ...]
     held_out: tuple[HeldOutScore, ...]
-    held_out_pooled: tuple[PooledScore, ...] = ()
-    error_sources: ErrorSources | None = None
+    held_out_pooled: tuple[PooledScore, ...]
+    error_sources: ErrorSources | None
     warnings: tuple[str, ...]
 
 
@@ -320,15 +320,15 @@ class GroupComparison(Record, frozen=True, kw_only=True):
     ----------
     pairs : the first group with each of the others
     transfer : the transfer matrix, by row, column and horizon
-    costs : of its cells beside the diagonal; empty in files of earlier versions
+    costs : of its cells off the diagonal
     """
 
     schema: Literal["icrtool/compare/1"]
-    tool_version: str = ""
+    tool_version: str
     groups: dict[str, ComparedGroup]
     pairs: tuple[ComparedPair, ...]
     transfer: tuple[TransferCell, ...]
-    costs: tuple[TransferCost, ...] = ()
+    costs: tuple[TransferCost, ...]
 
 
 class ForecastSource(Record, frozen=True):

@@ -326,7 +326,6 @@ class IntervalsDocument(Record, frozen=True):
 
     method: str
     block: str
-    resamples: int
     level: float
     seed: int
 
@@ -344,7 +343,7 @@ class DropoutDocument(Record, frozen=True, kw_only=True):
     starts_standing: int
     without_events: EventCostDocument | None
     tolerance_m: float
-    bootstrap: IntervalsDocument
+    intervals: IntervalsDocument
     models: tuple[ModelDocument, ...]
     trials: tuple[CountDocument, ...]
     reference_error: tuple[ReferenceRow, ...]
@@ -360,34 +359,3 @@ class DropoutDocument(Record, frozen=True, kw_only=True):
     outages: tuple[OutageDocument, ...]
     worst: tuple[TrialDocument, ...]
     examples: tuple[TrialDocument, ...]
-
-
-class EarlierInput(Record, frozen=True):
-    """A file of the log of an earlier report."""
-
-    sha256: str | None
-
-
-class EarlierRun(Record, frozen=True):
-    """The run of an earlier report; its configuration may have keys of another version."""
-
-    log: str
-    inputs: tuple[EarlierInput, ...]
-    config: dict[str, object]
-
-
-class EarlierModel(Record, frozen=True):
-    """A model's errors in an earlier report; older ones have no blocks."""
-
-    name: str
-    by_horizon: tuple[ErrorRow, ...]
-    blocks: tuple[BlocksDocument, ...] = ()
-
-
-class EarlierReport(Record, frozen=True):
-    """What a comparison needs of a report.json, of whatever version."""
-
-    schema: str
-    tool_version: str
-    run: EarlierRun
-    models: tuple[EarlierModel, ...]

@@ -17,7 +17,7 @@ FLEET_FILE = "fleet.json"
 """What a batch found, in its folder."""
 
 FLEET_FAMILY = "icrtool/fleet/"
-"""Schema of such a file, of whatever version."""
+"""Begin of the schema of a fleet.json."""
 
 RUNS, ROWS = "runs", ".rows"
 """Folders of a batch: of the runs, and of the rows of the logs, written as they come."""
@@ -89,7 +89,7 @@ class FleetLog(Record, frozen=True):
     icr : final ICRs [m] and, as ``std_…``, their standard deviations
     multiplier : (y_r - y_l)/b, wheel separation multiplier of a differential-drive controller, with `multiplier_std`
     errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``
-    bounds : those of the names in `errors` whose distance is a lower bound; none in files of earlier versions
+    bounds : those of the names in `errors` whose distance is a lower bound
     outages, warnings : how many
     baseline : of the same names as `errors`, numbers of the log's report in the baseline
     changes : how log, configuration and version differ from those of the baseline

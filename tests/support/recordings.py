@@ -8,12 +8,17 @@ import numpy as np
 
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.track import Track, ends_from
-from icrtool.motion.models import FittedModel, MotionModel, WheelMotion, wheel_motion
+from icrtool.motion.models import FULL_LINEAR, MODELS, FittedModel, MotionModel, WheelMotion, wheel_motion
 from icrtool.motion.recording import PathAt, Recording, Trials, trial_errors
 
 WIDTH_M = 0.6
 SLOWEST_TURN = 0.15
 """A robot whose turn gain is less, or negative, is none."""
+
+THREE_ICRS = MotionModel("icr", "three ICRs", ("vx_w", "omega_w", "vy_w"), "Pentzer 2014, Eqs. 8-12; Martinez 2005")
+SIX = MotionModel("six", "ICRs, scales, side slip", (*MODELS["five"].terms, "vy_vw"), "with Seegmiller 2014")
+FAMILY = MODELS | {model.name: model for model in (FULL_LINEAR, THREE_ICRS, SIX)}
+"""The models that are fitted, and others that are linear in the same terms, by name."""
 
 
 def twist(model: MotionModel, parameters: Floats, motion: WheelMotion) -> Floats:

@@ -65,7 +65,7 @@ class Kind(NamedTuple):
     Attributes
     ----------
     name : for messages ("run directory")
-    is_one : whether a directory is one, of whatever version
+    is_one : whether a directory is one
     files : matches the names below it of all that icrtool writes there; of a directory, with ``/`` at the end
     """
 

@@ -18,7 +18,7 @@ import msgspec
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import with_smoothed_reference
 from icrtool.errors import RunError
-from icrtool.motion.models import FAMILY
+from icrtool.motion.models import MODELS
 from icrtool.output.dropout_directory import DROPOUT_DIRECTORY, REPORT_FILE
 from icrtool.output.figure_catalogue import drive_charts
 from icrtool.output.files.atomic import write_file
@@ -107,7 +107,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
             place = f"datum {datum[0]:z.6f}° {datum[1]:z.6f}°, {datum[2]:z.1f} m"
     made = (
         f"icrtool {summary.tool_version}, {summary.schema}, {report.schema}; {report.starts:,} states; "
-        f"intervals by {report.bootstrap.method}"
+        f"intervals by {report.intervals.method}"
     )
     provenance = [("log", f"{one.path}: {one.bytes:,} bytes, sha256 {one.sha256}") for one in summary.inputs]
     made_from = Section("Provenance", [Facts([*provenance, ("place", place), ("made with", made)])], PAGE)
@@ -352,7 +352,7 @@ def comparison_page(found: GroupComparison, title: str) -> str:
     """Return the page of a comparison as HTML."""
     from icrtool.output.figures.calibrations import transfer
 
-    names, labels = list(found.groups), {name: model.label for name, model in FAMILY.items()}
+    names, labels = list(found.groups), {name: model.label for name, model in MODELS.items()}
     groups = "; ".join(
         f"{name}: {counted(len(one.logs), 'log')}, model {labels.get(one.model, one.model)}"
         for name, one in found.groups.items()

@@ -24,7 +24,7 @@ from icrtool.config import parse_config
 from icrtool.errors import ConfigError, DataError, RunError
 from icrtool.kernels.arrays import Bools
 from icrtool.kernels.track import Windows
-from icrtool.motion.models import FAMILY, MODELS
+from icrtool.motion.models import MODELS
 from icrtool.motion.recording import Recording, Trials, cut_trials, cut_windows, predicted_path
 from icrtool.motion.window_fit import Pool, own_constants
 from icrtool.output.files.formats import open_calibration, write_calibration
@@ -35,9 +35,9 @@ from icrtool.records.calibration_document import CalibratedRobot
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.samples import TWIST_TYPES
 from support.drives import make_log
-from support.recordings import WIDTH_M, make_recording, table_errors, trials_from_all
+from support.recordings import SIX, WIDTH_M, make_recording, table_errors, trials_from_all
 
-SIX, WHOLE = FAMILY["six"], MODELS["recommended"]
+WHOLE = MODELS["recommended"]
 TRUTH = np.array([0.96, -0.1, 0.6, -0.02, 0.1, -0.12])
 
 

@@ -26,9 +26,9 @@ from icrtool.kernels.error_statistics import (
 )
 from icrtool.output.dropout_directory import open_baseline, read_report
 from icrtool.output.files.formats import json_bytes
-from icrtool.records.dropout_document import EarlierInput
 from icrtool.records.fleet_document import FleetFile, FleetLog
 from icrtool.records.run import Run
+from icrtool.records.samples import InputFile
 from support.edits import edited
 
 HORIZON = 100
@@ -141,7 +141,7 @@ def test_a_report_equals_its_own_baseline(report: DropoutReport, written: Path) 
 def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, written: Path) -> None:
     baseline = read_report(written, "earlier")
     gate = parse_gate("icr.p95@2m <= 0.97 * baseline")
-    verdict = check_gate(gate, report, other_document(baseline, inputs=(EarlierInput("other"),)))
+    verdict = check_gate(gate, report, other_document(baseline, inputs=(other_file(baseline),)))
     assert verdict.margin_m < 0 < verdict.margin_high_m
     assert verdict.passed
     assert not check_gate(gate, report, baseline, strict=True).passed
@@ -163,6 +163,11 @@ def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, writt
         baseline.number_for(msgspec.structs.replace(gate, horizon_m=3.0))
 
 
+def other_file(baseline: BaselineReport) -> InputFile:
+    """The first file of the baseline's log, with another content."""
+    return replace(baseline.document.run.inputs[0], sha256="other")
+
+
 def other_document(baseline: BaselineReport, **changes: Any) -> BaselineReport:
     """The baseline, with other facts of its run."""
     run = msgspec.structs.replace(baseline.document.run, **changes)
@@ -171,9 +176,8 @@ def other_document(baseline: BaselineReport, **changes: Any) -> BaselineReport:
 
 def test_what_changed_is_listed(run: Run, report: DropoutReport, written: Path) -> None:
     baseline = read_report(written, "earlier")
-    config = json.loads(json.dumps(baseline.document.run.config))
-    config["filter"]["gate_probability"] = 0.5
-    other = other_document(baseline, config=config, inputs=(EarlierInput("x"),))
+    config = baseline.document.run.config.with_filter(gate_probability=0.5)
+    other = other_document(baseline, config=config, inputs=(other_file(baseline),))
     other = replace(other, document=msgspec.structs.replace(other.document, tool_version="0.0"))
     changes = other.changes(report.run_document)
     assert [
@@ -214,8 +218,10 @@ def test_what_is_no_report_is_refused(written: Path, old: str, new: str) -> None
 def test_an_edited_baseline_is_refused_in_one_line_or_compared(report: DropoutReport, written: Path) -> None:
     document = json.loads(written.read_text(encoding="utf-8"))
     compared, refusals = 0, []
-    for _, changed in edited({key: document[key] for key in ("schema", "tool_version", "run", "models", "ladder")}, 4):
-        written.write_text(json.dumps(changed), encoding="utf-8")
+    read = {key: document.pop(key) for key in ("schema", "tool_version", "run", "models")}
+    for _, changed in edited(read, 4):
+        whole = document | changed if isinstance(changed, dict) else changed
+        written.write_text(json.dumps(whole), encoding="utf-8")
         try:
             baseline = open_baseline(written).find("any", ())
             assert baseline is not None

@@ -156,7 +156,7 @@ def test_intervals_hold_the_estimate_and_depend_on_no_seed(run: Run) -> None:
     spans = [(r.results[0].column("p95_low_m")[0], r.results[0].column("p95_high_m")[0]) for r in reports]
     assert spans[0] == spans[1]
     assert spans[0][0] < reports[0].results[0].column("p95_m")[0] < spans[0][1]
-    assert [r.document.bootstrap.seed for r in reports] == [1, 2]
+    assert [r.document.intervals.seed for r in reports] == [1, 2]
 
 
 def test_a_histogram_holds_all_trials_and_shows_the_bulk(run: Run) -> None:

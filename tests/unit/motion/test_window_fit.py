@@ -13,12 +13,12 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.robust import LOSS_SIGMAS
 from icrtool.kernels.track import Track
-from icrtool.motion.models import FAMILY, TERMS, FittedModel, MotionModel, find_model, wheel_motion
+from icrtool.motion.models import MODELS, TERMS, FittedModel, MotionModel, find_model, wheel_motion
 from icrtool.motion.recording import LogConstants, Recording, cut_trials, cut_windows, predicted_path
 from icrtool.motion.window_fit import SETTLED, Fold, Pool, PooledFit, own_constants, residuals_of, shortening
-from support.recordings import WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all, twist
+from support.recordings import FAMILY, WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all, twist
 
-EIGHT = FAMILY["eight"]
+EIGHT = MODELS["recommended"]
 SEEDS = range(8)
 STEP = 1e-6
 ROUNDING_M = 1e-9
@@ -48,7 +48,7 @@ def test_a_prior_is_wide_where_the_drive_shows_more_than_it(gain: float, widened
     assert (abs(narrow.parameters[place] - gain) > 2.0 * abs(found.parameters[place] - gain)) == widened
 
 
-@pytest.mark.parametrize("name", ["eight", "six_gyro"])
+@pytest.mark.parametrize("name", ["recommended", "five_gyro"])
 def test_derivatives_are_those_of_differences(name: str) -> None:
     """Windows of one length: what slip shortens is held, as the scale of residuals is."""
     model = find_model(name)

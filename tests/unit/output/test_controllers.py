@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 from icrtool.calibration.pooled import calibrate
 from icrtool.calibration.record import Calibration, factor_to_old, fitted_model, parameter_documents, unfit_reasons
 from icrtool.errors import ConfigError, DataError
-from icrtool.motion.models import FAMILY, FittedModel, Lever, controller_model, wheel_motion
+from icrtool.motion.models import MODELS, FittedModel, Lever, controller_model, wheel_motion
 from icrtool.output.exports.controllers import TARGETS, format_export
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.records.calibration_document import ControllerDocument
@@ -113,9 +113,9 @@ def test_without_measured_errors_only_the_twist_model_is_given(calibration: Cali
 
 
 def test_the_twist_model_is_the_calibration_in_rep_103(calibration: Calibration) -> None:
-    """Evaluated as a robot's node would, for every term of the family: v_y and turn rate change sign, v_x does not."""
+    """Evaluated as a robot's node would, for every term of the models: v_y and turn rate change sign, v_x does not."""
     rng, b = np.random.default_rng(1), calibration.width_m
-    for model in FAMILY.values():
+    for model in MODELS.values():
         k = len(model.terms)
         fitted = FittedModel(model, rng.normal(size=k), np.eye(k))
         terms, parameters, covariance = parameter_documents(fitted)

@@ -101,8 +101,8 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
         rows = document["by_learning"][part]
         assert [row["trials"] for row in rows] == [row.trials for row in summary]
         assert [row["p95_m"] for row in rows] == [row.p95_m for row in summary]
-    assert document["bootstrap"]["seed"] == content.document.bootstrap.seed
-    assert {"method", "level", "block"} <= document["bootstrap"].keys()
+    assert document["intervals"]["seed"] == content.document.intervals.seed
+    assert {"method", "level", "block"} <= document["intervals"].keys()
     assert document["tolerance_m"] <= 1e-9
     assert document["run"]["inputs"] == json.loads(json_bytes({"x": run.summary["inputs"]}))["x"]
     assert [gate["passed"] for gate in document["gates"]] == [True, False, False]

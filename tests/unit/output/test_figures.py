@@ -250,7 +250,7 @@ def test_the_picture_of_a_comparison_answers_with_both_errors_and_its_words_stan
     ]  # fmt: skip
     figure = transfer(
         GroupComparison(
-            schema=COMPARE_SCHEMA, groups=dict.fromkeys(names, ComparedGroup("icr", (), {})), pairs=(),
+            schema=COMPARE_SCHEMA, tool_version="", groups=dict.fromkeys(names, ComparedGroup("icr", (), {})), pairs=(),
             transfer=tuple(cells), costs=tuple(one for one in cells if one.p95_m == 0.9),
         )
     )  # fmt: skip

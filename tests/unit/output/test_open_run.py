@@ -252,10 +252,7 @@ def cut(name: str) -> Callable[[Path], None]:
         (cut("measurements.npz"), "measurements.npz was edited or cut short"),
         (remove("B2SUMS"), "no readable B2SUMS"),
         (change("B2SUMS", b"states.csv", b"other.csv"), "B2SUMS names no states"),
-        (
-            change("B2SUMS", b"measurements.npz", b"headings.npz"),
-            "made by an older version of icrtool; fit the log again",
-        ),
+        (change("B2SUMS", b"measurements.npz", b"headings.npz"), "B2SUMS names no measurements.npz; fit the log again"),
     ],
 )
 def test_a_spoilt_run_is_refused_in_one_line(written: Path, spoil: Callable[[Path], None], sentence: str) -> None:

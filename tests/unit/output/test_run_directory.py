@@ -134,10 +134,9 @@ def test_an_old_run_is_replaced_with_its_dropout_analysis(written: Path, run: Ru
     (written / "dropout").mkdir()
     (written / "dropout" / "summary.csv").write_text("of the old states")
     (written / "report.html").write_text("of the old states")
-    (written / "headings.npz").write_text("of an earlier version")
     notes: list[str] = []
     write_run(run, written, states="parquet", plots=(), note=notes.append)
-    assert notes == [f"{written}: replaced: removed dropout/, headings.npz, report.html, states.csv"]
+    assert notes == [f"{written}: replaced: removed dropout/, report.html, states.csv"]
     assert names_in(written) == ["B2SUMS", "events.csv", "measurements.npz", "run.json", "states.parquet"]
     assert [path.name for path in written.parent.iterdir()] == ["barn"]
 
