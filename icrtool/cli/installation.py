@@ -119,10 +119,12 @@ def call_all_kernels() -> None:
     from icrtool.records.process_resources import unfinished
     from icrtool.records.run import track_of
     from icrtool.simulation.drives import DrivePlan, Sensors, simulate
+    from icrtool.simulation.friction import FrictionRobot
     from icrtool.simulation.studies import default_request, run_study
 
     config = icrtool.load_config(robot="husky-a200")
     columns, _ = simulate(DrivePlan(motor_lag_s=0.1), Sensors(), 0)
+    simulate(DrivePlan(robot=FrictionRobot(), duration_s=1.0), Sensors(), 0)
     robot = config.robot
     assert robot.wheel_radius_m is not None  # noqa: S101 - for the type checker
     assert robot.track_width_m is not None  # noqa: S101 - as above

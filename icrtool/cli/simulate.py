@@ -21,12 +21,14 @@ with when_used():
     from icrtool.logs import write_log
     from icrtool.output import simulation_files
     from icrtool.output.tables import study as study_tables
-    from icrtool.simulation import drives, studies
+    from icrtool.records import run as runs
+    from icrtool.simulation import drives, friction, studies
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
     from icrtool.records.tables import Icrs
     from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, TruthTable
+    from icrtool.simulation.friction import FrictionRobot
     from icrtool.simulation.study_records import Study, StudyRequest
 
 GNSS_NOISE_M = {"rtk": 0.01, "waas": 0.30}
@@ -108,6 +110,15 @@ DRIVE_DEFAULTS: dict[str, object] = {
 }  # fmt: skip
 """Of `simulate`, by field; a study has its own."""
 
+DYNAMICS = (
+    flag("--dynamics", "Contacts slide with friction, loads shift, the driver steers: the ICRs follow from forces."),
+    flag("--tracks", "With --dynamics: five road wheels a side, in place of two wheels."),
+    option("--friction", "MU", POSITIVE, "With --dynamics: friction coefficient along the wheels; default 0.7."),
+    option("--friction-std", "SHARE", NOT_NEGATIVE, "With --dynamics: how much friction varies along the path; default "
+           "0.1."),
+)  # fmt: skip
+"""Options of `simulate` and `study` for a robot on sliding contacts."""
+
 RECORDED = (
     ("--start-heading start_heading_rad", "DEG", degrees(), "Heading at the start, clockwise from north.", 30.0),
     ("--wheels", None, click.Choice(["encoder", "commanded"]),
@@ -140,7 +151,9 @@ def drive_options(*further: Option, **defaults: object) -> Option:
     text = "The ICRs become these after T seconds; repeatable."
     change = option("--change changes", "T:YR,YL,X", change_text, text, multiple=True)
     of_drive = [option(*row, default=defaults.get(row[0].split()[-1])) for row in DRIVE]
-    of_sensors = together("sensors", "icrtool.simulation.drives:Sensors", *of_drive, change, *further, change=True)
+    of_robot = together("contacts", "icrtool.simulation.friction:FrictionRobot", *DYNAMICS, change=True)
+    options_of_sensors = (*of_drive, change, of_robot, *further)
+    of_sensors = together("sensors", "icrtool.simulation.drives:Sensors", *options_of_sensors, change=True)
     of_plan = together("plan", "icrtool.simulation.drives:DrivePlan", of_sensors, change=True)
     return together("path", "icrtool.simulation.drives:PathPlan", of_plan, change=True)
 
@@ -160,13 +173,16 @@ def drive_options(*further: Option, **defaults: object) -> Option:
 def simulate_command(
     log: Path, force: bool, seed: int, speeds: Path | None, path: Change[PathPlan], plan: Change[DrivePlan],
     sensors: Change[Sensors], encoder_counts: float | None, wheel_rate: float | None, antenna: tuple[float, float],
-    wheel_messages: WheelMessages, convention: HeadingConvention, settings: ConfigSources, printer: Printer,
+    wheel_messages: WheelMessages, convention: HeadingConvention, contacts: Change[FrictionRobot], dynamics: bool,
+    tracks: bool, settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Drive a robot of known ICRs and record the log that its sensors would have written, with the truth beside it.
 
     The kinematics are the paper's (Eqs. 8-10), integrated without error; the sensors those of its Section 4. The robot
     is pentzer-tracked unless --robot, --config or --set robot.… name another. LOG.truth.csv holds the true pose (about
     latitude 40.7934, longitude -77.86), ICRs and track speeds at every wheel stamp.
+
+    With --dynamics the robot slides on contacts with friction, and its ICRs are a result of speed, load and ground.
 
     \b
     Example:
@@ -179,6 +195,7 @@ def simulate_command(
     driven = path(drives.PathPlan()) if speeds is None else simulation_files.read_speeds(speeds)
     duration_s = 100.0 if isinstance(driven, drives.PathPlan) else float(driven.t_s[-1])
     drive = plan(drives.DrivePlan(icrs_m=default_icrs(config), path=driven, duration_s=duration_s))
+    drive = replace(drive, robot=friction_robot(contacts, config, dynamics=dynamics, tracks=tracks))
     check_changes(drive.changes, drive.duration_s)
     counts = encoder_counts or config.robot.encoder_counts_per_rev or PAPER_COUNTS
     radius_m = needed(config, "wheel_radius_m")
@@ -210,6 +227,19 @@ def simulate_command(
     printer.detail(f"sensors: {sensed}")
 
 
+def friction_robot(
+    contacts: Change[FrictionRobot], config: Config, *, dynamics: bool, tracks: bool
+) -> FrictionRobot | None:
+    """Return the robot on sliding contacts of the configured track width; None without --dynamics."""
+    if not dynamics:
+        if tracks or contacts(friction.FrictionRobot()) != friction.FrictionRobot():
+            raise click.UsageError("--tracks, --friction and --friction-std belong to --dynamics: give it too")
+        return None
+    robot = friction.TRACKED_ROBOT if tracks else friction.FrictionRobot()
+    width_m = config.robot.track_width_m
+    return contacts(robot if width_m is None else friction.scaled_robot(robot, width_m))
+
+
 def default_icrs(config: Config) -> Icrs:
     """Return the true ICRs where none are given."""
     half = DEFAULT_MULTIPLIER * needed(config, "track_width_m") / 2
@@ -229,15 +259,16 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
     import numpy as np
 
     distance_m = float(np.hypot(np.diff(truth["north_m"]), np.diff(truth["east_m"])).sum())
+    right, left, x = plan.icrs_m
+    if plan.robot is not None:
+        right, left, x = (float(truth[name].mean()) for name in runs.ICR_COLUMNS)
     what = f"{plan.path.kind} path" if isinstance(plan.path, drives.PathPlan) else "track speeds as given"
     lines = [
         f"robot  {config.robot.name or 'as configured'}, b = {needed(config, 'track_width_m'):g} m",
         f"drive  {what}, {distance_m:.1f} m in {plan.duration_s:g} s, seed {seed}",
-        f"ICRs   y right {plan.icrs_m[0]:+z.3f}, y left {plan.icrs_m[1]:+z.3f}, x {plan.icrs_m[2]:+z.3f} m",
+        f"ICRs   y right {right:+z.3f}, y left {left:+z.3f}, x {x:+z.3f} m{', mean' if plan.robot else ''}",
     ]
-    lines += [
-        f"       from {time:g} s on {right:+z.3f}, {left:+z.3f}, {x:+z.3f} m" for time, (right, left, x) in plan.changes
-    ]
+    lines += [f"       from {time:g} s on {', '.join(f'{one:+z.3f}' for one in icrs)} m" for time, icrs in plan.changes]
     return "\n".join(lines)
 
 
@@ -265,7 +296,8 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
 def study_command(
     name: str, output: Path | None, request: Change[StudyRequest], preset: PresetName | None,
     path: Change[PathPlan], plan: Change[DrivePlan], sensors: Change[Sensors], encoder_counts: float | None,
-    rate: float | None, plots: tuple[str, ...], settings: ConfigSources, printer: Printer,
+    contacts: Change[FrictionRobot], dynamics: bool, tracks: bool, rate: float | None, plots: tuple[str, ...],
+    settings: ConfigSources, printer: Printer,
 ) -> None:  # fmt: skip
     """Simulate and filter many drives, and report accuracy, convergence time and consistency of the ICRs.
 
@@ -279,6 +311,7 @@ def study_command(
       input-noise   Fig. 12       ICR error by noise of the track speeds
       input-bias    Fig. 13       ICR error by bias of the track speeds
       gnss          Figs. 35-37   ICR error and open-loop error by noise of the GNSS
+      speed         Figs. 38-44   ICRs of a robot on sliding contacts, by its speed
       rate                        whether logs of any rate give the same ICRs
       consistency                 whether the filter's covariance is right
 
@@ -296,6 +329,8 @@ def study_command(
     if robot.track_width_m is not None:
         drive = replace(drive, icrs_m=default_icrs(config))
     drive = plan(replace(drive, path=driven))
+    if (robot_on_ground := friction_robot(contacts, config, dynamics=dynamics, tracks=tracks)) is not None:
+        drive = replace(drive, robot=robot_on_ground)
     check_changes(drive.changes, drive.duration_s)
     if rate is not None:
         sensed = replace(sensed, wheel_rate_hz=rate, heading_rate_hz=rate)

@@ -27,5 +27,5 @@ TrajectoryFormat = Literal["evo", "kitti"]
 
 StudyName = Literal[
     "convergence", "initial", "icr-change", "turn-radius", "input-noise", "input-bias", "input-source", "gnss", "rate",
-    "consistency",
+    "consistency", "speed",
 ]  # fmt: skip

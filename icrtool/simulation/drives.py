@@ -1,4 +1,4 @@
-"""Simulate a robot of known ICRs on a path, the sensors of Pentzer 2014, Section 4, and what is recorded of them."""
+"""Simulate a robot on a path, the sensors of Pentzer 2014, Section 4, and what is recorded of them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import numpy as np
 
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats, Ints, wrapped
-from icrtool.kernels.kinematics import drive, follow, poses_at
+from icrtool.kernels.kinematics import drive, follow
 from icrtool.records.choices import PathKind
 from icrtool.records.samples import SensorColumns
 from icrtool.records.tables import Icrs
+from icrtool.simulation.friction import FrictionRobot, slide_path
+from icrtool.simulation.truths import IcrTruth, Truth
 
 CURVED_SWINGS = ((0.8, 1.4), (0.2, 3.0))
 """Share of the curvature, and length in radii per radian, of the two oscillations of path ``curved``: the heading
@@ -79,11 +81,12 @@ class TrackSpeeds:
 
 @dataclass(frozen=True, slots=True)
 class DrivePlan:
-    """What is simulated: the robot's true ICRs, its path and its motors.
+    """What is simulated: the robot's true ICRs, or its contacts; its path and its motors.
 
     Attributes
     ----------
     icrs_m : true y_icr_right, y_icr_left, x_icr; the track speeds of a path are computed with them
+    robot : a robot on sliding contacts, whose ICRs follow from forces; its driver assumes `icrs_m`. None: the ICRs hold
     changes : (seconds, true ICRs from then on), in order of time; the track speeds do not change
     path : a path, or given track speeds
     command_rate_hz : rate of the motor commands, each held until the next; None: a command at every step
@@ -99,6 +102,7 @@ class DrivePlan:
     command_rate_hz: float | None = None
     motor_lag_s: float = 0.0
     step_s: float = TRUTH_STEP_S
+    robot: FrictionRobot | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,40 +142,6 @@ class Sensors:
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
-    """True motion on a fine grid of time.
-
-    Attributes
-    ----------
-    t_s : (n,) increasing from 0
-    command_left_mps, command_right_mps : (n,) motor commands, held over [k, k+1)
-    v_left_mps, v_right_mps : (n,) true track speeds, held over [k, k+1)
-    travel_left_m, travel_right_m : (n,) their integrals
-    icrs_m : (c, 3); which : int64 (n,) row of it that holds over [k, k+1)
-    pose : (n, 3) north, east [m], heading [rad] (unwrapped)
-    """
-
-    t_s: Floats
-    command_left_mps: Floats
-    command_right_mps: Floats
-    v_left_mps: Floats
-    v_right_mps: Floats
-    travel_left_m: Floats
-    travel_right_m: Floats
-    icrs_m: Floats
-    which: Ints
-    pose: Floats
-
-    def rows(self, times: Floats) -> Ints:
-        """Return the row (m,) whose step each time (m,) [s] falls into."""
-        return np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 1).astype(np.int64)
-
-    def poses(self, times: Floats) -> Floats:
-        """Return the pose (m, 3) at times (m,) [s]."""
-        return poses_at(times, self.t_s, self.v_left_mps, self.v_right_mps, self.icrs_m, self.which, self.pose)
-
-
-@dataclass(frozen=True, slots=True)
 class Readings:
     """Measurements of the sensors, by time of measurement.
 
@@ -203,7 +173,7 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
         It names the impossible value.
     """
     # Numbers whose samples fill the memory, or that are no size of a robot, a sensor or a drive.
-    for part in (plan, sensors, plan.path):
+    for part in (plan, sensors, plan.path, *([] if plan.robot is None else [plan.robot])):
         for name in (each.name for each in fields(part) if not isinstance(part, TrackSpeeds)):
             for number in _numbers_in(getattr(part, name)):
                 if number and not SMALLEST <= abs(number) <= LARGEST:
@@ -222,12 +192,22 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
     if isinstance(path, PathPlan) and path.radius_m == 0 and path.kind not in ("circle", "spins", "straight"):
         advice = "only a circle may have radius 0"
         raise ConfigError("radius", f"a {path.kind} path has no bends of radius 0", advice)
+    _check_robot(plan)
     times = [time for time, _ in plan.changes]
     if times != sorted(set(times)):
         raise ConfigError("change", f"the times {', '.join(f'{time:g}' for time in times)} do not increase")
     if plan.duration_s * slowest < 2:
         why = f"{plan.duration_s:g} s holds fewer than two samples at {slowest:g} Hz"
         raise ConfigError("duration", why, "drive longer")
+
+
+def _check_robot(plan: DrivePlan) -> None:
+    """Refuse what a robot on sliding contacts cannot be given: ICRs that change, and track speeds."""
+    if plan.robot is not None and plan.changes:
+        advice = "leave --change out, or --dynamics"
+        raise ConfigError("change", "the ICRs of a robot on sliding contacts follow from forces", advice)
+    if plan.robot is not None and isinstance(plan.path, TrackSpeeds):
+        raise ConfigError("speeds", "a robot on sliding contacts follows a path", "leave --speeds or --dynamics out")
 
 
 def _numbers_in(value: object) -> Iterator[float]:
@@ -277,8 +257,11 @@ def track_speeds(forward: Floats, turn: Floats, icrs_m: tuple[float, float, floa
     return forward - left * turn, forward - right * turn
 
 
-def drive_plan(plan: DrivePlan, tail_s: float) -> Truth:
-    """Return the true motion over a plan's duration and `tail_s` [s] more: the last wheel speed needs a next sample."""
+def drive_plan(plan: DrivePlan, tail_s: float, rng: np.random.Generator | None = None) -> Truth:
+    """Return the true motion over a plan's duration and `tail_s` [s] more: the last wheel speed needs a next sample.
+
+    `rng` draws the ground of a robot on sliding contacts; default: seed 0.
+    """
     end = plan.duration_s + tail_s + 2 * plan.step_s
     given = plan.path.t_s if isinstance(plan.path, TrackSpeeds) else np.empty(0)
     edges = np.array([time for time, _ in plan.changes])
@@ -288,6 +271,13 @@ def drive_plan(plan: DrivePlan, tail_s: float) -> Truth:
     command_t = t
     if plan.command_rate_hz is not None:
         command_t = np.floor(t * plan.command_rate_hz * (1 + 1e-12)) / plan.command_rate_hz
+    if plan.robot is not None and isinstance(plan.path, PathPlan):
+        decides = np.append(True, np.diff(command_t) > 0)
+        return slide_path(
+            plan.robot, t, *plan_body(plan.path, command_t, plan.icrs_m), decides, plan.icrs_m,
+            start_heading_rad=plan.start_heading_rad, lag_s=plan.motor_lag_s,
+            rng=rng if rng is not None else np.random.default_rng(0),
+        )  # fmt: skip
     if isinstance(plan.path, TrackSpeeds):
         row = np.clip(np.searchsorted(given, command_t, side="right") - 1, 0, None)
         left, right = plan.path.v_left_mps[row], plan.path.v_right_mps[row]
@@ -302,7 +292,10 @@ def drive_plan(plan: DrivePlan, tail_s: float) -> Truth:
     travel_left, travel_right = (np.concatenate([[0.0], np.cumsum(speed[:-1] * step)]) for speed in (v_left, v_right))
     start = np.array([0.0, 0.0, plan.start_heading_rad])
     pose = drive(t, v_left, v_right, icrs, which, start)
-    return Truth(t, left, right, v_left, v_right, travel_left, travel_right, icrs, which, pose)
+    return IcrTruth(
+        t_s=t, command_left_mps=left, command_right_mps=right, v_left_mps=v_left, v_right_mps=v_right,
+        travel_left_m=travel_left, travel_right_m=travel_right, pose=pose, icrs_m=icrs, which=which,
+    )  # fmt: skip
 
 
 def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Generator) -> Readings:
@@ -331,9 +324,7 @@ def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Gene
     psi += rng.normal(0.0, 1.0, len(heading_t)) * sensors.heading_std_rad
     if sensors.heading_resolution_rad > 0:
         psi = np.rint(psi / sensors.heading_resolution_rad) * sensors.heading_resolution_rad
-    row = truth.rows(heading_t)
-    width = truth.icrs_m[truth.which[row], 0] - truth.icrs_m[truth.which[row], 1]
-    turn = (truth.v_left_mps[row] - truth.v_right_mps[row]) / width
+    turn = truth.turn_rates(heading_t)
     turn += rng.normal(0.0, GYRO_STD_RADPS, len(heading_t))
     pose = truth.poses(gnss_t)
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
@@ -378,12 +369,12 @@ def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorColumn
         The plan cannot be driven, or a sensor gives too few samples.
     """
     check_drive(plan, sensors)
-    truth = drive_plan(plan, 1.0 / sensors.wheel_rate_hz)
+    truth = drive_plan(plan, 1.0 / sensors.wheel_rate_hz, np.random.default_rng((seed, 2)))
     readings = sense(truth, sensors, plan.duration_s, np.random.default_rng((seed, 0)))
     times, row = readings.wheel_t, truth.rows(readings.wheel_t)
     columns: TruthTable = {"stamp_ns": stamps(times), "t_s": times - times[0]}
     columns |= zip(("north_m", "east_m", "heading_rad"), truth.poses(times).T, strict=True)
-    columns |= zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), truth.icrs_m[truth.which[row]].T, strict=True)
+    columns |= zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), truth.icrs(times).T, strict=True)
     columns |= {"v_left_mps": truth.v_left_mps[row], "v_right_mps": truth.v_right_mps[row]}
     return record(readings, sensors, np.random.default_rng((seed, 1))), columns
 

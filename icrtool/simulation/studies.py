@@ -19,6 +19,7 @@ from icrtool.records.choices import PathKind
 from icrtool.records.tables import Icrs
 from icrtool.simulation import study_runs as measured
 from icrtool.simulation.drives import PathPlan, check_drive
+from icrtool.simulation.friction import FrictionRobot
 from icrtool.simulation.study_records import (
     IDEAL,
     PLAN,
@@ -219,6 +220,13 @@ STARTS = ("proper start", "inverted start")
 START_FATES = {"no guard": "those with y_icr_right > 0 (Fig. 6)", "": "all (Fig. 7)"}
 CHANGE_TIMES = {"inflated": "0.03-0.17 s (Fig. 9)", "": "100-140 s (Fig. 8)"}
 RADIUS_TIMES = {0.0: "0.1 s (Fig. 10)", 2.0: "1.8 s (Fig. 10)"}
+TABLE_III = {
+    "y_icr_right": {0.4: "0.65 ± 0.01 (Table III)", 1.6: "0.49 ± 0.02", 4.0: "0.49 ± 0.01"},
+    "y_icr_left": {0.4: "-0.64 ± 0.01 (Table III)", 1.6: "-0.56 ± 0.02", 4.0: "-0.61 ± 0.04"},
+    "x_icr": {0.4: "-0.04 ± 0.01 (Table III)", 1.6: "0.02 ± 0.13", 4.0: "0.21 ± 0.14"},
+}
+"""Mean and standard deviation of each ICR [m], by speed [m/s]."""
+
 RTK_ERROR = {0.01: "within 3.8 m for 95 % (RTK, tracked, Fig. 29)"}
 
 STUDIES: dict[str, Study] = {
@@ -320,6 +328,30 @@ STUDIES: dict[str, Study] = {
         title="GNSS of {value:g} m: 10 m without it cost {answer}",
         answer=Number("{series}", "blind_icr_10m_p95_m", "median", "m", at=largest),
     ),
+    "speed": Study(
+        about="ICRs of a robot on sliding contacts, by its speed",
+        figures="38-44",
+        varies="speed [m/s]",
+        varied="speed_mps",
+        runs=20,
+        values=(0.4, 1.6, 4.0),
+        plan=replace(
+            PLAN, icrs_m=(0.6, -0.6, 0.0), path=PathPlan(radius_m=5.0), motor_lag_s=0.1, robot=FrictionRobot()
+        ),
+        sensors=replace(IDEAL, wheels="encoder"),
+        vary=by_preset(lambda base, value: driving(base, speed_mps=value)),
+        measures=(measured.measure_means,),
+        numbers=(
+            *(
+                Number(f"{{series}}: mean {icr} at {{value:g}} m/s", f"mean_{icr}_m", "spread", "m", paper)
+                for icr, paper in TABLE_III.items()
+            ),
+            Number("{series}: std of {icr} at {value:g} m/s", "scatter_{icr}_m", "spread", "m"),
+            Number("{series}: mean position error at {value:g} m/s", "position_error_m", "spread", "m"),
+        ),
+        title="At {value:g} m/s the mean x is {answer}",
+        answer=Number("{series}", "mean_x_icr_m", "median", "m", at=largest),
+    ),
     "rate": Study(
         about="whether logs of any rate give the same ICRs",
         varies="rate of wheels and heading [Hz]",
@@ -375,6 +407,9 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
     check_drive(request.plan, request.sensors)
     study = STUDIES[request.name]
     plan, times_s = request.plan, study.changes_s
+    if plan.robot is not None and times_s:
+        why = f"study {request.name} changes known ICRs; those of a robot on sliding contacts follow from forces"
+        raise ConfigError("dynamics", why, "leave --dynamics out")
     if times_s and not plan.changes:
         # The ICRs change at the usual times, as far as the drive goes.
         if plan.duration_s <= times_s[0]:

@@ -24,7 +24,8 @@ from icrtool.kernels.kinematics import drive, model_states
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 from icrtool.simulation import drives
-from icrtool.simulation.drives import DrivePlan, PathPlan, Readings, Sensors, Truth
+from icrtool.simulation.drives import DrivePlan, PathPlan, Readings, Sensors
+from icrtool.simulation.truths import Truth
 
 Progress = Callable[[float], None]
 
@@ -185,10 +186,9 @@ def _simulate(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, F
     plan, phase = scenario.plan, rng.uniform(0.0, 2 * np.pi)
     if isinstance(plan.path, PathPlan):
         plan = replace(plan, path=replace(plan.path, phase_rad=phase))
-    motion = drives.drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz)
+    motion = drives.drive_plan(plan, 1 / scenario.sensors.wheel_rate_hz, rng)
     readings = drives.sense(motion, scenario.sensors, plan.duration_s, rng)
-    icrs = motion.icrs_m[motion.which[motion.rows(readings.wheel_t)]]
-    return readings, np.column_stack([motion.poses(readings.wheel_t), icrs]), motion
+    return readings, np.column_stack([motion.poses(readings.wheel_t), motion.icrs(readings.wheel_t)]), motion
 
 
 def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, Floats, None]:
@@ -244,6 +244,21 @@ def measure_errors(run: StudyRun) -> Found:
         numbers[f"error_{name}_m"] = error[:, place].mean()
         numbers[f"rms_{name}_m"] = np.sqrt((error[:, place] ** 2).mean())
     return numbers | _mean_nis(run)
+
+
+def measure_means(run: StudyRun) -> Found:
+    """Return mean and standard deviation of each estimated ICR over the second half of a run, and the mean truth [m].
+
+    Also the mean distance of the filter's position from the true one.
+    """
+    half = len(run.t_s) // 2
+    found: Found = {"inverted": inverted(run)}
+    for place, name in enumerate(ICR_NAMES, start=3):
+        found[f"mean_{name}_m"] = run.x[half:, place].mean()
+        found[f"scatter_{name}_m"] = run.x[half:, place].std()
+        found[f"true_{name}_m"] = run.truth[half:, place].mean()
+    found["position_error_m"] = float(np.hypot(*(run.x[half:, :2] - run.truth[half:, :2]).T).mean())
+    return found
 
 
 def _mean_nis(run: StudyRun) -> Found:

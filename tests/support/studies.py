@@ -17,6 +17,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "turn-radius": {"duration_s": 25.0, "values": (0.0, 2.0)},
     "input-noise": {"duration_s": 10.0, "values": (0.0, 0.1)},
     "input-bias": {"duration_s": 10.0, "values": (0.0, 0.1)},
+    "speed": {"duration_s": 10.0, "values": (0.4, 1.6)},
     "input-source": {"duration_s": 10.0},
     "gnss": {"duration_s": 30.0, "values": (0.01, 0.3)},
     "rate": {"duration_s": 10.0, "values": (20.0, 100.0)},

@@ -251,6 +251,7 @@ def coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
 
 
 SETTLED: Draw = partial(over, columns=_by_icr("settle_{icr}_s"))
+MEANS, SCATTER = (partial(over, columns=_by_icr(f"{what}_{{icr}}_m")) for what in ("mean", "scatter"))
 RMS: Draw = partial(over, columns=_by_icr("rms_{icr}_m"), log="xy")
 WITHOUT_GNSS: Draw = partial(
     over, columns={"blind_icr_10m_p95_m": OPEN_LOOP, "blind_no_slip_10m_p95_m": OPEN_LOOP_NO_SLIP}, log="xy"
@@ -270,6 +271,7 @@ PICTURES: dict[str, tuple[tuple[str, Draw], ...]] = {
     "input-source": (("Left track speed [m/s]", speeds), ("ICR error [m]", errors)),
     "gnss": (("ICR error, rms [m]", RMS), ("10 m without GNSS, p95 [m]", WITHOUT_GNSS)),
     "rate": (("ICR error [m]", partial(errors, log="x")),),
+    "speed": (("ICR, mean [m]", MEANS), ("ICR, std [m]", SCATTER)),
     "consistency": (("NEES, mean (6 expected)", nees), ("Within 2 sigma [%]", coverage)),
 }  # fmt: skip
 """The rows of panels of each picture: name of the y axis, and what is drawn."""

@@ -23,6 +23,7 @@ SHOWN: dict[str, dict[str, str]] = {
     "input-source": ERRORS | INVERTED,
     "gnss": {"rms_y_icr_right_m": "rms y right [m]", "blind_icr_10m_p95_m": "10 m without GNSS [m]"} | INVERTED,
     "rate": ERRORS,
+    "speed": {f"mean_{column}": word for column, word in ICR_WORDS.items()} | INVERTED,
 }
 """Metrics by study, with the heading of their column; the studies left out have no settings to list."""
 

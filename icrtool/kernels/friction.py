@@ -1,0 +1,139 @@
+"""A planar skid-steer robot whose contacts slide with Coulomb friction: its ICRs follow from forces."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.compiled import njit
+
+GRAVITY_MPS2 = 9.81
+
+SLOWEST_SLIP_MPS = 0.02
+"""Sliding speed at which friction is 0.7 of its limit while a track stands [m/s]: it keeps the equations smooth."""
+
+LONGEST_SUBSTEP_S = 0.001
+"""Longest step of the integration [s]: friction damps a sliding contact within some 3 ms."""
+
+LOAD_FOLLOWS_S = 0.05
+"""Time constant with which the load of the contacts follows the acceleration [s]: the suspension of the body."""
+
+LARGEST_TURN_RADPS = 2.0
+"""Largest turn rate that the driver commands [rad/s]."""
+
+
+class SlidingBody(NamedTuple):
+    """Constants of a robot and its driver.
+
+    Attributes
+    ----------
+    mass : [kg]; inertia : about the vertical axis through the centre of mass [kg m^2]
+    mass_forward, mass_height : centre of mass, ahead of the body origin and above the ground [m]
+    creep : share of the track speed at which friction is 0.7 of its limit
+    lateral : friction sideways over friction along the track
+    lag : time constant of the motors [s]; 0: none
+    steering : turn rate commanded for a heading error [1/s]
+    y_right, y_left : ICRs by which the driver turns velocities into track speeds [m]
+    cell : length of the cells of `grip` [m]
+    """
+
+    mass: float
+    inertia: float
+    mass_forward: float
+    mass_height: float
+    creep: float
+    lateral: float
+    lag: float
+    steering: float
+    y_right: float
+    y_left: float
+    cell: float
+
+
+@njit
+def slide(  # noqa: PLR0915 - the equations of one step, in the order in which they act
+    t: Floats, forward: Floats, turn: Floats, heading: Floats, decides: Ints, contact_x: Floats, contact_y: Floats,
+    grip: Floats, body: SlidingBody, commands: Floats, tracks: Floats, pose: Floats, velocity: Floats,
+) -> None:  # fmt: skip
+    """Integrate the motion of a robot on sliding contacts, and of the driver who steers it.
+
+    Parameters
+    ----------
+    t : (n,) increasing [s]
+    forward, turn, heading : (n,) velocity [m/s], turn rate [rad/s] and heading [rad] that the driver wants
+    decides : (n,) 1 where the driver gives new commands, else 0
+    contact_x, contact_y : (c,) contacts, body frame (x forward, y right) [m]; the sign of y is the side
+    grip : (g, 2) friction coefficient of left and right side by cell of distance; it repeats
+    body : constants
+    commands, tracks : (n, 2) become commanded and true track speeds, left and right [m/s]
+    pose : (n, 3) row 0 is the start; becomes N, E [m], psi [rad]
+    velocity : (n, 3) becomes v_x, v_y [m/s], omega [rad/s] of the body origin
+
+    Notes
+    -----
+    Newton and Euler in the body frame, semi-implicit Euler steps of at most `LONGEST_SUBSTEP_S`. A contact with load p
+    that slides with velocity s is held back by mu p s / sqrt(|s|^2 + s0^2) (regularised Coulomb friction); the load
+    shifts with the acceleration and the height of the centre of mass.
+    """
+    c, cells = len(contact_x), len(grip)
+    sum_xx, sum_yy = 0.0, 0.0
+    for i in range(c):
+        sum_xx += contact_x[i] * contact_x[i]
+        sum_yy += contact_y[i] * contact_y[i]
+    north, east, psi = pose[0, 0], pose[0, 1], pose[0, 2]
+    # velocity of the centre of mass, track speeds, commands, acceleration that the load follows, distance
+    u, w, omega = 0.0, 0.0, 0.0
+    left, right, command_left, command_right = 0.0, 0.0, 0.0, 0.0
+    a_x, a_y, driven = 0.0, 0.0, 0.0
+    for k in range(len(t)):
+        if decides[k]:
+            wanted = turn[k] + body.steering * (heading[k] - psi)
+            wanted = min(max(wanted, -LARGEST_TURN_RADPS), LARGEST_TURN_RADPS)
+            command_left, command_right = forward[k] - body.y_left * wanted, forward[k] - body.y_right * wanted
+        if k == 0:
+            left, right, u = command_left, command_right, forward[0]
+            omega = turn[0]
+            w = omega * body.mass_forward
+        v_y = w - omega * body.mass_forward
+        commands[k, 0], commands[k, 1], tracks[k, 0], tracks[k, 1] = command_left, command_right, left, right
+        pose[k, 0], pose[k, 1], pose[k, 2] = north, east, psi
+        velocity[k, 0], velocity[k, 1], velocity[k, 2] = u, v_y, omega
+        if k + 1 == len(t):
+            break
+        steps = math.ceil((t[k + 1] - t[k]) / LONGEST_SUBSTEP_S - 1e-9)
+        dt = (t[k + 1] - t[k]) / steps
+        kept = math.exp(-dt / body.lag) if body.lag > 0.0 else 0.0
+        followed = 1.0 - math.exp(-dt / LOAD_FOLLOWS_S)
+        mean_left, mean_right = 0.0, 0.0
+        for _ in range(steps):
+            left, right = command_left + (left - command_left) * kept, command_right + (right - command_right) * kept
+            mean_left, mean_right = mean_left + left / steps, mean_right + right / steps
+            v_y = w - omega * body.mass_forward
+            cell = int(driven / body.cell) % cells
+            per_x = (GRAVITY_MPS2 * body.mass_forward - a_x * body.mass_height) * body.mass / sum_xx
+            per_y = -a_y * body.mass_height * body.mass / sum_yy
+            force_x, force_y, moment = 0.0, 0.0, 0.0
+            for i in range(c):
+                x, y = contact_x[i], contact_y[i]
+                load = max(body.mass * GRAVITY_MPS2 / c + per_x * x + per_y * y, 0.0)
+                track = right if y > 0.0 else left
+                slip_x, slip_y = u - omega * y - track, v_y + omega * x
+                smooth = SLOWEST_SLIP_MPS + body.creep * abs(track)
+                limit = grip[cell, 1 if y > 0.0 else 0] * load
+                held = limit / math.sqrt(slip_x * slip_x + slip_y * slip_y + smooth * smooth)
+                f_x, f_y = -held * slip_x, -held * body.lateral * slip_y
+                force_x += f_x
+                force_y += f_y
+                moment += (x - body.mass_forward) * f_y - y * f_x
+            of_x, of_y = force_x / body.mass, force_y / body.mass
+            a_x, a_y = a_x + (of_x - a_x) * followed, a_y + (of_y - a_y) * followed
+            u, w, omega = u + dt * (of_x + omega * w), w + dt * (of_y - omega * u), omega + dt * moment / body.inertia
+            v_y = w - omega * body.mass_forward
+            middle = psi + 0.5 * dt * omega
+            north += dt * (u * math.cos(middle) - v_y * math.sin(middle))
+            east += dt * (u * math.sin(middle) + v_y * math.cos(middle))
+            psi += dt * omega
+            driven += dt * math.sqrt(u * u + v_y * v_y)
+        # What is held over the step is what the tracks travelled.
+        tracks[k, 0], tracks[k, 1] = mean_left, mean_right
