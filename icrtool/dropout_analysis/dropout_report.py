@@ -114,13 +114,22 @@ def dropout_report(
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
-    horizons_m to seed : the fields of `icrtool.records.requests.ReportRequest`
+    horizons_m, budgets_m : distances without GNSS [m]; errors [m] whose distances are reported
+    gates, strict_gates, allow_unusable : acceptance limits, and how they are checked
+    outage_s, outage_at_s : lengths and begins of forced outages [s]
+    starts, reference : the states that trials start from, and what trials are compared with
+    without_events, with_jumps : the trials that count
+    ladder, seed : whether models are tested on held-out distance; seed of the random draws
     calibrations, baseline, sink : as in `report_on`
 
     Raises
     ------
     ConfigError, DataError, RunError
         As of `report_on`.
+
+    Notes
+    -----
+    The fields of `icrtool.records.requests.ReportRequest` have the same names and state what each means.
     """
     request = ReportRequest(
         horizons_m=None if horizons_m is None else tuple(horizons_m),
