@@ -6,7 +6,7 @@ import re
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +17,18 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import number_fields
 from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.counters import TURNS, Modulus, continued, find_modulus, register_size
 from icrtool.logs.streams.message_types import KNOWN_TYPES
-from icrtool.logs.streams.sources import StampedRows, WheelSource, motion_of, of_topic, stamp_rows
+from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, stamp_rows
 from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTE, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import LogText
 
 _NUMBERS = ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32", "UInt64")
-PAIR_TYPES = {f"std_msgs/{name}" for name in _NUMBERS}
+BYTE_TYPES = {"std_msgs/Int8", "std_msgs/UInt8"}
+"""Message types that hold a counter of 8 bits, or the state of a lamp: the topic's name decides."""
+
+PAIR_TYPES = {f"std_msgs/{name}" for name in _NUMBERS} | BYTE_TYPES
 """Message types that hold one number of one side."""
 
 ARRAY_TYPES = {f"std_msgs/{name}MultiArray" for name in _NUMBERS}
@@ -76,8 +80,8 @@ class Side:
         """The name as `topics.wheel_left` has it: the topic, and after a dot the field where it is not ``data``."""
         return LogText(_name(LogText(self.table.topic).raw, self.path))
 
-    def values(self) -> NDArray[Any]:
-        """Return its numbers (n,) as recorded, counters unwrapped.
+    def columns(self) -> list[NDArray[Any]]:
+        """Return its numbers (n,) as recorded, of each element that is meant.
 
         Raises
         ------
@@ -87,11 +91,49 @@ class Side:
         column, places = elements(self.path)
         values = self.table.column(column)
         if not places:
-            return _unwrapped(values)
+            return [values]
         if values.ndim != 2 or max(places) >= values.shape[1]:
             raise DefinitionError(self.name, "its messages have no such element")
-        wheels: NDArray[Any] = np.array([_unwrapped(values[:, place]) for place in places])
-        return np.asarray(wheels[0] if len(places) == 1 else wheels.mean(axis=0))
+        return [values[:, place] for place in places]
+
+
+class PairNumbers(NamedTuple):
+    """The numbers of both sides (n,), counters continued, and the modulus at which they begin again, where it shows."""
+
+    left: NDArray[Any]
+    right: NDArray[Any]
+    modulus: Modulus | None
+
+
+def numbers_of(left: Side, right: Side, config: Config) -> PairNumbers:
+    """Return the numbers of two sides; of several elements their mean.
+
+    Raises
+    ------
+    DefinitionError
+        The messages of a side have no such field or element.
+    """
+    sides = [left.columns(), right.columns()]
+    modulus = None
+    if not _is_speed(left, config):
+        modulus = find_modulus([column for side in sides for column in side], config.robot.encoder_counts_per_rev)
+        if modulus is None and left.table.message_type in BYTE_TYPES:
+            modulus = Modulus(256.0)
+    means = []
+    for side in sides:
+        wheels = [_unwrapped(column, modulus) for column in side]
+        means.append(wheels[0] if len(wheels) == 1 else np.asarray(np.mean(wheels, axis=0)))
+    return PairNumbers(means[0], means[1], modulus)
+
+
+def _is_speed(side: Side, config: Config) -> bool:
+    """Return whether the configuration, or the name of a field or topic, states that numbers are speeds."""
+    if config.wheels.quantity != "auto":
+        return config.wheels.quantity == "velocity"
+    found = (
+        words for name in (side.path, side.table.topic) for words in (_SPEED_WORDS, _PLACE_WORDS) if words.search(name)
+    )
+    return next(found, None) is _SPEED_WORDS
 
 
 def topic_of_side(name: str) -> str:
@@ -137,7 +179,7 @@ def _fields_of(channel: Channel, searched: set[tuple[str, str]]) -> list[str]:
     """
     topic, message_type = channel.topic, channel.message_type
     if message_type in PAIR_TYPES:
-        return ["data"]
+        return ["data"] if _may_be_side(topic, message_type, "data") else []
     if message_type in ARRAY_TYPES:
         return ["data[*]"] if _OF_WHEELS.search(topic) and not _OTHER_WORDS.search(topic) else []
     words = f"{topic} {message_type} {channel.definition}"
@@ -152,6 +194,8 @@ def _fields_of(channel: Channel, searched: set[tuple[str, str]]) -> list[str]:
 
 def _may_be_side(topic: str, message_type: str, path: str) -> bool:
     """Return whether a field may be a wheel's motion: a driver's messages hold currents and states, too."""
+    if message_type in BYTE_TYPES:
+        return path == "data" and bool(_OF_WHEELS.search(topic)) and not _OTHER_WORDS.search(topic)
     if message_type in PAIR_TYPES:
         return path == "data"
     if not _OF_WHEELS.search(f"{topic} {message_type} {path}") or _OTHER_WORDS.search(path):
@@ -194,7 +238,8 @@ def _array_motion(table: TopicTable, config: Config) -> WheelSource:
     What of a wheel's motion the mean of all does not have is the turning, which has opposite signs on the two sides.
     """
     values = table.column("data[*]")
-    wheels = np.array([_unwrapped(column) for column in values.T])
+    modulus = find_modulus(list(values.T), config.robot.encoder_counts_per_rev)
+    wheels = np.array([_unwrapped(column, modulus) for column in values.T])
     turning = wheels - wheels.mean(axis=0)
     turning -= turning.mean(axis=1, keepdims=True)
     alike = turning @ turning[0] > 0.0
@@ -218,7 +263,7 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
     try:
         if not (len(times) and len(held)):
             raise DefinitionError(topic, f"{(right if len(times) else left).table.topic} holds no message")
-        lefts, rights = left.values(), right.values()
+        lefts, rights, modulus = numbers_of(left, right, config)
         # While both were recorded: a side that is held for long would look like a turn.
         slack = max(_half_interval(times), _half_interval(held))
         both = (times >= held[0] - slack) & (times <= held[-1] + max(slack, _HOLD_NS))
@@ -227,19 +272,26 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
     except DefinitionError as err:
         return WheelSource(topic=topic, message_type=kind, stamps=stamps, score=score, problem=err.why)
     moments, first, integer = times[both], lefts[both].astype(np.float64), lefts.dtype.kind == "i"
-    not_recorded = (None, None)
-    position = speed = not_recorded
+    position: Sides = (None, None)
+    speed: Sides = (None, None)
     unit: WheelUnit = "unknown"
-    if _is_position(left, lefts, config, integer=integer):
+    note = COMMAND_NOTE if commanded else ""
+    if modulus is not None or _is_position(left, lefts, config, integer=integer):
         unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
         what = "ticks" if unit == "counts" else "angles or distances"
         position = first, np.interp(moments, held, rights)
+        if modulus is not None:
+            note = f"its numbers begin again at {modulus.text}, as they show: counted on{'; ' + note if note else ''}"
+            if modulus.value in TURNS and not integer:
+                unit, what = "rad", "angles"
+                radians = 2 * np.pi / modulus.value
+                position = first * radians, np.interp(moments, held, rights) * radians
     else:
         place = np.clip(np.searchsorted(held, moments + _half_interval(times), side="right") - 1, 0, None)
         what, speed = "speeds", (first, rights[place].astype(np.float64))
     header = None if stamps.header_ns is None else stamps.header_ns[both]
     stamps = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both])
-    why, note = f"{why}: {what}", COMMAND_NOTE if commanded else ""
+    why = f"{why}: {what}"
     return motion_of(
         topic=topic, message_type=kind, stamps=stamps, position=position, speed=speed, unit=unit, score=score, why=why,
         note=note,
@@ -263,17 +315,12 @@ def _half_interval(times: Ints) -> int:
     return int(np.median(np.diff(times))) // 2 if len(times) > 1 else 0
 
 
-def _unwrapped(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a counter (n,) without its wraps: of the least of 16 and 32 bits that holds all its numbers."""
-    if values.dtype.kind == "f" or not len(values):
+def _unwrapped(values: NDArray[Any], modulus: Modulus | None) -> NDArray[Any]:
+    """Return a counter (n,) counted on past its modulus; None: of the least of 16 and 32 bits that holds it."""
+    if not len(values) or (modulus is None and values.dtype.kind == "f"):
         return values
-    low, high = int(values.min()), int(values.max())
-    for bits in (16, 32):
-        half = 1 << (bits - 1)
-        if (low >= 0 and high < 2 * half) or (low >= -half and high < half):  # without or with sign
-            steps = np.mod(np.diff(values) + half, 2 * half) - half
-            return np.cumsum(np.concatenate([values[:1], steps]))
-    return values
+    size = modulus.value if modulus is not None else register_size(values)
+    return values if size is None else continued(values, size)
 
 
 def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: bool) -> bool:

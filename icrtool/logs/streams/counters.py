@@ -1,0 +1,164 @@
+"""Counters and angles that begin again at a modulus: found in the numbers, and continued."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from icrtool.kernels.arrays import Floats
+
+TURNS = (360.0, 2 * np.pi)
+"""Moduli of angles [deg, rad]."""
+
+FEWEST_STEPS = 20
+"""Of a shorter recording no modulus is found."""
+
+LARGE_STEP = 0.5
+"""A step that is a larger part of the range of the numbers passes the modulus; smaller ones do not."""
+
+CONSISTENT_SHARE = 0.9
+"""Share of the large steps that must agree with one modulus."""
+
+BETWEEN_WRAPS = 0.4
+"""Between two passages of the modulus in one direction, a counter covers at least this part of its range."""
+
+ROUND_STEPS = (1000.0, 500.0, 100.0, 360.0)
+"""Moduli of counters are mostly multiples of one of these; the first that fits is taken."""
+
+
+TURN_TOLERANCE = 1e-3
+"""Angles are recorded as less than a turn, or as up to a rounded one."""
+
+POWERS = 7, 33
+"""Counters of 7 to 32 bits are known."""
+
+FEWEST_PASSAGES = 2
+"""A single step back by an unknown modulus may be a restart of the robot."""
+
+
+class Modulus(NamedTuple):
+    """Where numbers begin again.
+
+    Attributes
+    ----------
+    value : the modulus, in the unit of the numbers
+    std : its standard deviation; 0 where it is a known one
+    """
+
+    value: float
+    std: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """The modulus in words."""
+        known = {360.0: "360 deg", 2 * np.pi: "2 pi rad"}
+        return known.get(self.value, f"{self.value:.6g}") + (f" ± {self.std:.2g}" if self.std else "")
+
+
+class _Wraps(NamedTuple):
+    """Large steps of a column: the modulus that each one shows (w,), its uncertainty (w,), the range of the column."""
+
+    moduli: Floats
+    spread: Floats
+    extent: float
+    between: float
+
+
+def find_modulus(columns: Iterable[NDArray[Any]], given: float | None = None) -> Modulus | None:
+    """Return the modulus at which all of some counters, or angles, begin again; None where none shows.
+
+    At a passage of the modulus a column steps by nearly all of its range, and the step that is left is like its
+    neighbours; between two passages the column runs through its range.
+
+    Parameters
+    ----------
+    columns : (n,) each, of the wheels of one robot; whole numbers, or numbers that may be angles
+    given : the encoder counts of a turn, which are tried first
+    """
+    arrays = [np.asarray(column) for column in columns]
+    found = [wraps for column in arrays if (wraps := _wraps_of(column.astype(np.float64))) is not None]
+    if not found:
+        return None
+    moduli, spread = np.concatenate([one.moduli for one in found]), np.concatenate([one.spread for one in found])
+    modulus = float(np.median(moduli))
+    whole = all(column.dtype.kind != "f" or not np.any(np.mod(column[np.isfinite(column)], 1.0)) for column in arrays)
+    extent = max(one.extent for one in found)
+    margin = 2.0 * float(np.median(spread)) + (1.0 if whole else 1e-6 * modulus)
+    if np.mean(np.abs(moduli - modulus) <= 2.0 * spread + margin) < CONSISTENT_SHARE:
+        return None
+    count, passages = len(moduli), max(len(one.moduli) for one in found)
+    if passages > 1 and sum(one.between for one in found) < BETWEEN_WRAPS * sum(len(one.moduli) - 1 for one in found):
+        return None
+    std = float(np.median(np.abs(moduli - modulus))) * 1.5 / np.sqrt(count) + float(np.median(spread)) / count
+    lowest = extent + (1.0 if whole else 0.0)
+    least, most = max(lowest, modulus - 3 * std), max(lowest + margin, modulus + 3 * std)
+    if (known := _known_between(least, most, given, whole=whole)) is not None:
+        return Modulus(known)
+    if passages < FEWEST_PASSAGES or not whole:
+        return None
+    rounded = (float(np.ceil(least / step) * step) for step in ROUND_STEPS)
+    found_round = next((one for one in rounded if one <= most), None)
+    return Modulus(max(modulus, least), std) if found_round is None else Modulus(found_round)
+
+
+def _known_between(least: float, most: float, given: float | None, *, whole: bool) -> float | None:
+    """Return the first known modulus in a range: a turn, that of the configured encoder, a power of two."""
+    turn = next((one for one in TURNS if least <= (1 + TURN_TOLERANCE) * one and one <= most), None)
+    if turn is not None or not whole:
+        return turn
+    counts = [*([] if given is None else [given]), *(float(1 << bits) for bits in range(*POWERS))]
+    return next((one for one in counts if least <= one <= most), None)
+
+
+def _wraps_of(values: Floats) -> _Wraps | None:
+    """Return the large steps of a column (n,), None where it has none that a modulus can explain."""
+    values = values[np.isfinite(values)]
+    if len(values) < FEWEST_STEPS:
+        return None
+    extent, steps = float(np.ptp(values)), np.diff(values)
+    large = np.abs(steps) > LARGE_STEP * extent
+    rows = np.flatnonzero(large)
+    if not len(rows) or 2 * len(rows) > len(steps):
+        return None
+    small = np.where(large, np.nan, steps)
+    before, after = (small[np.clip(rows + side, 0, len(steps) - 1)] for side in (-1, 1))
+    neighbours = np.column_stack([before, after])
+    known = np.isfinite(neighbours).any(axis=1)
+    rows, neighbours = rows[known], neighbours[known]
+    if not len(rows):
+        return None
+    filled = np.where(np.isfinite(neighbours), neighbours, neighbours[:, ::-1])
+    expected = filled.mean(axis=1)
+    moduli = np.abs(steps[rows]) - np.sign(steps[rows]) * expected
+    spread = np.abs(filled[:, 0] - filled[:, 1]) / 2 + 0.25 * np.abs(expected)
+    travel = np.cumsum(np.abs(np.where(large, 0.0, steps)))
+    between = float(np.clip(np.diff(travel[rows]) / max(extent, 1e-12), 0.0, 1.0).sum())
+    return _Wraps(moduli, spread, extent, between)
+
+
+def continued(values: NDArray[Any], modulus: float) -> NDArray[Any]:
+    """Return a counter (n,) without its passages of the modulus; numbers that are not finite stay in their places."""
+    steps = np.diff(values[np.isfinite(values)]) if values.dtype.kind == "f" else np.diff(values)
+    whole = values.dtype.kind != "f" and float(modulus).is_integer()
+    size = int(modulus) if whole else modulus
+    half = size // 2 if whole else size / 2
+    steps = np.mod(steps + half, size) - half
+    if values.dtype.kind != "f":
+        return np.cumsum(np.concatenate([values[:1], steps]))
+    result = values.copy()
+    finite = np.isfinite(values)
+    result[finite] = np.cumsum(np.concatenate([values[finite][:1], steps]))
+    return result
+
+
+def register_size(values: NDArray[Any]) -> float | None:
+    """Return the size of the counter of 16 or 32 bits that holds all whole numbers (n,); None: neither does."""
+    low, high = int(values.min()), int(values.max())
+    for bits in (16, 32):
+        half = 1 << (bits - 1)
+        if (low >= 0 and high < 2 * half) or (low >= -half and high < half):  # without or with sign
+            return float(2 * half)
+    return None
