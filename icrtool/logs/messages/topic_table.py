@@ -188,8 +188,8 @@ class TopicTable:
         values = self.find(*paths)
         return np.full(len(self), np.nan) if values is None else values.astype(np.float64, copy=False)
 
-    def rows(self, chosen: NDArray[np.bool_]) -> TopicTable:
-        """Return the table of the chosen messages."""
+    def rows(self, chosen: NDArray[np.bool_] | Ints) -> TopicTable:
+        """Return the table of the chosen messages (n,), or of those in some places (m,)."""
         columns = {path: values[chosen] for path, values in self.columns.items()}
         return replace(self, log_time_ns=self.log_time_ns[chosen], columns=columns)
 

@@ -13,9 +13,10 @@ from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, R
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams import headings, wheels
 from icrtool.logs.streams.headings import Bearing, Orientation
+from icrtool.logs.streams.joints import Joints
 from icrtool.logs.streams.positions import Fix, Solution
 from icrtool.logs.streams.sources import Source
-from icrtool.logs.streams.wheels import FixedWheels, Joints, Twist
+from icrtool.logs.streams.wheels import FixedWheels, Twist
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX, RTK_FIX, Role
 
 

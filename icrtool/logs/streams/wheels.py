@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from icrtool.config import Config
 from icrtool.errors import DefinitionError
-from icrtool.kernels.arrays import Bools, Floats, Ints, unwrapped
+from icrtool.kernels.arrays import Floats, unwrapped
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
 from icrtool.logs.streams.sources import Sides, WheelSource, motion_of, moves, of_topic
@@ -50,7 +50,7 @@ def of_wheels(
         if columns:
             # before a side is averaged: a front and a rear wheel do not begin a turn at the same time
             turns_modulo = quantity == "position" and unit == "rad"
-            means[quantity], stuck = _side_means([*map(_unwound, columns)] if turns_modulo else columns, lefts)
+            means[quantity], stuck = _side_means([*map(unwound_turns, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
     note = f"{listed([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
     note = note if dead else ""
@@ -77,7 +77,7 @@ def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set
     return (means[0], means[1]), dead
 
 
-def _unwound(position: Floats) -> Floats:
+def unwound_turns(position: Floats) -> Floats:
     """Return positions [rad] (n,) of a wheel; those recorded modulo one turn are unwrapped."""
     with np.errstate(invalid="ignore"):  # infinity less infinity is not within a turn
         if not np.fmax.reduce(position) - np.fmin.reduce(position) <= ONE_TURN_RAD:
@@ -90,97 +90,6 @@ def _unwound(position: Floats) -> Floats:
     unwound = position.copy()
     unwound[finite] = unwrapped(position[finite])
     return unwound
-
-
-@dataclass(frozen=True, slots=True)
-class Joints:
-    """A message type that lists joints by name, in any order; other joints may be listed in between.
-
-    Attributes
-    ----------
-    what, worth : what it is called where it is chosen, and how suitable it is
-    names, position, speed : fields of the lists
-    """
-
-    what: str
-    worth: float
-    names: str
-    position: str
-    speed: str
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """The fields that are read."""
-        return self.names, self.position, self.speed
-
-    def read(self, table: TopicTable, config: Config) -> WheelSource:
-        """Return the motion of those joints that are wheels."""
-        codes, texts = table.words(self.names)
-        given = config.wheels.left_joints, config.wheels.right_joints
-        left, right = (
-            [i for i, name in enumerate(texts) if name in configured] if configured else named
-            for configured, named in zip(given, wheel_joints(texts), strict=True)
-        )
-        lefts, names, alike = len(left), [texts[i] for i in left + right], np.zeros(0, np.bool_)
-        problem, places = "", codes
-        if not (left and right):
-            named = f"no left and right wheel among its joints {listed(texts)}"
-            problem = f"{named}; name them in wheels.{{left,right}}_joints" if texts else "lists no joints"
-        elif max(lefts, len(right)) > MOST_WHEELS:
-            problem = f"lists {lefts} left and {len(right)} right wheels; at most {MOST_WHEELS} of a side are read"
-        else:
-            # All messages list the same joints in the same order: one row stands for them.
-            places, alike = _places_of(left, right, codes[:1] if codes.strides[0] == 0 else codes, len(texts))
-            problem = "" if alike.any() else "left and right wheels come in different messages"
-        if problem:
-            return WheelSource(**of_topic(table), joints=tuple(texts), problem=problem)
-        if not alike.all():
-            table, places = table.rows(alike), places[alike]
-        why = f"{self.what}: left {listed(names[:lefts])}, right {listed(names[lefts:])}"
-        paths = {"position": self.position, "speed": self.speed}
-        return of_wheels(
-            lambda quantity: _by_wheel(table.find(paths[quantity]), places), lefts, names, "rad",
-            **of_topic(table), joints=tuple(texts), score=self.worth, why=why,
-        )  # fmt: skip
-
-
-def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: int) -> tuple[Ints, Bools]:
-    """Return the place of each wheel in the list of each message (n, k), and which messages (n,) are used.
-
-    A wheel that a message does not list is at -1. Those messages are used that list the set of wheels most do, of those
-    sets with both sides: a mean over wheels that changes its members would jump.
-    """
-    wheels = [*left, *right]
-    wheel = np.full(joints + 1, -1)
-    wheel[wheels] = np.arange(len(wheels))
-    rows, at = np.nonzero(wheel[codes] >= 0)
-    places = np.full((len(wheels), len(codes)), -1).T
-    places[rows, wheel[codes[rows, at]]] = at
-    present = places >= 0
-    both: Bools = np.logical_and(present[:, : len(left)].any(axis=1), present[:, len(left) :].any(axis=1))
-    sets = present[both]
-    if len(sets) and np.any(sets != sets[0]):
-        _, which, count = np.unique(sets, axis=0, return_inverse=True, return_counts=True)
-        both[both] = which.reshape(-1) == int(np.argmax(count))
-    return places, both
-
-
-def _by_wheel(values: NDArray[Any] | None, places: Ints) -> list[Floats]:
-    """Return the values (n,) of each wheel, NaN where it is not listed; none where nothing is recorded."""
-    if values is None:
-        return []
-    columns = []
-    for place in places.T:
-        rows = (place >= 0) & (place < values.shape[1])
-        if rows[0] and (place == place[0]).all():
-            columns.append(values[:, place[0]])
-        else:
-            column = np.full(len(values), np.nan)
-            # Where one row stands for all messages, none of them has a value of this wheel.
-            if len(place) == len(column):
-                column[rows] = values[rows, place[rows]]
-            columns.append(column)
-    return columns
 
 
 _ELEMENTS = re.compile(r"\[([\d,]+)\]")
