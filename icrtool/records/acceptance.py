@@ -65,14 +65,6 @@ class BudgetDistance(Record, frozen=True):
         )
 
     @property
-    def reach_text(self) -> str:
-        """As `short_text`, with the horizons that it was interpolated between where they are far."""
-        low, high = self.between_m
-        if self.beyond or high - low <= NEAR_HORIZONS_M:
-            return self.short_text
-        return f"{self.distance_m:.1f} m (interpolated between {low:g} and {high:g} m)"
-
-    @property
     def interval_text(self) -> str:
         """``13.2-15.0 m`` or ``at least 13.2 m``; empty where the interval leaves the budget nowhere."""
         if self.low_m is None:

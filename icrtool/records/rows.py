@@ -103,6 +103,9 @@ the rows ``calibration`` and ``topic``."""
 MOST_USEFUL, WITHOUT_IT = "recommended", "icr"
 """The row that stands for a log, and the one that does where a report has no held-out rows."""
 
+LONGEST_ROW_NAME = 28
+"""Characters of a row's name in tables and titles; of a longer one the middle is left out."""
+
 FURTHER_LOOKS: tuple[tuple[Color, Dash], ...] = (
     ("teal", "dashdot"), ("olive", "dashed"), ("slate", "solid"), ("teal", "dotted"), ("olive", "solid"),
     ("slate", "dashdot"), ("teal", "dashed"), ("olive", "dotted"), ("slate", "dotted"),

@@ -13,7 +13,8 @@ from icrtool.output.figures import style
 from icrtool.output.text_format import error_text, run_title
 from icrtool.records.acceptance import BudgetDistance
 from icrtool.records.dropout_document import ModelResult, column_of
-from icrtool.records.rows import row_of, rows_of, shown_rows
+from icrtool.records.rows import LONGEST_ROW_NAME, row_of, rows_of, shown_rows
+from icrtool.records.text import shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,7 +59,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
     pens = _pens(report)
     title = "Error over distance: no trial was long enough"
     if best is not None:
-        title = f"Within {best.budget_m:g} m (95 %) for {best.reach_text}"
+        title = f"{shortened(best.model, LONGEST_ROW_NAME)}: within {best.budget_m:g} m (95 %) for {best.short_text}"
     elif known := [row for row in models[0].document.by_horizon if row.p95_m is not None]:
         # Of a run that is not usable no distance is stated.
         refused = "" if report.usable else "Do not use: "
@@ -210,6 +211,8 @@ def _mark_reaches(
         axes.plot([one.distance_m], [one.budget_m], zorder=5, **style.spot("white", color=pen["color"]))
         left = number == 0 and one.distance_m > SPACE_OF_LABEL * axes.get_xlim()[1]
         offset_pt, ha, va = ((-5.0, 5.0), "right", "bottom") if left else ((5.0, -below_pt), "left", "top")
+        if not left and one.distance_m > (1.0 - SPACE_OF_LABEL) * axes.get_xlim()[1]:
+            offset_pt, ha = (-5.0, -below_pt), "right"
         look: style.Look = {"ha": ha, "va": va, "color": pen["color"], "fontweight": "bold", "zorder": 6}
         style.write_beside(axes, f"{one.distance_m:.1f} m", (one.distance_m, one.budget_m), offset_pt, **look)
         below_pt += 0.0 if left else LABEL_LINE_PT

@@ -319,8 +319,8 @@ def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
     """Return what the table shows of a log, by the name of its column; `budgets`: error names of distances."""
     columns = {}
     for name in budgets:
-        bound, budget = "> " if name in log.bounds else "", name.rpartition("_within_")[2].removesuffix("m_m")
-        columns[f"within {budget} m for"] = _cell(log.errors.get(name), partial("{}{:.1f} m".format, bound))
+        bound, (row, _, budget) = "> " if name in log.bounds else "", name.removesuffix("m_m").rpartition("_within_")
+        columns[f"{row} within {budget} m"] = _cell(log.errors.get(name), partial("{}{:.1f} m".format, bound))
     for model in IN_CSV:
         columns[f"error, {model}"] = _cell(log.errors.get(f"{model}_p95_{CHOICE_HORIZON_M:g}m_m"), error_text)
     columns["multiplier"] = _with_std(log.multiplier, log.multiplier_std, "")

@@ -38,7 +38,7 @@ from icrtool.output.text_format import (
 )
 from icrtool.records.acceptance import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
-from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT, base_of, in_order, row_of, shown_rows
+from icrtool.records.rows import LONGEST_ROW_NAME, MOST_USEFUL, WITHOUT_IT, base_of, in_order, row_of, shown_rows
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
@@ -135,7 +135,7 @@ def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
         if rows and not lead:
             name, lead, note = rows[0]
             text = f"within {budget_m:g} m (95 %), by wheel speeds alone with {name} ({note})"
-        shown = [(shortened(name, 28), distance, note) for name, distance, note in rows]
+        shown = [(shortened(name, LONGEST_ROW_NAME), distance, note) for name, distance, note in rows]
         blocks.append(Table("lrl", shown, caption=f"How far within {budget_m:g} m (95 %)?"))
         blocks.append(Section("Other models", [Table("lrl", others)], VERBOSE))
     if not blocks:

@@ -16,13 +16,10 @@ from icrtool.output.text_blocks import VERBOSE, Block, Cell, Chart, Figure, Item
 from icrtool.output.text_format import duration_text, error_text
 from icrtool.records.acceptance import CHOICE_HORIZON_M, METRICS
 from icrtool.records.dropout_document import DropoutDocument, ModelDocument, column_of
-from icrtool.records.rows import in_order, shown_rows
+from icrtool.records.rows import LONGEST_ROW_NAME, in_order, shown_rows
 from icrtool.records.run import why_no_vendor
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
-
-LONGEST_NAME = 26
-"""Characters of a model's name that are printed."""
 
 LISTED_HORIZONS = 4
 """More horizons than this without a trial are printed as a range."""
@@ -97,7 +94,7 @@ def _error_row(model: ModelDocument, shown: Sequence[int]) -> list[str | Cell]:
         low, high = row.p95_low_m, row.p95_high_m
         interval = "too short" if low is None else f"{error_text(low).removesuffix(' m')}-{error_text(high)}"
         cells.append(_error_cell(row.horizon_m, row.p95_m, row.expected_error_m, interval))
-    return [shortened(model.name, LONGEST_NAME), Cell("95 %", more=("interval", "expected")), *cells]
+    return [shortened(model.name, LONGEST_ROW_NAME), Cell("95 %", more=("interval", "expected")), *cells]
 
 
 def _error_cell(horizon_m: float, p95_m: float | None, expected_m: float | None, *interval: str) -> Cell:

@@ -146,7 +146,8 @@ def test_the_summary_marks_the_distances_that_the_report_states(report: DropoutR
     written = [text.get_text() for text in figure.axes[0].texts]
     shown = ("recommended", "controller", "calibration:season")
     assert sorted(written) == sorted(f"{reaches[name].distance_m:.1f} m" for name in shown)
-    assert reaches["calibration:season"].reach_text in figure.texts[0].get_text()
+    first = reaches["calibration:season"]
+    assert figure.texts[0].get_text() == f"calibration:season: within 0.1 m (95 %) for {first.short_text}"
     marks = [line.get_xydata()[0].tolist() for line in figure.axes[0].lines if line.get_marker() == "o"]
     assert sorted(marks) == sorted([reaches[name].distance_m, 0.1] for name in shown)
 
