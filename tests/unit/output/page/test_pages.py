@@ -230,10 +230,10 @@ def test_text_of_a_log_stays_text(hostile_run: Run, report: DropoutReport) -> No
 
 def test_json_in_a_page_cannot_end_its_element(page: str, run: Run, report: DropoutReport) -> None:
     made = report.document
-    models = tuple(msgspec.structs.replace(one, label="</script><b>&") for one in made.models)
-    document = msgspec.structs.replace(made, models=models)
+    named = msgspec.structs.replace(made.models[0], name="calibration:</script><b>&")
+    document = msgspec.structs.replace(made, models=(named, *made.models))
     found = run_page(run, document, {})
-    assert data_of(found)["models"][0]["label"] == "</script><b>&"
+    assert data_of(found)["errors"]["models"][0]["label"] == "calibration:</script><b>&"
     assert "</script><b>" not in found
 
 
