@@ -62,7 +62,7 @@ def fit(
     """
     check_type(log, RobotLog, "icrtool.read_log(path, config) reads one")
     request = FitRequest(changes_s=tuple(changes_s), smooth=smooth)
-    # The callee alone holds the log, and frees what it needs no longer.
+    # Only the called function holds the log, so that it can free the columns.
     held = [log]
     del log
     config = config if config is not None else Config()
@@ -142,7 +142,7 @@ def fit_into(
         inside = inside if place is directory else None
         check_target(place, log, overwrite=files.overwrite, inside=inside)
         stage("reading")
-        # Nothing but the callee holds the log.
+        # No name here holds the log: its columns are freed where they are needed no longer.
         run = fit_log(
             read_log(log, config, share, start=request.start, end=request.end), config, request,
             warm_start=start, watch=begin,

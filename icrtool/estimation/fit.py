@@ -33,7 +33,7 @@ def fit_filter(
 ) -> Run:
     """Return the run of a log without its motion model: align the sensors, run the filter, summarise.
 
-    Parameters, errors and the other stage are those of `icrtool.pipeline.fit_log`.
+    Parameters and errors are those of `icrtool.pipeline.fit_log`.
 
     Notes
     -----

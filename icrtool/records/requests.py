@@ -1,9 +1,9 @@
 """What is asked of a fit, of a dropout report and of a batch: one record for each question.
 
-The command line makes a request of its options, a public function makes it of its keyword arguments. It reaches the
-code that acts on it unchanged, and run.json or report.json holds it as ``request``. A request holds words and numbers;
-what is read from files for it (calibrations, a baseline, a warm start) is passed beside it. Requests hold no files'
-formats either: `ResultFiles` does.
+The command line makes a request from its options, a public function makes it from its keyword arguments. The code that
+acts on a request gets it unchanged, and run.json or report.json holds it as ``request``. A request holds words and
+numbers. Calibrations, a baseline or a warm start are read from files and passed as further arguments. `ResultFiles`
+states which files are written: it changes no number, and no document holds it.
 """
 
 from __future__ import annotations
@@ -76,11 +76,11 @@ class ReportRequest(Record, frozen=True, kw_only=True):
 
     @property
     def fit(self) -> FitRequest:
-        """What is asked of the fit of a log that is to be reported on so."""
+        """What is asked of a fit whose run shall have such a report."""
         return FitRequest(smooth=self.reference == "smoothed")
 
     def configured(self, config: Config) -> ReportRequest:
-        """Return it with the horizons and outages that a configuration sets, where it has none of its own."""
+        """Return the request with the horizons and outages of a configuration, where the request states none."""
         dropout, given = config.dropout, config.given
         return msgspec.structs.replace(
             self,
