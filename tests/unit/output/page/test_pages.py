@@ -268,7 +268,8 @@ def test_fixes_lie_by_the_smoothed_path_without_coordinates(run: Run, report: Dr
     grid = replace(table, north_m=table.north_m + 4_440_123.0, east_m=table.east_m + 612_345.0)
     fixes = replace(fixes, north_m=fixes.north_m + 4_440_123.0, east_m=fixes.east_m + 612_345.0)
     there = replace(run, table=grid, smoothed=grid, sensors=replace(run.sensors, fixes=fixes))
-    document = msgspec.structs.replace(report.document, smoothed=True)
+    asked = msgspec.structs.replace(report.document.request, reference="smoothed")
+    document = msgspec.structs.replace(report.document, request=asked)
     data = data_of(run_page(there, document, {}, coordinates=False))
     for axis in ("north", "east"):
         assert np.abs(numbers(data["fixes"]["used"][axis])).max() < 1000.0
