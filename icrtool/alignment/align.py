@@ -21,6 +21,7 @@ from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.records.measurements import Finding, IcrStart, Measurements, SensorData
+from icrtool.records.notes import about, note
 from icrtool.records.run import ICR_COLUMNS, width_or_usual_m
 from icrtool.records.tables import RobotLog
 
@@ -56,10 +57,10 @@ def align(log: RobotLog, config: Config) -> Measurements:
             spans = tuple((event.begin_ns, event.end_ns) for event in seen.events)
             found = _align_once(replace(log, slipping_ns=spans), config)
             seen = find_disagreements(found.sensors, width)
-    filled, note = bridged(found.sensors.wheels, config.filter.wheel_gap_s)
-    notes = (f"{log.name}: {note}",) if note else ()
+    filled, bridge = bridged(found.sensors.wheels, config.filter.wheel_gap_s)
+    notes = () if bridge is None else about(log.name, [bridge])
     sensors = replace(found.sensors, wheels=filled, events=seen.events, jumps=seen.jumps)
-    return replace(found, sensors=sensors, warnings=(*found.warnings, *notes))
+    return replace(found, sensors=sensors, notes=(*found.notes, *notes))
 
 
 def _align_once(log: RobotLog, config: Config) -> Measurements:
@@ -100,7 +101,7 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
         fix_statistics=quality.statistics,
         clock_std_s=found.delays.clock_std_s,
         antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
-        warnings=(*found.log.warnings, *found.warnings, *quality.warnings),
+        notes=(*found.log.notes, *found.notes, *quality.notes),
     )
 
 
@@ -266,8 +267,10 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
     streams = tuple(
         replace(stream, why=f"{stream.why}; {why}") if stream.role == "gnss" else stream for stream in best.streams
     )
-    note = f"{log.name}: the position reference is {topics[0]}, which {why}; topics.gnss sets it"
-    return replace(best, streams=streams, warnings=(*best.warnings, note))
+    found_better = note(
+        "reference_chosen", f"the position reference is {topics[0]}, which {why}; topics.gnss sets it", log.name
+    )
+    return replace(best, streams=streams, notes=(*best.notes, found_better))
 
 
 def agreement(log: RobotLog, config: Config) -> Agreement:

@@ -36,6 +36,7 @@ from icrtool.kernels.arrays import Complexes, Floats, trapezoids
 from icrtool.kernels.robust import mad_std, robust_regression, sandwich_covariance, soft_l1_loss
 from icrtool.kernels.track import Track
 from icrtool.motion.recording import fit_gyro_line
+from icrtool.records.notes import Note, note
 from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
@@ -227,18 +228,18 @@ def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
     return cost, math.remainder(offset * one.position, 2 * math.pi)
 
 
-def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
-    """Return sentences on which sides or senses are not as named; the heading's own is reported with its offset."""
+def convention_notes(decision: Decision, *, corrects: bool) -> list[Note]:
+    """Return findings on which sides or senses are not as named; the heading's own is reported with its offset."""
     one, other, done = decision.convention, decision.as_likely, ": corrected" if corrects else ""
     notes = []
     if one.swapped:
-        notes.append(f"left and right wheels are swapped{done}")
+        notes.append(note("sides_swapped", f"left and right wheels are swapped{done}"))
     signs = (one.sign_left, one.sign_right)
     reversed_ = {(-1, 1): "the left wheels", (1, -1): "the right wheels", (-1, -1): "both wheels"}
     if signs in reversed_:
-        notes.append(f"{reversed_[signs]} count backwards{done}")
+        notes.append(note("side_reversed", f"{reversed_[signs]} count backwards{done}"))
     if one.position < 0:
-        notes.append(f"positions are mirrored (east for west){done}")
+        notes.append(note("positions_mirrored", f"positions are mirrored (east for west){done}"))
     if other is not None:
         parts = {
             "swapped sides": other.swapped,
@@ -249,7 +250,8 @@ def convention_notes(decision: Decision, *, corrects: bool) -> list[str]:
         }
         words = " with ".join(part for part, is_so in parts.items() if is_so)
         words = words or "sides as named and a heading turned by 180°"
-        notes.append(f"{words} would explain the log as well: check the wheels' names")
+        why = f"{words} would explain the log as well: check the wheels' names"
+        notes.append(note("sides_ambiguous", why))
     return notes
 
 

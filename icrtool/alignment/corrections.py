@@ -49,6 +49,7 @@ from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.config import Config
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import RESPONSE_S, HeadingFacts, WheelFacts
+from icrtool.records.notes import Note, about, note
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
@@ -106,14 +107,14 @@ class StreamDelays(NamedTuple):
         return math.sqrt((std**2 + value**2) / (1.0 + agree))
 
 
-def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tuple[StreamDelays, list[str]]:
+def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tuple[StreamDelays, list[Note]]:
     """Return the delays of heading and positions against the wheels, those that are corrected, and what to report."""
     heading = position = apart = UNKNOWN
     if fit is not None:
         found = (Delay(*fit.estimate(name)) for name in ("heading_delay", "position_delay"))
         heading, position = (one if one.std_s < 2 * LARGEST_STD_S else UNKNOWN for one in found)
         apart = Delay(*fit.estimate("position_after_heading"))
-    together, notes, applied, lags = log.heading_is_of_position, list[str](), (0.0, 0.0), [0.0, 0.0]
+    together, notes, applied, lags = log.heading_is_of_position, list[Note](), (0.0, 0.0), [0.0, 0.0]
     if config.filter.rules.corrects:
         if fit is not None and not fit.slips:
             applied = _clear_delays(heading, position, apart, together=together)
@@ -153,19 +154,20 @@ def _is_large(delay_s: float) -> bool:
     return delay_s > RESPONSE_S or delay_s < -SMALLEST_LEAD_S
 
 
-def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bool], *, together: bool) -> list[str]:
-    """Return a line for each stream, heading and position, that was moved and is free to be."""
+def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bool], *, together: bool) -> list[Note]:
+    """Return a finding for each stream, heading and position, that was moved and is free to be."""
     subjects = [("the heading", "lags", "frames.heading_delay_s"), ("the position", "lags", "frames.reference_delay_s")]
     alike = not together and applied[0] == applied[1] and free[0]
     also = "; the position is corrected alike, as nothing shows that its delay differs" if alike else ""
     if together:
         subjects[1] = ("the position and its heading", "lag", "frames.reference_delay_s")
-    notes = list[str]()
+    notes = list[Note]()
     for row in [1] if together else [0] if alike else [0, 1]:
         (subject, lags, key), value = subjects[row], applied[row]
         if value != 0.0 and free[row]:
             fact = f"{subject} {lags} the wheels" if value > 0 else f"the wheels lag {subject}"
-            notes.append(f"{fact} by {abs(value):.2f} ± {std_s[row]:.2f} s: corrected; {key} sets it{also}")
+            why = f"{fact} by {abs(value):.2f} ± {std_s[row]:.2f} s: corrected; {key} sets it{also}"
+            notes.append(note("delay_corrected", why))
     return notes
 
 
@@ -179,7 +181,7 @@ class AlignedStreams(NamedTuple):
         with, beside the configured scales; correlation_s : of the noise of a stated heading, where it was raised
     track : what the estimate was made of; fit : the estimate, None where the drive is too short
     derived : the heading where it was estimated, else None
-    warnings : what was found, in sentences
+    notes : what was found
     """
 
     log: RobotLog
@@ -191,7 +193,7 @@ class AlignedStreams(NamedTuple):
     track: Track
     fit: AlignmentFit | None
     derived: DerivedHeading | None
-    warnings: tuple[str, ...]
+    notes: tuple[Note, ...]
 
     def steps(self) -> tuple[FixSteps, FixSteps]:
         """Return steps of position and of heading [rad] between the fixes, beyond the motion of the wheels.
@@ -255,13 +257,13 @@ def align_streams(log: RobotLog, config: Config) -> AlignedStreams:
         if lags[name] != 0.0
     }
     log = replace(log, **moved) if moved else log
-    warnings = tuple(f"{log.name}: {note}" for note in (*notes, *of_wheels, *of_heading, *of_delays))
-    return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, warnings)
+    found = about(log.name, (*notes, *of_wheels, *of_heading, *of_delays))
+    return AlignedStreams(log, wheels, scales, heading, correlation_s, delays, windows.track, fit, derived, found)
 
 
 def _name_streams(
     log: RobotLog, config: Config, width_m: float
-) -> tuple[RobotLog, DerivedHeading | None, Decision, DriveWindows, list[str], bool]:
+) -> tuple[RobotLog, DerivedHeading | None, Decision, DriveWindows, list[Note], bool]:
     """Find the heading of a log without one, then which side is which, and in which sense streams turn.
 
     Returns

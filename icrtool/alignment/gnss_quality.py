@@ -25,6 +25,7 @@ from icrtool.alignment.sensor_noise import (
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 from icrtool.records.measurements import Fixes, FixStatistics
+from icrtool.records.notes import Note, about, note
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 from icrtool.records.tables import RobotLog
 
@@ -63,7 +64,7 @@ class GnssQuality(NamedTuple):
     fixes: Fixes
     statistics: FixStatistics
     losses_ns: Ints
-    warnings: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: float = math.nan) -> GnssQuality:
@@ -106,7 +107,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
     std_m = {name: float(np.median(one)) if len(one) else math.nan for name, one in known.items()}
     losses = _losses(gnss.stamp_ns, fixed) if norm else np.empty((0, 2), np.int64)
     notes = _notes(fixes, stated, given, raised, changes=changes)
-    return GnssQuality(fixes, FixStatistics(std_m, white), losses, tuple(f"{log.name}: {note}" for note in notes))
+    return GnssQuality(fixes, FixStatistics(std_m, white), losses, about(log.name, notes))
 
 
 def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
@@ -147,8 +148,8 @@ def _losses(stamps: Ints, fixed: Bools) -> Ints:
     return np.column_stack([times[:-1][lost], ends[lost]])
 
 
-def _notes(fixes: Fixes, stated: Floats, given: Floats, raised: dict[str, float], *, changes: bool) -> list[str]:
-    """Return sentences on fixes that are not fixed, and on classes whose noise was raised to what they scatter by.
+def _notes(fixes: Fixes, stated: Floats, given: Floats, raised: dict[str, float], *, changes: bool) -> list[Note]:
+    """Return findings on fixes that are not fixed, and on classes whose noise was raised to what they scatter by.
 
     Parameters
     ----------
@@ -167,16 +168,16 @@ def _notes(fixes: Fixes, stated: Floats, given: Floats, raised: dict[str, float]
     )
     if misreported.any():
         text = f"{count} state {accuracy(misreported, 'that they are fixed')} but scatter or jump like RTK float"
-        notes.append(f"{text}{': taken as float' if changes else ''}")
+        notes.append(note("gnss_float_as_fixed", f"{text}{': taken as float' if changes else ''}"))
     if down.any():
         used = f"they are used with ±{np.median(given[down]):.2g} m"
-        notes.append(f"{down_count} are not RTK fixed, as most of this log are: {used}")
+        notes.append(note("gnss_not_fixed", f"{down_count} are not RTK fixed, as most of this log are: {used}"))
     for code, name in CLASSES.items():
         rows = fixes.fix_class == code
         if name in raised and not fixes.down_weighted[rows].all():
             kind = {REFERENCE: "poses", FIXED_FIX: "fixes"}.get(code, f"{name} fixes")
             scatter = f"scatter by {raised[name]:.2g} m: the scatter is used"
-            notes.append(f"the {kind} state {accuracy(rows, 'no accuracy')} and {scatter}")
+            notes.append(note("gnss_noise_raised", f"the {kind} state {accuracy(rows, 'no accuracy')} and {scatter}"))
     return notes
 
 

@@ -16,6 +16,7 @@ from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
 from icrtool.records.measurements import HeadingFacts
+from icrtool.records.notes import Note, note
 from icrtool.records.plain_data import known
 from icrtool.records.samples import Datum
 from icrtool.records.tables import RobotLog
@@ -108,7 +109,12 @@ DUAL_ANTENNA_TYPES = ("NavRELPOSNED", "DualAntennaHeading", "DUALANTENNAHEADING"
 
 SMALLEST_OFFSET_RAD = math.radians(1.0)
 OPPOSITE_SENSE = "the heading turns in the opposite sense to the course over ground"
-OTHER_CONVENTION = f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned"
+OTHER_CONVENTION = note(
+    "heading_convention_contradicts", f"{OPPOSITE_SENSE}: set frames.heading to the other of enu and ned"
+)
+
+OF_THE_SENSE = {"heading_convention_contradicts", "heading_convention_corrected"}
+"""Codes of findings about the sense of a heading, which its offset is stated with."""
 
 EXPLAINED = 0.8
 """Mean resultant length of angles above which they are one direction; share of those that turn about."""
@@ -172,7 +178,7 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
 def align_heading(
     log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseComparison, convention: Convention,
     derived: DerivedHeading | None,
-) -> tuple[HeadingFacts, float, list[str]]:  # fmt: skip
+) -> tuple[HeadingFacts, float, list[Note]]:  # fmt: skip
     """Return offset and noise of the heading, and what is applied.
 
     Parameters
@@ -189,7 +195,7 @@ def align_heading(
     corrects, mirrored = config.filter.rules.corrects, convention.heading < 0
     offset, std, scatter, applied, correlation_s = math.nan, math.nan, math.nan, 0.0, 0.0
     attitude = None if derived is None or derived.attitude is None else derived.estimate.offset
-    name, notes = NO_NAME, list[str]()
+    name, notes = NO_NAME, list[Note]()
     if corrects and config.frames.heading_offset_deg != "auto" and (derived is None or attitude is not None):
         applied = -math.radians(config.frames.heading_offset_deg)
     if fit is not None:
@@ -200,16 +206,16 @@ def align_heading(
     if noisy:
         correlation_s = course.duration_s
         spread = f"by {math.degrees(scatter):.0f}° about the course over ground"
-        notes.append(f"the heading scatters {spread}: its noise is raised to that")
+        notes.append(note("heading_scatters", f"the heading scatters {spread}: its noise is raised to that"))
     if attitude is not None:
         offset, std = attitude
         applied = offset
         text, name = _offset_in_words(log, offset, std, mirrored=mirrored)
-        notes = [note for note in notes if OPPOSITE_SENSE in note]
+        notes = [one for one in notes if one.code in OF_THE_SENSE]
         if not notes and _significant(offset, std):
             notes = [_offset_note(text, offset)]
     elif derived is not None:
-        notes = [f"the heading is estimated: {derived.why}"]
+        notes = [note("heading_estimated", f"the heading is estimated: {derived.why}")]
     stated_type = next((stream.message_type for stream in log.streams if stream.role == "heading"), "")
     of_antennas = any(name in stated_type for name in DUAL_ANTENNA_TYPES)
     source = "dual_antenna_message" if of_antennas else "orientation"
@@ -235,7 +241,7 @@ def align_heading(
 
 def _correction(
     log: RobotLog, config: Config, fit: AlignmentFit, convention: Convention, found: tuple[float, float], fixed: float
-) -> tuple[float, OffsetName, list[str]]:
+) -> tuple[float, OffsetName, list[Note]]:
     """Return what is subtracted from a stated heading [rad], what its offset comes from, and what to report.
 
     Parameters
@@ -249,18 +255,21 @@ def _correction(
     significant = _significant(offset - fixed, std)
     applies = config.frames.heading_offset_deg == "auto" and corrects
     applied = offset if applies and (mirrored or significant) else fixed
-    notes = []
+    notes = list[Note]()
     if mirrored and not corrects:
         notes.append(OTHER_CONVENTION)
     elif pose_mirrored:
-        notes.append("the heading of the same poses is mirrored likewise: corrected; frames.heading sets it")
+        why = "the heading of the same poses is mirrored likewise: corrected; frames.heading sets it"
+        notes.append(note("heading_mirrored", why))
     elif mirrored:
         yaw = f"its yaw is of the other convention (ENU/NED), offset {text}"
-        notes.append(f"{OPPOSITE_SENSE}: {yaw}: applied; frames.heading sets it")
+        why = f"{OPPOSITE_SENSE}: {yaw}: applied; frames.heading sets it"
+        notes.append(note("heading_convention_corrected", why))
     elif significant and applies:
         notes.append(_offset_note(text, applied))
     elif significant:
-        notes.append(f"heading is {text} off the course over ground; {-math.degrees(fixed):+z.1f}° is applied")
+        why = f"heading is {text} off the course over ground; {-math.degrees(fixed):+z.1f}° is applied"
+        notes.append(note("heading_offset_differs", why))
     return applied, name, notes
 
 
@@ -272,9 +281,9 @@ def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool
     return f"{math.degrees(math.remainder(rest, 2 * math.pi)):+z.1f}° ± {math.degrees(std):.1f}°{cause}", name
 
 
-def _offset_note(text: str, applied: float) -> str:
+def _offset_note(text: str, applied: float) -> Note:
     done = f"{-math.degrees(applied):+z.1f}° is applied; frames.heading_offset_deg sets it"
-    return f"heading is {text} off the course over ground: {done}"
+    return note("heading_offset_corrected", f"heading is {text} off the course over ground: {done}")
 
 
 def _significant(offset: float, std: float) -> bool:

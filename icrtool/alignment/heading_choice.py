@@ -24,6 +24,7 @@ from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats, rows_of_cells, trapezoids, unwrapped, wrapped
 from icrtool.kernels.robust import mad_std
 from icrtool.kernels.track import Track
+from icrtool.records.notes import note
 from icrtool.records.samples import (
     NO_HEADINGS,
     GyroAxes,
@@ -298,4 +299,6 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
 def without_heading(log: RobotLog, why: str) -> RobotLog:
     """Return the log without its heading, so that one is estimated; `why` is reported."""
     streams = tuple(one for one in log.streams if one.role != "heading")
-    return replace(log, heading=NO_HEADINGS, streams=streams, warnings=(*log.warnings, f"{log.name}: {why}"))
+    return replace(
+        log, heading=NO_HEADINGS, streams=streams, notes=(*log.notes, note("heading_left_out", why, log.name))
+    )

@@ -12,6 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from icrtool.config import FilterConfig
 from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
 from icrtool.records.measurements import Fixes
+from icrtool.records.notes import note
 from icrtool.records.samples import HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog
 
@@ -156,11 +157,8 @@ def without_frozen(log: RobotLog) -> RobotLog:
         return log
     keep = ~np.repeat(old, count)
     keep[first] = True
-    note = (
-        f"{log.name}: {np.count_nonzero(~keep)} fixes repeat the one before to the last digit while the wheels go on: "
-        "left out"
-    )
-    return replace(log, gnss=gnss.cut(keep), warnings=(*log.warnings, note))
+    why = f"{np.count_nonzero(~keep)} fixes repeat the one before to the last digit while the wheels go on: left out"
+    return replace(log, gnss=gnss.cut(keep), notes=(*log.notes, note("fixes_frozen", why, log.name)))
 
 
 LARGEST_SANE_GNSS_STD_M, LARGEST_SANE_HEADING_STD_RAD = 100.0, math.radians(60.0)

@@ -22,6 +22,7 @@ from icrtool.kernels.arrays import rows_at_steps, unwrapped
 from icrtool.kernels.robust import robust_regression, sandwich_covariance
 from icrtool.kernels.track import Track
 from icrtool.records.measurements import WheelFacts
+from icrtool.records.notes import Note, note
 from icrtool.records.plain_data import known
 from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import RobotLog
@@ -68,7 +69,7 @@ def scaled(log: RobotLog, left: float, right: float) -> RobotLog:
     return replace(log, wheels=replace(wheels, left=left * wheels.v_left_mps, right=right * wheels.v_right_mps))
 
 
-def bridged(wheels: WheelSamples, gap_s: float) -> tuple[WheelSamples, str]:
+def bridged(wheels: WheelSamples, gap_s: float) -> tuple[WheelSamples, Note | None]:
     """Return wheels that report positions with samples in their gaps, and what to report.
 
     Parameters
@@ -85,20 +86,21 @@ def bridged(wheels: WheelSamples, gap_s: float) -> tuple[WheelSamples, str]:
     steps = np.ones(len(wheels.stamp_ns), np.int64)
     filled = (interval > gap_s) & (interval <= LONGEST_BRIDGE_S) & (interval >= 2.0 * usual)
     if not (wheels.from_position and filled.any()):
-        return wheels, ""
+        return wheels, None
     steps[:-1][filled] = np.round(interval[filled] / usual).astype(np.int64)
     row = np.repeat(np.arange(len(steps)), steps)
     within = np.arange(len(row)) - np.repeat(np.cumsum(steps) - steps, steps)
     length = np.append(np.diff(wheels.stamp_ns), 0)
     stamps = wheels.stamp_ns[row] + length[row] * within // steps[row]
-    note = (
+    found = note(
+        "wheel_gaps_bridged",
         f"{np.count_nonzero(filled)} gaps in the wheel data, {interval[filled].sum():.1f} s in all, are bridged "
-        "with the distance that the wheel positions show"
+        "with the distance that the wheel positions show",
     )
-    return replace(wheels, stamp_ns=stamps, left=wheels.left[row], right=wheels.right[row]), note
+    return replace(wheels, stamp_ns=stamps, left=wheels.left[row], right=wheels.right[row]), found
 
 
-def dead_or_copied(log: RobotLog) -> list[str]:
+def dead_or_copied(log: RobotLog) -> list[Note]:
     """Return a warning where a side never moves while the other does, or copies the other while the robot turns."""
     left, right = log.wheels.v_left_mps, log.wheels.v_right_mps
     seconds = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
@@ -114,16 +116,17 @@ def dead_or_copied(log: RobotLog) -> list[str]:
         if (distance := gone[end] - gone[begin]) > DEAD_M:
             span = f"from {seconds[begin]:.0f} s to {seconds[end]:.0f} s, while the others go {distance:.0f} m"
             meaning = "if so, do not use the ICRs: topics.wheels chooses others, --from and --to read the rest"
-            return [f"the {side} wheels hardly ever move {span}: is their encoder dead? {meaning}"]
+            why = f"the {side} wheels hardly ever move {span}: is their encoder dead? {meaning}"
+            return [note("side_dead", why)]
     if np.array_equal(left, right) and float(np.ptp(unwrapped(log.heading.heading_rad))) > SMALLEST_TURN_RAD:
         cause = "one is a copy of the other, or the robot steers as a car does, and has no track ICRs"
-        return [f"left and right wheels are equal throughout while the robot turns: {cause}"]
+        return [note("sides_equal", f"left and right wheels are equal throughout while the robot turns: {cause}")]
     return []
 
 
 def align_wheels(
     log: RobotLog, config: Config, fit: AlignmentFit | None, configured: tuple[float, float], *, sound: bool
-) -> tuple[WheelFacts, tuple[float, float], list[str]]:
+) -> tuple[WheelFacts, tuple[float, float], list[Note]]:
     """Return what is known of the wheels, what the sides are multiplied with, left and right, and what to report.
 
     Parameters
@@ -132,7 +135,7 @@ def align_wheels(
     fit : of it, None where the drive is too short
     sound : no side is dead or a copy of the other
     """
-    wheels, notes, applied = log.wheels, list[str](), (1.0, 1.0)
+    wheels, notes, applied = log.wheels, list[Note](), (1.0, 1.0)
     filtered = "" if fit is None or not sound else find_filtering(fit)
     if fit is not None and not filtered:
         applied, notes = _find_scales(fit, config, sound=sound)
@@ -141,7 +144,8 @@ def align_wheels(
     share = float(same[moving].mean()) if np.count_nonzero(moving) >= FEWEST_WINDOWS else 0.0
     if share > HELD_SHARE:
         rate = (1.0 - share) * 1e9 / float(np.median(np.diff(wheels.stamp_ns)))
-        notes.append(f"wheel values are held: they change {rate:.1f} times a second while moving")
+        why = f"wheel values are held: they change {rate:.1f} times a second while moving"
+        notes.append(note("wheel_values_held", why))
     scale, std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
     windows = 0 if fit is None else len(fit.windows.begin)
     facts = WheelFacts(
@@ -159,7 +163,7 @@ def align_wheels(
     return facts, applied, [*notes, *_fused_note(log)]
 
 
-def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[str]]:
+def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[Note]]:
     """Return the factors to apply to the speeds of the left and of the right side, and what to report.
 
     Notes
@@ -170,10 +174,10 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
     if fit.slips:
         apart = f"their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
         slip = f"over {fit.windows.length_m[0]:.0f} m {apart}, their turns by {100 * fit.turn_slip:.0f} %"
-        return (1.0, 1.0), [f"the wheels slip: {slip}; no scale and no delay is corrected"]
+        return (1.0, 1.0), [note("wheels_slip", f"the wheels slip: {slip}; no scale and no delay is corrected")]
     given = config.wheels.left_scale != "auto" or config.wheels.right_scale != "auto"
     may = config.filter.rules.corrects and sound and not given
-    factor, notes = 1.0, list[str]()
+    factor, notes = 1.0, list[Note]()
     scale, std = fit.estimate("scale")
     error, kept = abs(scale - 1.0), USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
     # twice the log-likelihood of a scale of its own, less that of none
@@ -183,9 +187,10 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
         text = f"the robot goes {100 * scale:.1f} ± {100 * std:.1f} % of the distance that the wheels report"
         if may and (small or any(abs(scale / value - 1.0) < FACTOR_TWO_TOLERANCE for value in (0.5, 2.0))):
             factor = scale
-            notes.append(f"{text}: corrected; wheels.left_scale and right_scale set it")
+            done = "corrected; wheels.left_scale and right_scale set it"
+            notes.append(note("wheel_scale_corrected", f"{text}: {done}"))
         else:
-            notes.append(f"{text}: check wheel radius, encoder resolution and units")
+            notes.append(note("wheel_scale_differs", f"{text}: check wheel radius, encoder resolution and units"))
     (asymmetry, asymmetry_std), (turn, turn_std) = fit.estimate("asymmetry"), fit.estimate("turn")
     if turn <= 0.0:
         return (factor, factor), notes
@@ -197,12 +202,12 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
     text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other} one"
     text = f"{text} where both report the same distance"
     if not may:
-        return (factor, factor), [*notes, f"{text}: check wheel radii and tyre pressures"]
-    notes.append(f"{text}: corrected; wheels.left_scale and right_scale set it")
+        return (factor, factor), [*notes, note("side_scale_differs", f"{text}: check wheel radii and tyre pressures")]
+    notes.append(note("side_scale_corrected", f"{text}: corrected; wheels.left_scale and right_scale set it"))
     return (factor * (1.0 + difference / 2), factor * (1.0 - difference / 2)), notes
 
 
-def _fused_note(log: RobotLog) -> list[str]:
+def _fused_note(log: RobotLog) -> list[Note]:
     """Warn of wheels that are another filter's output: their turn rate is the gyro's."""
     stream = next((one for one in log.streams if one.is_twist), None)
     if stream is None or log.gyro is None:
@@ -213,7 +218,7 @@ def _fused_note(log: RobotLog) -> list[str]:
     if not (np.ptp(rate) > 0.1 and np.ptp(apart) > 0 and float(np.corrcoef(rate, apart)[0, 1]) > FUSED_CORRELATION):
         return []
     fact = f"{stream.topic} turns exactly as the gyro does: it is fused, not measured by wheels, and shows no slip"
-    return [f"{fact}; name the wheels' own topic with topics.wheels"]
+    return [note("wheels_fused", f"{fact}; name the wheels' own topic with topics.wheels")]
 
 
 STARTS_A_SPAN, FEWEST_SPANS = 4, 6

@@ -23,6 +23,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.robust import mad_std
+from icrtool.records.notes import Note, about, note
 from icrtool.records.samples import NO_HEADINGS, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
 
@@ -63,7 +64,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     """Return the log with wheel speeds in m/s; the same log where its speeds are ready to use.
 
     What no wheel can have done is left out. What was used, and what had to be estimated, stands in the stream's
-    ``why`` and in the warnings.
+    ``why`` and in the findings.
 
     Raises
     ------
@@ -81,21 +82,23 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     except ConfigError:
         refuse_standing(log)
         raise
-    warnings = [f"{log.name}: {note}" for note in estimated]
+    notes = [*estimated]
     with np.errstate(over="ignore"):
         left, right = wheels.left * factor, wheels.right * factor
     stamps = wheels.stamp_ns
     possible = (np.abs(left) <= FASTEST_MPS) & (np.abs(right) <= FASTEST_MPS)
     if not possible.all():
         count = np.count_nonzero(~possible)
-        warnings.append(f"{log.name}: {topic}: {count} wheel speeds over {FASTEST_MPS:.0f} m/s left out")
+        why = f"{topic}: {count} wheel speeds over {FASTEST_MPS:.0f} m/s left out"
+        notes.append(note("wheel_speeds_impossible", why))
         stamps, left, right = stamps[possible], left[possible], right[possible]
     if (spikes := _spikes(left) | _spikes(right)).any():
-        warnings.append(
-            f"{log.name}: {topic}: {np.count_nonzero(spikes)} wheel speeds, up to "
+        why = (
+            f"{topic}: {np.count_nonzero(spikes)} wheel speeds, up to "
             f"{max(np.abs(left).max(), np.abs(right).max()):.0f} m/s, unlike those around them left out: "
             "were counters reset?"
         )
+        notes.append(note("wheel_speeds_impossible", why))
         stamps, left, right = stamps[~spikes], left[~spikes], right[~spikes]
     if len(stamps) < 2:
         raise DataError(log.name, f"{topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
@@ -104,7 +107,7 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
         for stream in log.streams
     )
     samples = WheelSamples(stamps, left, right, from_position=wheels.from_position)
-    return replace(log, wheels=samples, streams=streams, warnings=(*log.warnings, *warnings))
+    return replace(log, wheels=samples, streams=streams, notes=(*log.notes, *about(log.name, notes)))
 
 
 def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
@@ -195,7 +198,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
 
 def _metres_per_unit(
     wheels: WheelSamples, gnss: PositionFixes, config: Config, topic: str
-) -> tuple[float, str, list[str]]:
+) -> tuple[float, str, list[Note]]:
     """Return metres per unit, how it is known in words, and what had to be estimated because a key is missing."""
     radius, counts = config.robot.wheel_radius_m, config.robot.encoder_counts_per_rev
     known: dict[WheelUnit, float] = {"m": 1.0}
@@ -211,7 +214,7 @@ def _metres_per_unit(
         for other, value in (("m/s", 1.0), ("rpm", 2 * math.pi * radius / 60), ("deg/s", math.radians(radius))):
             if scale is not None and far and abs(math.log(scale.value / value)) < OTHER_UNIT_TOLERANCE:
                 why = f"{topic} is read in {other}, not rad/s: the position reference goes as far as that"
-                return value, f" in {other} (by the position reference)", [why]
+                return value, f" in {other} (by the position reference)", [note("wheel_unit_found", why)]
     if unit in known:
         return known[unit], "" if unit == "m" else f" in {unit}{per}", []
     scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
@@ -235,7 +238,7 @@ def _metres_per_unit(
     what = {"rad": "wheel radius", "counts": "travel of a count"}.get(unit, "travel of a unit of the wheels")
     how = f"{what} {_with_std(scale)} m (estimated from the position reference)"
     why = f"{topic} names no unit, and none that is known fits" if unit == "unknown" else f"{lacking} is not given"
-    return scale.value, f", {how}", [f"{why}: {how}"]
+    return scale.value, f", {how}", [note("wheel_unit_estimated", f"{why}: {how}")]
 
 
 def _with_std(scale: Scale) -> str:

@@ -24,6 +24,7 @@ from icrtool.motion.recording import ErrorsOf, GyroLine, Recording, cut_windows,
 from icrtool.motion.window_fit import Fold, Prediction, own_constants
 from icrtool.records import calibration_document as documents
 from icrtool.records.measurements import MeasuredHeading
+from icrtool.records.notes import Note, note
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
 from icrtool.records.run_document import RecommendedDocument
@@ -130,12 +131,12 @@ class CalibrationResult(NamedTuple):
 
     calibration: Calibration
     table: held_out.HeldOut
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
     left_out: tuple[LeftOut, ...] = ()
 
 
 def calibrate_recordings(
-    recordings: Sequence[Recording], robot: documents.CalibratedRobot | None = None, warnings: tuple[str, ...] = ()
+    recordings: Sequence[Recording], robot: documents.CalibratedRobot | None = None, findings: tuple[Note, ...] = ()
 ) -> CalibrationResult:
     """Fit the motion models to all recordings, and test each on what it was not fitted to.
 
@@ -143,7 +144,7 @@ def calibrate_recordings(
     ----------
     recordings : one or many, of one robot
     robot : as its calibration holds it; default: of no name
-    warnings : what to know before use
+    findings : what to know before use
 
     Raises
     ------
@@ -161,12 +162,13 @@ def calibrate_recordings(
         raise ConfigError(min(twice), "given twice", "name each log once: it would be tested on itself")
     table = held_out.hold_out(recordings)
     turnless = ", ".join(one.name for one in recordings if one.track.gyro is None)
-    notes = (f"no gyro that turns with the robot in {turnless}: wheels alone",) if turnless else ()
-    return CalibrationResult(calibration_from(table, robot, warnings), table, notes)
+    text = f"no gyro that turns with the robot in {turnless}: wheels alone"
+    notes = (note("gyro_not_used", text),) if turnless else ()
+    return CalibrationResult(calibration_from(table, robot, findings), table, notes)
 
 
 def calibration_from(
-    table: held_out.HeldOut, robot: documents.CalibratedRobot | None = None, warnings: tuple[str, ...] = ()
+    table: held_out.HeldOut, robot: documents.CalibratedRobot | None = None, findings: tuple[Note, ...] = ()
 ) -> Calibration:
     """Return the calibration of the recordings that a held-out table is of."""
     recordings, best = table.recordings, table.fits[RECOMMENDED]
@@ -211,7 +213,8 @@ def calibration_from(
         held_out=tuple(by_fold),
         held_out_pooled=tuple(together),
         error_sources=held_out.measure_error_sources(table, RECOMMENDED),
-        warnings=warnings,
+        notes=findings,
+        warnings=tuple(one.sentence for one in findings),
     )
 
 
@@ -279,20 +282,20 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
     """Calibrate as `calibrate` does, with the table of the test; one run at a time is held."""
     taken: list[_Taken] = []
     left_out: list[LeftOut] = []
-    alone: tuple[str, ...] = ()
+    alone: tuple[Note, ...] = ()
     for run in runs:
         check_type(run, Run, MAKE_RUN)
         recording = turning_recording_of(run)
         robot = robot_of(run, recording.width_m)
         positions = run.sensors.fixes.north_m + 1j * run.sensors.fixes.east_m
-        one = _Taken(recording, positions, robot, use_warnings(run, alone=False))
+        one = _Taken(recording, positions, robot, use_notes(run, alone=False))
         if why := _why_left_out(run, one, taken, allow_unusable=allow_unusable):
             left_out.append(LeftOut(run.name, why))
             continue
         parts = [_is_part(before, one) for before in taken]
         left_out += [LeftOut(taken[i].recording.name, f"a part of {run.name}") for i in np.flatnonzero(parts)]
         taken = [*(before for before, is_part in zip(taken, parts, strict=True) if not is_part), one]
-        alone = use_warnings(run)
+        alone = use_notes(run)
     recordings, robots = [one.recording for one in taken], [one.robot for one in taken]
     if not recordings:
         if not left_out:
@@ -303,7 +306,7 @@ def calibrate_runs(runs: Iterable[Run], *, allow_unusable: bool = False) -> Cali
     if len(found := {robot.wheel_radius_m for robot in robots}) > 1:
         why = f"{' and '.join(sorted(map(str, found)))} in the logs given"
         raise ConfigError("robot.wheel_radius_m", why, "fit them with the same value: parameters refer to it")
-    known = alone if len(taken) == 1 else tuple(dict.fromkeys(text for one in taken for text in one.warnings))
+    known = alone if len(taken) == 1 else tuple(dict.fromkeys(known for one in taken for known in one.notes))
     return calibrate_recordings(recordings, robots[0], known)._replace(left_out=tuple(left_out))
 
 
@@ -313,13 +316,13 @@ class _Taken(NamedTuple):
     Attributes
     ----------
     positions : complex (m,), of its fixes, north + i east [m]
-    warnings : of its use beside others
+    notes : of its use beside others
     """
 
     recording: Recording
     positions: Complexes
     robot: documents.CalibratedRobot
-    warnings: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 def _is_part(one: _Taken, of: _Taken) -> bool:
@@ -369,15 +372,16 @@ def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
     )
 
 
-def use_warnings(run: Run, *, alone: bool = True) -> tuple[str, ...]:
+def use_notes(run: Run, *, alone: bool = True) -> tuple[Note, ...]:
     """Return what to know of a run before a calibration from it is used; `alone`: it is from no other."""
-    warnings: list[str] = []
+    found: list[Note] = []
     if alone:
-        warnings += [] if run.usable else [f"not usable: {run.document.unusable_because}"]
-        warnings += run.document.excitation.sentences
+        found += [] if run.usable else [note("run_not_usable", f"not usable: {run.document.unusable_because}")]
+        found += run.document.excitation.notes
     if are_twist(run.document.streams) and run.config.wheels.twist_width_m is None:
-        warnings.append(
+        why = (
             "the wheels were read from body twists, which hold the controller's own multipliers: "
             "these numbers are right only where b and radius are those the twists were made with"
         )
-    return tuple(warnings)
+        found.append(note("wheels_from_twist", why))
+    return tuple(found)

@@ -30,6 +30,7 @@ from icrtool.motion.models import (
 )
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
+from icrtool.records.notes import Note, is_grave, note
 from icrtool.records.plain_data import plain
 from icrtool.records.run import WarmStart, call_output
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument
@@ -62,7 +63,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     geometry, geometry_std : ICRs [m], multiplier and radius factors, from one fit
     controller : what a controller is given, and the errors of that, where the drive is long enough to measure them
     error_sources : variances of what the model leaves out, for wheels alone; None where the drive is too short
-    warnings : what to know before use
+    notes : what to know before use; `warnings` : their sentences
     created : date and time, UTC, ISO 8601
     name : stem of the file that it was read from, which does not hold it
 
@@ -287,32 +288,32 @@ LARGEST_SHARE = 0.5
 """A calibration whose 95 % error is more than this share of the distance is not fit for use."""
 
 
-def unfit_reasons(calibration: Calibration) -> tuple[str, ...]:
+def unfit_reasons(calibration: Calibration) -> tuple[Note, ...]:
     """Return why a calibration is not fit for use, by what it was tested on; empty where it is."""
-    reasons = [one for one in calibration.warnings if one.startswith("not usable")]
+    reasons = [one for one in calibration.notes if is_grave(one)]
     p95, expected = calibration.held_out_m(RECOMMENDED, POSE_AFTER_M)
     _, without = calibration.held_out_m(NO_SLIP, POSE_AFTER_M)
     if p95 > LARGEST_SHARE * POSE_AFTER_M:
-        reasons.append(f"its error after {POSE_AFTER_M:g} m is {p95:.1f} m (95 %, held out of the fit)")
+        why = f"its error after {POSE_AFTER_M:g} m is {p95:.1f} m (95 %, held out of the fit)"
+        reasons.append(note("calibration_error_large", why))
     if expected >= without:
         errors = f"expected error {expected:.2f} m and {without:.2f} m, held out of the fit"
-        reasons.append(f"it is no better than no slip: {errors}")
+        reasons.append(note("calibration_no_better", f"it is no better than no slip: {errors}"))
     if "omega_w" in calibration.fitted.not_shown:
-        reasons.append("the driving did not show how the robot turns (omega_w)")
+        reasons.append(note("turning_not_shown", "the driving did not show how the robot turns (omega_w)"))
     return tuple(reasons)
 
 
-def export_warnings(calibration: Calibration) -> tuple[str, ...]:
-    """Return what to know before a controller uses a calibration, a sentence each."""
-    warnings = [one for one in unfit_reasons(calibration) if one not in calibration.warnings]
-    warnings += [
-        f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
-        for name in calibration.fitted.not_shown
-    ]
+def export_notes(calibration: Calibration) -> tuple[Note, ...]:
+    """Return what to know before a controller uses a calibration."""
+    found = [one for one in unfit_reasons(calibration) if one not in calibration.notes]
+    for name in calibration.fitted.not_shown:
+        why = f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
+        found.append(note("parameter_not_shown", why))
     if (multiplier := calibration.controller.multiplier) < 1.0:
         why = "a skid-steer robot turns less than its wheels, not more"
-        warnings.append(f"a multiplier of {multiplier:.2f} is below 1: {why}")
-    return (*calibration.warnings, *warnings)
+        found.append(note("multiplier_below_one", f"a multiplier of {multiplier:.2f} is below 1: {why}"))
+    return (*calibration.notes, *found)
 
 
 def factor_to_old(calibration: Calibration) -> float | None:

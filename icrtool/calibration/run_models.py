@@ -23,6 +23,7 @@ from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
 from icrtool.motion.models import FIVE, ICRS, NO_SLIP, RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.measurements import MeasuredHeading
+from icrtool.records.notes import Note, note
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.rows import row_of
 from icrtool.records.run import ICR_COLUMNS, Run, no_slip_icrs, vendor_icrs, width_or_usual_m
@@ -115,7 +116,7 @@ class ComparedModels(NamedTuple):
     table: HeldOut
     track: Track
     heading: str
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
     calibration: Calibration | None
 
 
@@ -142,29 +143,33 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     if unknown := " and ".join(word for word, known in parts.items() if not known):
         what = f"how far {unknown} the body's origin the position is measured is not known"
         lever = "in row controller it is a constant of this log"
-        notes.append(f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it")
+        why = f"{what}: {lever}; frames.antenna_forward_m and antenna_right_m set it"
+        notes.append(note("lever_unknown", why))
     found = hold_out([recording])
     give_back_freed()
     rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
     calibration = None
     if run.track_width_m is not None:
-        calibration = pooled.calibration_from(found, pooled.robot_of(run, recording.width_m), pooled.use_warnings(run))
+        calibration = pooled.calibration_from(found, pooled.robot_of(run, recording.width_m), pooled.use_notes(run))
     return ComparedModels(tuple(rows), found, recording.track, heading, tuple(notes), calibration)
 
 
-def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, list[str]]:
+def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Recording, str, list[Note]]:
     """Return the recording with the first measured heading that turns with the robot, its kind, and notes."""
-    notes = []
+    notes = list[Note]()
     plain = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     for one in headings:
         found = pooled.with_turn_rate(plain, one)
         if found.track.gyro is not None:
             if found.gyro_reversed:
-                notes.append(f"the {one.kind} counts turns in the other direction: its sign was changed")
+                why = f"the {one.kind} counts turns in the other direction: its sign was changed"
+                notes.append(note("gyro_sign_changed", why))
             return found, one.kind, notes
-        notes.append(f"the {one.kind} does not turn with the robot: rows with it are left out")
+        why = f"the {one.kind} does not turn with the robot: rows with it are left out"
+        notes.append(note("gyro_not_used", why))
     if not notes:
-        notes.append("the run holds no heading measured apart from the position: no rows with one")
+        why = "the run holds no heading measured apart from the position: no rows with one"
+        notes.append(note("gyro_not_used", why))
     return plain, "", notes
 
 

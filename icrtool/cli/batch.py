@@ -27,6 +27,7 @@ with when_used():
     from icrtool.output import text_blocks
     from icrtool.output.exports import acceptance
     from icrtool.output.files import remote_place
+    from icrtool.records import notes
 
 if TYPE_CHECKING:
     from icrtool.records.fleet_document import FleetLog
@@ -209,14 +210,14 @@ class View(LiveLine):
 
 def line_of(row: FleetLog) -> str:
     """Return a line about a log that could be used."""
-    # Of a log that can be used, the only reason is that its end is missing.
-    word = "skipped" if row.this_time == "skipped" else "cut off" if row.usable and row.reason else row.status
+    is_cut = row.usable and "log_cut_off" in row.codes
+    word = "skipped" if row.this_time == "skipped" else "cut off" if is_cut else row.status
     parts = [f"{word:7}", str(LogText(row.log))]
     if row.distance_m is not None:
         parts.append(f"{row.distance_m:.0f} m")
     if not row.usable:
-        # the first cause; all of it stands in fleet.csv
-        cause = re.split("[:;] ", row.reason.removeprefix("not usable: "))[0]
+        # the first cause, without its numbers; all of it stands in fleet.csv
+        cause = re.split("[:;] ", next((one.text for one in row.notes if notes.is_grave(one)), ""))[0]
         return "  ".join([*parts, f"do not use: {escaped(cause)}"])
     if row.multiplier is not None:
         parts.append(f"multiplier {row.multiplier:.3f} ± {row.multiplier_std or 0.0:.3f}")

@@ -73,7 +73,7 @@ def export_command(source: Path | None, target: str, output: Path | None, force:
         name, found = read_calibration(source, force=force, advice=f"; {ALL_THE_SAME}")
         if (reasons := record.unfit_reasons(found)) and not force:
             advice = f"calibrate with other logs; {ALL_THE_SAME}"
-            raise errors.DataError(name, f"not fit for use: {reasons[0]}", advice)
+            raise errors.DataError(name, f"not fit for use: {reasons[0].text}", advice)
         text = controllers.format_export(found, cast(ControllerTarget, target))
     else:
         run = _run(source, output)

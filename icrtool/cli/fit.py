@@ -26,7 +26,7 @@ with when_used():
     from icrtool.output import text_format
     from icrtool.output.tables import overview
     from icrtool.output.tables import run as run_tables
-    from icrtool.records import plain_data
+    from icrtool.records import notes, plain_data
 
 if TYPE_CHECKING:
     from icrtool.config import Config, ConfigSources
@@ -91,7 +91,7 @@ def fitted_log(
     warm_start: Path | None = None,
 ) -> Iterator[tuple[Run, Path]]:  # fmt: skip
     """Fit a log, and give as `icrtool.pipeline.fit_into` does; print warnings and chosen streams on stderr."""
-    notes: list[str] = []
+    told: list[str] = []
     with (
         printer.stages(LogText(log.name)) as stages,
         pipeline.fit_into(
@@ -103,12 +103,12 @@ def fitted_log(
             stages.begin,
             warm_start=warm_start,
             share=stages.share,
-            note=notes.append,
+            note=told.append,
             inside=place.inside,
         ) as found,  # fmt: skip
     ):
         yield found
-    printer.warn_of(found[0], *notes)
+    printer.warn_of(found[0], *told)
     for line in text_format.jump_lines(found[0].document.reference_jumps):
         printer.detail(line)
 
@@ -165,15 +165,17 @@ def _examine(
     # What errors and warnings of the log begin with: its name, or its path.
     names = (survey.name if survey is not None else LogText(log.stem), escaped(str(log)))
     command = overview.next_command(escaped(str(log)), given, run)
-    warnings = survey.problems if survey is not None else ()
+    found = survey.problems if survey is not None else ()
     if measured is not None:
-        warnings = measured.warnings if run is None else run.warnings
+        found = measured.notes if run is None else run.notes
+    warnings = notes.warnings_of(found)
     if printer.as_json:
         document.update(
             {
                 "reason": None,
                 **(plain_data.plain(holds) if holds is not None else {}),
                 "streams": plain_data.plain(measured.streams) if measured is not None else [],
+                "notes": plain_data.plain(found),
                 "warnings": list(warnings),
                 "verdict": overview.verdict(run, problem, names),
                 "next": command,

@@ -27,6 +27,7 @@ from icrtool.records.acceptance import DEFAULT_SEED, BudgetDistance, Gate, Verdi
 from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.choices import Reference, Starts
 from icrtool.records.dropout_document import TurningSplit, UsedCalibration
+from icrtool.records.notes import warnings_of
 from icrtool.records.plain_data import plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import ReportRequest
@@ -256,6 +257,7 @@ def _report(
     with_events : errors of all trials, where those of `errors` cross no slip event
     """
     made = None if found is None else found.calibration
+    notes = (*run.notes, *(() if found is None else found.notes))
     cost = None
     if with_events is not None:
         all_rows = {one.name: one.document.by_horizon for one in with_events.results}
@@ -273,6 +275,8 @@ def _report(
         run=documents.RunOfReport(*(getattr(run.document, key) for key in documents.RunOfReport.__struct_fields__)),
         usable=run.usable,
         unusable_because=run.document.unusable_because,
+        notes=notes,
+        warnings=warnings_of(notes),
         request=request,
         starts=errors.states,
         starts_standing=errors.standing,

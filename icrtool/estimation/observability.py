@@ -16,6 +16,7 @@ from icrtool.kernels.robust import Linearised, sandwich_covariance, scale_by_kin
 from icrtool.kernels.track import Track, Windows
 from icrtool.kernels.window_residuals import path_at, window_residuals
 from icrtool.motion.models import FULL_LINEAR, model_columns, parameters_of_icrs, wheel_motion
+from icrtool.records.notes import Note, note
 from icrtool.records.plain_data import known
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, width_or_usual_m
@@ -229,14 +230,14 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
         name: "shown" if value / width <= SHOWN_SHARE else "weak" if value / width <= WEAK_SHARE else "not shown"
         for name, value in stds.items()
     }
-    sentences = _sentences(stds, verdicts, right, left, windows)
+    notes = _lacking(stds, verdicts, right, left, windows)
     for name, why in unlearned.items():
         if verdicts[name] != "not shown":
-            sentences.append(f"{ICR_WORDS[name]} is not shown: {why}")
+            notes.append(note("icr_not_learned", f"{ICR_WORDS[name]} is not shown: {why}"))
         verdicts[name] = "not shown"
     return ExcitationDocument(
         NumberByIcr(*map(known, stds.values())), VerdictByIcr(*verdicts.values()), math.degrees(right),
-        math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), tuple(sentences),
+        math.degrees(left), math.degrees(spun_right), math.degrees(spun_left), tuple(notes),
     )  # fmt: skip
 
 
@@ -273,23 +274,25 @@ def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[
     return found
 
 
-def _sentences(
+def _lacking(
     stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, windows: StateWindows
-) -> list[str]:
-    """Return sentences: what is not shown, why, and what to drive."""
+) -> list[Note]:
+    """Return findings: what is not shown, why, and what to drive."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return []
     unshown = ", ".join(f"{ICR_WORDS[name]} ({verdicts[name]}, about ± {stds[name]:.2f} m)" for name in lacking)
-    first = f"this drive could not show the ICRs well: {unshown}"
+    first = note("icrs_poorly_shown", f"this drive could not show the ICRs well: {unshown}")
     turned = np.abs(windows.turned[1:])
     steered = float(turned[turned > SURELY_TURNED_RAD].sum())
     if steered > TURNS_NEEDED_RAD and right + left < STEERS * steered:
         angles = f"the robot turned by {math.degrees(steered):.0f}° and its sides by {math.degrees(right + left):.0f}°"
-        return [first, f"{angles}: it steers as a car does, and has no track ICRs, or one side is a copy of the other"]
+        why = f"{angles}: it steers as a car does, and has no track ICRs, or one side is a copy of the other"
+        return [first, note("steers_as_car", why)]
     if lacks := lacking_turns(right, left):
-        return [first, lacks]
-    return [first, f"too few turns in {windows.distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}"]
+        return [first, note("turns_lacking", lacks)]
+    why = f"too few turns in {windows.distance_m:.0f} m by the wheels for this measurement noise: {SPIN_BOTH}"
+    return [first, note("turns_lacking", why)]
 
 
 def lacking_turns(right_rad: float, left_rad: float) -> str:

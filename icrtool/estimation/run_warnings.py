@@ -1,4 +1,4 @@
-"""What a user should know before trusting a run, as sentences."""
+"""What a user should know before trusting a run, as findings."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from icrtool.estimation.run_filter import LARGEST_POSITION_MPS, STEP
 from icrtool.kernels.arrays import Bytes, Floats
 from icrtool.kernels.filter_records import GATED, UNSEEN
 from icrtool.records.measurements import Finding
+from icrtool.records.notes import Note, about, note
 from icrtool.records.presets import ProcessNoise
 from icrtool.records.run import ICR_WORDS
 from icrtool.records.run_document import ExcitationDocument
@@ -58,8 +59,8 @@ def unusable_reasons(
     filtered: str = "",
     *,
     inverted: bool = False,
-) -> list[str]:
-    """Return why the ICRs of a run must not be used; empty where they can be.
+) -> list[Note]:
+    """Return why the ICRs of a run must not be used, as grave findings; empty where they can be.
 
     Parameters
     ----------
@@ -70,29 +71,36 @@ def unusable_reasons(
     inverted : the right ICR ended left of the left one
     """
     if filtered:
-        return [f"filtered or fused odometry ({filtered}); wheel speeds are needed: topics.wheels names their topic"]
+        needed = "wheel speeds are needed: topics.wheels names their topic"
+        return [note("wheels_filtered", f"filtered or fused odometry ({filtered}); {needed}")]
     hidden = [ICR_WORDS[name] for name in excitation.verdict.not_shown]
     why = "it turns too little, or its sensors disagree"
-    reasons = [f"this drive does not show {', '.join(hidden)}: {why}"] if hidden else []
-    reasons += ["the ICRs ended inverted: check sides and signs of the wheels"] if inverted and not hidden else []
+    reasons = list[Note]()
+    if hidden:
+        reasons.append(note("icrs_not_shown", f"this drive does not show {', '.join(hidden)}: {why}"))
+    elif inverted:
+        reasons.append(note("icrs_inverted", "the ICRs ended inverted: check sides and signs of the wheels"))
     for word, share in rejected.items():
         if share > UNUSABLE_SHARE:
-            reasons.append(f"{100 * share:.0f} % of the {word} rejected")
+            reasons.append(note(f"{word}_mostly_rejected", f"{100 * share:.0f} % of the {word} rejected"))
     if noise.position_mps * STEP > LARGEST_POSITION_MPS:
-        reasons.append("the wheels explain almost none of the motion")
+        reasons.append(note("motion_unexplained", "the wheels explain almost none of the motion"))
     elif noise.heading_degps > USELESS_HEADING_DEGPS:
-        reasons.append("the wheels explain almost none of the turns: do they slip, as on ice?")
+        slip = "do they slip, as on ice?"
+        reasons.append(note("turns_unexplained", f"the wheels explain almost none of the turns: {slip}"))
     elif contradiction and not hidden:
-        reasons.append(contradiction)
+        reasons.append(note("windows_contradict", contradiction))
     if wheel_scale is not None and wheel_scale.value is not None and wheel_scale.std is not None:
         left = wheel_scale.value / wheel_scale.applied
         if wheel_scale.std < LARGEST_SCALE_STD and abs(left - 1.0) > LARGEST_SCALE_CORRECTION:
-            reasons.append(f"the robot goes {100 * left:.0f} % of the distance that the wheels report")
+            far = f"the robot goes {100 * left:.0f} % of the distance that the wheels report"
+            reasons.append(note("wheel_scale_wrong", far))
     if twist_separation is not None and twist_separation < LEAST_SEPARATION and not hidden:
-        reasons.append(
+        why = (
             f"the ICRs are {twist_separation:.2f} of the track width apart: the body twist turns as the robot does; "
             "its controller multiplies the width (set wheels.twist_width_m), or it is fused with a gyro"
         )
+        reasons.append(note("twist_holds_multiplier", why))
     return reasons
 
 
@@ -130,17 +138,18 @@ def rejected_share(code: Bytes) -> float:
     return float((seen == GATED).mean()) if len(seen) else 0.0
 
 
-def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[str]:
+def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[Note]:
     """Return what was done about wheels that contradict the position reference."""
-    configured, found = configured_noise(config), []
+    configured, found = configured_noise(config), list[Note]()
     if noise.position_mps != configured.position_mps:
         causes = "slip, clock offsets, repeated samples, fixes worse than they state"
         raised = f"position noise raised to {noise.position_mps:.1f} m/s; filter.process_position_mps sets it"
-        found.append(f"{name}: the wheels contradict the position reference ({causes}): {raised}")
+        why = f"the wheels contradict the position reference ({causes}): {raised}"
+        found.append(note("position_noise_raised", why, name))
     if noise.heading_degps != configured.heading_degps:
         causes = "repeated samples, clock offsets, slip"
         raised = f"heading noise raised to {noise.heading_degps:.0f} deg/s; filter.process_heading_degps sets it"
-        found.append(f"{name}: the wheels contradict the heading ({causes}): {raised}")
+        found.append(note("heading_noise_raised", f"the wheels contradict the heading ({causes}): {raised}", name))
     return found
 
 
@@ -152,7 +161,7 @@ def run_warnings(
     findings: Mapping[str, Finding],
     *,
     inverted: bool,
-) -> list[str]:
+) -> tuple[Note, ...]:
     """Return what a user should know before trusting the numbers.
 
     Parameters
@@ -162,25 +171,24 @@ def run_warnings(
     findings : of the alignment
     inverted : the right ICR ended left of the left one
     """
-    found = []
+    found = list[Note]()
     if multiplier is not None and excitation.verdict.shows_sides:
         value, std = multiplier
         if abs(value - 1.0) <= max(ROLLS, 2.0 * std) and std <= ROLLS_STD:
             rolls = f"this robot turns as a differential drive (multiplier {value:.3f} ± {std:.3f})"
-            found.append(f"{rolls}: ICRs improve nothing")
+            found.append(note("robot_does_not_slip", f"{rolls}: ICRs improve nothing"))
         elif not MULTIPLIERS[0] <= value <= MULTIPLIERS[1]:
             cause = f"slip makes it 1 to {MULTIPLIERS[1]:g}: check robot.track_width_m, wheel radius and sides"
-            found.append(f"the ICRs are {value:.2f} of the track width apart; {cause}")
+            found.append(note("multiplier_unusual", f"the ICRs are {value:.2f} of the track width apart; {cause}"))
     if inverted:
-        found.append(
-            "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
-        )
+        why = "the ICRs ended inverted (right not right of left): do not use them; check sides and signs of the wheels"
+        found.append(note("icrs_ended_inverted", why))
     delays = {"fixes": "position_delay_s", "headings": "heading_delay_s"}
     for word, share in rejected.items():
         if share > WORTH_WARNING_SHARE:
             cause = _cause_of_rejection(findings.get(delays[word]))
-            found.append(f"{100 * share:.0f} % of the {word} were rejected: {cause}")
-    return [f"{name}: {warning}" for warning in found]
+            found.append(note(f"{word}_rejected", f"{100 * share:.0f} % of the {word} were rejected: {cause}"))
+    return about(name, found)
 
 
 def _cause_of_rejection(delay: Finding | None) -> str:
@@ -194,8 +202,8 @@ def _cause_of_rejection(delay: Finding | None) -> str:
     return f"{scatter} (their clock agrees with the wheels to {max(delay.std, abs(left)):.2f} s)"
 
 
-def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
-    """Warn where both ICRs lie to one side of a position sensor whose place on the robot is not known.
+def antenna_warning(name: str, table: States, covariance: Floats) -> list[Note]:
+    """Return a finding where both ICRs lie to one side of a position sensor whose place on the robot is not known.
 
     Parameters
     ----------
@@ -216,13 +224,13 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[str]:
             return []
         unknown = "as the log does not hold its place on the robot"
         advice = "frames.antenna_forward_m sets how far ahead of the body origin it is, and is added to x"
-        return [f"{name}: x {x:+z.2f} m is counted from the position sensor (antenna), {unknown}: {advice}"]
+        why = f"x {x:+z.2f} m is counted from the position sensor (antenna), {unknown}: {advice}"
+        return [note("antenna_forward_unknown", why, name)]
     side, other = ("right", "left") if middle > 0 else ("left", "right")
     where = f"{abs(middle):.2f} m"
-    return [
-        (
-            f"{name}: both ICRs lie {where} to the {side} of the position sensor (antenna): the sensor is {other} of "
-            f"the centre line, or the sides slip unequally. If it is {where} {other} of it, set "
-            f"frames.antenna_right_m={-middle:z.2f}, and frames.antenna_forward_m, from which x_icr is counted"
-        )
-    ]
+    why = (
+        f"both ICRs lie {where} to the {side} of the position sensor (antenna): the sensor is {other} of "
+        f"the centre line, or the sides slip unequally. If it is {where} {other} of it, set "
+        f"frames.antenna_right_m={-middle:z.2f}, and frames.antenna_forward_m, from which x_icr is counted"
+    )
+    return [note("antenna_aside_unknown", why, name)]

@@ -32,6 +32,7 @@ from icrtool.kernels.arrays import Bools, Floats, Ints, runs_of
 from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
+from icrtool.records.notes import Note, about, note, unusable_because, warnings_of
 from icrtool.records.plain_data import known
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import FitRequest
@@ -110,6 +111,11 @@ def summarise(
         measurements.wheels.filtered or "" if rules.corrects else "",
         inverted=inverted,
     )  # fmt: skip
+    notes = _notes(
+        measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance,
+        rejected, inverted=inverted,
+    )  # fmt: skip
+    notes = (*notes, *about(sensors.name, unusable))
     hidden = () if rules.final_of_filter else excitation.verdict.not_shown
     lag = measurements.findings["heading_delay_s"]
     start_ns = int(table.stamp_ns[0])
@@ -121,14 +127,12 @@ def summarise(
         config=config,
         request=request,
         streams=measurements.streams,
-        warnings=_warnings(
-            measurements, filtered, config, None if unusable else multiplier, excitation, changes_s, covariance,
-            rejected, inverted=inverted,
-        ),
+        notes=notes,
+        warnings=warnings_of(notes),
         alignment=measurements.findings,
         drive=drive_summary(table),
         usable=not unusable,
-        unusable_because="; ".join(unusable) if unusable else None,
+        unusable_because=unusable_because(notes),
         icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, multiplier, hidden),
         odometry=OdometryDocument(
             EndErrorDocument(drive_wheels(table, filtered.in_gap, table.icrs_at(-1), len(table)).end_error_m),
@@ -156,16 +160,16 @@ def summarise(
     )  # fmt: skip
 
 
-def _warnings(
+def _notes(
     measurements: Measurements, filtered: Filtered, config: Config, multiplier: tuple[float, float] | None,
     excitation: ExcitationDocument, changes_s: Sequence[float], covariance: Floats,
     rejected: dict[str, float], *, inverted: bool,
-) -> tuple[str, ...]:  # fmt: skip
-    """Return the warnings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
+) -> tuple[Note, ...]:  # fmt: skip
+    """Return the findings of alignment and filter, in the order they were found; `covariance` of the final ICRs."""
     name, table = filtered.sensors.name, filtered.table
     end_s = float(table.t_s[-1])
     return (
-        *measurements.warnings,
+        *measurements.notes,
         *run_warnings(name, rejected, multiplier, excitation, measurements.findings, inverted=inverted),
         *(
             []
@@ -173,12 +177,12 @@ def _warnings(
             else antenna_warning(name, table, covariance)
         ),
         *(
-            f"{name}: no terrain change at {t:g} s: the drive lasts {end_s:.1f} s"
+            note("terrain_change_outside", f"no terrain change at {t:g} s: the drive lasts {end_s:.1f} s", name)
             for t in filtered.changes_s
             if t not in changes_s
         ),
         *noise_warnings(name, config, filtered.noise),
-        *(f"{name}: {sentence}" for sentence in excitation.sentences),
+        *about(name, excitation.notes),
     )
 
 

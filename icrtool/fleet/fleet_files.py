@@ -114,7 +114,8 @@ def fleet_rows(rows: Sequence[FleetLog]) -> list[dict[str, object]]:
                 found[f"{name.removesuffix('_m')}{IS_BOUND}"] = is_bound
         found |= {name: getattr(row, name) for name in AFTER_ERRORS}
         limits = row.gates_failed if row.status != "failed" else None
-        table.append(found | {"tags": ";".join(row.tags), "gates_failed": limits, "took_s": row.took_s})
+        listed = {"tags": ";".join(row.tags), "notes": ";".join(row.codes)}
+        table.append(found | listed | {"gates_failed": limits, "took_s": row.took_s})
     return table
 
 
@@ -213,6 +214,7 @@ def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
     import pyarrow.parquet as pq
 
     texts = {"log", "status", "this_time", "reason", "robot", "group", "start_utc", "tool_version", "run", "tags"}
+    texts.add("notes")
     counts = {"events", "outages", "warnings", "gates_failed", *(name for name in rows[0] if name.endswith(IS_BOUND))}
     kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in rows[0]}
     # Names of files need not be text. As JSON, since to convert lists pyarrow would load pandas.

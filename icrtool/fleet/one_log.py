@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from icrtool import __version__
 from icrtool.errors import IcrToolError, LogChangedError, OutputError
 from icrtool.fleet.recordings import as_text
-from icrtool.logs.containers.container import truncation
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, log_name
 from icrtool.output.files.remote_place import write_below
 from icrtool.pipeline import Stage, fit_into, report_into
@@ -114,7 +113,7 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
     if controller is None and report.calibration is not None:
         controller = report.calibration.controller
     unusable = f"not usable: {summary.unusable_because}" if not summary.usable else ""
-    cut = truncation(summary.warnings)
+    cut = next((one.sentence for one in summary.notes if one.code == "log_cut_off"), "")
     within = [(f"{one.model}_within_{one.budget_m:g}m_m", one) for one in report.document.budgets]
     earlier = report.baseline.document.models if report.baseline is not None else ()
     return replace(
@@ -134,6 +133,7 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
         events=len(summary.events),
         outages=len(report.outages),
         warnings=len(summary.warnings),
+        notes=summary.notes,
         verdicts=tuple(fleet_verdict(one, request.known.log) for one in report.document.gates),
         baseline=_errors(one for one in earlier if report.result(one.name) is not None),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),

@@ -183,7 +183,7 @@ def _report_definitions(container: Container, channels: Sequence[Channel]) -> No
     """Report the channels that are read with a bundled definition, because that of the log is damaged."""
     for channel in channels:
         if note := definition_note(channel):
-            container.report(f"{channel.topic}: {note}; the bundled definition is used")
+            container.report("definition_bundled", f"{channel.topic}: {note}; the bundled definition is used")
 
 
 def moment(given: Moment | None, key: str) -> float | datetime | None:

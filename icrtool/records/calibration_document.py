@@ -8,6 +8,7 @@ import msgspec
 from msgspec import UNSET, UnsetType, field
 
 from icrtool.config import Positive
+from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument
 from icrtool.records.samples import InputFile
@@ -240,6 +241,7 @@ class CalibrationDocument(CalibrationFile, frozen=True, kw_only=True):
     held_out: tuple[HeldOutScore, ...]
     held_out_pooled: tuple[PooledScore, ...]
     error_sources: ErrorSources | None
+    notes: tuple[Note, ...]
     warnings: tuple[str, ...]
 
 
@@ -371,5 +373,6 @@ class ForecastDocument(Record, frozen=True, kw_only=True):
     measured_to_m: float
     budgets: tuple[ForecastBudget, ...]
     not_shown: tuple[str, ...]
+    notes: tuple[Note, ...]
     warnings: tuple[str, ...]
     along: ForecastColumns

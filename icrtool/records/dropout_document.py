@@ -16,6 +16,7 @@ from icrtool.kernels.error_statistics import BlockSums, Histogram
 from icrtool.kernels.track import OpenLoopPath
 from icrtool.records.acceptance import BudgetDistance, Verdict
 from icrtool.records.calibration_document import CalibrationDocument
+from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.requests import ReportRequest
 from icrtool.records.run_document import DriveDocument, IcrDocument
@@ -179,7 +180,7 @@ class LadderDocument(Record, frozen=True):
     blocks: int | UnsetType = UNSET
     starts: int | UnsetType = UNSET
     heading: str | UnsetType | None = UNSET
-    notes: list[str] | UnsetType = UNSET
+    notes: list[Note] | UnsetType = UNSET
     models: list[ScoreDocument] | UnsetType = UNSET
     width_m: float | UnsetType = UNSET
     fits: dict[str, FitDocument] | UnsetType = UNSET
@@ -331,13 +332,20 @@ class IntervalsDocument(Record, frozen=True):
 
 
 class DropoutDocument(Record, frozen=True, kw_only=True):
-    """report.json."""
+    """report.json.
+
+    Attributes
+    ----------
+    notes : the findings of the run and of the comparison of models; `warnings` : the sentences of those not grave
+    """
 
     schema: Literal["icrtool/dropout/1"]
     tool_version: str
     run: RunOfReport
     usable: bool
     unusable_because: str | None
+    notes: tuple[Note, ...]
+    warnings: tuple[str, ...]
     request: ReportRequest
     starts: int
     starts_standing: int

@@ -7,6 +7,7 @@ from typing import Literal
 from msgspec import UNSET, UnsetType, field
 
 from icrtool.records.acceptance import Verdict
+from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT
 
@@ -91,6 +92,7 @@ class FleetLog(Record, frozen=True):
     errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``
     bounds : those of the names in `errors` whose distance is a lower bound
     outages, warnings : how many
+    notes : findings of the run, the grave ones among them
     baseline : of the same names as `errors`, numbers of the log's report in the baseline
     changes : how log, configuration and version differ from those of the baseline
     key : hash of configuration, request and version
@@ -117,6 +119,7 @@ class FleetLog(Record, frozen=True):
     events: int | None = None
     outages: int | None = None
     warnings: int | None = None
+    notes: tuple[Note, ...] = ()
     verdicts: tuple[FleetVerdict, ...] = ()
     baseline: dict[str, float | None] = field(default_factory=dict)
     changes: tuple[str, ...] = ()
@@ -125,6 +128,11 @@ class FleetLog(Record, frozen=True):
     tool_version: str = ""
     took_s: float = 0.0
     this_time: ThisTime = "processed"
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """The codes of its findings, each once."""
+        return tuple(dict.fromkeys(one.code for one in self.notes))
 
     def shown_error(self, *, baseline: bool = False) -> float | None:
         """Return the error [m] that stands for the log, or for its baseline."""

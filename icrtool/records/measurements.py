@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints, in_spans, runs_of
+from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
@@ -232,7 +233,7 @@ class Measurements:
     wheels, heading : what is known of them, for run.json
     clock_std_s : standard deviation of the time between position and heading after that
     antenna_is_known : its place was configured, or in the log
-    warnings : sentences for the user, in the order they were found
+    notes : findings, in the order they were made
     """
 
     sensors: SensorData
@@ -243,7 +244,7 @@ class Measurements:
     fix_statistics: FixStatistics
     clock_std_s: float
     antenna_is_known: bool
-    warnings: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from icrtool.kernels.filter_records import GATED, RECOVERED, USED
 from icrtool.kernels.track import Track
 from icrtool.records.choices import FigureSet, StatesFormat
 from icrtool.records.measurements import SensorData, intervals_in
+from icrtool.records.notes import Note
 from icrtool.records.plain_data import plain
 from icrtool.records.samples import are_twist
 from icrtool.records.tables import Icrs, States
@@ -144,6 +145,11 @@ class Run:
         """What run.json holds, as plain data."""
         found: dict[str, Any] = plain(self.document)
         return found
+
+    @property
+    def notes(self) -> tuple[Note, ...]:
+        """What was found, in order: each with a code, a grade and a text."""
+        return self.document.notes
 
     @property
     def warnings(self) -> tuple[str, ...]:

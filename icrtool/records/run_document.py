@@ -12,6 +12,7 @@ import msgspec
 
 from icrtool.config import Config
 from icrtool.records.measurements import Finding, HeadingFacts, IcrStart, ReferenceJump, SlipKind, Triple, WheelFacts
+from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.requests import FitRequest
 from icrtool.records.samples import InputFile, StreamChoice
@@ -260,7 +261,7 @@ class ExcitationDocument(Record, frozen=True):
     ----------
     std_m : standard deviation that the drive's information allows (Cramer-Rao, constants, some slip)
     turned_right_deg, turned_left_deg : heading changes summed to either side; spun_*: of these, on the spot
-    sentences : the verdict in words, and what to drive next; empty where all is shown
+    notes : the verdict in words, and what to drive next; empty where all is shown
     """
 
     std_m: NumberByIcr
@@ -269,7 +270,7 @@ class ExcitationDocument(Record, frozen=True):
     turned_left_deg: float
     spun_right_deg: float
     spun_left_deg: float
-    sentences: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 class ParameterDocument(Record, frozen=True):
@@ -324,7 +325,13 @@ class RecommendedDocument(Record, frozen=True):
 
 
 class RunDocument(Record, frozen=True, kw_only=True):
-    """run.json; `recommended`, `geometry`, `controller`: the robot's motion, of a run that `icrtool.fit` made."""
+    """run.json.
+
+    Attributes
+    ----------
+    notes : all findings; the grave ones make `unusable_because`, the others are the sentences of `warnings`
+    recommended, geometry, controller : the robot's motion, of a run that `icrtool.fit` made
+    """
 
     schema: Literal["icrtool/run/1"]
     tool_version: str
@@ -333,6 +340,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
     config: Config
     request: FitRequest
     streams: tuple[StreamChoice, ...]
+    notes: tuple[Note, ...]
     warnings: tuple[str, ...]
     alignment: dict[str, Finding]
     drive: DriveDocument

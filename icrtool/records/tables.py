@@ -12,6 +12,7 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.records.notes import Note, note, warnings_of
 from icrtool.records.samples import (
     Datum,
     GyroAxes,
@@ -66,7 +67,7 @@ class RobotLog:
     ----------
     datum : None where the position reference was metric already (total station, lidar, motion capture)
     rejected_fixes : number of fixes dropped while reading, by reason (``no fix``, ``not finite`` ...)
-    warnings : sentences for the user, in the order they were found
+    notes : findings, in the order they were made; `warnings` : their sentences
     antenna_m : the antenna from the body origin by the log's own transforms, forward and right; None without one
     gyro : turn rates of an inertial unit, None without one; the filter does not use them
     heading : without a row where no topic states one
@@ -84,7 +85,7 @@ class RobotLog:
     streams: tuple[StreamChoice, ...]
     inputs: tuple[InputFile, ...]
     rejected_fixes: dict[str, int]
-    warnings: tuple[str, ...]
+    notes: tuple[Note, ...]
     antenna_m: tuple[float, float] | None = None
     gyro: GyroSamples | None = None
     gyros: tuple[GyroAxes, ...] = ()
@@ -135,7 +136,7 @@ class RobotLog:
             ("gnss", "position", position, of_position, fixes.stamp_ns, "metric" if datum is None else "geodetic"),
             ("heading", "heading", heading, of_heading, headings.stamp_ns, "clockwise from north"),
         )
-        streams, warnings = [], []
+        streams, notes = [], []
         for role, group, frame, columns, stamps, kind in roles:
             rate_hz, jitter_ms = rate_and_jitter(stamps)
             why = f"columns; {kind}"
@@ -144,8 +145,14 @@ class RobotLog:
             )
             clock, seconds, sound = _stamped(frame, columns, group, name)
             if back := np.count_nonzero(np.diff(seconds[sound]) < 0):
-                warnings.append(f"{name}: {group}: {clock} goes back at {back} rows; rows are sorted by it")
-        return cls(LogText(name), samples, fixes, headings, datum, tuple(streams), (), {}, tuple(warnings), gyro=rates)
+                text = f"{group}: {clock} goes back at {back} rows; rows are sorted by it"
+                notes.append(note("rows_sorted", text, LogText(name)))
+        return cls(LogText(name), samples, fixes, headings, datum, tuple(streams), (), {}, tuple(notes), gyro=rates)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as sentences for people."""
+        return warnings_of(self.notes)
 
     def topic(self, role: Role, unknown: str = "") -> str:
         """Return the topic that a stream came from."""

@@ -229,7 +229,7 @@ def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
         streams=(),
         inputs=(),
         rejected_fixes={},
-        warnings=(),
+        notes=(),
     )
 
 

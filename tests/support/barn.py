@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from icrtool.config import Config, parse_config
+from icrtool.records.notes import note
 from icrtool.records.samples import Datum, HeadingSamples, InputFile, PositionFixes, StreamChoice, WheelSamples
 from icrtool.records.tables import RobotLog
 
@@ -64,7 +65,7 @@ def simulate(
         streams=streams,
         inputs=(InputFile("barn.mcap", 12, "ab" * 32),),
         rejected_fixes={"no fix": 3} if troubles else {},
-        warnings=("barn: a warning of the log",),
+        notes=(note("log_damaged", "a warning of the log", "barn"),),
     )
 
 

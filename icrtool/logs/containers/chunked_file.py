@@ -348,7 +348,7 @@ class ChunkedFile(Container):
         chunk = part.chunk
         place = chunk.at - self._chunk_head
         if chunk.size < 0:
-            self.report(f"no chunk at byte {place}, where the index lists one")
+            self.report("log_parts_contradict", f"no chunk at byte {place}, where the index lists one")
             return False
         self._at = min(chunk.at, self._size)
         try:
@@ -357,7 +357,7 @@ class ChunkedFile(Container):
             data = decompress(packed, spaces.records.of(packed.size + 1))
         except (DecompressionError, MemoryError) as err:
             if not chunk.is_cut:
-                self.report(f"chunk at byte {place} left out: {err}")
+                self.report("log_damaged", f"chunk at byte {place} left out: {err}")
             return False
         stop, begin = 0, -1
         while begin < stop < len(data):
@@ -365,7 +365,9 @@ class ChunkedFile(Container):
             block, stop = self._scanned(data, begin)
             yield block
         if stop < len(data) and not chunk.is_cut:
-            self.report(f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged")
+            self.report(
+                "log_damaged", f"chunk at byte {place}: {len(data) - stop} of {len(data)} bytes left out, damaged"
+            )
         return begin >= 0
 
     def _scanned(self, data: Bytes, begin: int = 0) -> tuple[MessageBlock, int]:

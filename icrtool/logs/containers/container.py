@@ -17,6 +17,7 @@ import zstandard
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.chunk import PIECE_BYTES, DecompressionError, Inflation
 from icrtool.logs.containers.recording_files import file_sha256
+from icrtool.records.notes import Note, note
 from icrtool.records.samples import InputFile
 from icrtool.records.text import LogText, escaped, shortened
 
@@ -24,6 +25,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 MOST_PROBLEMS, LONGEST_PROBLEM = 20, 500
+
+Report = Callable[[str, str], None]
+"""Takes the code and the text of a problem."""
 
 LATEST_NS = 1 << 62
 """The year 2116. A log time beyond it is damage, and differences of such times do not fit into 64 bits."""
@@ -158,7 +162,7 @@ def made_ahead(blocks: Iterator[MessageBlock], stop: Callable[[], object] | None
 
 
 def unpack_messages(
-    blocks: Iterator[MessageBlock], wanted: frozenset[int], compression: str, report: Callable[[str], None]
+    blocks: Iterator[MessageBlock], wanted: frozenset[int], compression: str, report: Report
 ) -> Iterator[MessageBlock]:
     """Decompress the wanted messages of a bag that was written with message compression.
 
@@ -201,16 +205,7 @@ def unpack_messages(
                 yield MessageBlock(data, block.channel[kept], block.log_time_ns[kept], np.append(0, end)[:-1], end)
                 kept, messages, held = [], [], 0
     if left_out:
-        report(f"{left_out} compressed messages left out: {reason}")
-
-
-CUT_OFF = "cut off"
-"""Stands in the sentence about a file whose end is missing."""
-
-
-def truncation(warnings: Iterable[str]) -> str:
-    """Return the warning that the end of a log is missing; empty where it is there."""
-    return next((one for one in warnings if CUT_OFF in one), "")
+        report("messages_unreadable", f"{left_out} compressed messages left out: {reason}")
 
 
 def ros_type_name(name: str) -> LogText:
@@ -253,19 +248,19 @@ class Container(ABC):
         self.mixed = False
         self.message_compression = message_compression
         self.origin = Origin()
-        self._name, self._problems = LogText(path.name), list[str]()
+        self._name, self._problems = LogText(path.name), list[Note]()
 
     @property
-    def problems(self) -> list[str]:
+    def problems(self) -> list[Note]:
         """What could not be read and was left out; complete after the last block."""
         return [*self._problems]
 
-    def report(self, problem: str) -> None:
-        """Remember what could not be read: each sentence once, and at most `MOST_PROBLEMS` of them."""
-        text = shortened(escaped(f"{self._name}: {problem}"), LONGEST_PROBLEM)
-        if text not in self._problems and len(self._problems) <= MOST_PROBLEMS:
+    def report(self, code: str, problem: str) -> None:
+        """Remember what could not be read: each finding once, and at most `MOST_PROBLEMS` of them."""
+        found = note(code, shortened(escaped(problem), LONGEST_PROBLEM), self._name)
+        if found not in self._problems and len(self._problems) <= MOST_PROBLEMS:
             is_last = len(self._problems) == MOST_PROBLEMS
-            self._problems.append(f"{self._name}: and more of the kind" if is_last else text)
+            self._problems.append(note("log_more_problems", "and more of the kind", self._name) if is_last else found)
 
     def inputs(self, ended: Event) -> tuple[InputFile, ...]:
         """Return the files that make up this log, with their SHA-256: of their beginning once `ended` is set."""
@@ -311,5 +306,5 @@ class Container(ABC):
         possible = block.log_time_ns.view(np.uint64) < LATEST_NS
         if possible.all():
             return block
-        self.report("messages with an impossible log time left out")
+        self.report("messages_unreadable", "messages with an impossible log time left out")
         return block.rows(possible)

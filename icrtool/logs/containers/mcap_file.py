@@ -25,7 +25,7 @@ from icrtool.logs.containers.chunk import (
     unaligned,
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
-from icrtool.logs.containers.container import CUT_OFF, Channel, MessageBlock, ros_type_name
+from icrtool.logs.containers.container import Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ class McapFile(ChunkedFile):
         if suspect and (self._remote is not None or self._chunks_in_order(end) == len(chunks)):
             return False
         for one in damaged:
-            self.report(one)
+            self.report("log_damaged", one)
         return True
 
     def _chunks_in_order(self, end: int) -> int:
@@ -272,7 +272,7 @@ class McapFile(ChunkedFile):
             if opcode == 0 or length > left:
                 break
             at += _HEAD_BYTES + length
-        self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
+        self.report("log_cut_off", f"cut off or damaged at byte {at} of {self._size}; everything before it was read")
 
     def _read_loose(self, at: int, length: int) -> tuple[MessageBlock | None, int]:
         """Return the messages of records outside chunks, and the number of bytes consumed after the first 9."""
@@ -283,7 +283,7 @@ class McapFile(ChunkedFile):
             block, stop = self._scanned(piece)
             if stop:
                 return block, stop - _HEAD_BYTES
-        self.report(f"record at byte {at} left out: damaged")
+        self.report("log_damaged", f"record at byte {at} left out: damaged")
         return None, length
 
     def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:
@@ -312,13 +312,15 @@ class McapFile(ChunkedFile):
         code, _, start, end = record
         described = _parse(code, bytes(data[start:end]))
         if described is None:
-            self.report("a schema or channel that cannot be read was left out")
+            self.report("log_damaged", "a schema or channel that cannot be read was left out")
             return
         before: dict[int, Any] = self._schemas if code == _SCHEMA else self._channels
         known = before.setdefault(described.id, described) == described
         if not known:
             what = f"{type(described).__name__.lower()} {described.id}"
-            self.report(f"{what} is described twice, differently; the first description was used")
+            self.report(
+                "log_parts_contradict", f"{what} is described twice, differently; the first description was used"
+            )
 
 
 def _parse(opcode: int, content: bytes) -> Any:  # noqa: ANN401 - a chunk, or a record of the library

@@ -35,6 +35,7 @@ from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, read_by_ranges
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save, unpack
+from icrtool.records.notes import Note
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
 from icrtool.records.samples import InputFile
 
@@ -82,21 +83,23 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
             scratch = ScratchFolder()
             undo.callback(scratch.close)
             log, origin, distant = _brought(path, scratch.path, remote, why_fetched, share)
-            problem = ""
+            problem = None
             try:
                 if _is_packed_file(log):
                     log, problem = unpack(log, scratch.path / "unpacked", share)
                 container = _plain_log(log, distant)
             except LogError as err:
                 # Its own path is gone when the user reads this.
-                raise LogError(path, err.why, "; ".join(filter(None, [problem, err.advice]))) from err
+                raise LogError(
+                    path, err.why, "; ".join(filter(None, [problem.text if problem is not None else "", err.advice]))
+                ) from err
             undo.pop_all()
     except FileNotFoundError as err:
         raise LogError(path, "no such file or directory") from err
     except OSError as err:
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
-    if problem:
-        container.report(problem)
+    if problem is not None:
+        container.report(problem.code, problem.text)
     container.path, container.files = path, [path]
     container.origin = origin._replace(remove=scratch.close)
     return container
@@ -153,8 +156,8 @@ def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
         file, origin, _ = _brought(path, scratch.path, remote)
         if _is_packed_file(file):
             file, problem = unpack(file, scratch.path / "unpacked")
-            if problem:
-                raise LogError(path, "does not decompress", problem)
+            if problem is not None:
+                raise LogError(path, "does not decompress", problem.text)
         yield file, origin.inputs[0] if origin.inputs else InputFile(str(path), path.stat().st_size, file_sha256(path))
 
 
@@ -234,10 +237,12 @@ def _usable(container: Container, path: Path) -> Container:
     if (count := len(container.channels)) > MOST_CHANNELS:
         kept = sorted(container.channels, key=lambda channel: -(channel.count or 0))[:MOST_CHANNELS]
         container.channels = sorted(kept, key=lambda channel: channel.id)
-        container.report(f"{count:,} topics and publishers: the {MOST_CHANNELS:,} of most messages are used")
+        container.report(
+            "log_limit_reached", f"{count:,} topics and publishers: the {MOST_CHANNELS:,} of most messages are used"
+        )
     if container.problems and not container.channels:
         container.close()
-        raise LogError(path, "nothing in it can be read", container.problems[0])
+        raise LogError(path, "nothing in it can be read", container.problems[0].sentence)
     return container
 
 
@@ -294,11 +299,13 @@ class BagDirectory(Container):
                 try:
                     self._parts[file] = self._open(file, bag.message_compression)
                 except LogError as err:
-                    self.report(f"{file.name}: {err.why}; {err.advice}")
+                    self.report("log_part_unreadable", f"{file.name}: {err.why}; {err.advice}")
                 except OSError as err:
-                    self.report(f"{file.name}: cannot be read; {err.strerror}")
+                    self.report("log_part_unreadable", f"{file.name}: cannot be read; {err.strerror}")
             if not self._parts:
-                raise LogError(path, "no storage file in it can be read", "; ".join(self.problems))
+                raise LogError(
+                    path, "no storage file in it can be read", "; ".join(one.sentence for one in self.problems)
+                )
         except BaseException:
             self.close()
             raise
@@ -307,7 +314,7 @@ class BagDirectory(Container):
         self.channels = self._merge_channels()
 
     @property
-    def problems(self) -> list[str]:
+    def problems(self) -> list[Note]:
         """What could not be read, of the directory and of each file."""
         return super().problems + [problem for part in self._parts.values() for problem in part.problems]
 
@@ -356,7 +363,7 @@ class BagDirectory(Container):
                 spans.append(FileTimes(min(begins), max(ends), file.name))
         if self._by_name:
             for odd in check_spans(self.path, spans):
-                self.report(odd)
+                self.report("log_parts_contradict", odd)
 
     def _open(self, file: Path, message_compression: str) -> Container:
         """Return the container of a storage file, decompressed to a temporary folder where it is packed."""
@@ -364,8 +371,8 @@ class BagDirectory(Container):
         if unpacked_name(file.name) != file.name:
             self._scratch = self._scratch or ScratchFolder()
             storage, problem = unpack(file, self._scratch.path / str(len(self._parts)))
-            if problem:
-                self.report(f"{file.name}: {problem}")
+            if problem is not None:
+                self.report(problem.code, f"{file.name}: {problem.text}")
         if storage.suffix == ".bag":
             return Ros1Bag(storage)
         if (source := self._distant.get(storage.name)) is not None:

@@ -93,12 +93,12 @@ class BagFiles(NamedTuple):
     by_name: bool = False
 
 
-def bag_files(directory: Path, report: Callable[[str], None]) -> BagFiles:
+def bag_files(directory: Path, report: Callable[[str, str], None]) -> BagFiles:
     """Return the files that metadata.yaml names and that are there; all storage files where it names none.
 
     Parameters
     ----------
-    report : called with what is missing; a recorder that was killed leaves no such file, or half of it
+    report : called with code and text of what is missing; a recorder that was killed leaves no such file, or half of it
 
     Raises
     ------
@@ -117,7 +117,7 @@ def bag_files(directory: Path, report: Callable[[str], None]) -> BagFiles:
         except (ValueError, OSError, RecursionError):
             trouble = "its metadata.yaml cannot be read"
     if trouble:
-        report(f"{trouble}; its storage files were found by their names")
+        report("log_part_unreadable", f"{trouble}; its storage files were found by their names")
     there, missing = dict[Path, None](), dict[str, None]()
     for name in (Path(one).name for one in names):
         # a file may have been unpacked since
@@ -128,7 +128,7 @@ def bag_files(directory: Path, report: Callable[[str], None]) -> BagFiles:
         else:
             missing[stored[0].name] = None
     if missing:
-        report(f"metadata.yaml names files that are not there: {listed([*missing])}")
+        report("log_parts_contradict", f"metadata.yaml names files that are not there: {listed([*missing])}")
     if there:
         return BagFiles([*there], message_compression)
     return BagFiles(storage_files(directory), message_compression, by_name=True)

@@ -24,7 +24,7 @@ from icrtool.logs.containers.chunk import (
     unaligned,
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
-from icrtool.logs.containers.container import CUT_OFF, Channel, MessageBlock, ros_type_name
+from icrtool.logs.containers.container import Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -186,7 +186,7 @@ class Ros1Bag(ChunkedFile):
         self._connections = {}
         chunks = self._listed_chunks()
         if chunks is None:
-            self.report(f"has no index (not closed, or {CUT_OFF}); read from start to end")
+            self.report("log_cut_off", "has no index (not closed, or cut off); read from start to end")
         return chunks
 
     def _described(self, chunk: Chunk) -> Chunk:
@@ -272,7 +272,9 @@ class Ros1Bag(ChunkedFile):
                 self._connect(record.fields, content)
             at = record.at + record.length
         if at < self._size:
-            self.report(f"{CUT_OFF} or damaged at byte {at} of {self._size}; everything before it was read")
+            self.report(
+                "log_cut_off", f"cut off or damaged at byte {at} of {self._size}; everything before it was read"
+            )
 
     def _packed(self, part: Part, space: Space, needed: int = 0) -> Packed:  # noqa: ARG002 - all of it
         chunk = part.chunk

@@ -19,7 +19,6 @@ import numpy as np
 from icrtool.errors import LogError
 from icrtool.logs.containers.chunk import ZSTD_MAGIC
 from icrtool.logs.containers.container import (
-    CUT_OFF,
     WHOLE,
     Channel,
     Container,
@@ -90,7 +89,9 @@ class SqliteBag(Container):
             if self._interruption is not None:
                 raise self._interruption from None
             is_damaged = getattr(err, "sqlite_errorcode", None) == sqlite3.SQLITE_CORRUPT
-            found = "; ".join([str(err), *self.problems, *([self._advice] if is_damaged else [])])
+            found = "; ".join(
+                [str(err), *(one.sentence for one in self.problems), *([self._advice] if is_damaged else [])]
+            )
             raise LogError(path, "not a readable rosbag2 database", found) from err
 
     def share_read(self) -> float:
@@ -133,7 +134,10 @@ class SqliteBag(Container):
                 database.execute("SELECT name FROM sqlite_master")
             except _DAMAGE as err:
                 database.close()
-                self.report(f"its write-ahead log cannot be read ({err}); the last messages may be missing")
+                self.report(
+                    "log_part_unreadable",
+                    f"its write-ahead log cannot be read ({err}); the last messages may be missing",
+                )
             else:
                 return database
         # Without `immutable` SQLite writes files beside a log that was recorded in WAL mode.
@@ -204,7 +208,7 @@ class SqliteBag(Container):
                 stored = self._query(query).fetchmany(_MOST_TOPICS)
                 definitions = {name: (encoding, str(text)) for name, encoding, text in stored}
             except _DAMAGE as err:
-                self.report(f"its message definitions cannot be read ({err})")
+                self.report("log_part_unreadable", f"its message definitions cannot be read ({err})")
         channels = []
         # A log may declare any number of topics; types and encodings are few.
         type_named, text = cache(ros_type_name), cache(LogText)
@@ -264,7 +268,7 @@ class SqliteBag(Container):
                 if self._interruption is not None:
                     raise self._interruption from None
                 if count == 1:
-                    self.report(f"damaged ({err}); what SQLite reads before was read; {self._advice}")
+                    self.report("log_damaged", f"damaged ({err}); what SQLite reads before was read; {self._advice}")
                     return
                 count //= 2  # those before the damage; or together they are too long
                 continue
@@ -273,7 +277,8 @@ class SqliteBag(Container):
             self._last_row = after = max(after + 1, last)
             if without:
                 self.report(
-                    f"rows without a time, or without a message of up to {_LARGEST_MESSAGE_BYTES} bytes, left out"
+                    "log_damaged",
+                    f"rows without a time, or without a message of up to {_LARGEST_MESSAGE_BYTES} bytes, left out",
                 )
             if content is None:
                 continue
@@ -294,7 +299,7 @@ class SqliteBag(Container):
         page_bytes = int.from_bytes(head[16:18], "big")
         page_bytes = page_bytes if page_bytes > 1 else 1 << 16
         if size % page_bytes or size < page_bytes * int.from_bytes(head[28:32], "big"):
-            self.report(f"{CUT_OFF}; what SQLite reads of it was read; {self._advice}")
+            self.report("log_cut_off", f"cut off; what SQLite reads of it was read; {self._advice}")
         return page_bytes if size % page_bytes else 0
 
 

@@ -33,9 +33,9 @@ import zstandard
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, LARGEST_RATIO, ZSTD_MAGIC
-from icrtool.logs.containers.container import CUT_OFF
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
 from icrtool.records import process_resources
+from icrtool.records.notes import Note, note
 from icrtool.records.places import open_regular
 from icrtool.records.text import listed
 
@@ -166,8 +166,8 @@ def save(source: Readable, place: Path) -> str:
     return digest.hexdigest()
 
 
-def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = None) -> tuple[Path, str]:
-    """Unpack a file that is compressed, or an archive: return the log, and what went wrong (empty: nothing).
+def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = None) -> tuple[Path, Note | None]:
+    """Unpack a file that is compressed, or an archive: return the log, and what went wrong (None: nothing).
 
     Parameters
     ----------
@@ -190,9 +190,11 @@ def unpack(path: Path, folder: Path, share: Callable[[float], None] | None = Non
         free = shutil.disk_usage(folder).free
         raise LogError(path, f"cannot be unpacked: {err.strerror}", f"{free} bytes are free for it") from err
     written = [file for file in folder.rglob("*") if file.is_file() and file.stat().st_size]
-    if budget.trouble and not written:
-        raise LogError(path, "does not decompress", budget.trouble)
-    return found, f"{budget.trouble}; what could be unpacked was read" if budget.trouble else ""
+    if budget.trouble is None:
+        return found, None
+    if not written:
+        raise LogError(path, "does not decompress", budget.trouble.text)
+    return found, note(budget.trouble.code, f"{budget.trouble.text}; what could be unpacked was read")
 
 
 @dataclass(slots=True)
@@ -200,11 +202,11 @@ class _Budget:
     """The bytes that a file may still be unpacked to, and the first thing that went wrong."""
 
     left: int
-    trouble: str = ""
+    trouble: Note | None = None
 
-    def stop(self, trouble: object) -> None:
+    def stop(self, code: str, trouble: object) -> None:
         """Let nothing more be read."""
-        self.trouble = self.trouble or str(trouble)
+        self.trouble = self.trouble or note(code, str(trouble))
 
 
 class _Stream:
@@ -233,14 +235,14 @@ class _Stream:
         except _DECODING_ERRORS as err:
             if isinstance(err, OSError) and err.errno is not None:
                 raise  # of the disk, not of the data
-            self._budget.stop(f"{CUT_OFF} or damaged ({err})")
+            self._budget.stop("log_cut_off", f"cut off or damaged ({err})")
             return b""
         self._left -= len(piece)
         if not piece and self._left < math.inf:
-            self._budget.stop(CUT_OFF)
+            self._budget.stop("log_cut_off", "cut off")
         self._budget.left -= len(piece)
         if self._budget.left < 0:
-            self._budget.stop(f"more than {LARGEST_RATIO} times its size when unpacked")
+            self._budget.stop("log_limit_reached", f"more than {LARGEST_RATIO} times its size when unpacked")
             return b""
         return piece
 
@@ -337,7 +339,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
         try:
             info = TarInfo.frombuf(head, "utf-8", "surrogateescape")
         except TarError as err:
-            return budget.stop(f"{CUT_OFF} or damaged ({err})")
+            return budget.stop("log_cut_off", f"cut off or damaged ({err})")
         if info.type in {b"L", b"x"}:
             # A name, or a size, that the header of the next entry has no space for.
             fields = _extra_fields(info.type, stream.exactly(min(info.size, _LARGEST_EXTRA_BYTES)))
@@ -354,7 +356,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
         elif info.type not in SUPPORTED_TYPES or info.type == b"g":
             stream.skip(size + -size % _BLOCK_BYTES)
         name, stated = "", None
-    return budget.stop(f"more than {_MOST_ENTRIES} entries")
+    return budget.stop("log_limit_reached", f"more than {_MOST_ENTRIES} entries")
 
 
 def _extra_fields(kind: bytes, extra: bytes) -> dict[bytes, bytes]:
@@ -410,8 +412,10 @@ def _zip_entries(file: BufferedReader, budget: _Budget) -> Iterator[tuple[str, _
                 if info.is_dir():
                     continue
                 if info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2}:
-                    budget.stop(f"compression {info.compress_type} of {info.filename} is not known")
+                    budget.stop(
+                        "log_part_unreadable", f"compression {info.compress_type} of {info.filename} is not known"
+                    )
                 with archive.open(info) as content:
                     yield info.filename, _Stream(content, budget)
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, ValueError) as err:
-        budget.stop(err)
+        budget.stop("log_damaged", err)

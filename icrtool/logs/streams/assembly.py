@@ -29,6 +29,7 @@ from icrtool.logs.streams.sources import (
     increasing,
 )
 from icrtool.logs.streams.wheel_pairs import topic_of_side
+from icrtool.records.notes import Note, about, note
 from icrtool.records.samples import (
     NO_HEADINGS,
     Datum,
@@ -69,7 +70,7 @@ class Survey:
     channels: tuple[Channel, ...]
     tables: tuple[TopicTable, ...]
     candidates: Candidates
-    problems: tuple[str, ...]
+    problems: tuple[Note, ...]
     inputs: tuple[InputFile, ...]
     transfer: str = ""
 
@@ -95,8 +96,8 @@ def _lost(survey: Survey) -> str:
     if not survey.problems:
         return ""
     first, *others = survey.problems
-    first = first.removeprefix(f"{Path(survey.path).name}: ")
-    return f"{first} (icrtool info lists {len(others)} more)" if others else first
+    text = first.text if first.subject == Path(survey.path).name else first.sentence
+    return f"{text} (icrtool info lists {len(others)} more)" if others else text
 
 
 def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
@@ -107,22 +108,22 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     if source is not None:
         chosen["heading"] = source
     clock = common_clock([one.stamps for one in chosen.values()])
-    notes = []
+    notes = list[Note]()
     if clock == "log":
         far = "one stream has no header stamps, and the header stamps of another are far from log time"
-        notes.append(f"{far}; log time is used for all streams")
+        notes.append(note("log_time_used", f"{far}; log time is used for all streams"))
     notes += clock_notes([(role, one.stamps) for role, one in chosen.items()], name)
     gnss, datum = _fixes(position, config, clock)
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock)
     wheels, wheel_notes = wheel_samples(motion, motion.stamps.on(clock), config, name)
     notes += wheel_notes + ignored_joints(motion, config)
-    notes += [f"{one.topic}: {one.note}" for one in chosen.values() if one.note]
+    notes += [note(one.note.code, f"{one.topic}: {one.note.text}") for one in chosen.values() if one.note is not None]
     if source is None:
-        notes += [f"{one.topic} gives no heading: {one.problem}" for one in found.heading]
+        notes += [note("heading_unusable", f"{one.topic} gives no heading: {one.problem}") for one in found.heading]
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
     used_topics = [topic_of_side(side) for one in chosen.values() for side in one.topic.split(" + ")]
     notes += [
-        f"{topic}: {unreadable[topic]} messages do not fit their message type; left out"
+        note("messages_unreadable", f"{topic}: {unreadable[topic]} messages do not fit their message type; left out")
         for topic in dict.fromkeys(used_topics)
         if topic in unreadable
     ]
@@ -146,15 +147,15 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     units = inertial_units(survey.tables, GYRO_AXES, clock, known)
     log = RobotLog(
         name, wheels, gnss, heading, datum, tuple(streams), survey.inputs, dict(position.rejected),
-        (*survey.problems, *(f"{name}: {note}" for note in notes)), antenna,
+        (*survey.problems, *about(name, notes)), antenna,
         find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, known),
         tuple(GyroAxes(table.topic, stamps, np.array(rates).T) for table, stamps, rates in units), tuple(receivers),
     )  # fmt: skip
     return longest_part(log)
 
 
-def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[str]:
-    """Yield sentences about clocks of streams that were set, one for all, and that cannot be used, one for each.
+def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[Note]:
+    """Yield findings about clocks of streams that were set, one for all, and that cannot be used, one for each.
 
     Raises
     ------
@@ -173,10 +174,11 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment}Z ({roles})"
         if largest.pieces <= MOST_PIECES:
             cause = "the clock was set back, or messages are stored out of order; all are used, sorted by time"
-            yield f"{why}: {cause}; if it was set back, fit each part alone (--from, --to)"
+            yield note("clock_set", f"{why}: {cause}; if it was set back, fit each part alone (--from, --to)")
         elif largest.step_ns <= NEAR_NS:
             mixed = "samples of that time are mixed, which makes errors there too large"
-            yield f"{why}: the clock was set back while recording, and {mixed}; fit each part alone (--from, --to)"
+            told = f"{why}: the clock was set back while recording, and {mixed}; fit each part alone (--from, --to)"
+            yield note("clock_set", told)
         else:
             raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
     if found := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:
@@ -185,13 +187,13 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         moment, roles = np.datetime64(before_ns // 10**9, "s"), ", ".join(role for _, role in found)
         why = f"header stamps go {sense} by {size_ns / 1e9:.1f} s after {moment}Z ({roles})"
         moved = "the later ones are moved by as much, which log time shows"
-        yield f"{why}: their clock was set {setting} while recording; {moved}"
+        yield note("clock_set", f"{why}: their clock was set {setting} while recording; {moved}")
     for role, rows in streams:
         if rows.note and rows.note != "no header":
-            yield f"{role}: {rows.note}; log time is used"
+            yield note("log_time_used", f"{role}: {rows.note}; log time is used")
         if rows.replaced > 1:
             counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
-            yield f"{role}: {counted}; log time is used for them"
+            yield note("log_time_used", f"{role}: {counted}; log time is used for them")
 
 
 def common_clock(streams: Sequence[StampedRows]) -> Clock:
@@ -245,12 +247,12 @@ MOST_NOT_FINITE = 0.01
 """A larger share of wheel samples without a number is reported."""
 
 
-def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: str) -> tuple[WheelSamples, list[str]]:
-    """Return wheel speeds held over each interval, in the unit of the log, and warnings.
+def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: str) -> tuple[WheelSamples, list[Note]]:
+    """Return wheel speeds held over each interval, in the unit of the log, and findings.
 
     Returns
     -------
-    samples, warnings
+    samples, findings
 
     Raises
     ------
@@ -259,19 +261,20 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
     DataError
         Fewer than two usable samples.
     """
-    topic, notes = motion.topic, []
+    topic, notes = motion.topic, list[Note]()
     rows, backwards, dropped = increasing(stamps)
     if backwards:
-        notes.append(f"{topic}: {backwards} wheel stamps go back; sorted")
+        notes.append(note("rows_sorted", f"{topic}: {backwards} wheel stamps go back; sorted"))
     if dropped > len(stamps) // 100:
         shared = f"{dropped} of {len(stamps)} wheel samples share a stamp with another"
-        notes.append(f"{topic}: {shared}; the last was kept")
+        notes.append(note("stamps_shared", f"{topic}: {shared}; the last was kept"))
     left, right, unit, is_position = _pick(motion, config)
     left, right = left[rows], right[rows]
     finite = np.isfinite(left) & np.isfinite(right)
     lost = len(finite) - int(np.count_nonzero(finite))
     if lost > len(finite) * MOST_NOT_FINITE:
-        notes.append(f"{topic}: {lost} of {len(finite)} wheel samples are not finite numbers; left out")
+        why = f"{topic}: {lost} of {len(finite)} wheel samples are not finite numbers; left out"
+        notes.append(note("samples_not_finite", why))
     stamps, left, right = stamps[rows][finite], left[finite], right[finite]
     if len(stamps) < 2:
         raise DataError(log_name, f"{topic} holds {len(stamps)} usable wheel samples", "at least two are needed")
@@ -283,7 +286,8 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
     if motion.twist is not None and config.wheels.twist_width_m is None:
         undone = f"converted to wheel speeds with {config.robot.track_width_m:g} m (robot.track_width_m)"
         advice = "if its controller multiplies the wheel separation, set wheels.twist_width_m to the product"
-        notes.append(f"{topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close together")
+        why = f"{topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close together"
+        notes.append(note("wheels_from_twist", why))
     return WheelSamples(stamps, left, right, unit, is_position), notes
 
 
@@ -321,7 +325,7 @@ PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0
 
 
 def longest_part(log: RobotLog) -> RobotLog:
-    """Return a log without what another clock stamped, and with warnings where its clock may have been set forward.
+    """Return a log without what another clock stamped, and with a finding where its clock may have been set forward.
 
     Of parts that are `LONGEST_PAUSE_S` and more apart, that with the most wheel samples, and positions, is kept.
     """
@@ -332,7 +336,7 @@ def longest_part(log: RobotLog) -> RobotLog:
     longest = int(np.argmax((ends - begins) * (positions > 1)))
     first, last = stamps[begins[longest]], stamps[ends[longest]]
     parts: dict[str, Any] = {}
-    lost, paused = [], []
+    lost, paused = [], list[Note]()
     for role, margin_ns in (("wheels", 0), ("gnss", pause_ns), ("heading", pause_ns)):
         samples: Samples = getattr(log, role)
         inside = (samples.stamp_ns >= first - margin_ns) & (samples.stamp_ns <= last + margin_ns)
@@ -342,11 +346,9 @@ def longest_part(log: RobotLog) -> RobotLog:
         longest_s = np.diff(kept.stamp_ns).max(initial=0) / 1e9
         if longest_s > PAUSE_S:
             why = "the recording was paused, or its clock was set forward"
-            paused.append(f"{log.name}: {role}: no samples for {longest_s:.0f} s: {why}")
-    warnings = list(log.warnings)
+            paused.append(note("recording_paused", f"{role}: no samples for {longest_s:.0f} s: {why}"))
+    found = paused[:1]
     if lost:
-        warnings.append(
-            f"{log.name}: more than a day apart from the other samples, and left out: {', '.join(lost)}; if the clock "
-            "was set, --from and --to read that part"
-        )
-    return replace(log, warnings=(*warnings, *paused[:1]), **parts)
+        why = f"more than a day apart from the other samples, and left out: {', '.join(lost)}; if the clock was set, "
+        found.insert(0, note("samples_days_apart", f"{why}--from and --to read that part"))
+    return replace(log, notes=(*log.notes, *about(log.name, found)), **parts)

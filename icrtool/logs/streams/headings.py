@@ -26,6 +26,7 @@ from icrtool.logs.streams.sources import (
     of_topic,
     stamp_rows,
 )
+from icrtool.records.notes import Note, note
 from icrtool.records.samples import GyroSamples
 
 FUSED_WORTH = 30.0
@@ -171,7 +172,7 @@ class Orientation:
     def read(self, table: TopicTable, _: Config) -> HeadingSource:
         """Return the yaw of its orientations."""
         q = [table.column(f"{self.path}.{axis}").astype(np.float64, copy=False) for axis in "xyzw"]
-        yaw, usable, note = nose_yaw(q, table.floats(self.rate) if self.rate in table.columns else None)
+        yaw, usable, mounting = nose_yaw(q, table.floats(self.rate) if self.rate in table.columns else None)
         variance = table.floats(self.variance)
         variance = np.where(variance > 0, variance, np.nan)
         unknown = variance >= UNKNOWN_RAD2
@@ -193,7 +194,7 @@ class Orientation:
         off += RAW if _RAW_WORDS.search(table.topic) else 0.0
         return HeadingSource(
             **of_topic(table), yaw_rad=yaw, variance=variance, usable=usable, convention=convention, convention_why=why,
-            score=self.worth - off, why=self.what, problem=problem, note=note,
+            score=self.worth - off, why=self.what, problem=problem, note=mounting,
         )  # fmt: skip
 
 
@@ -224,7 +225,7 @@ def frame_convention(table: TopicTable) -> tuple[Convention, str]:
     return "enu", "REP-103"
 
 
-def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple[Floats, Bools, str]:
+def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple[Floats, Bools, Note | None]:
     """Return yaw [rad] (n,), which rows are rotations (n,), and a note where the sensor is not mounted upright.
 
     Yaw is that of the sensor's x axis seen from above. In a sensor mounted on its side another axis is level all the
@@ -241,7 +242,7 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     usable = np.abs(off, out=off) < QUATERNION_NORM_TOLERANCE
     del off
     norm[~usable] = np.nan
-    places, note = _written_order(q, norm, usable, yaw_rate_radps)
+    places, found = _written_order(q, norm, usable, yaw_rate_radps)
     ordered = [q[place] for place in places]
 
     def tilt(axis: int) -> float:
@@ -252,8 +253,8 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
     if tilt(2) < UPRIGHT_COSINE:
         level = min(range(3), key=tilt)
         used = "is level and is used as heading, with an offset to be estimated"
-        note = f"mounted on its side: its {'xyz'[level]} axis {used}"
-    return _of_rows(partial(_bearing, level), ordered, norm), usable, note
+        found = note("heading_mounting", f"mounted on its side: its {'xyz'[level]} axis {used}")
+    return _of_rows(partial(_bearing, level), ordered, norm), usable, found
 
 
 def _of_rows(make: Callable[..., Floats], q: Sequence[Floats], norm: Floats | float = 1.0) -> Floats:
@@ -273,7 +274,7 @@ def _bearing(axis: int, x: Floats, y: Floats, z: Floats, w: Floats) -> Floats:
 
 def _written_order(
     q: Sequence[Floats], norm: Floats, usable: Bools, yaw_rate_radps: Floats | None
-) -> tuple[Sequence[int], str]:
+) -> tuple[Sequence[int], Note | None]:
     """Return the positions of x, y, z, w, and a note where they are not in this order.
 
     On the ground one axis of the sensor stays upright, whatever the mounting. If no axis does, and another order of the
@@ -288,13 +289,13 @@ def _written_order(
     # Of each axis of the sensor, the share of the time in which it is not upright.
     upward = np.array([turned_axis(axis, *some.T)[2] for axis in range(3)])
     if len(some) < 2 or ((np.abs(upward) < UPRIGHT_COSINE).mean(axis=1) < TILTED_SHARE).any():
-        return as_named, ""
+        return as_named, None
     rate = None if yaw_rate_radps is None else yaw_rate_radps[rows]
-    for order, note in ORDERS:
+    for order, why in ORDERS:
         tilted = (np.abs(turned_axis(2, *some[:, order].T)[2]) < LEVEL_COSINE).mean()
         if tilted < TILTED_SHARE and _turns_with(unit(rows)[:, order], rate):
-            return order, note
-    return as_named, ""
+            return order, note("heading_mounting", why)
+    return as_named, None
 
 
 def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:

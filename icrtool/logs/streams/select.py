@@ -22,6 +22,7 @@ from icrtool.logs.streams.positions import (
 )
 from icrtool.logs.streams.sources import HeadingSource, PositionSource, Source, WheelSource, of_topic
 from icrtool.logs.streams.wheel_pairs import PAIR_TYPES, pair_candidates, side_fields, topic_of_side
+from icrtool.records.notes import Note, note
 from icrtool.records.samples import ROLE_WORDS, Role
 from icrtool.records.text import did_you_mean, listed
 
@@ -360,9 +361,11 @@ def check_joints(chosen: WheelSource | None, candidates: Sequence[WheelSource], 
         raise ConfigError(f"wheels.{key}", why, f"its joints are {advice}")
 
 
-def ignored_joints(chosen: WheelSource, config: Config) -> list[str]:
+def ignored_joints(chosen: WheelSource, config: Config) -> list[Note]:
     """Return a warning for every configured joint list that is not used, because the messages list no joints."""
     if chosen.joints:
         return []
     why = f"{chosen.topic} ({chosen.message_type}) lists no joints by name"
-    return [f"wheels.{key} is not used: {why}" for key in JOINT_KEYS if getattr(config.wheels, key)]
+    return [
+        note("joints_not_used", f"wheels.{key} is not used: {why}") for key in JOINT_KEYS if getattr(config.wheels, key)
+    ]

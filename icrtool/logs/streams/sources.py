@@ -16,6 +16,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints
 from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, STAMPS, SetBack, TopicTable
+from icrtool.records.notes import Note
 from icrtool.records.samples import WheelUnit
 
 LARGEST_SHARE_BACKWARDS = 0.01
@@ -162,7 +163,7 @@ class Source:
     ----------
     score : how suitable the type is; why : the reason as text
     problem : why it cannot be used, empty when it can
-    note : what a user must know of it
+    note : what a user must know of it, None for nothing
     usable : (n,) rows to use, of positions and headings
     """
 
@@ -172,7 +173,7 @@ class Source:
     score: float = 0.0
     why: str = ""
     problem: str = ""
-    note: str = ""
+    note: Note | None = None
     usable: Bools = field(default_factory=lambda: NO_ROWS)
 
     @property

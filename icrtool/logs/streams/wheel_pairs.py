@@ -294,7 +294,7 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
     why = f"{why}: {what}"
     return motion_of(
         topic=topic, message_type=kind, stamps=stamps, position=position, speed=speed, unit=unit, score=score, why=why,
-        note=note,
+        note=COMMAND_NOTE if commanded else None,
     )  # fmt: skip
 
 

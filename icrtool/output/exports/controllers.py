@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.calibration.held_out import TWIST_OVER_M
-from icrtool.calibration.record import POSE_AFTER_M, Calibration, export_warnings, factor_to_old
+from icrtool.calibration.record import POSE_AFTER_M, Calibration, export_notes, factor_to_old
 from icrtool.errors import DataError
 from icrtool.kernels.window_residuals import OMEGA, VX, VY
 from icrtool.motion.models import TERMS, Term, wheel_motion
@@ -114,7 +114,7 @@ def format_export(calibration: Calibration, target: ControllerTarget) -> str:
             "icrs_m": [calibration.geometry[name] for name in ICR_COLUMNS],
             "icr_std_m": [calibration.geometry_std[name] for name in ICR_COLUMNS],
             **msgspec.structs.asdict(errors),
-            "warnings": export_warnings(calibration),
+            "warnings": [one.sentence for one in export_notes(calibration)],
             "twist_width_m": robot.twist_width_m or None,
         }
         return json_bytes(document).decode().rstrip("\n")
@@ -182,7 +182,7 @@ def _header(calibration: Calibration, errors: ControllerErrors, driven: str) -> 
             f"the odometry of the log was made with wheel_separation_multiplier {old:.4f}: the new one replaces it, "
             f"{factor:.4f} times the old"
         )
-    sentences += [f"WARNING: {_one_line(warning)}" for warning in export_warnings(calibration)]
+    sentences += [f"WARNING: {_one_line(one.sentence)}" for one in export_notes(calibration)]
     return [
         line for sentence in sentences for line in textwrap.wrap(f"# {sentence}", TEXT_WIDTH, subsequent_indent="# ")
     ]

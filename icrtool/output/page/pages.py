@@ -47,6 +47,7 @@ from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.calibration_document import GroupComparison
 from icrtool.records.dropout_document import DROPOUT_SCHEMA, DropoutDocument
 from icrtool.records.fleet_document import FleetCalibration, FleetDocument, FleetLog
+from icrtool.records.notes import is_grave, warnings_of
 from icrtool.records.places import is_regular
 from icrtool.records.rows import IN_CSV, rows_of, shown_rows
 from icrtool.records.run import ICR_WORDS, Run, check_type
@@ -147,7 +148,7 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
         Figure(("trajectory", "icr_estimates", "gnss_difference"), "drive", drive_charts(position_word(summary))),
         Section("", [events], PAGE), *outage_blocks(report), Figure(("icr_clusters", "outages")),
     ]  # fmt: skip
-    warnings = [one.removeprefix(f"{summary.log}: ") for one in summary.warnings]
+    warnings = [one.text for one in summary.notes if not is_grave(one)]
     return [
         unusable_line(summary), Facts([("next", advice(summary))]),
         Section("Answer", answer_sections(summary, report), name="answer"),
@@ -227,16 +228,23 @@ def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, Dropo
     """
     document, changed = run.document, msgspec.structs.replace
     north, east = float(run.table.north_m[0]), float(run.table.east_m[0])
-    cause, datum = document.heading.offset_name, document.gnss.datum
+    cause, datum, notes = document.heading.offset_name, document.gnss.datum, document.notes
+    stated = report.notes
+    if cause:
+        notes, stated = (
+            tuple(changed(one, text=one.text.replace(cause, "its cause is left out")) for one in some)
+            for some in (notes, stated)
+        )
     shown = changed(
         document,
         config=replace(document.config, frames=replace(document.config.frames, datum=None)),
-        warnings=tuple(one.replace(cause, "its cause is left out") if cause else one for one in document.warnings),
+        notes=notes,
+        warnings=warnings_of(notes),
         gnss=changed(document.gnss, datum=None if datum is None else (math.nan, math.nan, math.nan)),
         heading=changed(document.heading, offset_name=None, magnetic_declination_deg=None, utm_convergence_deg=None),
     )
     moved = (changed(one, north_m=one.north_m - north, east_m=one.east_m - east) for one in report.worst)
-    return shown, changed(report, worst=tuple(moved))
+    return shown, changed(report, worst=tuple(moved), notes=stated, warnings=warnings_of(stated))
 
 
 def fleet_page(document: FleetDocument, folder: Path) -> str:
@@ -331,7 +339,7 @@ def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
         "duration": _cell(log.duration_s, duration_text),
         "start": Cell(log.start_utc.replace("T", " ").removesuffix("Z"), order=log.start_utc),
         "events": _cell(log.events, str),
-        "warnings": _cell(log.warnings, str),
+        "warnings": _cell(log.warnings, str)._replace(note=", ".join(log.codes)),
         "limits not met": _cell(log.gates_failed, str),
     }
 

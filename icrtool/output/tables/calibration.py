@@ -53,7 +53,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
     model = [
         parameter_table(calibration.fitted, calibration.fitted_with_gyro),
         *held_out_blocks(table),
-        *result.notes,
+        *(one.sentence for one in result.notes),
     ]
     return [
         Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
@@ -159,6 +159,7 @@ def forecast_document(
         measured_to_m=measured_to_m(calibration),
         budgets=tuple(documents.ForecastBudget(*reached) for reached in reaches),
         not_shown=calibration.fitted.not_shown,
+        notes=calibration.notes,
         warnings=calibration.warnings,
         along=documents.ForecastColumns(**columns),
     )
@@ -202,7 +203,7 @@ def forecast_blocks(
         blocks.append(f"errors were measured up to {longest:g} m; what is beyond is extrapolated")
     if unknown := "; ".join(TERMS[name].meaning for name in calibration.fitted.not_shown):
         blocks.append(f"not found by the calibration, too small or not driven: {unknown}")
-    return [*blocks, *calibration.warnings]
+    return [*blocks, *(one.sentence for one in calibration.notes)]
 
 
 def transfer_csv(found: documents.GroupComparison) -> bytes:

@@ -38,6 +38,7 @@ from icrtool.output.text_format import (
 )
 from icrtool.records.acceptance import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
+from icrtool.records.notes import is_grave
 from icrtool.records.rows import LONGEST_ROW_NAME, MOST_USEFUL, WITHOUT_IT, base_of, in_order, row_of, shown_rows
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
@@ -156,8 +157,8 @@ def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
     sentence = f"yes, with care: {'; '.join(cares)}" if cares else "yes"
     if not (summary.usable and report.passed):
         grade, sentence = "bad", f"no: {summary.unusable_because or 'an acceptance limit is not met'}"
-    if summary.warnings:
-        checks.append(Check("care", "log", f"{counted(len(summary.warnings), 'warning')} about it"))
+    if count := sum(not is_grave(one) for one in summary.notes):
+        checks.append(Check("care", "log", f"{counted(count, 'warning')} about it"))
     found = Section("", [Checks(sorted(checks, key=lambda one: one.grade != "care"))], VERBOSE)
     return Section("May I trust it?", [found], lead=sentence, label="Trust?", grade=grade)
 
@@ -242,9 +243,9 @@ def model_section(report: DropoutDocument) -> Section:
     """Return the parameters of the recommended motion model, and how the models were compared."""
     parameters: list[Block] = []
     if (found := report.recommended) is not None:
-        parameters = [parameter_table(fitted_model(found.model, found)), *found.warnings]
-    notes = report.ladder.notes if report.ladder.notes is not UNSET else ()
-    blocks = [Section("Parameters of the motion model", parameters, VERBOSE), *notes]
+        parameters = [parameter_table(fitted_model(found.model, found)), *(one.sentence for one in found.notes)]
+    notes = [one.sentence for one in report.ladder.notes or ()]
+    blocks: list[Block] = [Section("Parameters of the motion model", parameters, VERBOSE), *notes]
     return Section("The motion model", blocks, VERBOSE, name="models")
 
 

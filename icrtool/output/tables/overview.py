@@ -12,7 +12,7 @@ from icrtool.config import Config
 from icrtool.errors import IcrToolError
 from icrtool.logs.read_log import SurveyDocument, SurveyedTopic
 from icrtool.logs.streams.wheel_pairs import topic_of_side
-from icrtool.output.tables.run import Row, excitation_check, gravest, next_line
+from icrtool.output.tables.run import Row, excitation_check, next_line, warnings_line
 from icrtool.output.text_blocks import VERBOSE, Block, Facts, Section, Table
 from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
@@ -77,8 +77,8 @@ def info_blocks(
         _, what, text, more = excitation_check(run.document)
         rows.append((what, "; ".join((text, *more))))
     rows += _topic_rows(survey, log)
-    warnings = run.warnings if run is not None else log.warnings if log is not None else ()
-    rows.append(("warnings", gravest(warnings, names[0])))
+    notes = run.notes if run is not None else log.notes if log is not None else ()
+    rows.append(("warnings", warnings_line(notes)))
     if run is not None and config.robot.track_width_m is None:
         missing = (
             "robot.track_width_m (no multiplier, no no-slip odometry): --robot NAME (icrtool robots lists them), or "

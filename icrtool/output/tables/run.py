@@ -36,6 +36,7 @@ from icrtool.output.text_format import (
     topics_text,
 )
 from icrtool.records.measurements import RESPONSE_S
+from icrtool.records.notes import Note, first_to_read, is_grave
 from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, icr_text
 from icrtool.records.run_document import ControllerNumbers, RunDocument
 from icrtool.records.text import counted, distance_text, shortened
@@ -84,7 +85,7 @@ def run_blocks(summary: RunDocument) -> list[Block]:
     excitation = summary.excitation
     turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
     driven = f"{distance_text(summary.drive.distance_m)}, {duration_text(summary.drive.duration_s)}"
-    line = f"{'USABLE' if summary.usable else '':12}{gravest(summary.warnings, summary.log)}".rstrip()
+    line = f"{'USABLE' if summary.usable else '':12}{warnings_line(summary.notes)}".rstrip()
     shown = line if len(line) <= BRIEF_WIDTH else f"{line[: BRIEF_WIDTH - 1].rstrip()}…"
     roles: dict[str, list[str]] = {}
     for stream in summary.streams:
@@ -124,11 +125,11 @@ def unusable_line(summary: RunDocument) -> Line:
     return Line("" if summary.usable else f"Do not use: {summary.unusable_because}", "bad")
 
 
-def gravest(warnings: Sequence[str], log: str) -> str:
-    """Return how many warnings there are and the gravest: the first that nothing was done about; none: empty."""
-    plain = [one.removeprefix(f"{log}: ") for one in warnings]
-    first = min(plain, key=lambda one: ("is not given" in one) + 2 * (": corrected" in one), default="")
-    return f"{counted(len(plain), 'warning')} (-v), first: {first}" if len(plain) > 1 else first
+def warnings_line(notes: Sequence[Note]) -> str:
+    """Return how many warnings there are, and the first of the highest grade; none: empty."""
+    count, first = sum(not is_grave(one) for one in notes), first_to_read(notes)
+    text = "" if first is None else first.text
+    return f"{counted(count, 'warning')} (-v), first: {text}" if count > 1 else text
 
 
 def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None) -> list[Block]:
@@ -304,7 +305,7 @@ def to_drive(summary: RunDocument) -> str:
     excitation = summary.excitation
     if excitation.verdict.all_shown:
         return lacking_turns(*np.radians([excitation.turned_right_deg, excitation.turned_left_deg]).tolist())
-    return next((one for one in excitation.sentences if "drive two full turns" in one), "")
+    return next((one.text for one in excitation.notes if one.code == "turns_lacking"), "")
 
 
 def streams_section(summary: RunDocument) -> Section:

@@ -12,6 +12,7 @@ from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventio
 from icrtool.alignment.corrections import align_streams
 from icrtool.alignment.log_track import cut_windows, track_of_log
 from icrtool.kernels.track import Track
+from icrtool.records.notes import warnings_of
 from icrtool.records.samples import GyroSamples
 from support.exact_drives import CONFIG, simulate
 
@@ -103,7 +104,7 @@ def test_a_gyro_tells_swapped_sides_from_a_mirrored_pose(sense: int) -> None:
     )
     found = align_streams(spoilt_log, CONFIG)
     assert found.heading.applied_mirror == (sense < 0)
-    assert any("wheels are swapped" in warning for warning in found.warnings) == (sense > 0)
+    assert any("wheels are swapped" in warning for warning in warnings_of(found.notes)) == (sense > 0)
 
 
 def test_geodetic_positions_are_never_mirrored(track: Track) -> None:

@@ -18,6 +18,7 @@ from icrtool.kernels.filter_records import GATED
 from icrtool.logs.read_log import read_log
 from icrtool.logs.write_log import WriteOptions, write_log
 from icrtool.pipeline import fit
+from icrtool.records.notes import warnings_of
 from icrtool.records.run import Run
 from icrtool.records.samples import (
     FIXED_FIX,
@@ -259,7 +260,7 @@ def test_noise_that_is_raised_is_said_for_every_class(told: int, stated_m: float
     said, stated_class = np.full(count, stated_m**2), np.full(count, told, np.uint8)
     log = replace(log, gnss=replace(log.gnss, var_north_m2=said, var_east_m2=said, stated_class=stated_class))
     quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).steps()[0])
-    (warning,) = quality.warnings
+    (warning,) = warnings_of(quality.notes)
     assert warning.startswith(f"made: {words}")
     assert np.sqrt(quality.fixes.var_north_m2) == pytest.approx(real_m, rel=0.1)
 
@@ -270,7 +271,7 @@ def test_what_is_done_to_float_fixes_is_said_by_number_and_noise() -> None:
     quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).steps()[0])
     count = int(np.count_nonzero(float_))
     # 0.4 m, erring alike for 10 s at 25 Hz: 500 fixes tell what one would.
-    (warning,) = quality.warnings
+    (warning,) = warnings_of(quality.notes)
     assert f"{count:,} fixes ({100 * count / len(float_):.0f} %)" in warning
     assert f"±{0.4 * np.sqrt(2 * 10 * 25):.2g} m" in warning
 
@@ -282,8 +283,8 @@ def test_fixes_that_only_say_that_they_are_fixed_are_misreported_without_a_numbe
     log = replace(log, gnss=replace(log.gnss, var_north_m2=unknown, var_east_m2=unknown, stated_class=told))
     quality = grade_fixes(log, CONFIG, align_streams(log, CONFIG).steps()[0])
     assert quality.fixes.misreported.any()
-    assert "RTK float" in quality.warnings[0]
-    assert not any("nan" in warning for warning in quality.warnings)
+    assert "RTK float" in warnings_of(quality.notes)[0]
+    assert not any("nan" in warning for warning in warnings_of(quality.notes))
 
 
 @pytest.mark.parametrize("heading_from_s", [0.0, 10.0])

@@ -14,6 +14,7 @@ from icrtool.config import load_config
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.pipeline import fit
+from icrtool.records.notes import warnings_of
 from icrtool.records.run import Run
 from icrtool.records.samples import Datum, HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
@@ -86,14 +87,14 @@ def rows_to_and_fro() -> RobotLog:
 
 def test_the_other_convention_is_told_from_an_offset_by_the_turns_between_rows() -> None:
     log = rows_to_and_fro()
-    assert not [warning for warning in align_streams(log, load_config()).warnings if "heading" in warning]
+    assert not [warning for warning in warnings_of(align_streams(log, load_config()).notes) if "heading" in warning]
     other = align_streams(told(log, math.pi / 2 - log.heading.heading_rad), load_config())
     assert other.heading.agreement is not None
     assert other.heading.agreement > 0.8
     assert other.heading.applied_mirror
-    assert [warning for warning in other.warnings if "other convention" in warning]
+    assert [warning for warning in warnings_of(other.notes) if "other convention" in warning]
     paper = align_streams(other_log := told(log, -log.heading.heading_rad), load_config(sets=["filter.preset=paper"]))
-    assert [warning for warning in paper.warnings if "set frames.heading" in warning]
+    assert [warning for warning in warnings_of(paper.notes) if "set frames.heading" in warning]
     assert np.abs(icrs(fit(other_log, load_config(sets=[WIDTH]))) - ICRS).max() < ICR_TOLERANCE_M
 
 
@@ -165,7 +166,7 @@ def test_a_heading_in_whole_degrees_on_straight_rows_is_not_stuck(left_scale: fl
     log = rows()
     wheels = replace(log.wheels, left=left_scale * log.wheels.left)
     check = align_streams(replace(log, wheels=wheels), load_config(sets=[WIDTH]))
-    assert not [warning for warning in check.warnings if "heading" in warning]
+    assert not [warning for warning in warnings_of(check.notes) if "heading" in warning]
     assert check.heading.agreement is not None
     assert check.heading.agreement > 0.99
 

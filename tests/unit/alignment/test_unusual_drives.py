@@ -12,6 +12,7 @@ from icrtool.alignment.wheel_units import reference_scale
 from icrtool.config import load_config
 from icrtool.errors import DataError
 from icrtool.pipeline import fit
+from icrtool.records.notes import warnings_of
 from icrtool.records.samples import NO_HEADINGS, HeadingSamples, PositionFixes
 from support.drives import make_log
 from support.exact_drives import CONFIG as EXACT
@@ -30,7 +31,7 @@ def test_wheels_that_spin_show_no_scale_and_no_delay() -> None:
     found = align_streams(replace(spoilt, heading=moved(spoilt.heading, 0.3)), CONFIG)
     assert found.scales == (1.0, 1.0)
     assert found.delays.applied_heading_s == found.delays.applied_gnss_s == 0.0
-    assert any("the wheels slip" in warning for warning in found.warnings)
+    assert any("the wheels slip" in warning for warning in warnings_of(found.notes))
 
 
 def moved(heading: HeadingSamples, late_s: float) -> HeadingSamples:

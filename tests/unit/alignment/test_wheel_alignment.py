@@ -14,6 +14,7 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import DataError
 from icrtool.pipeline import fit
+from icrtool.records.notes import warnings_of
 from icrtool.records.samples import GyroSamples, HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors, drive_plan, sense
@@ -31,7 +32,7 @@ def with_wheels(log: RobotLog, left: np.ndarray, right: np.ndarray) -> RobotLog:
 def test_good_wheels_are_left_as_they_are() -> None:
     log = make_log(seconds=120.0)
     found = align_streams(log, CONFIG)
-    assert found.warnings == ()
+    assert warnings_of(found.notes) == ()
     assert found.log.wheels is log.wheels
     assert found.wheels.scale == pytest.approx(1.0, abs=0.01)
 
@@ -77,7 +78,7 @@ def test_certain_faults_are_put_right_and_said(spoil, words: str) -> None:  # ty
 def test_faults_that_cannot_be_put_right_are_named(spoil, words: str) -> None:  # type: ignore[no-untyped-def]
     log = make_log(seconds=120.0)
     check = align_streams(with_wheels(log, *spoil(log.wheels.v_left_mps, log.wheels.v_right_mps)), CONFIG)
-    assert any(words in warning for warning in check.warnings)
+    assert any(words in warning for warning in warnings_of(check.notes))
     assert check.scales == (1.0, 1.0)
 
 
@@ -110,7 +111,7 @@ def test_a_drive_too_straight_to_tell_the_convention_swaps_no_wheels() -> None:
         )
         found = align_streams(straight, CONFIG)
         assert found.scales == (1.0, 1.0)
-        assert not [warning for warning in found.warnings if re.search("wheel|side|mirrored", warning)]
+        assert not [warning for warning in warnings_of(found.notes) if re.search("wheel|side|mirrored", warning)]
 
 
 def test_spins_about_a_point_beside_the_origin_are_no_wheel_that_counts_backwards() -> None:
@@ -136,7 +137,7 @@ def test_a_configured_scale_is_not_touched() -> None:
     spoilt = with_wheels(log, 1.07 * log.wheels.v_left_mps, 1.07 * log.wheels.v_right_mps)
     check = align_streams(spoilt, load_config(sets=["wheels.left_scale=1.0", "wheels.right_scale=1.0"]))
     assert check.scales == (1.0, 1.0)
-    assert any("check wheel radius" in warning for warning in check.warnings)
+    assert any("check wheel radius" in warning for warning in warnings_of(check.notes))
 
 
 def with_gaps(log: RobotLog, *, every_s: float, gap_s: float, from_position: bool) -> RobotLog:
@@ -157,8 +158,8 @@ def test_gaps_of_wheels_that_report_positions_are_bridged() -> None:
     counted, open_ = runs
     assert not counted.in_gap.any()
     assert np.count_nonzero(open_.in_gap) == len(open_.summary["wheel_gaps_ns"]) > 20
-    assert any("are bridged" in warning for warning in counted.warnings)
-    assert not any("are bridged" in warning for warning in open_.warnings)
+    assert any("are bridged" in warning for warning in warnings_of(counted.notes))
+    assert not any("are bridged" in warning for warning in warnings_of(open_.notes))
     distance = whole.summary["drive"]["distance_m"]
     assert counted.summary["drive"]["distance_m"] == pytest.approx(distance, rel=0.01)
     assert counted.table.distance_m[-1] == pytest.approx(whole.table.distance_m[-1], rel=0.01)
@@ -177,7 +178,7 @@ def test_gaps_of_wheels_that_report_positions_are_bridged() -> None:
 def test_few_wheel_samples_have_nothing_to_bridge(count: int) -> None:
     stamps = np.arange(count, dtype=np.int64) * 100_000_000
     wheels = WheelSamples(stamps, np.ones(count), np.ones(count), from_position=True)
-    assert bridged(wheels, 0.5) == (wheels, "")
+    assert bridged(wheels, 0.5) == (wheels, None)
 
 
 def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
@@ -187,7 +188,8 @@ def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
     short = replace(wheels, stamp_ns=np.where(stamps > 10**10, stamps - 12 * 10**9, stamps))
     filled, note = bridged(short, 0.5)
     assert np.diff(filled.stamp_ns).tolist() == [100_000_000] * (len(filled.stamp_ns) - 1)
-    assert note.startswith("1 gaps")
+    assert note is not None
+    assert note.text.startswith("1 gaps")
 
 
 def test_a_robot_on_a_stand_is_refused() -> None:
@@ -213,7 +215,7 @@ def test_fused_odometry_offered_as_wheels_is_reported(message_type: str, share: 
     streams = tuple(replace(stream, message_type=message_type) for stream in log.streams)
     gyro = GyroSamples("/imu", log.wheels.stamp_ns, rate)
     fused = replace(with_wheels(log, speed + 0.4 * turn, speed - 0.4 * turn), streams=streams, gyro=gyro)
-    warnings = align_streams(fused, CONFIG).warnings
+    warnings = warnings_of(align_streams(fused, CONFIG).notes)
     assert any("it is fused" in warning and "topics.wheels" in warning for warning in warnings) == warned
 
 

@@ -72,14 +72,16 @@ def test_a_gyro_is_scaled_and_refused_where_it_does_not_turn(run: Run) -> None:
     assert p95[1] == pytest.approx(p95[0], abs=0.01)
     other = compare_models(run, [MeasuredHeading("gyro", 0.1 * heading)])
     assert other.heading == ""
-    assert "does not turn with the robot" in other.notes[0]
+    assert "does not turn with the robot" in other.notes[0].text
 
 
 def test_a_gyro_of_the_other_sign_is_turned_and_reported(run: Run) -> None:
     angle = 0.97 * run.table.heading_rad + 0.01 * run.table.t_s
     usual, turned = (compared_errors(run, [MeasuredHeading("gyro", sign * angle)]) for sign in (1, -1))
-    known = set(usual[0].notes)
-    assert set(turned[0].notes) - known == {"the gyro counts turns in the other direction: its sign was changed"}
+    known = {one.text for one in usual[0].notes}
+    assert {one.text for one in turned[0].notes} - known == {
+        "the gyro counts turns in the other direction: its sign was changed"
+    }
     for name, errors in usual[1].items():
         assert np.allclose(errors, turned[1][name], atol=ROUNDING_M, equal_nan=True)
 
@@ -116,12 +118,12 @@ def test_the_whole_model_predicts_better_than_the_momentary_icrs(run: Run) -> No
 
 
 def test_where_the_place_of_the_position_is_not_known_a_note_states_it(run: Run) -> None:
-    notes = " ".join(compare_models(run).notes)
+    notes = " ".join(one.text for one in compare_models(run).notes)
     assert "ahead of and to the right of the body's origin" in notes
     frames = {"antenna_forward_m": 0.2, "antenna_right_m": 0.0}
     config = parse_config({"robot": {"track_width_m": 0.6}, "frames": frames})
     placed = fit(make_log(0, 180.0, rate=20.0), config)
-    assert "body's origin" not in " ".join(compare_models(placed).notes)
+    assert "body's origin" not in " ".join(one.text for one in compare_models(placed).notes)
 
 
 def test_too_short_a_drive_is_refused() -> None:

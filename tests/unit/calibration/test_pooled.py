@@ -17,7 +17,7 @@ from icrtool.calibration.pooled import (
     predictor,
     recording_of,
     robot_of,
-    use_warnings,
+    use_notes,
     with_turn_rate,
 )
 from icrtool.config import parse_config
@@ -240,7 +240,7 @@ def test_wheels_of_any_body_twist_keep_the_width_of_their_controller(message_typ
     known, unknown = (fit(of_twist, parse_config({**wide, **wheels})) for wheels in ({}, {"wheels": {}}))
     assert robot_of(known, 0.6).twist_width_m == 0.9
     assert robot_of(unknown, 0.6).twist_width_m is msgspec.UNSET
-    assert len(use_warnings(unknown)) == len(use_warnings(known)) + 1
+    assert len(use_notes(unknown)) == len(use_notes(known)) + 1
     assert robot_of(fit(log, parse_config(wide)), 0.6).twist_width_m is msgspec.UNSET
 
 

@@ -12,7 +12,7 @@ from icrtool.config import parse_config
 from icrtool.records.run import Run
 from support.drives import make_log
 
-SCORES = {"gyro", "models", "logs", "held_out", "warnings", "created"}
+SCORES = {"gyro", "models", "logs", "held_out", "notes", "warnings", "created"}
 """What a calibration holds beside the recommendation: it needs the other models, or their scores."""
 
 

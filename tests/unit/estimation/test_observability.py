@@ -23,7 +23,7 @@ def varied():
 
 def test_a_varied_drive_shows_all_and_says_nothing(varied) -> None:
     assert set(astuple(varied.verdict)) == {"shown"}
-    assert varied.sentences == ()
+    assert varied.notes == ()
     assert varied.turned_right_deg > 180.0
     assert varied.turned_left_deg > 180.0
     assert all(0.0 < std < 0.03 for std in astuple(varied.std_m))
@@ -32,13 +32,13 @@ def test_a_varied_drive_shows_all_and_says_nothing(varied) -> None:
 def test_a_straight_drive_shows_none_and_asks_for_spins() -> None:
     found = excitation_of(fit(simulate(0, path="straight", seconds=60.0, offset_deg=0.0), CONFIG))
     assert set(astuple(found.verdict)) == {"not shown"}
-    assert "two full turns on the spot" in found.sentences[-1]
+    assert "two full turns on the spot" in found.notes[-1].text
 
 
 def test_a_circle_asks_for_the_other_way() -> None:
     found = excitation_of(fit(simulate(0, path="circle", seconds=60.0, offset_deg=0.0), CONFIG))
     assert set(astuple(found.verdict)) != {"shown"}
-    assert "to the left" in found.sentences[-1]
+    assert "to the left" in found.notes[-1].text
 
 
 def test_more_way_tells_more(varied) -> None:

@@ -17,6 +17,7 @@ from icrtool.kernels.filter_records import GATED, UNSEEN, USED
 from icrtool.output.tables.dropout import format_dropout
 from icrtool.output.tables.run import format_run
 from icrtool.pipeline import fit
+from icrtool.records.notes import unusable_because
 from icrtool.records.presets import FIELD, ProcessNoise
 from icrtool.records.run import Run
 from icrtool.records.run_document import ExcitationDocument, VerdictByIcr
@@ -75,7 +76,8 @@ def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, wo
     excitation = SimpleNamespace(verdict=VerdictByIcr("shown", "shown", "shown"))
     reasons = unusable_reasons(cast(ExcitationDocument, excitation), {}, noise)
     assert bool(reasons) is bool(words)
-    assert words in " ".join(reasons)
+    assert words in " ".join(one.text for one in reasons)
+    assert unusable_because(reasons) == ("; ".join(one.text for one in reasons) or None)
 
 
 def test_a_body_twist_that_turns_as_the_robot_does_makes_a_run_unusable() -> None:

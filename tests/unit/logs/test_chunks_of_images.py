@@ -50,7 +50,7 @@ def small_messages(path: Path) -> tuple[list[tuple[int, bytes]], list[str], int]
             for row in np.flatnonzero(block.channel == number):
                 content = block.data[block.start[row] : block.end[row]].tobytes()
                 found.append((int(block.log_time_ns[row]), content))
-        return found, list(container.problems), size
+        return found, [one.sentence for one in container.problems], size
     finally:
         container.close()
 

@@ -60,7 +60,7 @@ def read_log(path):
             for channel, stamp, start, end in zip(*(x.tolist() for x in block[1:]), strict=True)
             if channel in topics
         ]
-        return messages, list(container.problems)
+        return messages, [one.sentence for one in container.problems]
     finally:
         container.close()
 

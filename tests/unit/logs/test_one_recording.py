@@ -52,7 +52,7 @@ def read_log(path: Path) -> tuple[list[int], list[str]]:
     try:
         wanted = frozenset(channel.id for channel in container.channels)
         stamps = [stamp for block in container.blocks(wanted) for stamp in block.log_time_ns.tolist()]
-        return stamps, list(container.problems)
+        return stamps, [one.sentence for one in container.problems]
     finally:
         container.close()
 

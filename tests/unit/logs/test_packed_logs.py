@@ -69,7 +69,7 @@ def content(path: Path) -> tuple[list[tuple[str, int, bytes]], list[str]]:
             for block in container.blocks(frozenset(topics))
             for channel, time_ns, start, end in zip(*(column.tolist() for column in block[1:]), strict=True)
         ]
-        return found, list(container.problems)
+        return found, [one.sentence for one in container.problems]
     finally:
         container.close()
 

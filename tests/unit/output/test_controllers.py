@@ -159,8 +159,8 @@ def test_what_predicts_badly_is_not_fit_for_use(calibration: Calibration) -> Non
     for pooled, word in ((far, "14.8 m"), (worse, "no slip")):
         spoilt = msgspec.structs.replace(calibration, held_out_pooled=pooled)
         (reason,) = unfit_reasons(spoilt)
-        assert word in reason
-        assert f"WARNING: {reason.split(':')[0]}" in " ".join(format_export(spoilt, "clearpath").split("\n# "))
+        assert word in reason.text
+        assert f"WARNING: {reason.text.split(':')[0]}" in " ".join(format_export(spoilt, "clearpath").split("\n# "))
 
 
 def test_the_factor_to_the_multiplier_that_made_the_odometry_is_given(calibration: Calibration) -> None:

@@ -1,0 +1,76 @@
+"""Findings: what a log, a run, a report or a calibration shows that its user should know, as data.
+
+A finding has a code, which programs compare; its text is for people, and no program searches in it. The codes, with
+cause, consequence and what to do, are in `icrtool.records.note_catalogue` and in docs/warnings.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from icrtool.records.note_catalogue import CATALOGUE, GRADES, Grade
+from icrtool.records.plain_data import Record
+
+GRAVE: Grade = "grave"
+"""Grade of a finding after which the numbers must not be used."""
+
+
+class Note(Record, frozen=True):
+    """One finding.
+
+    Attributes
+    ----------
+    code : a key of `CATALOGUE`
+    grade : ``info``: corrected, or of little consequence; ``warning``: numbers may be wrong; ``grave``: do not use them
+    subject : name of the log or file that it is about; empty where the document is about one log
+    text : what was found with its numbers, what was done, and what the user can do
+    """
+
+    code: str
+    grade: Grade
+    subject: str
+    text: str
+
+    @property
+    def sentence(self) -> str:
+        """The text after the name of what it is about."""
+        return f"{self.subject}: {self.text}" if self.subject else self.text
+
+
+def note(code: str, text: str, subject: str = "") -> Note:
+    """Return a finding with the grade of its code.
+
+    Raises
+    ------
+    KeyError
+        The code is not in the catalogue.
+    """
+    return Note(code, CATALOGUE[code].grade, subject, text)
+
+
+def about(subject: str, notes: Iterable[Note]) -> tuple[Note, ...]:
+    """Return findings as those of a log or file of this name."""
+    return tuple(msgspec.structs.replace(one, subject=subject) for one in notes)
+
+
+def is_grave(one: Note) -> bool:
+    """Return whether the numbers must not be used after a finding."""
+    return one.grade == GRAVE
+
+
+def warnings_of(notes: Iterable[Note]) -> tuple[str, ...]:
+    """Return the sentences of the findings that are not grave: `unusable_because` gives the others."""
+    return tuple(one.sentence for one in notes if not is_grave(one))
+
+
+def unusable_because(notes: Iterable[Note]) -> str | None:
+    """Return the texts of the grave findings in one line; None where there is none: the numbers may be used."""
+    return "; ".join(one.text for one in notes if is_grave(one)) or None
+
+
+def first_to_read(notes: Sequence[Note]) -> Note | None:
+    """Return the first finding of the highest grade below grave, None without one."""
+    shown = [one for one in notes if not is_grave(one)]
+    return max(shown, key=lambda one: GRADES.index(one.grade), default=None)
