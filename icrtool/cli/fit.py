@@ -91,7 +91,7 @@ def fitted_log(
     warm_start: Path | None = None,
 ) -> Iterator[tuple[Run, Path]]:  # fmt: skip
     """Fit a log, and give as `icrtool.pipeline.fit_into` does; print warnings and chosen streams on stderr."""
-    told: list[str] = []
+    reported: list[str] = []
     with (
         printer.stages(LogText(log.name)) as stages,
         pipeline.fit_into(
@@ -103,12 +103,12 @@ def fitted_log(
             stages.begin,
             warm_start=warm_start,
             share=stages.share,
-            note=told.append,
+            note=reported.append,
             inside=place.inside,
         ) as found,  # fmt: skip
     ):
         yield found
-    printer.warn_of(found[0], *told)
+    printer.warn_of(found[0], *reported)
     for line in text_format.jump_lines(found[0].document.reference_jumps):
         printer.detail(line)
 

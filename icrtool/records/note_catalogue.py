@@ -156,6 +156,24 @@ OF_WHEELS: dict[str, Explanation] = {
         "The ICRs are wrong: one side is a copy of the other, or the robot steers as a car does.",
         "Choose a topic with both sides by `topics.wheels`.",
     ),
+    "second_publisher": Explanation(
+        "warning",
+        "Messages of zeros come between others that state motion: two programs publish on one topic.",
+        "The messages of zeros are left out.",
+        "Stop the second publisher, or give it another topic.",
+    ),
+    "wheels_joined": Explanation(
+        "info",
+        "Each wheel, or each side, is stated in messages of its own.",
+        "They are joined by time: positions are interpolated, speeds held.",
+        "None is needed. Wheels in one message have no error of time.",
+    ),
+    "counter_begins_again": Explanation(
+        "info",
+        "The numbers of a wheel begin again at a limit, as counters of few bits and angles do.",
+        "They are counted on.",
+        "None is needed. Check the named limit.",
+    ),
     "joints_not_used": Explanation(
         "warning",
         "`wheels.left_joints` or `right_joints` is configured, and the messages list no joints by name.",
@@ -201,7 +219,7 @@ OF_WHEELS: dict[str, Explanation] = {
     "wheel_values_held": Explanation(
         "warning",
         "Wheel values repeat the one before while the robot moves: the driver sends faster than it measures.",
-        "Speeds are late by up to one interval of the measurement.",
+        "Speeds lag by up to one interval of the measurement.",
         "Let the driver send each measurement once.",
     ),
     "wheels_slip": Explanation(
@@ -278,7 +296,7 @@ OF_POSITIONS: dict[str, Explanation] = {
         "warning",
         "Fixes that the receiver states as RTK fixed scatter or jump like RTK float.",
         "They get the larger variance of a float fix, except with preset `paper`.",
-        "Check corrections and antenna of the receiver. Errors are judged where fixes are good.",
+        "Check corrections and antenna of the receiver.",
     ),
     "gnss_not_fixed": Explanation(
         "info",
@@ -447,7 +465,7 @@ OF_RUNS: dict[str, Explanation] = {
     "turns_lacking": Explanation(
         "warning",
         "The drive has too few turns, or turns to one side only.",
-        "ICRs cannot be told from wheel scales and offsets.",
+        "ICRs cannot be distinguished from wheel scales and offsets.",
         "Drive two full turns on the spot to each side.",
     ),
     "steers_as_car": Explanation(

@@ -117,7 +117,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     heading, convention = (NO_HEADINGS, "") if source is None else _headings(source, config, clock)
     wheels, wheel_notes = wheel_samples(motion, motion.stamps.on(clock), config, name)
     notes += wheel_notes + ignored_joints(motion, config)
-    notes += [note(one.note.code, f"{one.topic}: {one.note.text}") for one in chosen.values() if one.note is not None]
+    notes += [note(reported.code, f"{one.topic}: {reported.text}") for one in chosen.values() for reported in one.notes]
     if source is None:
         notes += [note("heading_unusable", f"{one.topic} gives no heading: {one.problem}") for one in found.heading]
     unreadable: dict[str, int] = {table.topic: table.unreadable for table in survey.tables if table.unreadable}
@@ -177,8 +177,8 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
             yield note("clock_set", f"{why}: {cause}; if it was set back, fit each part alone (--from, --to)")
         elif largest.step_ns <= NEAR_NS:
             mixed = "samples of that time are mixed, which makes errors there too large"
-            told = f"{why}: the clock was set back while recording, and {mixed}; fit each part alone (--from, --to)"
-            yield note("clock_set", told)
+            reported = f"{why}: the clock was set back while recording, and {mixed}; fit each part alone (--from, --to)"
+            yield note("clock_set", reported)
         else:
             raise DataError(name, why, "times come again, and samples cannot be put in order; cut the recording there")
     if found := [(rows.clock_set, role) for role, rows in streams if rows.clock_set.size_ns]:

@@ -194,7 +194,7 @@ class Orientation:
         off += RAW if _RAW_WORDS.search(table.topic) else 0.0
         return HeadingSource(
             **of_topic(table), yaw_rad=yaw, variance=variance, usable=usable, convention=convention, convention_why=why,
-            score=self.worth - off, why=self.what, problem=problem, note=mounting,
+            score=self.worth - off, why=self.what, problem=problem, notes=() if mounting is None else (mounting,),
         )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.sources import WheelSource, of_topic, stamp_rows
 from icrtool.logs.streams.wheels import MOST_WHEELS, Quantity, of_wheels, unwound_turns, wheel_joints
+from icrtool.records.notes import Note, note
 from icrtool.records.text import listed
 
 
@@ -62,12 +63,12 @@ class Joints:
         if found is None:
             problem = "the joints of the left and of the right were not recorded at the same time"
             return WheelSource(**of_topic(table), joints=tuple(texts), problem=problem)
-        columns, source, note = found
+        columns, source, notes = found
         motion = of_wheels(
             lambda quantity: columns[quantity], lefts, names, "rad", **source, joints=tuple(texts), score=self.worth,
             why=why,
         )  # fmt: skip
-        return replace(motion, note="; ".join(filter(None, [note, motion.note])))
+        return replace(motion, notes=(*notes, *motion.notes))
 
 
 Columns = dict[Quantity, list[NDArray[Any]]]
@@ -82,19 +83,20 @@ LITTLE_CHANGE = 0.5
 
 def _by_message(
     table: TopicTable, paths: Mapping[Quantity, str], places: Ints, alike: Bools
-) -> tuple[Columns, dict[str, Any], str]:
-    """Return the columns of messages that list both sides, what a source has of its topic, and a note."""
+) -> tuple[Columns, dict[str, Any], tuple[Note, ...]]:
+    """Return the columns of messages that list both sides, what a source has of its topic, and findings."""
     if not alike.all():
         table, places = table.rows(alike), places[alike]
     columns: Columns = {quantity: _by_wheel(table.find(path), places) for quantity, path in paths.items()}
     foreign = _of_second_publisher(columns["position"], columns["speed"])
     if foreign is None:
-        return columns, of_topic(table), ""
+        return columns, of_topic(table), ()
     kept = {quantity: [column[~foreign] for column in wheels] for quantity, wheels in columns.items()}
     counted = (
         f"{np.count_nonzero(foreign)} of {len(foreign)} messages state 0 for every wheel, between others that do not"
     )
-    return kept, of_topic(table.rows(~foreign)), f"{counted}: those of a second publisher, left out"
+    left_out = note("second_publisher", f"{counted}: those of a second publisher, left out")
+    return kept, of_topic(table.rows(~foreign)), (left_out,)
 
 
 def _of_second_publisher(positions: Sequence[NDArray[Any]], speeds: Sequence[NDArray[Any]]) -> Bools | None:
@@ -123,7 +125,7 @@ def _of_second_publisher(positions: Sequence[NDArray[Any]], speeds: Sequence[NDA
 
 def _by_own_messages(
     table: TopicTable, paths: Mapping[Quantity, str], places: Ints
-) -> tuple[Columns, dict[str, Any], str] | None:
+) -> tuple[Columns, dict[str, Any], tuple[Note, ...]] | None:
     """Return the columns of wheels that come in messages of their own, at the stamps of the first wheel.
 
     Positions are interpolated, speeds held; None where the wheels were not recorded at the same time.
@@ -161,8 +163,8 @@ def _by_own_messages(
     source = of_topic(table.rows(rows[0][orders[0]][both]))
     if not by_header:
         source["stamps"] = replace(source["stamps"], header_ns=None, note="no header of every wheel", delay_ns=0)
-    note = "its wheels come in messages of their own: joined by time"
-    return columns, source, note
+    joined = note("wheels_joined", "its wheels come in messages of their own: joined by time")
+    return columns, source, (joined,)
 
 
 def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: int) -> tuple[Ints, Bools]:

@@ -163,7 +163,7 @@ class Source:
     ----------
     score : how suitable the type is; why : the reason as text
     problem : why it cannot be used, empty when it can
-    note : what a user must know of it, None for nothing
+    notes : what a user must know of it
     usable : (n,) rows to use, of positions and headings
     """
 
@@ -173,7 +173,7 @@ class Source:
     score: float = 0.0
     why: str = ""
     problem: str = ""
-    note: Note | None = None
+    notes: tuple[Note, ...] = ()
     usable: Bools = field(default_factory=lambda: NO_ROWS)
 
     @property

@@ -20,7 +20,8 @@ from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.counters import TURNS, Modulus, continued, find_modulus, register_size
 from icrtool.logs.streams.message_types import KNOWN_TYPES
 from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, stamp_rows
-from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTE, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
+from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTES, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
+from icrtool.records.notes import note
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import LogText
 
@@ -275,13 +276,14 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
     position: Sides = (None, None)
     speed: Sides = (None, None)
     unit: WheelUnit = "unknown"
-    note = COMMAND_NOTE if commanded else ""
+    notes = COMMAND_NOTES if commanded else ()
     if modulus is not None or _is_position(left, lefts, config, integer=integer):
         unit = "counts" if integer or config.wheels.quantity == "counts" else "unknown"
         what = "ticks" if unit == "counts" else "angles or distances"
         position = first, np.interp(moments, held, rights)
         if modulus is not None:
-            note = f"its numbers begin again at {modulus.text}, as they show: counted on{'; ' + note if note else ''}"
+            counted = f"its numbers begin again at {modulus.text}, as they show: counted on"
+            notes = (note("counter_begins_again", counted), *notes)
             if modulus.value in TURNS and not integer:
                 unit, what = "rad", "angles"
                 radians = 2 * np.pi / modulus.value
@@ -294,7 +296,7 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
     why = f"{why}: {what}"
     return motion_of(
         topic=topic, message_type=kind, stamps=stamps, position=position, speed=speed, unit=unit, score=score, why=why,
-        note=COMMAND_NOTE if commanded else None,
+        notes=notes,
     )  # fmt: skip
 
 

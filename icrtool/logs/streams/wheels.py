@@ -18,7 +18,7 @@ from icrtool.kernels.arrays import Floats, unwrapped
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.positions import REFERENCE_WORDS
 from icrtool.logs.streams.sources import Sides, WheelSource, motion_of, moves, of_topic
-from icrtool.records.notes import note
+from icrtool.records.notes import Note, note
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import listed
 
@@ -54,8 +54,8 @@ def of_wheels(
             means[quantity], stuck = _side_means([*map(unwound_turns, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
     why = f"{listed([names[i] for i in sorted(dead)])} never turns while the other wheels of its side do: left out"
-    found = note("wheel_dead", why) if dead else None
-    return motion_of(position=means["position"], speed=means["speed"], unit=unit, note=found, **others)
+    found = (note("wheel_dead", why),) if dead else ()
+    return motion_of(position=means["position"], speed=means["speed"], unit=unit, notes=found, **others)
 
 
 def _side_means(columns: Sequence[NDArray[Any]], lefts: int) -> tuple[Sides, set[int]]:
@@ -187,9 +187,11 @@ def read_ticks(table: TopicTable, _: Config) -> WheelSource:
 
 
 COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.IGNORECASE)
-COMMAND_NOTE = note(
-    "wheels_commanded",
-    "commanded speeds, not measured ones: what the wheels did not do of them is in the ICRs and delays",
+COMMAND_NOTES = (
+    note(
+        "wheels_commanded",
+        "commanded speeds, not measured ones: what the wheels did not do of them is in the ICRs and delays",
+    ),
 )
 COMMAND = 40.0
 """Taken off of a topic with commanded speeds."""
@@ -234,16 +236,20 @@ class Twist:
         forward, sideways, turn = self.fields
         twist = np.column_stack([table.column(forward), table.column(turn)]).astype(np.float64)
         forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], table.floats(sideways)))
-        score, why, known = self.worth, f"{self.what}, converted to wheel speeds with the track width", None
+        score, why, known = (
+            self.worth,
+            f"{self.what}, converted to wheel speeds with the track width",
+            tuple[Note, ...](),
+        )
         score -= self.fused if _FUSED.search(table.topic) else 0.0
         if COMMANDED.search(table.topic):
-            score, why, known = score - COMMAND, f"{why} (commanded)", COMMAND_NOTE
+            score, why, known = score - COMMAND, f"{why} (commanded)", COMMAND_NOTES
         problem = ""
         if not moves(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
             problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
         elif self.fused and REFERENCE_WORDS.search(table.topic):
             problem = "its name is that of a position reference, not of wheels"
-        return motion_of(**of_topic(table), twist=twist, unit="m", score=score, why=why, note=known, problem=problem)
+        return motion_of(**of_topic(table), twist=twist, unit="m", score=score, why=why, notes=known, problem=problem)
 
 
 WHEEL_WORDS = re.compile(r"wheel|track(?!er|ing)|sprocket|drive|motor|tire|tyre", re.IGNORECASE)

@@ -130,7 +130,7 @@ def test_joints_go_before_odometry_before_commands_and_the_others_are_named() ->
     commanded = choose([twist(), *rest])
     assert commanded.wheels.topic == "/cmd_vel"
     assert "(commanded)" in commanded.wheels.why
-    assert "not measured" in str(commanded.wheels.note)
+    assert [one.code for one in commanded.wheels.notes] == ["wheels_commanded"]
 
 
 def test_a_measured_twist_goes_before_a_commanded_one() -> None:

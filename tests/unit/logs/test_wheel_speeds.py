@@ -74,10 +74,9 @@ def test_a_wheel_with_a_dead_encoder_is_left_out_of_its_side() -> None:
     motion = joints_motion(np.column_stack([np.zeros(50), travel, 2.0 * travel, 2.0 * travel]))
     assert motion.position is not None
     assert motion.position[0] == pytest.approx(travel)
-    assert motion.note is not None
-    assert motion.note.text.startswith("front_left_wheel never turns")
+    assert motion.notes[0].text.startswith("front_left_wheel never turns")
     parked = joints_motion(np.zeros((50, 4)))
-    assert (parked.note, parked.position is None) == (None, False)
+    assert (parked.notes, parked.position is None) == ((), False)
 
 
 def test_a_dead_encoder_is_named_where_messages_do_not_name_wheels() -> None:
@@ -87,8 +86,7 @@ def test_a_dead_encoder_is_named_where_messages_do_not_name_wheels() -> None:
     motion = read_source("wheels", table, CONFIG)
     assert motion.position is not None
     assert motion.position[1] == pytest.approx(travel)
-    assert motion.note is not None
-    assert motion.note.text.startswith("wheel 3 never turns")
+    assert motion.notes[0].text.startswith("wheel 3 never turns")
 
 
 def joints_motion(positions: Floats) -> WheelSource:
