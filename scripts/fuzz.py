@@ -21,6 +21,7 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cache
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
@@ -33,6 +34,7 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
 
 import fuzz_runs  # noqa: E402 - beside this script
+import fuzz_schemas  # noqa: E402
 import fuzz_structures  # noqa: E402
 
 Random = np.random.Generator
@@ -185,6 +187,9 @@ def database(path: Path, rng: Random) -> str:
 KINDS = (("mcap", "none"), ("mcap", "none"), ("mcap", "zstd"), ("bag", "none"), ("bag", "lz4"), ("db3", "none"),
          ("db3", "zstd"), ("csv", "none"))  # fmt: skip
 
+SCHEMA_LOGS = 0.1
+"""Share of logs that are made of schemas, of long names and many fields, in each serialization that is read."""
+
 VENDOR_LOGS = 0.1
 """Share of logs that hold messages of every type that is read, in place of a drive."""
 
@@ -274,6 +279,8 @@ def make_log(folder: Path, rng: Random) -> tuple[Path, list[str]]:
 
     from tests.property.test_fuzz_logs import WHEELS, drive
 
+    if rng.random() < SCHEMA_LOGS:
+        return fuzz_schemas.write_log(folder / "log.mcap", rng)
     if rng.random() < VENDOR_LOGS:
         path = folder / "log.mcap"
         content = bytearray(vendor_log(int(rng.integers(20)), bool(rng.random() < 0.5)))
@@ -365,7 +372,8 @@ def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
         else:
             path, done = make_log(folder, np.random.default_rng(seed))
             seconds += bytes_of(path) / BYTES_A_SECOND
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            megabytes += int(MEMORY_A_BYTE * bytes_of(path) / 1e6)
+        before = peak_kilobytes(anew=True)
         began = time.process_time()
         begun()
         signal.signal(signal.SIGPROF, too_long)
@@ -376,7 +384,7 @@ def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
             # A warning of a library prints lines of code to whoever uses the log.
             warnings.simplefilter("error")
             outcome = fuzz_runs.use_run(folder, home, command) if runs else use(path, whole=whole)
-        grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+        grown = (peak_kilobytes() - before) / 1024
         if grown > megabytes:
             outcome, text = "FOUND", f"{grown:.0f} MB"
     except ValueError as err:
@@ -396,6 +404,16 @@ def work(job: Job, begun: Callable[[], None] = lambda: None) -> Result:
         (place / "finding.txt").write_text(f"{done}\n{text}", encoding="utf-8", errors="replace")
     shutil.rmtree(folder, ignore_errors=True)
     return seed, outcome, done, text, used, reached
+
+
+def peak_kilobytes(*, anew: bool = False) -> int:
+    """Return the most memory that this process had; `anew`: from now on."""
+    with suppress(OSError):
+        if anew:
+            Path("/proc/self/clear_refs").write_text("5")
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0])
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def bytes_of(path: Path) -> int:
@@ -429,7 +447,7 @@ def functions() -> Iterator[str]:
 
 def serve(connection: Connection, megabytes: int) -> None:
     """Use logs in this process, whose memory is bounded beyond what its libraries take."""
-    resource.setrlimit(resource.RLIMIT_AS, ((megabytes + 3000) << 20,) * 2)
+    resource.setrlimit(resource.RLIMIT_AS, ((megabytes + 4000) << 20,) * 2)
     gc.set_threshold(100_000)
     while (job := connection.recv()) is not None:
         connection.send(work(job, lambda: connection.send(None)))
@@ -438,8 +456,8 @@ def serve(connection: Connection, megabytes: int) -> None:
 RENEWED = 500
 """Logs a worker uses: what leaks is seen, and is not taken for the fault of one log."""
 
-BYTES_A_SECOND = 1e7
-"""Of a log, beyond the seconds of any log."""
+BYTES_A_SECOND, MEMORY_A_BYTE = 1e6, 50
+"""Of a log, beyond the seconds and the memory of any log."""
 
 RUN_SECONDS = 20.0
 """CPU time of a command on a forged run, with its start-up; --baseline and batch fit or read several."""
@@ -539,8 +557,8 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=0, help="forged runs that are made and used, in place of logs")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=2.0, help="CPU time a log may take, and 1 s for each 10 MB")
-    parser.add_argument("--megabytes", type=int, default=1000, help="memory a log may take")
+    parser.add_argument("--seconds", type=float, default=2.0, help="CPU time a log may take, and 1 s for each MB")
+    parser.add_argument("--megabytes", type=int, default=200, help="memory a log may take, and 50 times its size")
     parser.add_argument("--coverage", type=int, default=50, help="functions reached are recorded for one of so many")
     parser.add_argument("--minutes", type=float, default=0.0, help="stop after this time; default: never")
     parser.add_argument("--keep", default="", help="directory for the logs of findings")

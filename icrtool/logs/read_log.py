@@ -24,6 +24,7 @@ from icrtool.errors import DataError, DefinitionError, LogError
 from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED, log_name
+from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.logs.messages.definitions import definition_note
 from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, collector_for
 from icrtool.logs.streams.assembly import Survey, assemble, longest_part
@@ -138,6 +139,7 @@ def _collect(
     unread: dict[str, str] = {}
     collectors: dict[int, TopicCollector | None] = {}
     by_topic: dict[tuple[str, str], TopicCollector] = {}
+    budget = DefinitionBudget()
     by_id = {channel.id: channel for channel in container.channels}
     topics = {channel.id: (channel.topic, channel.message_type) for channel in container.channels}
     wanted = fields_to_take(container.channels, config)
@@ -155,7 +157,7 @@ def _collect(
                         # A definition is compiled when its first message comes: a log may declare any number of topics.
                         collectors[number] = None
                         before = by_topic.get(topics[number])
-                        by_topic[topics[number]] = collector_for(by_id[number], wanted[number], before)
+                        by_topic[topics[number]] = collector_for(by_id[number], wanted[number], before, budget)
                         collectors[number] = by_topic[topics[number]]
                     if (collector := collectors[number]) is not None:
                         collector.feed(block, number)

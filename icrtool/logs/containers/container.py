@@ -208,6 +208,10 @@ def unpack_messages(
         report("messages_unreadable", f"{left_out} compressed messages left out: {reason}")
 
 
+LARGEST_DESCRIPTIONS_BYTES = 1 << 24
+"""Of the schemas and topics of a log with their definitions: those of 400 topics have 2 MB."""
+
+
 def ros_type_name(name: str) -> LogText:
     """Return ``package/Name`` for ``package/msg/Name`` or ``package/Name``; a name of one part as it is."""
     package, separator, rest = name.partition("/")

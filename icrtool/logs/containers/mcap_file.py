@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
+from functools import cache
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ from icrtool.logs.containers.chunk import (
     unaligned,
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
-from icrtool.logs.containers.container import Channel, MessageBlock, ros_type_name
+from icrtool.logs.containers.container import LARGEST_DESCRIPTIONS_BYTES, Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
@@ -133,13 +134,21 @@ class McapFile(ChunkedFile):
     _schemas: dict[int, Schema]
     _channels: dict[int, McapChannel]
     _counts: dict[int, int]
+    _described_bytes: int
 
     def _described_channels(self) -> list[Channel]:
         described = []
+
+        @cache
+        def text_of(number: int) -> str:
+            """Return the text of a schema, once for all of its channels."""
+            schema = self._schemas[number]
+            text = ("latin-1",) if schema.encoding == "protobuf" else ("utf-8", "replace")
+            return schema.data.decode(*text)
+
         for number, channel in sorted(self._channels.items()):
             schema = self._schemas.get(channel.schema_id)
             encoding, written = channel.message_encoding, schema.encoding if schema else ""
-            text = ("latin-1",) if written == "protobuf" else ("utf-8", "replace")
             is_known = schema is not None and (encoding, written) in _ENCODINGS
             described.append(
                 Channel(
@@ -147,7 +156,7 @@ class McapFile(ChunkedFile):
                     topic=LogText(channel.topic),
                     message_type=ros_type_name(schema.name) if schema else LogText(""),
                     encoding=LogText(encoding),
-                    definition=schema.data.decode(*text) if schema is not None and is_known else "",
+                    definition=text_of(channel.schema_id) if is_known else "",
                     definition_format="idl" if written == "ros2idl" else "msg",
                     count=self._counts.get(number) if self._chunks is not None else None,
                 )
@@ -158,7 +167,7 @@ class McapFile(ChunkedFile):
         if self._source.read_at(0, len(MAGIC)) != MAGIC:
             raise LogError(self.path, "not an MCAP file", "its first bytes are not those of MCAP")
         # those that the index describes; without one, the records do
-        self._schemas, self._channels, self._counts = {}, {}, {}
+        self._schemas, self._channels, self._counts, self._described_bytes = {}, {}, {}, 0
         start, summary = self._summary()
         chunks: list[Chunk] = []
         schemas: dict[int, Schema] = {}
@@ -310,11 +319,18 @@ class McapFile(ChunkedFile):
 
     def _learn(self, data: Bytes, record: tuple[int, int, int, int]) -> None:
         code, _, start, end = record
+        if end - start > LARGEST_DESCRIPTIONS_BYTES - self._described_bytes:
+            self.report(
+                "log_damaged", f"schemas and channels of more than {LARGEST_DESCRIPTIONS_BYTES} bytes were left out"
+            )
+            return
         described = _parse(code, bytes(data[start:end]))
         if described is None:
             self.report("log_damaged", "a schema or channel that cannot be read was left out")
             return
         before: dict[int, Any] = self._schemas if code == _SCHEMA else self._channels
+        if described.id not in before:
+            self._described_bytes += end - start
         known = before.setdefault(described.id, described) == described
         if not known:
             what = f"{type(described).__name__.lower()} {described.id}"

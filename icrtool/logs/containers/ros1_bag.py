@@ -24,7 +24,7 @@ from icrtool.logs.containers.chunk import (
     unaligned,
 )
 from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_spaces
-from icrtool.logs.containers.container import Channel, MessageBlock, ros_type_name
+from icrtool.logs.containers.container import LARGEST_DESCRIPTIONS_BYTES, Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -172,6 +172,7 @@ class Ros1Bag(ChunkedFile):
     _message_index = staticmethod(_message_index)
 
     _connections: dict[int, Channel]
+    _described_bytes: int
 
     def _described_channels(self) -> list[Channel]:
         return list(self._connections.values())
@@ -183,7 +184,7 @@ class Ros1Bag(ChunkedFile):
             raise LogError(self.path, "a bag of another version", advice)
         if start != MAGIC:
             raise LogError(self.path, "not a ROS 1 bag", "its first bytes are not a bag's")
-        self._connections = {}
+        self._connections, self._described_bytes = {}, 0
         chunks = self._listed_chunks()
         if chunks is None:
             self.report("log_cut_off", "has no index (not closed, or cut off); read from start to end")
@@ -293,6 +294,10 @@ class Ros1Bag(ChunkedFile):
         number = int.from_bytes(header.get(b"conn", b"")[:4], "little")
         fields = {name: value.decode("utf-8", "replace") for name, value in _header_fields(content).items()}
         if number in self._connections or b"type" not in fields:
+            return
+        self._described_bytes += len(content)
+        if self._described_bytes > LARGEST_DESCRIPTIONS_BYTES:
+            self.report("log_damaged", f"connections of more than {LARGEST_DESCRIPTIONS_BYTES} bytes were left out")
             return
         self._connections[number] = Channel(
             id=number,

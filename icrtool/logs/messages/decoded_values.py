@@ -9,7 +9,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, reduce
 from itertools import islice
 from operator import xor
@@ -23,12 +23,12 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoder import Decoder, text_numbers
+from icrtool.logs.messages.definition_bounds import MOST_FIELDS, FieldNames
 from icrtool.logs.messages.definition_text import full_name
 from icrtool.logs.messages.definitions import (
     BASE,
     DEEPEST,
     MOST_ELEMENTS,
-    MOST_FIELDS,
     NAME,
     SEQUENCE,
     SIZES,
@@ -39,7 +39,7 @@ from icrtool.logs.messages.definitions import (
     steps_of,
 )
 from icrtool.logs.messages.protobuf import definitions_in, descriptors_of, field_of, protobuf_parser
-from icrtool.records.text import LONGEST_TEXT
+from icrtool.records.text import LONGEST_TEXT, LogText
 
 LONGEST_MESSAGE_BYTES = 1 << 20
 """Of a message that is decoded by itself; those that icrtool uses have some hundred bytes."""
@@ -295,24 +295,31 @@ _MOST_PATHS, _MOST_NESTED = 512, 3
 
 def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
     """Return the decoder of Protobuf or JSON; a JSON schema without fields leaves it to the messages what they hold."""
-    definitions = _definitions_of(channel)
+    paths, kinds = _columns_of(replace(channel, id=0, topic=LogText(""), count=None), wanted)
+    if channel.encoding == "json":
+        return ValueDecoder(kinds, paths, parse_json, property_of)
+    descriptors = descriptors_of(channel.definition, channel.message_type)
+    parse = protobuf_parser(descriptors, channel.message_type, map(steps_of, paths.values()))
+    return ValueDecoder(kinds, paths, parse, field_of)
+
+
+@lru_cache(maxsize=64)
+def _columns_of(alike: Channel, wanted: tuple[str, ...]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return, by column, the path that it is made of and its type, in channels that are alike."""
+    definitions = _definitions_of(alike)
     paths: dict[str, str] = {}
     kinds: dict[str, str] = {}
     for column in wanted:
         others = _OTHER_NAMES.get(column, ())
         for path in (column, *others) if definitions else others[:1] or (column,):
             if definitions:
-                kind = kind_at(definitions, full_name(channel.message_type), steps_of(path))
+                kind = kind_at(definitions, full_name(alike.message_type), steps_of(path))
             else:
                 kind = _FOXGLOVE_KINDS.get(path.rpartition(".")[2], "float64")
             if kind is not None:
                 paths[column], kinds[column] = path, kind
                 break
-    if channel.encoding == "json":
-        return ValueDecoder(kinds, paths, parse_json, property_of)
-    descriptors = descriptors_of(channel.definition, channel.message_type)
-    parse = protobuf_parser(descriptors, channel.message_type, map(steps_of, paths.values()))
-    return ValueDecoder(kinds, paths, parse, field_of)
+    return paths, kinds
 
 
 @lru_cache(maxsize=64)
@@ -331,10 +338,31 @@ def definitions_in_schema(text: str, message_type: str) -> Definitions:
     except ValueError as err:
         raise DefinitionError(message_type, "the schema in the log is no JSON") from err
     definitions: dict[str, tuple[Any, Any]] = {}
-    _add(definitions, message_type, schema, 0)
-    if sum(len(fields) for _, fields in definitions.values()) > MOST_FIELDS:
-        raise DefinitionError(message_type, f"its schema has more than {MOST_FIELDS} fields", "it is not read")
+    _count(schema, [], FieldNames(message_type))
+    _add(definitions, full_name(message_type), schema, 0)
     return definitions
+
+
+def _count(schema: object, within: list[str], names: FieldNames) -> int:
+    """Return how many fields an object has, with those of the objects in it.
+
+    Raises
+    ------
+    DefinitionError
+        They are too many, or their names too long.
+    """
+    properties = schema.get("properties") if isinstance(schema, dict) else None
+    if not isinstance(properties, dict) or len(within) > DEEPEST:
+        return 0
+    fields = 0
+    for part, described in properties.items():
+        names.add(*within, part)
+        inner = described.get("items") if _kind(described) == "array" else described
+        fields += 1 + (_count(inner, [*within, part], names) if _kind(inner) == "object" else 0)
+        if fields > MOST_FIELDS:
+            why = f"its schema has more than {MOST_FIELDS} fields"
+            raise DefinitionError(names.message_type, why, "it is not read")
+    return fields
 
 
 def _add(definitions: dict[str, tuple[Any, Any]], name: str, schema: object, depth: int) -> None:

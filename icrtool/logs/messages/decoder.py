@@ -8,7 +8,8 @@ gathered at once. Messages without a like are decoded one by one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from struct import Struct
 from typing import Any, Literal, NamedTuple
 
@@ -30,7 +31,7 @@ from icrtool.logs.messages.definitions import (
     compile_layout,
     ros_definitions,
 )
-from icrtool.records.text import LONGEST_TEXT
+from icrtool.records.text import LONGEST_TEXT, LogText
 
 _SHAPES_AT_ONCE, _COMPARED_SHAPES, _TRIED_SHAPES = 1 << 10, 1 << 8, 1 << 4
 """Shapes that messages decoded at once may have; those of them that messages are compared with; and the least."""
@@ -360,6 +361,13 @@ def text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
     return numbers
 
 
+@lru_cache(maxsize=64)
+def _layout(alike: Channel, wanted: tuple[str, ...]) -> Layout:
+    """Return the layout of channels that are alike: thousands of topics of a log may have one type."""
+    encoding: Literal["cdr", "ros1"] = "cdr" if alike.encoding == "cdr" else "ros1"
+    return compile_layout(ros_definitions(alike), alike.message_type, wanted, encoding)
+
+
 def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:
     """Return the decoder of a channel of ROS messages.
 
@@ -368,6 +376,5 @@ def ros_decoder(channel: Channel, wanted: Sequence[str]) -> Decoder:
     DefinitionError
         The layout of the channel's type is not known.
     """
-    encoding: Literal["cdr", "ros1"] = "cdr" if channel.encoding == "cdr" else "ros1"
-    layout = compile_layout(ros_definitions(channel), channel.message_type, wanted, encoding)
+    layout = _layout(replace(channel, id=0, topic=LogText(""), count=None), tuple(wanted))
     return Decoder(layout, {path: kind for path, (kind, _) in layout.slots.items()})

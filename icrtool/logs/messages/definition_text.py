@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, Literal
 
 from icrtool.errors import DefinitionError
+from icrtool.logs.messages.definition_bounds import FieldNames
 from icrtool.records.text import LONGEST_NAME, shortened
 
 SEPARATOR = "=" * 80
@@ -23,7 +23,7 @@ _NAMED = re.compile(r"\s*Definition of\b\s*([\w/]*).*", re.IGNORECASE)
 _SEPARATOR = f"{SEPARATOR}\n"
 LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
 """Limits for a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
-LONGEST_IDL, MOST_IDL_NUMBERS = 1 << 16, 512
+LONGEST_IDL, MOST_IDL_NUMBERS = 1 << 16, 256
 """Characters and lengths, bounds and constants of a definition in IDL; the parser takes 5 ms for each number."""
 
 _COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
@@ -50,17 +50,20 @@ def plain_definition(text: str, own_name: str) -> str:
     text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\0", "").replace("\xa0", " ")
     own = own_name.replace("/msg/", "/")
     lines: list[str] = []
+    states = False  # whether some line states a field, a constant or a name
     for line in text.removeprefix("\ufeff").removeprefix("\xef\xbb\xbf").split("\n"):
         head, named = _HEAD.fullmatch(line), _NAMED.fullmatch(line)
         if head is None and named is None:
             lines.append(line.rstrip())
+            states = states or line.lstrip("= \t")[:1] not in ("", "#")
             continue
         kind, name = head.groups() if head is not None else ("MSG", named[1] if named is not None else "")
         _end_type(lines)
-        if kind == "MSG" and name.replace("/msg/", "/") == own and not _states(lines):
+        if kind == "MSG" and name.replace("/msg/", "/") == own and not states:
             lines.clear()
         elif name.count("/") and f"{kind}: {name}" not in lines[-1:]:
             lines += [SEPARATOR, f"{kind}: {name}"]
+            states = True
     _end_type(lines)
     return "\n".join([*lines, ""])
 
@@ -71,11 +74,6 @@ def _end_type(lines: list[str]) -> None:
         lines.pop()
     if lines and len(lines[-1]) - len(without := lines[-1].rstrip("=")) >= _FEWEST_SIGNS:
         lines[-1] = without.rstrip()
-
-
-def _states(lines: Sequence[str]) -> bool:
-    """Return whether some line states a field, a constant or a name: it is not empty and no comment."""
-    return any(line.strip() and not line.lstrip().startswith("#") for line in lines)
 
 
 @lru_cache(maxsize=64)
@@ -95,21 +93,33 @@ def parse_definition(text: str, written: Literal["msg", "idl"], message_type: st
     text = plain_definition(text, message_type)
     if text.count(_SEPARATOR) > MOST_TYPES:
         raise DefinitionError(message_type, long, "this type is not read")
+    names = FieldNames(message_type)
+    names.add_text(text)
     try:
         if written == "msg":
-            return get_types_from_msg(text, full_name(message_type))
+            return _counted(get_types_from_msg(text, full_name(message_type)), names)
         parts = text.split(_SEPARATOR)[1:] if text.startswith(f"{_SEPARATOR}IDL: ") else [f"\n{text}"]
         plain = [_plain_idl(part.split("\n", 1)[1]) for part in parts]
         numbers = sum(part.count(sign) for part in plain for sign in "[<=")
         if numbers > MOST_IDL_NUMBERS or sum(map(len, plain)) > LONGEST_IDL or any(map(_EXPRESSION.search, plain)):
             why = f"expressions, {MOST_IDL_NUMBERS} numbers, or {LONGEST_IDL} characters without comments"
             raise DefinitionError(message_type, f"its definition has {why}", "this type is not read")
+        for part in plain:
+            names.add_modules(part)
         types: dict[str, Any] = {}
         for part in plain:
             types.update(get_types_from_idl(part))
     except (TypesysError, ValueError, IndexError, KeyError, RecursionError) as err:
         first = shortened(_where(str(err)), LONGEST_NAME)
         raise DefinitionError(message_type, f"the definition in the log cannot be parsed: {first}") from err
+    return _counted(types, names)
+
+
+def _counted(types: dict[str, tuple[Any, Any]], names: FieldNames) -> dict[str, tuple[Any, Any]]:
+    """Return parsed types; refuse them by the full names of their fields."""
+    for name, (_, fields) in types.items():
+        for named, _ in fields:
+            names.add(name, named)
     return types
 
 

@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.container import Channel
+from icrtool.logs.messages.definition_bounds import MOST_FIELDS, FieldNames
 from icrtool.logs.messages.definition_text import LONGEST_DEFINITION, full_name, parse_definition, plain_definition
 
 NUMBERS, TEXT, LOOP = range(3)
@@ -36,10 +37,10 @@ SIZES = {
 LONGEST_UNROLLED = 4096
 """Longest fixed array of which elements are taken: a covariance has 36."""
 
-DEEPEST, MOST_FIELDS, LONGEST_FIXED, MOST_NUMBERS = 32, 20_000, 1 << 31, 1 << 16
-"""Bounds of a definition: messages within one another, fields in all, elements of a fixed array, numbers taken.
+DEEPEST, LONGEST_FIXED, MOST_NUMBERS = 32, 1 << 31, 1 << 16
+"""Bounds of a definition: messages within one another, elements of a fixed array, numbers taken.
 
-Real definitions reach a depth of 6 and some hundred fields; a definition that refers to itself has no end.
+Real definitions reach a depth of 6; a definition that refers to itself has no end.
 """
 MOST_ELEMENTS, MOST_TAKEN = 256, 1024
 """Taken of a sequence, and of sequences in the elements of a sequence together."""
@@ -235,6 +236,7 @@ class Layout:
     Attributes
     ----------
     slots : by path
+    fields : of the type, with those of the types in it
     taken : how many slots the program knows; of a field that a definition has twice, the last one counts
     """
 
@@ -242,6 +244,7 @@ class Layout:
     slots: dict[str, Slot]
     taken: int
     cdr: bool
+    fields: int = 0
 
 
 def steps_of(path: str) -> tuple[Step, ...]:
@@ -253,13 +256,13 @@ def steps_of(path: str) -> tuple[Step, ...]:
 class _Compiler:
     """Reads a definition once and writes the program."""
 
-    def __init__(self, definitions: Definitions, wanted: Sequence[str], *, cdr: bool) -> None:
-        self._definitions = definitions
+    def __init__(self, definitions: Definitions, names: FieldNames, wanted: Sequence[str], *, cdr: bool) -> None:
+        self._definitions, self._names = definitions, names
         self._wanted = frozenset(wanted)
         self.cdr = cdr
         self.program: list[Operation] = []
         self.slots: dict[str, Slot] = {}
-        self._fields = self._depth = self._loops = self.taken = self._numbers_taken = 0
+        self.fields = self._depth = self._loops = self.taken = self._numbers_taken = 0
 
     def message(self, name: str, prefix: str) -> None:
         """Write the fields of message type `name`."""
@@ -268,11 +271,12 @@ class _Compiler:
         if self._depth >= DEEPEST:
             raise DefinitionError(name, f"its definition nests more than {DEEPEST} messages", "this type is not read")
         self._depth += 1
-        for field, (node, detail) in self._definitions[name][1]:
-            self._fields += 1
-            if self._fields > MOST_FIELDS:
+        for named, (node, detail) in self._definitions[name][1]:
+            self.fields += 1
+            if self.fields > MOST_FIELDS:
                 raise DefinitionError(name, f"its definition has more than {MOST_FIELDS} fields", "it is not read")
-            path = f"{prefix}{field}"
+            path = f"{prefix}{named}"
+            self._names.add(path)
             if node == NAME:
                 self.message(detail, f"{path}.")
             elif node == BASE:
@@ -377,9 +381,9 @@ def compile_layout(
         The definition of a type in it is missing, or a field has a type that cannot be skipped.
     """
     package, _, name = message_type.partition("/")
-    compiler = _Compiler(definitions, wanted, cdr=encoding == "cdr")
+    compiler = _Compiler(definitions, FieldNames(message_type), wanted, cdr=encoding == "cdr")
     compiler.message(f"{package}/msg/{name}", "")
     program = compiler.program
     while program and not program[-1].takes:
         program.pop()
-    return Layout(tuple(program), compiler.slots, compiler.taken, compiler.cdr)
+    return Layout(tuple(program), compiler.slots, compiler.taken, compiler.cdr, compiler.fields)

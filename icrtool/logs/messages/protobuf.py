@@ -12,17 +12,17 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from icrtool.errors import DefinitionError
+from icrtool.logs.messages.definition_bounds import MOST_FIELDS, FieldNames
 from icrtool.logs.messages.definitions import (
     BASE,
     DEEPEST,
     MOST_ELEMENTS,
-    MOST_FIELDS,
     NAME,
     SEQUENCE,
     Definitions,
     Step,
 )
-from icrtool.records.text import LONGEST_TEXT, LogText
+from icrtool.records.text import LogText
 
 if TYPE_CHECKING:
     from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto
@@ -74,7 +74,7 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
     Raises
     ------
     DefinitionError
-        It cannot be read, is too large, nests too many types, has too long a name, or lacks the type.
+        It cannot be read, is too large, nests too many types, has too long a name or names, or lacks the type.
     """
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.message import DecodeError
@@ -86,13 +86,16 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
     except (DecodeError, UnicodeDecodeError, RecursionError) as err:
         raise DefinitionError(message_type, "the schema in the log is no FileDescriptorSet") from err
     found: dict[str, list[ProtobufField]] = {}
-    parts = 0
+    parts, names = 0, FieldNames(message_type)
     for file in files[:MOST_FIELDS]:
         prefix = f"{_name(file.package)}." if file.package else ""
-        for name, message in _types_in(file.message_type, prefix, 1):
+        for name, message in _types_in(file.message_type, prefix, 1, names):
             parts += 1 + len(message.field)
             if parts > MOST_FIELDS:
                 raise DefinitionError(message_type, f"the schema in the log has more than {MOST_FIELDS} parts")
+            for one in message.field:
+                names.add(name, _name(one.name))
+                names.add(_name(one.type_name))
             found[name] = [
                 ProtobufField(
                     name=_name(one.name),
@@ -116,17 +119,17 @@ def _name(text: str | bytes) -> str:
     return text.decode("utf-8", "replace") if isinstance(text, bytes) else text
 
 
-def _types_in(messages: Iterable[DescriptorProto], prefix: str, depth: int) -> Iterator[tuple[str, DescriptorProto]]:
+def _types_in(
+    messages: Iterable[DescriptorProto], prefix: str, depth: int, names: FieldNames
+) -> Iterator[tuple[str, DescriptorProto]]:
     """Yield messages, which lie in `depth` - 1 others, and those within them, with their full names."""
     for message in messages:
         name = f"{prefix}{_name(message.name)}"
-        # a name of megabytes before each of thousands of types would fill the memory
-        if len(name) > LONGEST_TEXT:
-            raise DefinitionError(LogText(name), f"its name has more than {LONGEST_TEXT} characters", "it is not read")
+        names.add(name)
         if depth > DEEPEST:
             raise DefinitionError(LogText(name), f"it lies within more than {DEEPEST - 1} messages", "it is not read")
         yield name, message
-        yield from _types_in(message.nested_type, f"{name}.", depth + 1)
+        yield from _types_in(message.nested_type, f"{name}.", depth + 1, names)
 
 
 def definitions_in(descriptors: Descriptors) -> Definitions:

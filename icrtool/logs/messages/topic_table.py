@@ -16,6 +16,7 @@ from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Channel, MessageBlock
 from icrtool.logs.messages.decoded_values import NMEA_SENTENCE, SentenceDecoder, ValueDecoder, value_decoder
 from icrtool.logs.messages.decoder import Decoded, Decoder, ros_decoder
+from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.records.text import LogText
 
 _MOST_EXPECTED = 1 << 22
@@ -317,28 +318,47 @@ READ_ENCODINGS = ("cdr", "ros1", "protobuf", "json")
 """Serializations of messages that are read: of ROS 2, of ROS 1, and those of Foxglove."""
 
 
-def collector_for(channel: Channel, wanted: tuple[str, ...], before: TopicCollector | None = None) -> TopicCollector:
+def collector_for(
+    channel: Channel,
+    wanted: tuple[str, ...],
+    before: TopicCollector | None = None,
+    budget: DefinitionBudget | None = None,
+) -> TopicCollector:
     """Return what gathers the wanted columns of a channel: `before`, where another one of the topic came already.
+
+    Parameters
+    ----------
+    budget : of the log; None: of this channel alone
 
     Raises
     ------
     DefinitionError
-        The layout of the channel's type is not known, or its serialization is not read.
+        The layout of the channel's type is not known, or its serialization is not read; or the budget is spent.
     """
-    if channel.encoding not in READ_ENCODINGS:
-        raise DefinitionError(channel.topic, f"serialization {str(channel.encoding)!r} is not read")
+    budget = budget if budget is not None else DefinitionBudget()
+    budget.take(channel)
+    try:
+        decoder = _decoder_for(channel, wanted)
+    except DefinitionError as err:
+        budget.spend(channel, err)
+        raise
+    if isinstance(inner := decoder.inner if isinstance(decoder, SentenceDecoder) else decoder, Decoder):
+        budget.spend(channel, inner.layout.fields)
     collector = before if before is not None else TopicCollector(channel)
-    decoder: MessageDecoder
-    if channel.message_type == DYNAMIC_JOINT_STATE:
-        decoder = _interface_decoder(channel)
-    elif channel.encoding in ("protobuf", "json"):
-        decoder = value_decoder(channel, wanted)
-    elif channel.message_type == NMEA_SENTENCE:
-        decoder = SentenceDecoder(ros_decoder(channel, (*HEADER, "sentence")))
-    else:
-        decoder = ros_decoder(channel, wanted)
     collector.decoders[channel.id] = decoder
     return collector
+
+
+def _decoder_for(channel: Channel, wanted: tuple[str, ...]) -> MessageDecoder:
+    if channel.encoding not in READ_ENCODINGS:
+        raise DefinitionError(channel.topic, f"serialization {str(channel.encoding)!r} is not read")
+    if channel.message_type == DYNAMIC_JOINT_STATE:
+        return _interface_decoder(channel)
+    if channel.encoding in ("protobuf", "json"):
+        return value_decoder(channel, wanted)
+    if channel.message_type == NMEA_SENTENCE:
+        return SentenceDecoder(ros_decoder(channel, (*HEADER, "sentence")))
+    return ros_decoder(channel, wanted)
 
 
 def _interface_decoder(channel: Channel) -> Decoder:

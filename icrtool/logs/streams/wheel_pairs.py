@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Container, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import number_fields
+from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.counters import TURNS, Modulus, continued, find_modulus, register_size
 from icrtool.logs.streams.message_types import KNOWN_TYPES
@@ -54,8 +56,9 @@ _OF_WHEELS = re.compile(
 )
 """Words of a message about wheels; the last ones are makes of motor controllers."""
 
-MOST_SEARCHED = 1 << 19
-"""Characters of the definitions in a log whose fields are searched for sides: those of some hundred types."""
+MOST_LOOKED_AT, MOST_SEARCHED, MOST_PATHS = 1 << 21, 1 << 17, 1 << 20
+"""Characters of the definitions in a log that are looked through for words of wheels; of those with such words, whose
+fields are searched for sides, some ten types; and of the paths of these fields."""
 
 MOST_PAIRS = 256
 """Of sides of a log that are looked at."""
@@ -156,11 +159,11 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
                     found[channel.id].add(elements(path or "data")[0])
         return found
     names: dict[str, dict[str, list[tuple[int, str]]]] = {}
-    searched: set[tuple[str, str]] = set()
+    search = _Search()
     for channel in channels:
         if topics.wheels in (None, channel.topic):
             alike = names.setdefault(channel.message_type, {})
-            for path in _fields_of(channel, searched):
+            for path in _fields_of(channel, search):
                 alike.setdefault(_name(channel.topic, path), []).append((channel.id, path))
     for alike in names.values():
         for left, places in alike.items():
@@ -171,26 +174,63 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
     return found
 
 
-def _fields_of(channel: Channel, searched: set[tuple[str, str]]) -> list[str]:
-    """Return the fields of a channel's messages that may be of wheels; of unknown types by their names.
+@dataclass(slots=True)
+class _Search:
+    """What was found in the definitions of a log, each looked through once, and how much may still be.
 
-    Parameters
+    Attributes
     ----------
-    searched : the types whose definitions were parsed for that; this one joins them
+    looked_at, paths : characters that are left
+    searched : what may still be parsed
+    of_wheels : by type and definition, whether words of wheels and of sides are in it
+    fields : by type and definition, the paths of its numbers
     """
+
+    looked_at: int = MOST_LOOKED_AT
+    searched: DefinitionBudget = field(default_factory=lambda: DefinitionBudget(MOST_SEARCHED))
+    paths: int = MOST_PATHS
+    of_wheels: dict[tuple[str, str], tuple[bool, bool]] = field(default_factory=dict)
+    fields: dict[tuple[str, str], list[str]] = field(default_factory=dict)
+
+    def words_of(self, channel: Channel) -> tuple[bool, bool]:
+        """Return whether the definition of a channel has a word of a side, and one of wheels."""
+        one = (channel.message_type, channel.definition)
+        if one not in self.of_wheels:
+            self.looked_at -= len(channel.definition)
+            text = channel.definition if self.looked_at >= 0 else ""
+            self.of_wheels[one] = bool(_SIDE_WORDS.search(text)), bool(_OF_WHEELS.search(text))
+        return self.of_wheels[one]
+
+    def fields_of(self, channel: Channel) -> list[str]:
+        """Return the paths of the numbers in the messages of a channel; none beyond what may be searched."""
+        one = (channel.message_type, channel.definition)
+        if one not in self.fields:
+            self.fields[one] = []
+            with suppress(DefinitionError):
+                self.searched.take(channel)
+                self.fields[one] = number_fields(channel)
+        found = []
+        for path in self.fields[one]:
+            self.paths -= len(path) + len(channel.topic)
+            if self.paths < 0:
+                break
+            found.append(path)
+        return found
+
+
+def _fields_of(channel: Channel, search: _Search) -> list[str]:
+    """Return the fields of a channel's messages that may be of wheels; of unknown types by their names."""
     topic, message_type = channel.topic, channel.message_type
     if message_type in PAIR_TYPES:
         return ["data"] if _may_be_side(topic, message_type, "data") else []
     if message_type in ARRAY_TYPES:
         return ["data[*]"] if _OF_WHEELS.search(topic) and not _OTHER_WORDS.search(topic) else []
-    words = f"{topic} {message_type} {channel.definition}"
-    if message_type in KNOWN_TYPES or not (_SIDE_WORDS.search(words) and _OF_WHEELS.search(words)):
+    if message_type in KNOWN_TYPES:
         return []
-    one = (message_type, channel.definition)
-    if sum(len(text) for _, text in searched | {one}) > MOST_SEARCHED:
+    name, (side, of_wheels) = f"{topic} {message_type}", search.words_of(channel)
+    if not ((side or _SIDE_WORDS.search(name)) and (of_wheels or _OF_WHEELS.search(name))):
         return []
-    searched.add(one)
-    return [path for path in number_fields(channel) if _may_be_side(topic, message_type, path)]
+    return [path for path in search.fields_of(channel) if _may_be_side(topic, message_type, path)]
 
 
 def _may_be_side(topic: str, message_type: str, path: str) -> bool:

@@ -434,8 +434,8 @@ def test_a_header_of_empty_fields_costs_no_time(tmp_path: Path) -> None:
 def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
     from icrtool import config
     from icrtool.fleet import recordings
-    from icrtool.logs.containers import chunk, open_log, recording_files, sqlite_bag, unpack
-    from icrtool.logs.messages import decoded_values, decoder, definitions, protobuf
+    from icrtool.logs.containers import chunk, container, open_log, recording_files, sqlite_bag, unpack
+    from icrtool.logs.messages import decoded_values, decoder, definition_bounds, definitions, protobuf
     from icrtool.logs.streams import wheel_pairs, wheels
     from icrtool.records import text
 
@@ -447,10 +447,11 @@ def test_the_bounds_that_are_promised_are_those_of_the_code() -> None:
         chunk.LARGEST_CHUNK_BYTES, chunk.LARGEST_RATIO, chunk.FREE_BYTES,
         unpack._MOST_ENTRIES, unpack._LARGEST_READ_BYTES, unpack._LARGEST_EXTRA_BYTES,
         sqlite_bag._LARGEST_MESSAGE_BYTES, decoded_values.LONGEST_MESSAGE_BYTES, protobuf.LONGEST_DESCRIPTORS,
-        definitions.DEEPEST, definitions.MOST_FIELDS,
+        definitions.DEEPEST, definition_bounds.MOST_FIELDS, text.LONGEST_TEXT, definition_bounds.MOST_NAME_CHARACTERS,
+        container.LARGEST_DESCRIPTIONS_BYTES, definition_bounds.MOST_PARSED,
         sqlite_bag._MOST_TOPICS, open_log.MOST_CHANNELS, text.LONGEST_TEXT, decoder.MOST_TEXTS,
         recording_files.LARGEST_METADATA_BYTES, open_log.MOST_FILES, wheels.MOST_WHEELS,
-            wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PAIRS,
+        wheel_pairs.MOST_LOOKED_AT, wheel_pairs.MOST_SEARCHED, wheel_pairs.MOST_PATHS, wheel_pairs.MOST_PAIRS,
         LONGEST_HEAD_BYTES, config.LARGEST_FILE_BYTES, recordings.LARGEST_MANIFEST_BYTES,
     ]  # fmt: skip
 

@@ -1,0 +1,138 @@
+"""Bounds of what the definitions in a log may hold, and of what may be parsed of all of them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+from icrtool.errors import DefinitionError
+from icrtool.logs.containers.container import Channel
+from icrtool.records.text import LONGEST_TEXT
+
+MOST_FIELDS = 20_000
+"""Fields of a message type, with those of the types in it. Real definitions have some hundred."""
+
+MOST_NAME_CHARACTERS = 1 << 20
+"""Sum of the characters of all full names of fields of a message type, with the types in it. The schemas of all of
+Foxglove together have 40,000."""
+
+MOST_PARSED = 1 << 19
+"""Characters of the different definitions that are parsed for one log: a second of CPU. Those of 30 topics have
+100,000."""
+
+_LEAST_COST, _IDL_WEIGHT, _IDL_NUMBER_WEIGHT, _SCHEMA_SHARE = 1000, 3, 2000, 8
+"""Any definition takes as long as so many characters of ROS definitions; a character of IDL, or a number in it, as so
+many; so many characters of JSON or bytes of Protobuf take as long as one."""
+
+_IDL_NUMBER = re.compile(r"[\[<]|(?<!=)=(?!=)")
+_LONG_WORD = re.compile(rf"[\w/]{{{LONGEST_TEXT + 1}}}")
+_MODULE = re.compile(r"\bmodule\s+(\w+)\s*\{|[{}]")
+_COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
+
+
+@dataclass(slots=True)
+class FieldNames:
+    """Counts the full names of the fields of a message type, before anything is made of them.
+
+    A name that is long, times fields that are many, would fill the memory where each bound for itself does not.
+
+    Attributes
+    ----------
+    message_type : in errors
+    left : characters that further names may have together
+    """
+
+    message_type: str
+    left: int = MOST_NAME_CHARACTERS
+
+    def add(self, *parts: str) -> None:
+        """Count one full name, of its parts with a dot between two.
+
+        Raises
+        ------
+        DefinitionError
+            The name is longer than `LONGEST_TEXT`, or all are longer than `MOST_NAME_CHARACTERS`.
+        """
+        length = sum(map(len, parts)) + len(parts) - 1
+        self.left -= length
+        if length > LONGEST_TEXT:
+            why = f"a field has a full name of {length} characters; at most {LONGEST_TEXT} are read"
+        elif self.left < 0:
+            why = f"the full names of its fields have more than {MOST_NAME_CHARACTERS} characters"
+        else:
+            return
+        raise DefinitionError(self.message_type, why, "this type is not read")
+
+    def add_text(self, text: str) -> None:
+        """Refuse a definition with a word that is too long for a name, but in comments and strings.
+
+        Raises
+        ------
+        DefinitionError
+            There is one.
+        """
+        if (word := _LONG_WORD.search(_COMMENT_OR_STRING.sub(" ", text))) is not None:
+            self.add(word[0])
+
+    def add_modules(self, idl: str) -> None:
+        """Count the full name of each place within modules of IDL: the parser puts all of it before each type.
+
+        Raises
+        ------
+        DefinitionError
+            As `add`.
+        """
+        within: list[str] = []
+        for found in _MODULE.finditer(idl):
+            if found[0] == "}":
+                within = within[:-1]
+            else:
+                within.append(found[1] or "")
+                self.add(*within)
+
+
+@dataclass(slots=True)
+class DefinitionBudget:
+    """What may still be parsed of the definitions in a log, whose topics may each have another one.
+
+    Attributes
+    ----------
+    left : characters of ROS definitions, or what takes as long
+    refused : by type and definition, why they cannot be read: that is found out once
+    """
+
+    left: int = MOST_PARSED
+    refused: dict[tuple[str, str], DefinitionError] = field(default_factory=dict)
+    _parsed: set[tuple[str, str]] = field(default_factory=set)
+
+    def take(self, channel: Channel) -> None:
+        """Count the definition of a channel, the first time that it comes.
+
+        Raises
+        ------
+        DefinitionError
+            Those before it were so long that this one is not parsed.
+        """
+        one, cost = (channel.message_type, channel.definition), len(channel.definition)
+        if (before := self.refused.get(one)) is not None:
+            raise before
+        if one in self._parsed:
+            return
+        if channel.encoding in ("json", "protobuf"):
+            cost //= _SCHEMA_SHARE
+        elif channel.definition_format == "idl":
+            cost = _IDL_WEIGHT * cost + _IDL_NUMBER_WEIGHT * len(_IDL_NUMBER.findall(channel.definition))
+        cost += _LEAST_COST
+        if cost > self.left:
+            why = f"the definitions of its types are longer than {MOST_PARSED} characters together"
+            raise DefinitionError(channel.topic, why, "name the topics that are needed in [topics]")
+        self.left -= cost
+        self._parsed.add(one)
+
+    def spend(self, channel: Channel, fields: int | DefinitionError) -> None:
+        """Count the fields of the layout of a channel, which may be many: one that is refused, for the most of them."""
+        if isinstance(fields, DefinitionError):
+            self.refused[channel.message_type, channel.definition] = fields
+            self.left -= MOST_FIELDS if channel.definition else 0
+        else:
+            self.left -= fields
