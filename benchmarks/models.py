@@ -21,7 +21,7 @@ from unseen import robot_config
 from unseen_drives import is_on_ice, load_drives
 from unseen_logs import draw_case, make_log
 
-from icrtool.calibration.held_out import HORIZONS_M, errors_without, plan_folds
+from icrtool.calibration.held_out import HELD_OUT_HORIZONS_M, errors_without, plan_folds
 from icrtool.calibration.pooled import recording_of
 from icrtool.config import Config, load_config
 from icrtool.errors import IcrToolError
@@ -112,7 +112,7 @@ class Tested:
         with priors(stds, widen=row.widen):
             found = pool.fit(FAMILY[FIVE if row.model == CONTROLLER else row.model])
             errors = [
-                errors_without(one, cut_trials(one, HORIZONS_M, pooled), folds, i,
+                errors_without(one, cut_trials(one, HELD_OUT_HORIZONS_M, pooled), folds, i,
                                lambda fold, one=one: predict(row.model, found, fold, one), windows[i].track).position
                 for i, one in enumerate(self.recordings)
             ]  # fmt: skip
@@ -153,7 +153,7 @@ def learn_priors(shown: Sequence[tuple[Floats, Floats]]) -> dict[str, float]:
 def format_table(title: str, tested: Sequence[Tested], *, others: Sequence[Tested]) -> Iterator[str]:
     """Yield the lines of one table; priors are learned from `others` but those of the recordings tested."""
     shown = {one.name: one.wide() for one in others}
-    errors = np.empty((len(ROWS), len(tested), len(HORIZONS_M)))
+    errors = np.empty((len(ROWS), len(tested), len(HELD_OUT_HORIZONS_M)))
     for r, row in enumerate(ROWS):
         for i, one in enumerate(tested):
             mine = {recording.name for recording in one.recordings}

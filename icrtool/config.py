@@ -23,7 +23,7 @@ from icrtool.records.presets import PRESETS, Preset
 from icrtool.records.text import LONGEST_NAME, did_you_mean, shortened
 
 LARGEST_FILE_BYTES = 1 << 20
-MOST_LISTED = 1000
+MOST_LIST_ITEMS = 1000
 """Horizons, or outages."""
 
 _DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]+\s*\.\s*){64}")
@@ -147,8 +147,8 @@ class DropoutConfig:
 
     def __post_init__(self) -> None:
         for key in ("horizons_m", "forced_outage_s"):
-            if (count := len(getattr(self, key))) > MOST_LISTED:
-                raise ValueError(f"{key}: {count} numbers; at most {MOST_LISTED} are analysed")
+            if (count := len(getattr(self, key))) > MOST_LIST_ITEMS:
+                raise ValueError(f"{key}: {count} numbers; at most {MOST_LIST_ITEMS} are analysed")
         if not self.horizons_m:
             raise ValueError("horizons_m: is empty; give one distance or more")
         if len(set(self.horizons_m)) != len(self.horizons_m):

@@ -1,4 +1,4 @@
-"""The architecture as a test: which package may import which, no circles, no module too long (docs/architecture.md).
+"""The architecture as a test: which package may import which, no circles, one meaning a name (docs/architecture.md).
 
 A breach is reported as a sentence.
 """
@@ -146,6 +146,44 @@ def circle_among(modules: dict[str, str]) -> list[str]:
     return []
 
 
+ENTRY_POINTS = {"main"}
+"""Functions that each process has one of; nobody imports them."""
+
+
+def defined_names(source: str) -> tuple[list[str], list[str]]:
+    """Return the upper-case constants and the public functions that a module defines at its top level."""
+    constants: list[str] = []
+    functions: list[str] = []
+    todo: list[ast.stmt] = list(ast.parse(source).body)
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.If | ast.Try):
+            todo += [*node.body, *node.orelse]
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            functions.append(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [one.id for target in targets for one in ast.walk(target) if isinstance(one, ast.Name)]
+            constants += [name for name in names if name.strip("_").isupper()]
+    return constants, [name for name in functions if not name.startswith("_") and name not in ENTRY_POINTS]
+
+
+def names_with_two_meanings(modules: dict[str, str]) -> list[str]:
+    """Return the constants and public functions that several modules define, a sentence each.
+
+    A module that needs the constant of another one imports it: an equal value that is written twice is also a breach.
+    """
+    homes: dict[str, set[str]] = {}
+    for module, source in modules.items():
+        for name in (name for names in defined_names(source) for name in names):
+            homes.setdefault(name, set()).add(module)
+    return [
+        f"{name} is defined in {', '.join(sorted(found))}: give each meaning its name, or import it"
+        for name, found in sorted(homes.items())
+        if len(found) > 1
+    ]
+
+
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
 
 
@@ -161,6 +199,39 @@ def test_no_imports_go_in_a_circle() -> None:
         if path.name not in {"__init__.py", "__main__.py"}
     }
     assert (circle := circle_among(sources)) == [], " imports ".join(circle)
+
+
+def test_a_name_has_one_meaning_in_the_package() -> None:
+    sources = {str(path): (PACKAGE / path).read_text(encoding="utf-8") for path in MODULES}
+    assert not (found := names_with_two_meanings(sources)), "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "name"),
+    [
+        ("WIDTH_M = 0.5", "WIDTH_M = 0.6", "WIDTH_M"),
+        ("WIDTH_M = 0.5", "WIDTH_M: float = 0.5", "WIDTH_M"),
+        ("LEAST, MOST = 1, 2", "if True:\n    MOST = 3", "MOST"),
+        ("_CHUNK = 6", "_CHUNK = 5", "_CHUNK"),
+        ("def save(): ...", "def save(): ...", "save"),
+    ],
+)
+def test_a_name_with_two_meanings_is_found(one: str, other: str, name: str) -> None:
+    [sentence] = names_with_two_meanings({"a.py": one, "b.py": other})
+    assert sentence.startswith(f"{name} is defined in a.py, b.py")
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("WIDTH_M = 0.5", "from a import WIDTH_M"),
+        ("def main(): ...", "def main(): ..."),
+        ("def _row(): ...", "def _row(): ..."),
+        ("LEAST = 1\nLEAST = 2", "def f():\n    LEAST = 3"),
+    ],
+)
+def test_a_name_that_is_imported_or_local_has_one_meaning(one: str, other: str) -> None:
+    assert names_with_two_meanings({"a.py": one, "b.py": other}) == []
 
 
 def test_a_circle_of_types_is_found() -> None:

@@ -13,7 +13,7 @@ from icrtool.alignment.conventions import apply_convention, decide_conventions
 from icrtool.alignment.corrections import AlignedStreams, align_streams
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.gnss_quality import grade_fixes
-from icrtool.alignment.log_track import check_streams, cut_windows, track_of_log
+from icrtool.alignment.log_track import check_streams, cut_drive_windows, track_of_log
 from icrtool.alignment.sensor_noise import fixes_of, heading_variance, reference_noise, without_frozen
 from icrtool.alignment.slip_events import find_disagreements
 from icrtool.alignment.wheel_alignment import bridged
@@ -225,7 +225,7 @@ LENGTH_M, SHARE = 10.0, 0.9
 POOR_M = 1.0
 """A reference whose residual is less is kept: GNSS gives positions on the globe, and does not drift."""
 
-BETTER = 0.5
+BETTER_RESIDUAL_RATIO = 0.5
 """Another reference is taken where its residual is less than this part of the chosen one's."""
 
 LEAST_SHARE_COVERED = 0.7
@@ -259,7 +259,7 @@ def choose_reference(log: RobotLog, config: Config) -> RobotLog:
     least = LEAST_SHARE_COVERED * chosen.distance_m
     fit = [(one.residual_m, other) for one, other in found if one.distance_m > least]
     residual, best = min(fit, key=lambda one: one[0], default=(math.inf, log))
-    if not residual < min(BETTER * chosen.residual_m, POOR_M):
+    if not residual < min(BETTER_RESIDUAL_RATIO * chosen.residual_m, POOR_M):
         return log
     topics = [one.topic("gnss") for one in (best, log)]
     against = f"{chosen.residual_m:.2f} m" if math.isfinite(chosen.residual_m) else "not comparable"
@@ -282,7 +282,7 @@ def agreement(log: RobotLog, config: Config) -> Agreement:
     except (ConfigError, DataError):
         return NONE
     track = track_of_log(log)
-    windows = cut_windows(track, length_m=LENGTH_M)
+    windows = cut_drive_windows(track, length_m=LENGTH_M)
     free = config.frames.heading == "auto"
     decision = decide_conventions(windows, metric=log.datum is None and free, mirror_allowed=free)
     named = apply_convention(log, decision.convention)

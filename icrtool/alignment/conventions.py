@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.log_track import (
+    FEWEST_ALIGNMENT_WINDOWS,
     FEWEST_OVERLAPPING,
-    FEWEST_WINDOWS,
     LEAST_CHORD_M,
     STARTS_A_WINDOW,
     DriveWindows,
@@ -45,7 +45,7 @@ EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
 DECISIVE = 25.0
 """Twice the log-likelihood, five standard deviations: less does not overrule that everything is as it is named."""
 
-PRIOR_STD = 10.0
+VAGUE_PRIOR_STD = 10.0
 """Hardly any prior, of parameters near one."""
 
 FAULTS = {"swapped": 1.0, "one side reversed": 1.0, "both reversed": 1.0, "heading mirrored": 1.0,
@@ -164,7 +164,7 @@ def senses_by_distance(track: Track) -> Convention:
     _, step, left, right = cut_chords(track)
     chord = np.abs(step)
     moved = chord > max(LEAST_CHORD_M, CHORD_IN_POSITION_STD * track.place_std_m)
-    if np.count_nonzero(moved) < FEWEST_WINDOWS:
+    if np.count_nonzero(moved) < FEWEST_ALIGNMENT_WINDOWS:
         return AS_NAMED
     as_named, reversed_ = (
         float(np.median(np.abs(chord - np.abs(both) / 2)[moved])) for both in (left + right, left - right)
@@ -193,7 +193,7 @@ def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -
     turns = [track.cumulate(one) for one in (track.half_difference, track.mean_speed)]
     by = [np.interp(last, track.t, total) - np.interp(first, track.t, total) for total in turns]
     place, turn = (
-        robust_regression(design, target, np.full(design.shape[1], PRIOR_STD), float(STARTS_A_WINDOW))
+        robust_regression(design, target, np.full(design.shape[1], VAGUE_PRIOR_STD), float(STARTS_A_WINDOW))
         for design, target in (
             (np.concatenate([columns.real, columns.imag]), np.concatenate([seen.real, seen.imag])),
             (np.column_stack(by), hand * windows.heading_changes),

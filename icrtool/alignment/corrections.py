@@ -21,7 +21,7 @@ from icrtool.alignment.conventions import (
     gyro_sense,
     senses_by_distance,
 )
-from icrtool.alignment.estimator import PRIOR_STD, TP, AlignmentFit, estimate_alignment
+from icrtool.alignment.estimator import ESTIMATE_PRIOR_STD, TP, AlignmentFit, estimate_alignment
 from icrtool.alignment.heading_alignment import (
     NOT_COMPARED,
     OTHER_CONVENTION,
@@ -53,7 +53,7 @@ from icrtool.records.notes import Note, about, note
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
-SIGNIFICANT_SIGMAS = 2.5
+CORRECTION_SIGMAS = 2.5
 SMALLEST_LEAD_S, LARGEST_STD_S = 0.2, 0.1
 """A robot follows its wheels by up to `RESPONSE_S`, which is no clock; the standard deviation of a delay holds that. A
 stream that leads by little is more often a response that the model lacks than a clock."""
@@ -68,7 +68,7 @@ class Delay(NamedTuple):
     @property
     def is_significant(self) -> bool:
         """Whether it is known well, and is not zero."""
-        return self.std_s < LARGEST_STD_S and abs(self.value_s) > SIGNIFICANT_SIGMAS * self.std_s
+        return self.std_s < LARGEST_STD_S and abs(self.value_s) > CORRECTION_SIGMAS * self.std_s
 
 
 UNKNOWN = Delay(math.nan, math.nan)
@@ -103,7 +103,7 @@ class StreamDelays(NamedTuple):
             return 0.0
         if self.applied_gnss_s != self.applied_heading_s:
             return std
-        agree = PRIOR_STD[TP] / std * math.exp(-0.5 * (value / std) ** 2)
+        agree = ESTIMATE_PRIOR_STD[TP] / std * math.exp(-0.5 * (value / std) ** 2)
         return math.sqrt((std**2 + value**2) / (1.0 + agree))
 
 
@@ -129,7 +129,7 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tupl
 def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> tuple[float, float]:
     """Return the delays of heading and position to correct: of the ways in which streams lag, the likeliest.
 
-    Twice the negative log-likelihood, with a penalty for each delay that is not zero (`SIGNIFICANT_SIGMAS` squared).
+    Twice the negative log-likelihood, with a penalty for each delay that is not zero (`CORRECTION_SIGMAS` squared).
     """
     if together:
         common = position.value_s if position.is_significant and _is_large(position.value_s) else 0.0
@@ -142,7 +142,7 @@ def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bo
     costs = {
         (first, second): ((lag - first) / heading.std_s) ** 2
         + ((after - second + first) / apart.std_s) ** 2
-        + SIGNIFICANT_SIGMAS**2 * free[first, second]
+        + CORRECTION_SIGMAS**2 * free[first, second]
         for first, second in free
         if all(value == 0.0 or _is_large(value) for value in (first, second))
     }

@@ -28,7 +28,7 @@ from icrtool.kernels.track import Track
 from icrtool.motion.models import FIVE, MODELS, FittedModel, TrackGeometry
 from icrtool.records.measurements import RESPONSE_S
 
-NAMES = (
+ESTIMATE_NAMES = (
     "scale",
     "middle",
     "sideways",
@@ -43,8 +43,8 @@ NAMES = (
 )
 A, M, C, L, K, Q, G, D, TP, TH, N = range(11)
 
-PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-PRIOR_STD = np.array([0.5, 0.1, 0.5, 0.2, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5, 0.1])
+ESTIMATE_PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+ESTIMATE_PRIOR_STD = np.array([0.5, 0.1, 0.5, 0.2, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5, 0.1])
 """They keep apart what a drive does not, and hardly matter where it does. Robots are symmetric: their ICRs lie about as
 far to either side (`MIDDLE_STD_M`), and x_icr within half of b (the third is in b). Delays of position and
 heading of one robot usually agree to 0.15 s. An absolute heading drifts by no more than a degree in a minute: without
@@ -56,7 +56,7 @@ MIDDLE_STD_M = 0.1
 SAME_CLOCK_STD_S = 1e-3
 """Fields of the same messages lag alike."""
 
-STEP_S, TURN_STEP_S = 0.02, 0.1
+DELAY_STEP_S, HEADING_STEP_S = 0.02, 0.1
 """Delays are differentiated over the first step to either side, noisy headings over the second."""
 
 SMOOTH_S = 0.2
@@ -91,9 +91,9 @@ ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
 MOUNTING_STD_RAD = math.radians(3.0)
 """A sensor whose offset no drive shows points ahead to within this."""
 
-MOST_STEPS = 15
+MOST_NEWTON_STEPS = 15
 
-SIGNIFICANT_SIGMAS = 4.0
+EVIDENCE_SIGMAS = 4.0
 """What contradicts that sensors are mounted along the robot, sides alike or wheels measured is this sure: standard
 deviations of few stretches of distance are uncertain themselves."""
 
@@ -118,7 +118,7 @@ class ResidualsByEstimate(NamedTuple):
 
 
 class AlignmentFit(NamedTuple):
-    """The parameters in the order of `NAMES`.
+    """The parameters in the order of `ESTIMATE_NAMES`.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ class AlignmentFit(NamedTuple):
         if name == "position_delay":
             both = self.covariance[np.ix_([TP, TH], [TP, TH])]
             return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(max(float(both.sum()), 0.0))
-        row = NAMES.index(name)
+        row = ESTIMATE_NAMES.index(name)
         variance = float(self.covariance[row, row])
         # rounding may leave a variance below zero where the drive hardly shows the parameter
         return float(self.fit.x[row]), math.sqrt(variance) if variance > 0.0 else math.inf
@@ -194,7 +194,7 @@ class AlignmentFit(NamedTuple):
 def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
     """Return the residuals of all windows before and after the estimate."""
     w = len(found.windows.begin)
-    neutral = PRIOR_MEAN.copy()
+    neutral = ESTIMATE_PRIOR_MEAN.copy()
     neutral[K] = found.fit.x[K]
     before, after = (found.model.evaluate(x)[0] for x in (neutral, found.fit.x))
     return ResidualsByEstimate(
@@ -224,7 +224,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     if min(len(windows.begin), len(windows.turn_begin)) < FEWEST_OVERLAPPING:
         return None
     track, model = windows.track, MotionOfWindows(windows, width_m)
-    start = PRIOR_MEAN.copy()
+    start = ESTIMATE_PRIOR_MEAN.copy()
     # the direction of the displacements from wheels laid along the heading
     unit = (windows.seen * np.conj(windows.laid))[np.abs(windows.laid) > windows.length_m / 3]
     spins = len(unit) < FEWEST_OVERLAPPING
@@ -233,7 +233,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     w, u = len(windows.begin), len(windows.turn_begin)
     kind = np.concatenate([np.zeros(w, np.int64), np.ones(w, np.int64), np.full(u, 2)])
     group = np.concatenate([windows.group, windows.group, windows.turn_group])
-    prior_std = PRIOR_STD.copy()
+    prior_std = ESTIMATE_PRIOR_STD.copy()
     # spins show the distance of the ICRs' middle from the antenna, and not its direction
     prior_std[D] = MOUNTING_STD_RAD if spins else prior_std[D]
     prior_std[TP] = SAME_CLOCK_STD_S if track.same_clock else prior_std[TP]
@@ -241,7 +241,13 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     prior_std[C] *= width_m
     try:
         fit = robust_least_squares(
-            model.evaluate, start, PRIOR_MEAN, prior_std, kind=kind, overlap=OVERLAP, most_steps=MOST_STEPS
+            model.evaluate,
+            start,
+            ESTIMATE_PRIOR_MEAN,
+            prior_std,
+            kind=kind,
+            overlap=OVERLAP,
+            most_steps=MOST_NEWTON_STEPS,
         )
         covariance = correlated_covariance(fit, group)
     except np.linalg.LinAlgError:
@@ -296,11 +302,11 @@ class MotionOfWindows:
         predicted = x @ by
         by[D] = 1j * predicted
         path = track.cumulate(np.asarray((ahead + 1j * aside * rate) * nose))
-        before, after = (np.interp(t + shift_s, track.t, path) for shift_s in (-STEP_S, STEP_S))
-        by[TP] = np.diff(before - after, axis=0) / (2 * STEP_S)
-        # the derivative of the heading's unit vector, over `TURN_STEP_S`
-        after, before = (track.heading_at(t + shift_s + x[TH]) + x[D] for shift_s in (TURN_STEP_S, -TURN_STEP_S))
-        turning = 0.5j * (after - before) / TURN_STEP_S * np.exp(0.5j * (after + before))
+        before, after = (np.interp(t + shift_s, track.t, path) for shift_s in (-DELAY_STEP_S, DELAY_STEP_S))
+        by[TP] = np.diff(before - after, axis=0) / (2 * DELAY_STEP_S)
+        # the derivative of the heading's unit vector, over `HEADING_STEP_S`
+        after, before = (track.heading_at(t + shift_s + x[TH]) + x[D] for shift_s in (HEADING_STEP_S, -HEADING_STEP_S))
+        turning = 0.5j * (after - before) / HEADING_STEP_S * np.exp(0.5j * (after + before))
         begin, end = np.interp(t, track.t + track.held / 2, aside) * turning
         by[TH] = by[TP] + 1j * laid(rate * ahead) + end - begin
         level = self.level * np.exp(-1j * x[D])
@@ -344,5 +350,5 @@ class MotionOfWindows:
         by = np.zeros((len(x), edges.shape[1]))
         by[K], by[Q], by[G] = over(self.turn_w), over(self.turn_v) / self.b, edges[1] - edges[0]
         predicted = x @ by
-        by[TH] = x[K] * (over(self.turn_w, -STEP_S) - over(self.turn_w, STEP_S)) / (2 * STEP_S)
+        by[TH] = x[K] * (over(self.turn_w, -DELAY_STEP_S) - over(self.turn_w, DELAY_STEP_S)) / (2 * DELAY_STEP_S)
         return predicted - self.windows.heading_changes, by

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.sensor_noise import (
-    FEWEST_STEPS,
+    FEWEST_NOISE_STEPS,
     LARGEST_SANE_GNSS_STD_M,
     NOISIER,
     FixSteps,
@@ -198,7 +198,7 @@ LONGEST_EXCURSION_S = 60.0
 TAKEN_BACK = 0.25
 """A jump that another takes back, up to this part, within this time: the fixes between were off."""
 
-MOST_JUMPS = 500
+MOST_RTK_JUMPS = 500
 """With more of them the position reference is something else than RTK that is lost now and then."""
 
 
@@ -219,16 +219,16 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
     usual = max(float(np.median(moving if len(moving) >= 2 else known)), USUAL_M2)
     with np.errstate(invalid="ignore"):
         noisy = level > STRETCH_VARIANCE * usual
-    noisy &= ~flagged[1 : 1 + len(level) * FEWEST_STEPS].reshape(-1, FEWEST_STEPS).any(axis=1)
+    noisy &= ~flagged[1 : 1 + len(level) * FEWEST_NOISE_STEPS].reshape(-1, FEWEST_NOISE_STEPS).any(axis=1)
     jumps = np.flatnonzero(claimed[steps.jump_row] & claimed[np.maximum(steps.jump_row - 1, 0)])
     beside, nearby = _moving_mean(level, BESIDE_JUMP), _moving_mean(level, 3)
     undecided = []
-    for jump in jumps.tolist() if len(jumps) <= MOST_JUMPS else ():
-        float_side = _noisy_side(beside, nearby, moves, (int(steps.jump_row[jump]) - 1) // FEWEST_STEPS)
+    for jump in jumps.tolist() if len(jumps) <= MOST_RTK_JUMPS else ():
+        float_side = _noisy_side(beside, nearby, moves, (int(steps.jump_row[jump]) - 1) // FEWEST_NOISE_STEPS)
         noisy[float_side] = True
         if float_side.start == float_side.stop:
             undecided.append(jump)
-    misreported[1 : 1 + len(level) * FEWEST_STEPS] = np.repeat(noisy, FEWEST_STEPS)
+    misreported[1 : 1 + len(level) * FEWEST_NOISE_STEPS] = np.repeat(noisy, FEWEST_NOISE_STEPS)
     for jump, back in pairwise(undecided):
         first, last = steps.jump_row[[jump, back]]
         away, home = steps.step[[first - 1, last - 1]]

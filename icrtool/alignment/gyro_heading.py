@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS
-from icrtool.alignment.log_track import FEWEST_WINDOWS
+from icrtool.alignment.estimator import EVIDENCE_SIGMAS
+from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.turn_rates import Courses, Guess, TurnRate, fit_middle, measure_courses
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.kalman import (
@@ -34,23 +34,23 @@ from icrtool.kernels.kalman import (
 from icrtool.kernels.robust import long_run_factor
 from icrtool.kernels.track import Track
 
-PSI, BIAS, SCALE, X, DELAY = range(5)
+ANGLE, BIAS, SCALE, X, DELAY = range(5)
 OFFSET, WANDER, LAG = 5, 6, 7
 """States of the first absolute heading; those of the next one follow."""
-STATES, STATES_OF_A_SOURCE = 5, 3
-COURSE, STANDING, NOTHING, ABSOLUTE = range(4)
+GYRO_STATES, STATES_OF_A_SOURCE = 5, 3
+COURSE, STANDSTILL, NOTHING, ABSOLUTE = range(4)
 
 SETTLED_SIGMAS = 3.0
 LARGEST_RATE_HZ = 20.0
 
 STANDING_S = 0.6
 STANDING_RATE_STD = math.radians(0.05)
-PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1])
+GYRO_STATE_PRIOR_STD = np.array([math.pi, math.radians(2.0), 0.02, 0.3, 0.1])
 ABSOLUTE_PRIOR_STD = np.array([math.pi, math.radians(1.0), 0.05])
 ANY_DIRECTION_STD = math.pi / math.sqrt(3.0)
 """Standard deviation [rad] of a direction that may be any, as before the robot drives."""
 
-LONGEST_STEP_S = 1.0
+LONGEST_GYRO_STEP_S = 1.0
 """A gap between events is cut into steps of at most this, so that the uncertainty grows within it."""
 
 LEAST_COURSE_STD_RAD = math.radians(0.05)
@@ -61,7 +61,7 @@ MOST_SWEEPS = 3
 MOST_EVENTS = 2000
 """The likelihood looks at so many events."""
 
-NOISES = {
+GYRO_NOISES = {
     "angle": np.radians([0.01, 0.02, 0.05, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0]),
     "bias": np.radians([0.0003, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0]),
     "fixes": np.array([0.7, 1.0, 1.4, 2.0, 3.0, 5.0]),
@@ -78,7 +78,7 @@ NOISES_OF_A_SOURCE = {
 """White noise in the stated one; growth [rad/sqrt(s)] and standard deviation [rad] of the error that wanders."""
 
 
-USUAL_NOISES = {name: float(grid[len(grid) // 2]) for name, grid in NOISES.items()}
+USUAL_NOISES = {name: float(grid[len(grid) // 2]) for name, grid in GYRO_NOISES.items()}
 """Where the search for the noises begins."""
 
 WANDERS = "0 size"
@@ -160,12 +160,12 @@ def estimate_heading(
     attempt = 0
     while True:
         courses = measure_courses(track, turn, guess)
-        if len(courses.end) < FEWEST_WINDOWS:
+        if len(courses.end) < FEWEST_ALIGNMENT_WINDOWS:
             return None
         problem = _Problem(courses, still, turn, ())
         if attempt:
             # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
-            noises = problem.choose(NOISES, noises)
+            noises = problem.choose(GYRO_NOISES, noises)
         better = problem.guess(noises)._replace(middle=fit_middle(courses, guess))
         turned = float(np.abs(better.bias - guess.bias).max() * np.median(courses.end - courses.begin))
         settled = turned < LARGE_BIAS_RAD and abs(better.delay_s - guess.delay_s) < LONG_DELAY_S and attempt > 0
@@ -181,7 +181,7 @@ def estimate_heading(
         noises = problem.choose(grids, noises)
     if absolute and math.isfinite(absolute[0].aligned_std):
         offset, std = problem.offset(noises)
-        if abs(offset) <= SIGNIFICANT_SIGMAS * std:
+        if abs(offset) <= EVIDENCE_SIGMAS * std:
             # not significant: that of a sensor mounted along the robot
             problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
     return problem.solve(noises)
@@ -210,18 +210,21 @@ class _Problem:
         t = np.concatenate([courses.end, still_t, *(one.t for one in absolute)])
         # steps that measure nothing, between events far apart
         at = np.sort(t)
-        far = np.flatnonzero(np.diff(at) > 2.0 * LONGEST_STEP_S)
-        steps = [np.arange(at[i] + LONGEST_STEP_S, at[i + 1] - 0.5 * LONGEST_STEP_S, LONGEST_STEP_S) for i in far]
+        far = np.flatnonzero(np.diff(at) > 2.0 * LONGEST_GYRO_STEP_S)
+        steps = [
+            np.arange(at[i] + LONGEST_GYRO_STEP_S, at[i + 1] - 0.5 * LONGEST_GYRO_STEP_S, LONGEST_GYRO_STEP_S)
+            for i in far
+        ]
         nothing = np.zeros(sum(map(len, steps)))
         t = np.concatenate([t, *steps])
         kind = np.repeat(
-            [COURSE, STANDING, *range(ABSOLUTE, ABSOLUTE + len(absolute)), NOTHING],
+            [COURSE, STANDSTILL, *range(ABSOLUTE, ABSOLUTE + len(absolute)), NOTHING],
             [len(courses.end), len(still_t), *(len(one.t) for one in absolute), len(nothing)],
         )
         order = np.lexsort((kind, t))
-        h = np.zeros((len(t), STATES + STATES_OF_A_SOURCE * len(absolute)))
-        h[:, PSI] = (kind != STANDING) & (kind != NOTHING)
-        h[kind == STANDING, BIAS] = 1.0
+        h = np.zeros((len(t), GYRO_STATES + STATES_OF_A_SOURCE * len(absolute)))
+        h[:, ANGLE] = (kind != STANDSTILL) & (kind != NOTHING)
+        h[kind == STANDSTILL, BIAS] = 1.0
         rows = kind == COURSE
         h[rows, BIAS], h[rows, SCALE], h[rows, X], h[rows, DELAY] = (
             courses.of_bias, courses.of_scale, courses.of_x, courses.of_delay,
@@ -237,7 +240,7 @@ class _Problem:
         elapsed, turned = (np.diff(column, prepend=column[:1]) for column in (self.t, self.at))
         holes = np.diff(turn.hole_variance(self.t), prepend=0.0)
         variance = np.concatenate(std)[order] ** 2
-        self.stated = HeadingEvents(elapsed, turned, holes, z[order], h, variance, angle=h[:, PSI] > 0.0)
+        self.stated = HeadingEvents(elapsed, turned, holes, z[order], h, variance, angle=h[:, ANGLE] > 0.0)
 
     def events(self, noises: dict[str, float], alike: float = 1.0, count: int | None = None) -> HeadingEvents:
         """Return the events, or so many of them, with the variances of some noises."""
@@ -250,16 +253,16 @@ class _Problem:
     def model(self, noises: dict[str, float]) -> HeadingModel:
         """Return start and process of the states."""
         count = len(self.absolute)
-        std = np.concatenate([PRIOR_STD, *(ABSOLUTE_PRIOR_STD for _ in range(count))])
+        std = np.concatenate([GYRO_STATE_PRIOR_STD, *(ABSOLUTE_PRIOR_STD for _ in range(count))])
         std[SCALE], std[BIAS] = self.turn.scale_std, self.turn.bias_std
         x, q, decay = np.zeros(len(std)), np.zeros(len(std)), np.zeros(len(std))
         first = int(np.argmax(self.kind == COURSE))
-        x[PSI] = self.stated.z[first] - (self.at[first] - self.at[0])
-        q[PSI], q[BIAS] = noises["angle"] ** 2, noises["bias"] ** 2
+        x[ANGLE] = self.stated.z[first] - (self.at[first] - self.at[0])
+        q[ANGLE], q[BIAS] = noises["angle"] ** 2, noises["bias"] ** 2
         for i in range(count):
             one = int(np.argmax(self.kind == ABSOLUTE + i))
             at = STATES_OF_A_SOURCE * i
-            x[at + OFFSET] = math.remainder(self.stated.z[one] - x[PSI] - (self.at[one] - self.at[0]), 2 * math.pi)
+            x[at + OFFSET] = math.remainder(self.stated.z[one] - x[ANGLE] - (self.at[one] - self.at[0]), 2 * math.pi)
             growth, size = noises[f"{i} rate"] ** 2, noises[f"{i} size"]
             std[at + OFFSET] = self.absolute[i].offset_std
             x[at + OFFSET] *= math.isinf(std[at + OFFSET])
@@ -318,11 +321,11 @@ class _Problem:
         states, covariances = smooth_headings(events, model, passes)
         del passes  # of a long log, as large as what the pass below makes
         fixed = np.ones(len(model.x), np.bool_)
-        fixed[[PSI, BIAS]] = False
-        fixed[STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
+        fixed[[ANGLE, BIAS]] = False
+        fixed[GYRO_STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
         both = np.outer(fixed, fixed)
         start = np.where(fixed, states[-1], model.x), np.where(both, covariances[-1], model.P)
-        psi_variance, final_std = covariances[:, PSI, PSI].copy(), np.sqrt(np.diagonal(covariances[-1]))
+        psi_variance, final_std = covariances[:, ANGLE, ANGLE].copy(), np.sqrt(np.diagonal(covariances[-1]))
         del covariances
         passes = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
         causal, of_causal = passes.x, passes.P
@@ -335,15 +338,15 @@ class _Problem:
         s = turn.t[rows]
         last = np.clip(np.searchsorted(t, s, side="right") - 1, 0, len(t) - 1)
         dt, dG = s - t[last], G[rows] - self.at[last]
-        psi, scale, bias = (causal[last, state] for state in (PSI, SCALE, BIAS))
+        psi, scale, bias = (causal[last, state] for state in (ANGLE, SCALE, BIAS))
         carried = psi + (1 + scale) * dG - bias * dt
         variance = noises["angle"] ** 2 * dt
-        f = {PSI: np.ones(len(rows)), BIAS: -dt, SCALE: dG}
+        f = {ANGLE: np.ones(len(rows)), BIAS: -dt, SCALE: dG}
         for i, j in product(f, f):
             variance += f[i] * of_causal[last, i, j] * f[j]
         variance += turn.hole_variance(s) - turn.hole_variance(t)[last]
         gain = 1 + states[-1, SCALE]
-        smoothed = gain * G[rows] + np.interp(s, t, states[:, PSI] - gain * self.at)
+        smoothed = gain * G[rows] + np.interp(s, t, states[:, ANGLE] - gain * self.at)
         # a rate may be the mean over the interval before its stamp, or after it
         delay_s = interval_s / 2.0 if turn.delay_std_s is None else turn.delay_std_s
         stamp = (turn.rate[rows] * delay_s) ** 2

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from icrtool.alignment.conventions import Convention
-from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
+from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit
 from icrtool.alignment.heading_choice import NOISY_SCATTER_RAD, DerivedHeading
-from icrtool.alignment.log_track import FEWEST_WINDOWS, STARTS_A_WINDOW, DriveWindows
+from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS, STARTS_A_WINDOW, DriveWindows
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.errors import DataError
@@ -27,7 +27,12 @@ that well has no name."""
 
 SMALLEST_NAME_RAD = math.radians(0.5)
 UTM_LATITUDES_DEG = (-80.0, 84.0)
-TURNS = {0.0: "", 90.0: "a quarter turn clockwise", -90.0: "a quarter turn counter-clockwise", 180.0: "half a turn"}
+TURN_WORDS = {
+    0.0: "",
+    90.0: "a quarter turn clockwise",
+    -90.0: "a quarter turn counter-clockwise",
+    180.0: "half a turn",
+}
 
 
 class OffsetName(NamedTuple):
@@ -65,7 +70,7 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
     for what, angle_deg in (("magnetic declination", declination), ("UTM grid convergence", convergence)):
         if angle_deg is not None and abs(angle_deg) > math.degrees(SMALLEST_NAME_RAD):
             norths.append((f"{what} here is {angle_deg:+z.1f}°", math.radians(angle_deg)))
-    for turn, turn_text in TURNS.items():
+    for turn, turn_text in TURN_WORDS.items():
         for north_text, north in norths:
             away = abs(math.remainder(offset_rad - math.radians(turn) + north, 2 * math.pi))
             texts = [text for text in (turn_text, north_text) if text]
@@ -166,7 +171,7 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
     backwards = (gone < 0.0)[moved]
     ahead, back = angle[~backwards], angle[backwards]
     turns_about = False
-    if min(len(ahead), len(back)) >= FEWEST_WINDOWS:
+    if min(len(ahead), len(back)) >= FEWEST_ALIGNMENT_WINDOWS:
         about = (back * np.conj(ahead.mean())).real < 0.0
         turns_about = abs(ahead.mean()) > EXPLAINED and float(about.mean()) > EXPLAINED
     agreement, mirrored_agreement = float(abs(angle.mean())), float(abs(turned_over.mean()))
@@ -287,7 +292,7 @@ def _offset_note(text: str, applied: float) -> Note:
 
 
 def _significant(offset: float, std: float) -> bool:
-    return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, SIGNIFICANT_SIGMAS * std)
+    return abs(math.remainder(offset, 2 * math.pi)) > max(SMALLEST_OFFSET_RAD, EVIDENCE_SIGMAS * std)
 
 
 def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseComparison) -> None:

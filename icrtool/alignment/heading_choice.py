@@ -17,7 +17,7 @@ from icrtool.alignment.gyro_heading import (
 )
 from icrtool.alignment.log_track import fix_std_m, track_of_log
 from icrtool.alignment.sensor_noise import is_hole
-from icrtool.alignment.turn_rates import BETTER, TurnRate, course_changes, gyro_rates, wheel_rate
+from icrtool.alignment.turn_rates import BETTER_SCATTER_RATIO, TurnRate, course_changes, gyro_rates, wheel_rate
 from icrtool.alignment.wheel_alignment import compare_turns
 from icrtool.alignment.wheel_units import refuse_standing
 from icrtool.errors import DataError
@@ -89,7 +89,7 @@ LARGEST_START_STD_RAD = math.radians(5.0)
 LARGEST_DRIFT = math.radians(10.0)
 """A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
 
-COMPARED_S, LEFT_SHARE, LEAST_GAIN, LARGEST_GAIN = 1.0, 0.3, 0.15, 1.3
+TURNS_COMPARED_S, LEFT_SHARE, LEAST_GAIN, LARGEST_GAIN = 1.0, 0.3, 0.15, 1.3
 """A gyro whose turns within a second are those of the wheels but for this share, with such a gain, turns with the
 robot: what contradicts it contradicts the wheels as much, and it is the fixes that err."""
 
@@ -191,7 +191,7 @@ def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: 
     by_gyro = track._replace(heading_t=t, heading=trapezoids(t, derived.gyro.rate_radps))
     return any(
         found.left_rad < LEFT_SHARE * found.turn_rad and LEAST_GAIN < found.ratio < LARGEST_GAIN
-        for found in compare_turns(by_gyro, width_m, 0.0, (COMPARED_S,))
+        for found in compare_turns(by_gyro, width_m, 0.0, (TURNS_COMPARED_S,))
     )
 
 
@@ -206,7 +206,7 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
         for row, (turn, axis) in enumerate(rates if stated is None else rates[:1]):
             found = _derived(log, track, turn, gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})", stated)
             std = math.inf if found is None else found.estimate.median_std
-            std *= 1.0 if row else BETTER
+            std *= 1.0 if row else BETTER_SCATTER_RATIO
             if std < least:
                 best, least = found, std
     return best

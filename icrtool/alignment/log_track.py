@@ -22,7 +22,7 @@ from icrtool.records.measurements import TURNING_MPS, Fixes
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
 
-WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
+ALIGNMENT_WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
 WINDOW_IN_WIDTHS = 4.0
 """Windows of small robots are so many track widths long: slip is a share of the distance, and hides them over 2 m."""
 
@@ -32,14 +32,14 @@ WINDOW_IN_POSITION_STD = 12.0
 WINDOW_IN_VALUES = 12.0
 """A value that is held while the robot accelerates moves the end of a window by a part of its own distance."""
 
-STARTS_A_WINDOW, FEWEST_WINDOWS = 8, 8
+STARTS_A_WINDOW, FEWEST_ALIGNMENT_WINDOWS = 8, 8
 FEWEST_OVERLAPPING = 2 * STARTS_A_WINDOW
 """Fewer windows that follow one another show nothing, nor do less than two that overlap."""
 
-LONGEST_WINDOW_S = 30.0
+LONGEST_ALIGNMENT_WINDOW_S = 30.0
 """A window that takes longer holds an outage or a stop."""
 
-TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS, TURN_STEP_S = 1.0, 2.0, 0.5
+TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS, TURN_WINDOW_EVERY_S = 1.0, 2.0, 0.5
 """Heading changes are compared over this time, and at least so many intervals; windows start at every step."""
 
 CHORD_S, LEAST_CHORD_M = 2.0, 0.3
@@ -153,10 +153,10 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
 
 def windows_of_log(log: RobotLog, width_m: float, heading: HeadingSamples | None = None) -> DriveWindows:
     """Return the windows of the alignment, for a robot of track width b [m]; `heading` in place of the log's."""
-    return cut_windows(track_of_log(log, heading), min(WINDOW_M, WINDOW_IN_WIDTHS * width_m))
+    return cut_drive_windows(track_of_log(log, heading), min(ALIGNMENT_WINDOW_M, WINDOW_IN_WIDTHS * width_m))
 
 
-def cut_windows(track: Track, least_m: float = WINDOW_M, *, length_m: float = 0.0) -> DriveWindows:
+def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, length_m: float = 0.0) -> DriveWindows:
     """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
 
     All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
@@ -177,7 +177,7 @@ def cut_windows(track: Track, least_m: float = WINDOW_M, *, length_m: float = 0.
     covers = [track.t, track.heading_t] if len(track.heading_t) else [track.t]
     first, last = max(t[0] for t in covers), min(t[-1] for t in covers)
     t, at = track.place_t, track.distance
-    whole = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_WINDOW_S)
+    whole = (t[begin] >= first) & (t[end] <= last) & (t[end] - t[begin] < LONGEST_ALIGNMENT_WINDOW_S)
     whole &= at[end] - at[begin] < 2.0 * length
     begin, end, lengths = begin[whole], end[whole], windows.length_m[whole]
     # windows of time in which wheels and heading were sampled and the wheels turned
@@ -185,7 +185,9 @@ def cut_windows(track: Track, least_m: float = WINDOW_M, *, length_m: float = 0.
     sampled = track.heading_t
     if len(sampled):
         usual = float(np.median(np.diff(sampled))) if len(sampled) > 1 else 0.0
-        turn_begin = sampled[0] + TURN_STEP_S * np.unique(np.floor((sampled - sampled[0]) / TURN_STEP_S))
+        turn_begin = sampled[0] + TURN_WINDOW_EVERY_S * np.unique(
+            np.floor((sampled - sampled[0]) / TURN_WINDOW_EVERY_S)
+        )
         turn_end = turn_begin + max(TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS * usual)
         whole = (turn_begin >= first) & (turn_end <= last) & track.clear(turn_begin, turn_end)
         whole &= np.searchsorted(sampled, turn_end) > np.searchsorted(sampled, turn_begin) + 1

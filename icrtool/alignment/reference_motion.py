@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from icrtool.alignment.estimator import estimate_alignment
-from icrtool.alignment.log_track import cut_windows, track_of_streams
+from icrtool.alignment.log_track import cut_drive_windows, track_of_streams
 from icrtool.alignment.sensor_noise import FEWEST_FIXES, MOVES_MPS, OUTLIER_SIGMAS, USUAL_POSITION_STD_M, is_hole
 from icrtool.kernels.arrays import Bools, Bytes, Complexes, Floats, Ints, trapezoids
 from icrtool.kernels.robust import mad_std
@@ -32,19 +32,19 @@ KNOT_S = 0.1
 SPEED_S = 0.1
 """The speed at a knot is the mean of this much time about it."""
 
-LONGEST_HOLE_S = 0.6
+LONGEST_SAMPLE_HOLE_S = 0.6
 """Longer without a sample: a hole, which no window spans."""
 
 LONGEST_HELD_IN_USUAL = 2.0
 """A value held for longer than this many times the usual was constant."""
 
-WINDOW_M = 1.0
+MOTION_WINDOW_M = 1.0
 """The motion is estimated over shorter windows than the alignment: events disturb fewer of them."""
 
 LEAST_TURN_GAIN = 1e-3
 
 WINDOWS_S = (0.5, 1.0, 2.0)
-LONGEST_WINDOW_S = 16.0
+LONGEST_MOTION_WINDOW_S = 16.0
 """Windows are doubled to this where the fixes are too noisy for shorter ones."""
 
 FEWEST_INTERVALS = 2
@@ -204,7 +204,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
 
 def _in_hole(sampled: Floats, t: Floats) -> Bools:
     """Return which steps between times t (m,) begin or end in a hole of a stream, or hold one whole (m - 1,)."""
-    before = np.flatnonzero(is_hole(np.diff(sampled), LONGEST_HOLE_S))
+    before = np.flatnonzero(is_hole(np.diff(sampled), LONGEST_SAMPLE_HOLE_S))
     begun = np.searchsorted(sampled[before], t[1:])
     return np.asarray(begun > np.searchsorted(sampled[before + 1], t[:-1], side="right"))
 
@@ -220,7 +220,7 @@ def compare_by_duration(knots: Knots, motion: Motion) -> list[tuple[float, Compa
     if moving.any():
         speed = float(np.median(path[moving] / dt[moving]))
         needed = math.sqrt(2 * LEAST_DISTANCE2 * float(np.median(knots.variance)))
-        while speed * durations[-1] < needed and durations[-1] < LONGEST_WINDOW_S:
+        while speed * durations[-1] < needed and durations[-1] < LONGEST_MOTION_WINDOW_S:
             durations.append(2 * durations[-1])
     found = []
     for duration_s in reversed(durations):
@@ -241,7 +241,7 @@ def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
     """
     # intervals that no window spans
     left_out = ~(quiet[1:] & quiet[:-1]) | (np.diff(knots.holes) > 0)
-    windows = cut_windows(knots.track._replace(slipping=np.append(left_out, False)), WINDOW_M)
+    windows = cut_drive_windows(knots.track._replace(slipping=np.append(left_out, False)), MOTION_WINDOW_M)
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
     begin, end = np.searchsorted(knots.t, [windows.turn_begin, windows.turn_end]).clip(0, len(knots.t) - 1)
     kept = (disturbed[end + 1] == disturbed[begin]) & (knots.holes[end] == knots.holes[begin])

@@ -16,7 +16,7 @@ from icrtool.records.notes import note
 from icrtool.records.samples import HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog
 
-FEWEST_STEPS = 40
+FEWEST_NOISE_STEPS = 40
 """Fewer steps show no noise; a stretch is evaluated by as many."""
 
 FEWEST_FIXES = 30
@@ -71,16 +71,16 @@ class FixSteps(NamedTuple):
     def white_std_m(self, rows: Bools) -> float:
         """Return the white noise of the fixes `rows` (m,), an axis [m]; NaN where there are too few steps."""
         inside = rows[:-2] & rows[1:-1] & rows[2:] & np.isfinite(self.product)
-        if np.count_nonzero(inside) < FEWEST_STEPS:
+        if np.count_nonzero(inside) < FEWEST_NOISE_STEPS:
             return float("nan")
         return float(np.sqrt(max(float(self.product[inside].mean()) / 2, 0.0)))
 
     def stretches(self, claimed: Bools) -> tuple[Floats, Bools]:
-        """Return the white variance of stretches of `FEWEST_STEPS` fixes, and whether the robot moves for most of each.
+        """Return the white variance of stretches of `FEWEST_NOISE_STEPS` fixes, and whether the robot mostly moves.
 
         The variance is that of both axes together [m^2], of the fixes that are `claimed` (m,); NaN where unknown.
         """
-        shape = len(self.product) // FEWEST_STEPS, FEWEST_STEPS
+        shape = len(self.product) // FEWEST_NOISE_STEPS, FEWEST_NOISE_STEPS
         inside = claimed[:-2] & claimed[1:-1] & claimed[2:] & np.isfinite(self.product)
         inside[np.clip(np.concatenate([self.jump_row - 2, self.jump_row - 1]), 0, None)] = False
         products, used, moves = (
@@ -88,7 +88,7 @@ class FixSteps(NamedTuple):
             for column in (np.where(inside, self.product, 0.0), inside, self.moves)
         )
         count, level = used.sum(axis=1), np.full(shape[0], np.nan)
-        np.divide(products.sum(axis=1), count, out=level, where=count > FEWEST_STEPS // 2)
+        np.divide(products.sum(axis=1), count, out=level, where=count > FEWEST_NOISE_STEPS // 2)
         return level, np.asarray(moves.mean(axis=1) > 0.5)
 
 
@@ -107,7 +107,7 @@ def measure_steps(t: Floats, place: Floats | Complexes, expected: Floats | Compl
     step[is_hole(dt)] = np.nan
     moves = np.abs(np.diff(expected)) > MOVES_MPS * dt
     moving = step[moves & np.isfinite(step)]
-    size = np.abs(moving if len(moving) >= FEWEST_STEPS else step[np.isfinite(step)])
+    size = np.abs(moving if len(moving) >= FEWEST_NOISE_STEPS else step[np.isfinite(step)])
     scale = max(float(np.median(size)) / MEDIAN_OF_RAYLEIGH, 1e-6) if len(size) else 1e-6
     with np.errstate(invalid="ignore"):
         usual_step = np.where(np.abs(step) <= OUTLIER_SIGMAS * scale, step, np.nan)

@@ -42,7 +42,7 @@ LEAST_SHARE = 0.3
 LEAST_OF_SIDE = 0.12
 """... where the robot drives and one side keeps to its wheels. In a spin a side slips by its own share."""
 
-STUCK_SHARE = 0.2
+IMMOBILISED_SHARE = 0.2
 """Robot that moves and turns less than this share of what its wheels do: immobilised."""
 
 KEEPING_SHARE = 1 / 3
@@ -61,7 +61,7 @@ RETURN_S, RETURNED_SHARE, RETURN_SIGMAS = 5.0, 0.5, 5.0
 """A reference that comes back by this share within this time was wrong; what is missed must stand out of its noise."""
 
 SHORTEST_EVENT_S = 0.5
-FEWEST_STEPS = 2
+FEWEST_EVENT_STEPS = 2
 
 MOST_EVIDENCE = 4.0
 """One step counts no more than this for an event or against it: a jump is not one."""
@@ -204,7 +204,7 @@ def _weigh(
     # what stands still is rarer than any slip, and so is its opposite: twice the motion of the wheels
     doubled = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
     doubled = np.maximum(doubled, np.abs(windows.turned - windows.model_turned))
-    still, twice = (far < STUCK_SHARE * windows.path_m for far in (windows.made, doubled))
+    still, twice = (far < IMMOBILISED_SHARE * windows.path_m for far in (windows.made, doubled))
     of_stuck = _false_rate(windows, square, still, twice)
     of_others = _false_rate(windows, square, ~beyond & ~still, beyond)
     return windows, square, np.where(still, of_stuck, np.where(beyond, np.inf, of_others)), error
@@ -347,7 +347,7 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
 
     begin_s = float(t[span.start + 1]) - time_in(span.start, 1.0) - time_in(span.start - 1, 0.0)
     end_s = float(t[span.stop - 1]) + time_in(span.stop - 1, 1.0) + time_in(span.stop, 0.0)
-    if end_s - begin_s < SHORTEST_EVENT_S or span.stop - span.start < FEWEST_STEPS:
+    if end_s - begin_s < SHORTEST_EVENT_S or span.stop - span.start < FEWEST_EVENT_STEPS:
         return None
     # rounding is evidence, too, where the wheels stand: a share of no motion is none
     if not steps.path_m[span].any():
@@ -377,7 +377,7 @@ def _measured(steps: ComparedWindows, span: slice, shares: Floats, begin_s: floa
         "skid": aside,
     }
     made = float(np.abs(sides - missed).sum()) / 2
-    stuck = max(made, aside) / path < STUCK_SHARE
+    stuck = max(made, aside) / path < IMMOBILISED_SHARE
     return Extent(
         span.start,
         span.stop,

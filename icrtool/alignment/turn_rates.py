@@ -238,7 +238,7 @@ Z_UP = np.array([0.0, 0.0, -1.0])
 ALONG_AN_AXIS = 0.95
 """A sensor whose axis is this near to the vertical (cosine) is mounted along it."""
 
-BETTER = 0.9
+BETTER_SCATTER_RATIO = 0.9
 """Another axis than z up is used where turns of the course over ground scatter about it by no more than this share, or
 where that is the share of the heading's standard deviation with it."""
 
@@ -311,7 +311,7 @@ def _axis_by_courses(turned: Floats, seconds: Floats, change: Floats) -> tuple[F
     axis, name = _named(found[:3] / size)
     left = change[:, None] - found[3] * seconds[:, None] - turned @ np.column_stack([axis, Z_UP])
     scatter = np.abs(wrapped(left)).mean(axis=0)
-    return (axis, name) if name == "z up" or scatter[0] < BETTER * scatter[1] else None
+    return (axis, name) if name == "z up" or scatter[0] < BETTER_SCATTER_RATIO * scatter[1] else None
 
 
 def _main_axis(turned: Floats, seconds: Floats, change: Floats) -> Floats | None:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.estimator import SIGNIFICANT_SIGMAS, AlignmentFit
-from icrtool.alignment.log_track import FEWEST_WINDOWS
+from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit
+from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
 from icrtool.kernels.arrays import rows_at_steps, unwrapped
@@ -141,7 +141,7 @@ def align_wheels(
         applied, notes = _find_scales(fit, config, sound=sound)
     moving = (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))[1:] > 0
     same = (np.diff(wheels.v_left_mps) == 0) & (np.diff(wheels.v_right_mps) == 0)
-    share = float(same[moving].mean()) if np.count_nonzero(moving) >= FEWEST_WINDOWS else 0.0
+    share = float(same[moving].mean()) if np.count_nonzero(moving) >= FEWEST_ALIGNMENT_WINDOWS else 0.0
     if share > HELD_SHARE:
         rate = (1.0 - share) * 1e9 / float(np.median(np.diff(wheels.stamp_ns)))
         why = f"wheel values are held: they change {rate:.1f} times a second while moving"
@@ -196,7 +196,7 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
         return (factor, factor), notes
     # left over right scale, minus 1, to first order
     difference, std = asymmetry / turn, math.hypot(asymmetry_std, asymmetry * turn_std / turn) / turn
-    if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, SIGNIFICANT_SIGMAS * std):
+    if abs(difference) <= max(SMALLEST_SIDE_DIFFERENCE, EVIDENCE_SIGMAS * std):
         return (factor, factor), notes
     side, other = ("left", "right") if difference < 0 else ("right", "left")
     text = f"the {side} side goes {100 * abs(difference):.1f} ± {100 * std:.1f} % less far than the {other} one"
@@ -301,7 +301,7 @@ def find_filtering(fit: AlignmentFit) -> str:
         return ""
     noise, short, middle, long = found
     change, std = long.ratio - short.ratio, math.hypot(short.ratio_std, long.ratio_std)
-    if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(SIGNIFICANT_SIGMAS * std, SMALLEST_CHANGE * long.ratio):
+    if abs(long.ratio - 1.0) < AS_THE_ROBOT and change > max(EVIDENCE_SIGMAS * std, SMALLEST_CHANGE * long.ratio):
         ratios = f"{short.ratio:.2f} ± {short.ratio_std:.2f} over {SHORT_S:g} s and {long.ratio:.2f} ± "
         return f"the robot turns by {ratios}{long.ratio_std:.2f} over {long_s:.0f} s of what they show"
     at_middle, at_end = (math.sqrt(max(one.left_rad**2 - noise.left_rad**2, 0.0)) for one in (middle, long))

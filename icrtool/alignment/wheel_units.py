@@ -13,7 +13,7 @@ import numpy as np
 
 from icrtool.alignment.log_track import (
     CHORD_S,
-    FEWEST_WINDOWS,
+    FEWEST_ALIGNMENT_WINDOWS,
     LEAST_CHORD_M,
     DriveWindows,
     cut_chords,
@@ -126,14 +126,14 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
     gone = ""
     if windows is not None:
         track = windows.track
-        if len(windows.begin) < FEWEST_WINDOWS:
+        if len(windows.begin) < FEWEST_ALIGNMENT_WINDOWS:
             return
         turned = np.abs(windows.turned)
         apart = np.abs(windows.over(track.at_places(track.half_difference)))
         laid, went = np.abs(windows.laid), np.abs(windows.seen)
         moved = (went > STILL * np.maximum(laid, apart / 4)) | (turned > math.radians(10.0))
         clear = np.maximum(laid, apart) > windows.length_m / 4
-        if np.count_nonzero(clear) < FEWEST_WINDOWS or float((~moved)[clear].mean()) <= STANDS_SHARE:
+        if np.count_nonzero(clear) < FEWEST_ALIGNMENT_WINDOWS or float((~moved)[clear].mean()) <= STANDS_SHARE:
             return
         gone = f" ({track.travel[-1]:.0f} m)"
     elif not len(log.gnss.stamp_ns) or np.mean((log.wheels.left != 0.0) | (log.wheels.right != 0.0)) < TURNING_SHARE:
@@ -182,14 +182,14 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
     distance, turn = (left + right) / 2, np.abs(left - right)
     usable = (np.abs(duration - CHORD_S) < CHORD_S / 4) & (chord > LEAST_CHORD_M) & (distance > 0)
     straight = usable & (turn < STRAIGHT * distance)
-    if np.count_nonzero(straight) < FEWEST_WINDOWS:
+    if np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:
         bend = np.full(len(chord), np.inf)
         bend[1:-1] = np.abs(np.angle(step[2:] * np.conj(step[:-2]))) / 2
         beside = usable.copy()
         beside[1:-1] &= usable[2:] & usable[:-2]
         straight = beside & (turn < BENT * distance) & (bend < LARGEST_BEND_RAD)
         chord[straight] /= np.sinc(bend[straight] / 2 / math.pi)
-    if np.count_nonzero(straight) < FEWEST_WINDOWS:
+    if np.count_nonzero(straight) < FEWEST_ALIGNMENT_WINDOWS:
         return None
     ratio = chord[straight] / distance[straight]
     centre = float(np.median(ratio))

@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from msgspec.structs import astuple
 
+from icrtool.alignment.wheel_units import FASTEST_MPS
 from icrtool.calibration.record import Calibration
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Complexes, Floats, Ints, unwrapped
@@ -33,12 +34,12 @@ STEP_M = 0.1
 SPEED_MPS = 0.5
 """Speed of a plan that gives none."""
 
-SLOWEST_MPS = 0.02
+SLOWEST_PLAN_MPS = 0.02
 
 INVERSIONS = 8
 
-FURTHEST_M, FASTEST_MPS = 1e8, 100.0
-"""Of a point from the origin, which may be that of UTM; of any robot with tracks."""
+FURTHEST_M = 1e8
+"""Largest distance of a point of a plan from the origin [m]. The origin may be the origin of UTM coordinates."""
 
 LONGEST_PATH_M = 100_000.0
 
@@ -261,7 +262,7 @@ def forecast_plan(
     if not ((np.abs(speed) > 0.0) & (np.abs(speed) <= FASTEST_MPS)).all():
         why = f"a speed that is zero, no number, or beyond {FASTEST_MPS:g} m/s"
         raise DataError("plan", why, "give speed_mps in m/s, negative in reverse")
-    speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_MPS)
+    speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_PLAN_MPS)
     # a corner of the plan is turned over the steps around it, not on the spot: means over a track width
     width = max(round(calibration.width_m / STEP_M), 1)
     padded = np.pad(unwrapped(np.angle(step * np.sign(speed))), (width // 2, width - 1 - width // 2), mode="edge")

@@ -40,9 +40,9 @@ from icrtool.records.acceptance import CHOICE_HORIZON_M, BudgetDistance
 from icrtool.records.calibration_document import ControllerErrors, ErrorSources
 from icrtool.records.plain_data import known
 
-HORIZONS_M = (5.0, 10.0, 20.0)
+HELD_OUT_HORIZONS_M = (5.0, 10.0, 20.0)
 
-SHORTEST_BLOCK_M, FEWEST_BLOCKS, MOST_BLOCKS = 25.0, 3, 5
+SHORTEST_BLOCK_M, FEWEST_FOLD_BLOCKS, MOST_FOLD_BLOCKS = 25.0, 3, 5
 
 STRIP_M, MOST_STRIPS = 5.0, 2
 """Trials from one strip of distance to another are predicted by one fit: strips at least so long, so many a block."""
@@ -50,7 +50,7 @@ STRIP_M, MOST_STRIPS = 5.0, 2
 HELD_OUT = (NO_SLIP, CONTROLLER, RECOMMENDED)
 """The rows of a held-out table; each may come again with a gyro, ``_gyro`` behind its name."""
 
-GYRO = "_gyro"
+GYRO_SUFFIX = "_gyro"
 
 TOO_SHORT = "too short to fit on one part and test on another"
 
@@ -64,7 +64,7 @@ ALWAYS_TO_M, FEWEST_STRETCHES = 20.0, 10
 SCALED_FROM_M = 5.0
 """Errors of shorter windows are more the reference's noise than the model's; they do not scale the quantiles."""
 
-FEWEST_WINDOWS = 20
+FEWEST_HELD_OUT_WINDOWS = 20
 
 NORMAL_STRETCHES = 10
 """That the errors are normal counts as much as so many independent stretches: quantiles of as many are as uncertain as
@@ -146,12 +146,12 @@ class HeldOut:
     @property
     def has_gyro(self) -> bool:
         """Whether there are rows with a gyro: every recording has one."""
-        return f"{RECOMMENDED}{GYRO}" in self.fits
+        return f"{RECOMMENDED}{GYRO_SUFFIX}" in self.fits
 
     @property
     def rows(self) -> tuple[str, ...]:
         """The names of the rows of the table."""
-        turned = [f"{name}{GYRO}" for name in HELD_OUT] if self.has_gyro else []
+        turned = [f"{name}{GYRO_SUFFIX}" for name in HELD_OUT] if self.has_gyro else []
         return (*HELD_OUT, *turned)
 
     def score(self, name: str) -> HeldOutRow:
@@ -162,7 +162,7 @@ class HeldOut:
         """Return what a row predicts without a fold; None where too little is left to fit it."""
         if name == NO_SLIP:
             return self.fits[NO_SLIP].fitted, NO_CONSTANTS
-        base = name.removesuffix(GYRO)
+        base = name.removesuffix(GYRO_SUFFIX)
         if base != CONTROLLER:
             return self.fits[name].without(fold)
         if (found := self.fits[name.replace(CONTROLLER, FIVE)].without(fold)) is None:
@@ -203,7 +203,7 @@ def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
     total = float(recordings[0].track.distance[-1])
     if total < 2.0 * CHOICE_HORIZON_M:
         raise DataError(recordings[0].name, f"{total:.1f} m of driven distance", TOO_SHORT)
-    count = int(np.clip(total // SHORTEST_BLOCK_M, FEWEST_BLOCKS, MOST_BLOCKS))
+    count = int(np.clip(total // SHORTEST_BLOCK_M, FEWEST_FOLD_BLOCKS, MOST_FOLD_BLOCKS))
     edges = np.linspace(0.0, total, count + 1).tolist()
     return tuple(Fold(f"block {i + 1}", i, 0, edges[i], edges[i + 1]) for i in range(count))
 
@@ -278,11 +278,11 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
         off = float(np.sqrt(np.mean([one.x_clock_std_m**2 for one in recordings])))
         fits[FIVE] = fits[FIVE].with_clock_error(off)
     if all(one.track.gyro is not None for one in recordings):
-        fits |= {f"{name}{GYRO}": pool.fit(MODELS[name].with_gyro(), fits[name]) for name in names}
+        fits |= {f"{name}{GYRO_SUFFIX}": pool.fit(MODELS[name].with_gyro(), fits[name]) for name in names}
     return fits
 
 
-def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HORIZONS_M) -> HeldOut:
+def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HELD_OUT_HORIZONS_M) -> HeldOut:
     """Fit the motion models, and test each on what it was not fitted to.
 
     Parameters
@@ -345,7 +345,7 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     length = np.concatenate([one[0] for one in found]) if found else np.empty(0)
     used = length <= measured_to_m
     length = length[used]
-    if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_WINDOWS:
+    if np.count_nonzero(length >= SCALED_FROM_M) < FEWEST_HELD_OUT_WINDOWS:
         return None
     of_sources, of_parameters = ([getattr(one[1], part) for one in found] for part in ("of_sources", "of_parameters"))
     sources, stated = (

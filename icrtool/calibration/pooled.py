@@ -191,8 +191,8 @@ def calibration_from(
                 together.append(documents.PooledScore(row.name, horizon, p95, expected))
     gyro = None
     if table.has_gyro:
-        turned = table.fits[f"{RECOMMENDED}{held_out.GYRO}"].fitted
-        sources = held_out.measure_error_sources(table, f"{RECOMMENDED}{held_out.GYRO}")
+        turned = table.fits[f"{RECOMMENDED}{held_out.GYRO_SUFFIX}"].fitted
+        sources = held_out.measure_error_sources(table, f"{RECOMMENDED}{held_out.GYRO_SUFFIX}")
         gyro = documents.GyroDocument(turned.model.name, *parameter_documents(turned), sources)
     robot = robot if robot is not None else documents.CalibratedRobot(track_width_m=recordings[0].width_m)
     geometry, covariance = table.fits[FIVE].fitted.geometry(robot.track_width_m)

@@ -254,7 +254,7 @@ def parameter_documents(one: FittedModel) -> tuple[tuple[str, ...], dict[str, Pa
     return one.model.terms, found, one.covariance.tolist()
 
 
-LARGEST = 1e6
+LARGEST_PARAMETER = 1e6
 """Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
 
 
@@ -276,7 +276,9 @@ def fitted_model(
     covariance = np.array(document.covariance, np.float64).reshape(k, k)
     if (np.diag(covariance) < 0).any():
         raise ValueError(f"variances of {name}")
-    if not (np.abs(parameters).max(initial=0) < LARGEST and np.abs(covariance).max(initial=0) < LARGEST):
+    if not (
+        np.abs(parameters).max(initial=0) < LARGEST_PARAMETER and np.abs(covariance).max(initial=0) < LARGEST_PARAMETER
+    ):
         raise ValueError(f"parameters of {name}")
     return FittedModel(model, parameters, covariance)
 

@@ -14,13 +14,13 @@ import msgspec
 import numpy as np
 
 from icrtool.calibration import pooled
-from icrtool.calibration.held_out import GYRO, HeldOut, fit_models, hold_out
+from icrtool.calibration.held_out import GYRO_SUFFIX, HeldOut, fit_models, hold_out
 from icrtool.calibration.record import Calibration, controller_numbers, fitted_document
 from icrtool.errors import DataError
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
-from icrtool.motion.models import FIVE, ICRS, NO_SLIP, RECOMMENDED, TrackGeometry
+from icrtool.motion.models import FIVE, ICR_VALUES, NO_SLIP, RECOMMENDED, TrackGeometry
 from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.notes import Note, note
@@ -48,9 +48,9 @@ def with_motion(run: Run) -> RunDocument:
         # The filter's final ICRs, with radii as configured.
         right, left, x = run.table.icrs_at(-1)
         geometry = TrackGeometry(right, left, x, (right - left) / width, 1.0, 1.0)
-        by_icr = np.zeros((len(geometry), ICRS))
-        by_icr[:ICRS] = np.eye(ICRS)
-        by_icr[ICRS, :2] = 1.0 / width, -1.0 / width
+        by_icr = np.zeros((len(geometry), ICR_VALUES))
+        by_icr[:ICR_VALUES] = np.eye(ICR_VALUES)
+        by_icr[ICR_VALUES, :2] = 1.0 / width, -1.0 / width
         covariance: Floats = by_icr @ np.array(run.document.icr.final_covariance_m2) @ by_icr.T
     elif FIVE in fits:
         geometry, covariance = fits[FIVE].geometry(width)
@@ -70,7 +70,7 @@ def with_motion(run: Run) -> RunDocument:
     return msgspec.structs.replace(
         run.document,
         recommended=found,
-        geometry=GeometryDocument(**shown, covariance_m2=covariance[:ICRS, :ICRS].tolist()),
+        geometry=GeometryDocument(**shown, covariance_m2=covariance[:ICR_VALUES, :ICR_VALUES].tolist()),
         controller=controller_numbers(geometry, covariance, robot)
         if found is not None and set(ICR_COLUMNS[:2]) <= shown.keys()
         else None,
@@ -178,7 +178,7 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
     for name in found.rows:
         if name == NO_SLIP:
             continue
-        public = name.replace(GYRO, f"_{kind}")
+        public = name.replace(GYRO_SUFFIX, f"_{kind}")
         yield ComparedRow(public, partial(found.errors, name, 0), partial(found.path, name, 0))
     if found.has_gyro:
         (recording,) = found.recordings

@@ -32,10 +32,14 @@ class _Kind(NamedTuple):
     finding: str = ""
 
 
-AHEAD, ASIDE, SEPARATION = "antenna_forward_minus_x_icr_m", "antenna_right_minus_icr_middle_m", "icr_separation_m"
-KINDS = {
-    AHEAD: _Kind("antenna forward − x ICR", 0.03),
-    ASIDE: _Kind("antenna right − middle of the ICRs", 0.03),
+ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION = (
+    "antenna_forward_minus_x_icr_m",
+    "antenna_right_minus_icr_middle_m",
+    "icr_separation_m",
+)
+FINDING_KINDS = {
+    ANTENNA_AHEAD: _Kind("antenna forward − x ICR", 0.03),
+    ANTENNA_ASIDE: _Kind("antenna right − middle of the ICRs", 0.03),
     "heading_offset_deg": _Kind("heading offset", 1.0),
     "gnss_delay_s": _Kind("position lags the wheels by", 0.05, "position_delay_s"),
     "heading_delay_s": _Kind("heading lags the wheels by", 0.05),
@@ -63,7 +67,7 @@ MOVING_MPS, TURNING_DEGPS = 0.05, 2.0
 SETTING_SIGMAS = 3.0
 
 
-LABELS = {key: kind.label for key, kind in KINDS.items()} | {
+LABELS = {key: kind.label for key, kind in FINDING_KINDS.items()} | {
     "antenna_forward_m": "antenna forward", "antenna_right_m": "antenna right", "y_icr_right_m": "y ICR right",
     "y_icr_left_m": "y ICR left", "x_icr_m": "x ICR",
 }  # fmt: skip
@@ -83,12 +87,12 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.Sensor
         The drive is too short for an estimate.
     """
     wheels, found = run.document.wheels, run.document.alignment
-    if not {kind.finding or key for key, kind in KINDS.items()} <= found.keys():
+    if not {kind.finding or key for key, kind in FINDING_KINDS.items()} <= found.keys():
         metres = run.document.drive.distance_m
         why = f"{metres:.0f} m of driven distance are too few windows"
         raise DataError(run.name, why, "drive longer")
     driven, parameters = _drive(run), {}
-    for key, kind in KINDS.items():
+    for key, kind in FINDING_KINDS.items():
         value, std = _numbers(found[kind.finding or key])
         verdict: documents.SensorVerdict = "not shown"
         if std <= WEAK * kind.useful:
@@ -158,7 +162,7 @@ def _derive(
     run: Run, direct: Mapping[str, documents.SensorParameter], x_icr_m: float | None
 ) -> dict[str, documents.SensorParameter]:
     """Return antenna and ICRs, as far as one of them is known; else the middle of the ICRs is assumed at y = 0."""
-    of_antenna_and_icrs = [direct[key] for key in (AHEAD, ASIDE, SEPARATION)]
+    of_antenna_and_icrs = [direct[key] for key in (ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION)]
     (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, of_antenna_and_icrs)
     of_ahead, of_aside, of_separation = (one.verdict for one in of_antenna_and_icrs)
     forward, right = known_antenna_m(run)

@@ -30,7 +30,7 @@ from icrtool.records.plain_data import known
 from icrtool.records.run import Run
 from icrtool.records.text import with_interval, with_std
 
-HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
+TRANSFER_HORIZONS_M = (1.0, 5.0, CHOICE_HORIZON_M, 20.0)
 
 TWO_SIDED = 1.96
 """Standard deviations in a 95 % interval."""
@@ -92,7 +92,7 @@ def compare_calibrations(
                 found = _test(result, recordings[column], own=False)
             differences = _differences(held_out, found, paired=True)
             costs += [documents.TransferCost(*astuple(one), calibrated_on=row, tested_on=column) for one in differences]
-        for h, horizon in enumerate(HORIZONS_M):
+        for h, horizon in enumerate(TRANSFER_HORIZONS_M):
             errors, _ = _sum_up(found.errors[:, h], found.path, horizon)
             trials = int(np.count_nonzero(np.isfinite(found.errors[:, h])))
             cells.append(documents.TransferCell(*astuple(errors), calibrated_on=row, tested_on=column, trials=trials))
@@ -146,7 +146,7 @@ def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bo
     """Test a calibration in recordings; those of its own are predicted by fits that do not contain them."""
     errors, path, before = [], [], 0.0
     for i, one in enumerate(recordings):
-        trials = cut_trials(one, HORIZONS_M)
+        trials = cut_trials(one, TRANSFER_HORIZONS_M)
         found = result.table.errors(RECOMMENDED, i, trials) if own else predictor(result.calibration, one)(trials)
         errors.append(found.position)
         path.append(before + one.track.distance[trials.starts])
@@ -170,7 +170,7 @@ def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[docum
     """Return the difference of errors at each horizon, second minus first; of the same trials only where both are."""
     found = []
     same = np.array_equal(first.path, second.path)
-    for h, horizon in enumerate(HORIZONS_M):
+    for h, horizon in enumerate(TRANSFER_HORIZONS_M):
         sides = [one.errors[:, h] for one in (first, second)]
         if same:
             both = np.isfinite(sides[0]) & np.isfinite(sides[1])

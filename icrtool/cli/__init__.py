@@ -28,7 +28,7 @@ __all__ = ["main", "when_used"]
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a program that Ctrl-C ended."""
 
-GRACE_S = 0.5
+SIGNAL_GRACE_S = 0.5
 """Time in which the main thread may end the process, and the processes of a batch, after a signal [s]."""
 
 OVER = 0
@@ -160,7 +160,7 @@ def end_at_once() -> Iterator[None]:
 def _watch(arrived: int, over: threading.Event) -> None:
     """Wait for SIGINT or SIGTERM, and end the process where the main thread does not."""
     while (number := os.read(arrived, 1)[0]) != OVER:
-        if number in (signal.SIGINT, signal.SIGTERM) and not over.wait(GRACE_S):
+        if number in (signal.SIGINT, signal.SIGTERM) and not over.wait(SIGNAL_GRACE_S):
             _end(number)
     os.close(arrived)
 

@@ -58,7 +58,7 @@ WORKERS = options.together(
 
 BATCH = options.together(
     "batch",
-    f"{options.REQUESTS}:BatchRequest",
+    f"{options.REQUESTS_MODULE}:BatchRequest",
     option("--timeout timeout_s", "SECONDS", POSITIVE, "Stop a log that takes longer.", default=1800.0),
     flag("--redo", "Also process logs that are done."),
     options.reporting(flag("--overwrite", "Also replace runs of other recordings.")),
@@ -72,7 +72,7 @@ BATCH = options.together(
         required=True)  # fmt: skip
 @WORKERS
 @BATCH
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def batch_command(
     places: tuple[Path, ...], output: Path, workers: Workers, batch: BatchRequest, exports: Exports, printer: Printer
 ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options, when_used
-from icrtool.cli.inputs import check_run_config, read_calibration, runs_of, runs_or_logs
+from icrtool.cli.inputs import check_run_config, read_calibration, runs_named, runs_or_logs
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, PLACE, option
 from icrtool.cli.printing import Printer
 
@@ -38,7 +38,7 @@ LARGEST_PLAN_BYTES = 50_000_000
 @option("--plot", "FILE", NEW_PICTURE, "Draw the residuals before and after the calibration: png, svg, pdf. One log.")
 @options.ALLOW_UNUSABLE
 @options.CONFIGURATION
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def calibrate_command(
     sources: tuple[Path, ...],
     output: Path | None,
@@ -69,7 +69,7 @@ def calibrate_command(
         formats.calibration_file(output)
     if all(run_directory.is_run_directory(source) for source in sources):
         check_run_config(config)
-    runs = runs_of(sources, config, printer)
+    runs = runs_named(sources, config, printer)
     sensors = None
     if len(runs) == 1:
         printer.warn_of(runs[0])

@@ -28,7 +28,7 @@ _COMMANDS = {
     "study": "Simulate and filter many drives: accuracy, convergence time and consistency of the ICRs.",
 }
 
-_HOMES = {
+_COMMAND_MODULES = {
     "info": "fit",
     "forecast": "calibrate",
     "compare": "report",
@@ -48,7 +48,9 @@ class _Commands(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         name = cmd_name.replace("-", "_")
-        command: click.Command = getattr(import_module(f"icrtool.cli.{_HOMES.get(name, name)}"), f"{name}_command")
+        command: click.Command = getattr(
+            import_module(f"icrtool.cli.{_COMMAND_MODULES.get(name, name)}"), f"{name}_command"
+        )
         return command
 
     def resolve_command(

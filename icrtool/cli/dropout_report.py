@@ -10,7 +10,7 @@ import click
 
 from icrtool.cli import options, when_used
 from icrtool.cli.fit import fitted_log
-from icrtool.cli.inputs import RUNS, ResultPlace, RunPlace, check_run_config, logs_of, run_directories
+from icrtool.cli.inputs import RUNS_FOLDER, ResultPlace, RunPlace, check_run_config, logs_of, run_directories
 from icrtool.cli.options import FILE, POSITIVE, Exports, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.choices import Reference, Starts
@@ -45,7 +45,7 @@ def distances(text: str) -> tuple[float, ...]:
     return found
 
 
-REPORT = options.reporting(
+REPORT_OPTIONS = options.reporting(
     options.PLACES,
     option("--horizons horizons_m", "M,M,...", distances, "Distances without GNSS [m], in place of the configured "
            "ones."),
@@ -68,9 +68,9 @@ REPORT = options.reporting(
 
 @click.command("dropout-report", epilog=EPILOG_GATE)
 @click.argument("sources", metavar="[RUN|LOG]...", nargs=-1, type=options.LOG)
-@REPORT
+@REPORT_OPTIONS
 @options.CONFIGURATION
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def dropout_report_command(
     sources: tuple[Path, ...], place: ResultPlace, calibration_files: tuple[Path, ...], report: ReportRequest,
     files: ResultFiles, baseline: Path | None, exports: Exports, settings: ConfigSources, printer: Printer,
@@ -122,7 +122,7 @@ def plan_sources(
     Everything that can be refused without reading a log is refused here: a finished run keeps its configuration and
     its place.
     """
-    sources = logs_of(sources or (run_directory.newest_run(RUNS),), printer)
+    sources = logs_of(sources or (run_directory.newest_run(RUNS_FOLDER),), printer)
     logs = tuple(
         source
         for source in sources

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast, get_args
 import click
 
 from icrtool.cli import when_used
-from icrtool.cli.inputs import RUNS, read_calibration
+from icrtool.cli.inputs import RUNS_FOLDER, read_calibration
 from icrtool.cli.options import FILE, PLACE, choice, flag, option
 from icrtool.cli.printing import Printer, write_or_print
 from icrtool.records.choices import ControllerTarget, TrajectoryFormat
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from icrtool.records.run import Run
 
 CONTROLLERS, TRAJECTORIES = get_args(ControllerTarget), get_args(TrajectoryFormat)
-TARGETS = (*CONTROLLERS, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
+EXPORT_TARGETS = (*CONTROLLERS, *TRAJECTORIES, "google-earth", "qgis", "foxglove")
 
 TEXT_SUFFIXES = (".txt", ".csv")
 """Of a file for one trajectory, beside those of the formats; what else a name has after a dot is part of the name."""
@@ -34,7 +34,7 @@ ALL_THE_SAME = "--force exports it all the same"
 
 @click.command("export")
 @click.argument("source", metavar="[RUN|CAL.json]", required=False, type=PLACE)
-@choice("--for target", TARGETS, "What the result is for.", required=True)
+@choice("--for target", EXPORT_TARGETS, "What the result is for.", required=True)
 @option("-o --output", "FILE", FILE, "File to write; for evo and kitti a directory with a file for each path of the "
         "run, or a file with the suffix .tum, .kitti, .txt or .csv.")  # fmt: skip
 @flag("--force", "Also export what is not fit for use.")
@@ -114,7 +114,7 @@ def _run(source: Path | None, output: Path | None = None) -> Run:
     if source is not None and source.is_file():
         advice = "name a directory that icrtool fit wrote"
         raise errors.RunError(source, "is a file, and paths come from a run", advice)
-    run = run_directory.open_run(source or run_directory.newest_run(RUNS))
+    run = run_directory.open_run(source or run_directory.newest_run(RUNS_FOLDER))
     if output is not None and output.resolve() in (Path(file.path).resolve() for file in run.document.inputs):
         raise errors.OutputError(output, "is the log that the run was made from", "name another file")
     if not run.usable:

@@ -33,14 +33,14 @@ if TYPE_CHECKING:
     from icrtool.records.requests import FitRequest, ResultFiles
     from icrtool.records.run import Run
 
-REQUEST = options.together("request", f"{options.REQUESTS}:FitRequest", options.together(
+REQUEST = options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", options.together(
     "files",
-    f"{options.REQUESTS}:ResultFiles",
+    f"{options.REQUESTS_MODULE}:ResultFiles",
     options.PLACES,
     choice("--states", get_args(StatesFormat), "Format of the states; default: csv, parquet for over a million "
            "states."),
-    options.PLOTS,
-    options.FIGURES,
+    options.PLOTS_OPTION,
+    options.FIGURES_OPTION,
     option("--warm-start", "RUN|CAL.json", PLACE, "Start from another run's final ICRs and covariance, or from those "
            "of a calibration."),
     option("--terrain-change changes_s", "T", lambda text: options.numbers("T, finite seconds", 1)(text)[0], "The "
@@ -54,7 +54,7 @@ REQUEST = options.together("request", f"{options.REQUESTS}:FitRequest", options.
 @options.LOGS
 @REQUEST
 @options.CONFIGURATION
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def fit_command(
     logs: tuple[Path, ...], place: ResultPlace, warm_start: Path | None, request: FitRequest, files: ResultFiles,
     settings: ConfigSources, printer: Printer,
@@ -115,9 +115,9 @@ def fitted_log(
 
 @click.command("info")
 @options.LOGS
-@options.together("request", f"{options.REQUESTS}:FitRequest", options.CUT)
+@options.together("request", f"{options.REQUESTS_MODULE}:FitRequest", options.CUT)
 @options.CONFIGURATION
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def info_command(logs: tuple[Path, ...], request: FitRequest, settings: ConfigSources, printer: Printer) -> None:
     """List what each log holds, which topics are used for wheels, position and heading, and the problems found.
 

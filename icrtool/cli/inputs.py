@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from icrtool.config import Config
     from icrtool.records.run import Run
 
-RUNS = Path("icrtool-runs")
+RUNS_FOLDER = Path("icrtool-runs")
 
 
 def logs_of(places: tuple[Path, ...], printer: Printer) -> tuple[Path, ...]:
@@ -51,7 +51,7 @@ def runs_or_logs(place: Path) -> list[Path]:
     return [one.path for one in recordings.find_recordings([place])]
 
 
-def runs_of(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run]:
+def runs_named(paths: Sequence[Path], config: Config, printer: Printer) -> list[Run]:
     """Read runs, and fit logs without a recommendation; nothing is written."""
     found = []
     with printer.progress("reading") as progress:
@@ -100,7 +100,7 @@ def run_directories(logs: tuple[Path, ...], place: ResultPlace) -> list[RunPlace
     if parent is not None and (parent / run_directory.RUN_FILE).is_file():
         advice = "fitting that run again would remove the runs in it: name another place"
         raise errors.OutputError(parent, "is a run itself", advice)
-    folder = parent or RUNS
+    folder = parent or RUNS_FOLDER
     return [RunPlace(folder / name, folder) for name in recordings.distinct_names(logs)]
 
 
@@ -108,7 +108,7 @@ def read_calibration(source: Path | None, *, force: bool = False, advice: str = 
     """Return a calibration and its name: of a calibration file, or of a run, which is calibrated."""
     if source is not None and source.is_file():
         return source.name, formats.open_calibration(source)
-    run = run_directory.open_run(source or run_directory.newest_run(RUNS))
+    run = run_directory.open_run(source or run_directory.newest_run(RUNS_FOLDER))
     if not (run.usable or force):
         why = f"its ICRs are not usable: {run.document.unusable_because}"
         raise errors.DataError(run.name, why, f"drive again, with turns to both sides{advice}")

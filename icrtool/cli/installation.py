@@ -89,7 +89,7 @@ def warm(*, quiet: bool) -> None:
     """  # noqa: D301 - click reads the escape
     import icrtool
     from icrtool.errors import OutputError
-    from icrtool.kernels.compiled import all_kernels, places, processor, writable_place
+    from icrtool.kernels.compiled import all_kernels, cache_places, processor, writable_place
 
     begin = time.perf_counter()
     for module in pkgutil.walk_packages(icrtool.__path__, "icrtool."):
@@ -97,7 +97,7 @@ def warm(*, quiet: bool) -> None:
         importlib.import_module(module.name)
     place = writable_place()
     if place is None:
-        raise OutputError(places()[0], "cannot be written", "set NUMBA_CACHE_DIR to a directory that can")
+        raise OutputError(cache_places()[0], "cannot be written", "set NUMBA_CACHE_DIR to a directory that can")
     call_all_kernels()
     if not quiet:
         compiled = [bool(one.compiled) for one in all_kernels()]

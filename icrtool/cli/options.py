@@ -45,7 +45,7 @@ Option = Callable[[Command], Command]
 Record = TypeVar("Record")
 Change = Callable[[Record], Record]
 
-REQUESTS = "icrtool.records.requests"
+REQUESTS_MODULE = "icrtool.records.requests"
 """Where the records are that options make, imported when a command is called."""
 
 POSITIVE = click.FloatRange(min=0, min_open=True)
@@ -243,7 +243,7 @@ CUT = add_all(
 AS_JSON = flag("--json as_json", "Print one JSON document on standard output, and nothing else there.")
 QUIET_RESULTS = flag("-q --quiet", "Print no results.")
 QUIET = flag("-q --quiet", "Print no results and no warnings.")
-VERBOSE = flag("-v --verbose", "Print more details.")
+VERBOSE_OPTION = flag("-v --verbose", "Print more details.")
 
 
 def printing(*options: Option) -> Option:
@@ -266,8 +266,8 @@ def plot_formats(text: str) -> tuple[str, ...]:
     return asked
 
 
-PLOTS = option("--plots", "png,svg,pdf|none", plot_formats, "Formats of the pictures.", default="png")
-FIGURES = choice(
+PLOTS_OPTION = option("--plots", "png,svg,pdf|none", plot_formats, "Formats of the pictures.", default="png")
+FIGURES_OPTION = choice(
     "--figures", get_args(FigureSet), "all: also those of the paper, such as a histogram a distance.", default="default"
 )
 BUDGETS = option(
@@ -298,9 +298,9 @@ class Exports(NamedTuple):
 
 def reporting(*further: Option) -> Option:
     """Add the options of a report as `report`, `files`, `exports` and `baseline`; `further`: those of one command."""
-    return together("exports", Exports, together("files", f"{REQUESTS}:ResultFiles", together(
+    return together("exports", Exports, together("files", f"{REQUESTS_MODULE}:ResultFiles", together(
         "report",
-        f"{REQUESTS}:ReportRequest",
+        f"{REQUESTS_MODULE}:ReportRequest",
         *further,
         BUDGETS,
         option("--gate gates", "LIMIT", None, "Acceptance limit, or several, one a line: exit status 3 if one is not "
@@ -314,8 +314,8 @@ def reporting(*further: Option) -> Option:
         option("--junit", "FILE", NEW_FILE, "Write the verdicts on the limits as JUnit XML."),
         option("--markdown", "FILE", NEW_FILE, "Write a summary for a pull request."),
         ALLOW_UNUSABLE,
-        PLOTS,
-        FIGURES,
+        PLOTS_OPTION,
+        FIGURES_OPTION,
         flag("--page/--no-page", "Also write report.html: pictures, tables and an interactive map in one file.",
              default=True, show_default=True),
     )))  # fmt: skip

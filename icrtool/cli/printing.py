@@ -17,7 +17,7 @@ import click
 
 from icrtool import __version__
 from icrtool.cli import when_used
-from icrtool.output.text_blocks import Block, Line, Table, fitted, format_blocks, printed
+from icrtool.output.text_blocks import Block, Line, Table, fitted_to, format_blocks, printed
 from icrtool.records.text import LONGEST_NAME, escaped, listed, shortened
 
 with when_used():
@@ -42,7 +42,7 @@ WIDEST = 120
 FEWEST_COLUMNS = 3
 """Columns of a table that stay on the narrowest terminal."""
 
-STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
+TEXT_STYLES = {"title": "bold", "good": "green", "bad": "bold red", "as is": ""}
 
 
 def show(blocks: Iterable[Block], *, verbose: bool) -> None:
@@ -59,7 +59,7 @@ def show(blocks: Iterable[Block], *, verbose: bool) -> None:
         if isinstance(block, Table):
             _print_table(block, console)
         elif isinstance(block, Line):
-            console.print(RichText(block.text, STYLES[block.look]), soft_wrap=block.look == "as is")
+            console.print(RichText(block.text, TEXT_STYLES[block.look]), soft_wrap=block.look == "as is")
         else:
             console.print(RichText(str(block)))
 
@@ -68,7 +68,7 @@ def _print_table(block: Table, console: Console) -> None:
     from rich.table import Table as RichTable
     from rich.text import Text as RichText
 
-    table, left_out = fitted(block, console.width, FEWEST_COLUMNS)
+    table, left_out = fitted_to(block, console.width, FEWEST_COLUMNS)
     shown = RichTable(box=None, pad_edge=False, show_header=bool(table.head))
     sides = table.sides()
     for number, side in enumerate(sides):

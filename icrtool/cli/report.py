@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from icrtool.cli import options, when_used
-from icrtool.cli.inputs import RUNS, runs_of, runs_or_logs
+from icrtool.cli.inputs import RUNS_FOLDER, runs_named, runs_or_logs
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, flag, option
 from icrtool.cli.printing import Printer
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of
@@ -49,7 +49,7 @@ def report_command(sources: tuple[Path, ...], output: Path | None, no_coordinate
       icrtool report icrtool-runs/field -o field.html --no-coordinates
       icrtool report results/
     """  # noqa: D301 - click reads the escape
-    sources = sources or (run_directory.newest_run(RUNS),)
+    sources = sources or (run_directory.newest_run(RUNS_FOLDER),)
     if output is not None and len(sources) > 1:
         advice = "leave it out: each page goes to its own directory"
         raise errors.ConfigError("-o", "names one file for several pages", advice)
@@ -113,7 +113,7 @@ def _as_written(place: Path, advice: str) -> Iterator[None]:
 @option("-o --output", "FILE", NEW_FILE, "Write the comparison as JSON, for icrtool report.")
 @option("--plot", "FILE", NEW_PICTURE, "Draw the comparison: png, svg, pdf.")
 @options.CONFIGURATION
-@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE)
+@options.printing(options.AS_JSON, options.QUIET, options.VERBOSE_OPTION)
 def compare_command(
     sources: tuple[str, ...],
     csv: Path | None,
@@ -137,7 +137,7 @@ def compare_command(
         (name, one) for name, places in groups_of(sources).items() for path in places for one in runs_or_logs(path)
     ]
     groups: dict[str, list[Run]] = {}
-    runs = runs_of([path for _, path in found], config, printer)
+    runs = runs_named([path for _, path in found], config, printer)
     for (name, _), run in zip(found, runs, strict=True):
         groups.setdefault(name, []).append(run)
     compared = transfer.compare_groups(groups)

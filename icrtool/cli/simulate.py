@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import click
 
 from icrtool.cli import options, when_used
-from icrtool.cli.inputs import RUNS
+from icrtool.cli.inputs import RUNS_FOLDER
 from icrtool.cli.options import FILE, NOT_NEGATIVE, POSITIVE, Change, Option, choice, flag, numbers, option, together
 from icrtool.cli.printing import Printer
 from icrtool.records.choices import HeadingConvention, PathKind, PresetName, StudyName, WheelMessages
@@ -169,7 +169,7 @@ def drive_options(*further: Option, **defaults: object) -> Option:
     **DRIVE_DEFAULTS,
 )
 @options.CONFIGURATION
-@options.printing(options.QUIET, options.VERBOSE)
+@options.printing(options.QUIET, options.VERBOSE_OPTION)
 def simulate_command(
     log: Path, force: bool, seed: int, speeds: Path | None, path: Change[PathPlan], plan: Change[DrivePlan],
     sensors: Change[Sensors], encoder_counts: float | None, wheel_rate: float | None, antenna: tuple[float, float],
@@ -290,9 +290,9 @@ def _summary(config: Config, plan: DrivePlan, truth: TruthTable, seed: int) -> s
     option("--rate", "HZ", click.FloatRange(min=1, max=200), "Wheel and heading samples per second."),
     option("--heading-std heading_std_rad", "DEG", degrees(POSITIVE), "White noise of the heading."),
 )
-@options.PLOTS
+@options.PLOTS_OPTION
 @options.CONFIGURATION
-@options.printing(options.QUIET, options.VERBOSE)
+@options.printing(options.QUIET, options.VERBOSE_OPTION)
 def study_command(
     name: str, output: Path | None, request: Change[StudyRequest], preset: PresetName | None,
     path: Change[PathPlan], plan: Change[DrivePlan], sensors: Change[Sensors], encoder_counts: float | None,
@@ -344,7 +344,7 @@ def study_command(
         preset = "field"
     presets = asked.presets if preset is None else (preset,)
     asked = replace(asked, plan=drive, sensors=sensed, paths=paths, presets=presets)
-    directory = output if output is not None else RUNS / f"study-{name}"
+    directory = output if output is not None else RUNS_FOLDER / f"study-{name}"
     simulation_files.check_study_target(directory)
     with printer.progress(f"study {name}") as progress:
         result = studies.run_study(asked, progress)

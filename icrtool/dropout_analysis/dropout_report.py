@@ -20,7 +20,7 @@ from icrtool.dropout_analysis.starts import split_by_turning, with_smoothed_refe
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
-from icrtool.kernels.error_statistics import FEWEST_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_BLOCKS
+from icrtool.kernels.error_statistics import FEWEST_PATH_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_PATH_BLOCKS
 from icrtool.kernels.open_loop import TOLERANCE_M
 from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import DEFAULT_SEED, BudgetDistance, Gate, Verdict
@@ -34,7 +34,7 @@ from icrtool.records.requests import ReportRequest
 from icrtool.records.run import MAKE_RUN, Run, check_type
 from icrtool.records.text import distance_text
 
-ERRORS = len(documents.ErrorRow.__struct_fields__)
+ERROR_FIELDS = len(documents.ErrorRow.__struct_fields__)
 
 
 def dropout(
@@ -262,7 +262,7 @@ def _report(
     if with_events is not None:
         all_rows = {one.name: one.document.by_horizon for one in with_events.results}
         numbers = {
-            name: [documents.ErrorRow(*astuple(row)[:ERRORS]) for row in rows] for name, rows in all_rows.items()
+            name: [documents.ErrorRow(*astuple(row)[:ERROR_FIELDS]) for row in rows] for name, rows in all_rows.items()
         }
         cost = documents.EventCostDocument(len(run.sensors.events), numbers)
     earlier = None
@@ -284,7 +284,7 @@ def _report(
         tolerance_m=TOLERANCE_M,
         intervals=documents.IntervalsDocument(
             method="Student's t over blocks of path",
-            block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_BLOCKS} to {MOST_BLOCKS} blocks",
+            block=f"{HORIZONS_A_BLOCK} horizons or more, {FEWEST_PATH_BLOCKS} to {MOST_PATH_BLOCKS} blocks",
             level=LEVEL,
             seed=request.seed,
         ),
@@ -347,7 +347,7 @@ def _ladder(
     for one in errors.results:
         if one.name not in given:
             with_heading = bool(found.heading) and one.name.endswith(turned)
-            rows = [astuple(row)[1:ERRORS] for row in one.document.by_horizon]
+            rows = [astuple(row)[1:ERROR_FIELDS] for row in one.document.by_horizon]
             heading = found.heading if with_heading else "wheels"
             models.append(
                 documents.ScoreDocument(one.name, one.document.knows, heading, *map(list, zip(*rows, strict=True)))

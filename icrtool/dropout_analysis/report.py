@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 
     from icrtool.calibration.record import Calibration
 
-_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_NUMBER_FORM = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(
     r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max|within)@(?P<at>\d+(?:\.\d+)?)\s*m?\s*"
-    rf"(?P<relation><=|>=|<|>)\s*(?:(?P<bound>[+-]?{_NUMBER})\s*m?|"
-    rf"(?:(?P<factor>{_NUMBER})\s*\*\s*)?(?P<baseline>baseline)(?:\s*(?P<offset>[+-]\s*{_NUMBER})\s*m?)?)\s*$"
+    rf"(?P<relation><=|>=|<|>)\s*(?:(?P<bound>[+-]?{_NUMBER_FORM})\s*m?|"
+    rf"(?:(?P<factor>{_NUMBER_FORM})\s*\*\s*)?(?P<baseline>baseline)(?:\s*(?P<offset>[+-]\s*{_NUMBER_FORM})\s*m?)?)\s*$"
 )
 _RELATIONS: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,

@@ -39,7 +39,7 @@ MOST_SPACED = 10
 SAME_M = 1e-6
 """Before the first outage the disturbed run is the undisturbed one, to rounding."""
 
-COMPARED_S = 1.0
+FIXES_COMPARED_S = 1.0
 """Fixes of this time after an outage are compared with the open-loop path, which is driven on for as long."""
 
 
@@ -252,7 +252,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         first, last = (int(row) for row in np.searchsorted(table.stamp_ns, [begin, end]))
         if first == 0 or last >= len(table) or last <= first or run.in_gap[first:last].any():
             continue
-        after = int(np.searchsorted(table.stamp_ns, end + round(COMPARED_S * 1e9)))
+        after = int(np.searchsorted(table.stamp_ns, end + round(FIXES_COMPARED_S * 1e9)))
         gaps = np.flatnonzero(run.in_gap[last:after])
         after = last + int(gaps[0]) if len(gaps) else min(after, len(table) - 1)
         path = open_loop_path(track, *table.icrs_at(first), first, after)

@@ -186,7 +186,7 @@ def with_smoothed_reference(run: Run) -> Run:
 
 SPLIT_HORIZON_M = 5.0
 STRAIGHT_RAD = math.radians(10.0)
-CELLS = 20
+CELLS_A_HORIZON = 20
 """Cells of path a horizon is cut into, to find the range of the heading."""
 
 SPLIT_MODELS = ("icr", "no_slip")
@@ -213,7 +213,7 @@ def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
 
 def heading_range(track: Track, horizon_m: float) -> Floats:
     """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of path."""
-    size = horizon_m / CELLS
+    size = horizon_m / CELLS_A_HORIZON
     # A step longer than a horizon counts as a little more than one: a damaged speed fills no memory.
     distance = track.distance
 
@@ -222,11 +222,11 @@ def heading_range(track: Track, horizon_m: float) -> Floats:
 
     first = rows_of_cells(distance, cells_of)
     steps = np.diff(cells_of(distance[first]), prepend=0.0)
-    cell = np.cumsum(np.minimum(steps, CELLS + 1.0)).astype(np.int64)
-    cells = np.arange(cell[-1] + CELLS + 1)
+    cell = np.cumsum(np.minimum(steps, CELLS_A_HORIZON + 1.0)).astype(np.int64)
+    cells = np.arange(cell[-1] + CELLS_A_HORIZON + 1)
     # In a cell without a state the heading lies between those around it.
     highest, lowest = (
-        sliding_window_view(np.interp(cells, cell, extreme.reduceat(track.heading, first)), CELLS + 1)
+        sliding_window_view(np.interp(cells, cell, extreme.reduceat(track.heading, first)), CELLS_A_HORIZON + 1)
         for extreme in (np.maximum, np.minimum)
     )
     return np.repeat((highest.max(axis=1) - lowest.min(axis=1))[cell], np.diff(first, append=len(distance)))

@@ -56,7 +56,7 @@ SHORTEST_HORIZON_M = 1e-3
 STARTS_AT_ONCE = 1 << 14
 """Starts tried by a thread at a time."""
 
-THREADS = 2
+TRIAL_THREADS = 2
 """The kernels run beside each other; more threads would need more memory and find little more to do."""
 
 
@@ -102,7 +102,7 @@ def measure_errors(
     before: list[documents.ErrorRow] = []
     after: list[documents.ErrorRow] = []
     together = max(1, LARGEST_TABLE_BYTES // (BYTES_A_TRIAL * len(run.table)))
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(TRIAL_THREADS) as pool:
         for columns in [slice(begin, begin + together) for begin in range(0, len(horizons), together)]:
             group = horizons[columns]
             ends = counted_ends(track, group, starts).T
@@ -118,7 +118,7 @@ def measure_errors(
                 else:
                     errors, tested, touching = _errors(track, model, ends, pool), blocks, slipping
                 # Beside each other, columns of a long log would fill the memory.
-                each = pool.map if together > THREADS else map
+                each = pool.map if together > TRIAL_THREADS else map
                 rows.extend(each(_at_horizon, group.tolist(), errors.T, of_few.heading.T[columns], tested, touching))
                 if model.name == "icr":
                     first = len(errors) if learned is None else learned

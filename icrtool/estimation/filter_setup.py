@@ -23,7 +23,7 @@ GAP_SPEED_STD_MPS = 2.0
 GAP_TURN_STD_RADPS = 1.0
 """Standard deviation of how far the pose may move in the first second of a gap in the wheel data."""
 
-GAP_IN_INTERVALS = 2.5
+WHEEL_GAP_IN_INTERVALS = 2.5
 """Slow wheel streams: an interval is a gap only when it is this many times the usual one."""
 
 LEAST_ICR_IN_HALF_WIDTHS = 0.2
@@ -220,7 +220,7 @@ def _initial_icrs(config: Config, found: IcrStart | None) -> tuple[Floats, Float
 
 def wheel_gap_s(config: Config, wheel_t: Floats) -> float:
     """Return the interval between wheel samples [s] above which they are a gap: never less than a few samples."""
-    return max(config.filter.wheel_gap_s, GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
+    return max(config.filter.wheel_gap_s, WHEEL_GAP_IN_INTERVALS * float(np.median(np.diff(wheel_t))))
 
 
 def configured_noise(config: Config) -> ProcessNoise:

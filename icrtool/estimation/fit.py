@@ -70,10 +70,10 @@ def fit_filter(
     return replace(run, smoothed=smooth_run(run))
 
 
-NEAR_NS = 10**9
+SAME_JUMP_NS = 10**9
 """Jumps closer together than this are one: no trial fits between them."""
 
-SETTLED_SIGMAS, SETTLES_S = 3.0, 5.0
+FOLLOWED_SIGMAS, FOLLOWS_WITHIN_S = 3.0, 5.0
 """The filter has followed where its estimate is this near to a fix; it takes no longer than this."""
 
 BRIDGED = 0.25
@@ -97,7 +97,7 @@ def followed_jumps(
     """
     used = gnss.stamp_ns[gnss.used], heading.stamp_ns[heading.used]
     noise = np.sqrt(sensors.fixes.var_north_m2 + sensors.fixes.var_east_m2)
-    near = gnss.stamp_ns[gnss.used & (gnss.difference < SETTLED_SIGMAS * noise)]
+    near = gnss.stamp_ns[gnss.used & (gnss.difference < FOLLOWED_SIGMAS * noise)]
 
     def followed(jump: ReferenceJump) -> ReferenceJump:
         stamps = used[jump.kind == "heading"]
@@ -107,7 +107,7 @@ def followed_jumps(
 
     def settled(jump: ReferenceJump) -> ReferenceJump:
         end = jump.end_ns if jump.kind == "heading" else _first_from(near, jump.end_ns)
-        return msgspec.structs.replace(jump, end_ns=min(end, jump.end_ns + round(SETTLES_S * 1e9)))
+        return msgspec.structs.replace(jump, end_ns=min(end, jump.end_ns + round(FOLLOWS_WITHIN_S * 1e9)))
 
     # the filter follows nothing between the jumps of one rejection
     spans = [
@@ -117,16 +117,16 @@ def followed_jumps(
         if one.kind == "heading" or math.hypot(one.moved_north_m, one.moved_east_m) >= BRIDGED * one.size_m
     ]
     # what is decided takes in what is undecided about it
-    decided = _joined([one for one in spans if not one.undecided], NEAR_NS)
+    decided = _joined([one for one in spans if not one.undecided], SAME_JUMP_NS)
     begins, free = [one.begin_ns for one in decided], []
     for one in spans:
         row = bisect_right(begins, one.begin_ns)
         before, after = decided[max(row - 1, 0) : row], decided[row : row + 1]
-        joins = any(one.begin_ns <= other.end_ns + NEAR_NS for other in before)
-        joined = any(other.begin_ns <= one.end_ns + NEAR_NS for other in after)
+        joins = any(one.begin_ns <= other.end_ns + SAME_JUMP_NS for other in before)
+        joined = any(other.begin_ns <= one.end_ns + SAME_JUMP_NS for other in after)
         if one.undecided and not joins and not joined:
             free.append(one)
-    return tuple(sorted((*decided, *_joined(free, NEAR_NS)), key=attrgetter("begin_ns")))
+    return tuple(sorted((*decided, *_joined(free, SAME_JUMP_NS)), key=attrgetter("begin_ns")))
 
 
 def _first_from(stamps: Ints, at: int) -> int:

@@ -23,7 +23,7 @@ from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, width_or_usual_m
 from icrtool.records.run_document import ExcitationDocument, Excited, NumberByIcr, VerdictByIcr
 from icrtool.records.tables import States
 
-WINDOW_M, WINDOW_IN_SEPARATIONS = 2.0, 3.0
+STATE_WINDOW_M, WINDOW_IN_SEPARATIONS = 2.0, 3.0
 """Distance of the wheels, spins included, over which displacement and turn are compared: this, or so many times
 y right - y left where that is less. Slip is a share of the distance: over 2 m it hides the ICRs of a robot of 0.2 m."""
 
@@ -88,7 +88,7 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
     if right - left < half or right <= 0.0 or left >= 0.0:
         right, left, x = 1.4 * half, -1.4 * half, 0.0
     distance, separation_m = track.travel, float(right - left)
-    window_m = min(WINDOW_M, WINDOW_IN_SEPARATIONS * separation_m)
+    window_m = min(STATE_WINDOW_M, WINDOW_IN_SEPARATIONS * separation_m)
     rows = rows_at_steps(distance, window_m)
     start, end = np.arange(len(rows) - 1), np.arange(1, len(rows))
     parameters, by_icrs = parameters_of_icrs(np.array([right, left, x]), WIDTH_M)

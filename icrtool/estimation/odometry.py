@@ -136,7 +136,7 @@ def drive_summary(table: States) -> DriveDocument:
     return DriveDocument(duration, distance, mean, spread)
 
 
-LONGEST_HOLE_S = 1.0
+LONGEST_GYRO_HOLE_S = 1.0
 """A gyro silent for longer than this is not trusted."""
 
 
@@ -168,7 +168,7 @@ def _since(stamp_ns: Ints, epoch_ns: Ints) -> Floats:
 
 def _covers(measured_ns: Ints, states_ns: Ints) -> bool:
     """Return whether measurements reach from the first state to the last without a long hole."""
-    hole = LONGEST_HOLE_S * 1e9
+    hole = LONGEST_GYRO_HOLE_S * 1e9
     within = measured_ns[(measured_ns > states_ns[0]) & (measured_ns < states_ns[-1])]
     return bool(np.max(np.diff(np.concatenate([states_ns[:1], within, states_ns[-1:]]))) < hole)
 

@@ -172,7 +172,7 @@ LARGEST_HEADING_DEGPS = 120.0
 TAIL_DEGREES = 4.0
 """Degrees of freedom of Student's t: Lange, Little and Taylor 1989 recommend it where outliers are few but gross."""
 
-FLAT = 0.1
+LIKE_COST = 0.1
 """Costs that differ by less than this a measurement are alike: it is what 5 % of error in both deviations costs."""
 
 MOST_ROUNDS = 3
@@ -180,7 +180,7 @@ MOST_ROUNDS = 3
 Moving = tuple[Bools, Bools]
 """Which fixes (m,) and which headings (h,) were measured while the wheels turned."""
 
-MOST_SAMPLES = 60_000
+MOST_SEARCHED_SAMPLES = 60_000
 """Wheel samples the search looks at: ten minutes at 100 Hz."""
 
 
@@ -228,13 +228,13 @@ def run_adaptively(
 
 
 def _busiest_part(sensors: SensorData) -> SensorData:
-    """Return the `MOST_SAMPLES` wheel samples in which the wheels travel most, all where there are no more."""
+    """Return the `MOST_SEARCHED_SAMPLES` wheel samples in which the wheels travel most, all where there are no more."""
     wheels = sensors.wheels
-    if len(wheels.stamp_ns) <= MOST_SAMPLES:
+    if len(wheels.stamp_ns) <= MOST_SEARCHED_SAMPLES:
         return sensors
     travel = np.concatenate([[0.0], np.cumsum(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))])
-    first = int(np.argmax(travel[MOST_SAMPLES:] - travel[:-MOST_SAMPLES]))
-    return sensors.part(slice(first, first + MOST_SAMPLES))
+    first = int(np.argmax(travel[MOST_SEARCHED_SAMPLES:] - travel[:-MOST_SEARCHED_SAMPLES]))
+    return sensors.part(slice(first, first + MOST_SEARCHED_SAMPLES))
 
 
 def find_noise(
@@ -256,7 +256,7 @@ def find_noise(
     Notes
     -----
     One coordinate after the other, each over all its doublings: too small a noise rejects nearly all measurements, and
-    the first doublings may change nothing. Smallest: every noise whose cost is within `FLAT` of the least is as good.
+    the first doublings may change nothing. Smallest: a noise whose cost is within `LIKE_COST` of the least is as good.
     """
     cost_of = functools.cache(cost)
     largest = (LARGEST_POSITION_MPS if positions else 0.0, largest_degps if headings else 0.0)
@@ -269,7 +269,7 @@ def find_noise(
                 steps.append(steps[-1] * STEP)
             if last > 0.0:
                 tried = [best._replace(**{name: value}) for value in steps]
-                limit = min(map(cost_of, tried)) + FLAT
+                limit = min(map(cost_of, tried)) + LIKE_COST
                 best = next(one for one in tried if cost_of(one) <= limit)
         if best == before:
             break

@@ -62,7 +62,7 @@ from icrtool.records.run_document import (
 from icrtool.records.samples import Datum, InputFile, are_twist
 from icrtool.records.tables import States
 
-SETTLED_S = 2.0
+ARRIVED_S = 2.0
 """An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""
 
 SMALLEST_CHANGE_M = 0.03
@@ -275,7 +275,7 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
     dict
         By column: time [s] at which the estimate has made 10 % of the change from its start to its settled value
         (median over the second half of the run), and time from which on it stays within 10 % of that change for
-        `SETTLED_S`; None where the change is below `SMALLEST_CHANGE_M` or the estimate never settles.
+        `ARRIVED_S`; None where the change is below `SMALLEST_CHANGE_M` or the estimate never settles.
 
     Notes
     -----
@@ -294,7 +294,7 @@ def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tup
         gone = (estimate - estimate[0]) / change
         first = int(np.argmax(np.abs(gone) >= 0.1))
         begin, behind = runs_of(np.abs(gone - 1.0) <= 0.1)
-        settled_by = np.searchsorted(t_s, t_s[begin] + SETTLED_S)
+        settled_by = np.searchsorted(t_s, t_s[begin] + ARRIVED_S)
         stays = begin[(settled_by <= behind) & (settled_by < rows)]
         spans[column] = (float(t_s[first]), float(t_s[stays[0]])) if len(stays) else None
     return spans

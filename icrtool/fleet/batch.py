@@ -19,7 +19,7 @@ from icrtool.errors import ConfigError, LogError, OutputError
 from icrtool.fleet.fleet_files import check_tables
 from icrtool.fleet.one_log import failed, files_of, path_of
 from icrtool.fleet.processes import Lost, close_all, process_apart
-from icrtool.fleet.recordings import about, as_text, find_recordings, is_manifest, logs_among, read_manifest
+from icrtool.fleet.recordings import about_recording, as_text, find_recordings, is_manifest, logs_among, read_manifest
 from icrtool.logs.containers.recording_files import files_of_log
 from icrtool.logs.containers.source import RemoteFile
 from icrtool.output.files.formats import CHECKSUM_FILE
@@ -75,7 +75,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
         baseline = open_baseline(batch.baseline).digest
     requests = []
     for one in find_recordings(searched):
-        known, settings = about(one.path, entries), batch.settings
+        known, settings = about_recording(one.path, entries), batch.settings
         builtin = known.robot in builtin_robots()
         # A robot that is not built in is a name, which needs a configuration of its own.
         if known.robot and not builtin and known.config is None and settings.file is None:

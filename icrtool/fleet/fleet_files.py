@@ -75,12 +75,12 @@ def check_tables(folder: Path, *, page: bool) -> None:
     stated = formats.schema_of(folder / FLEET_FILE, folder)
     if stated.startswith(documents.FLEET_FAMILY) or (folder / ROWS).is_dir():
         return
-    for file in (*(folder / name for name in TABLES), *pictures_in(folder)):
+    for file in (*(folder / name for name in TABLES), *pictures_of_batch(folder)):
         if file.exists() and not file.is_symlink():
             raise OutputError(file, "a file that no batch wrote is there", "it is left alone; name another folder")
 
 
-def pictures_in(folder: Path) -> list[Path]:
+def pictures_of_batch(folder: Path) -> list[Path]:
     """Return where the pictures of a batch are in its folder, in every format."""
     names = [name for name, entry in FIGURES.items() if entry.of == "fleet"]
     return [folder / PLOTS / f"{name}.{form}" for name in names for form in formats.PLOT_FORMATS]
@@ -199,7 +199,7 @@ def write_figures(rows: Sequence[FleetLog], folder: Path, picture_formats: Seque
             errors.setdefault(name, {})[row.log] = error
     make_folders(folder / PLOTS, folder)
     numbers = FleetNumbers(f"{len(rows)} logs", points, errors, model)
-    old = set(pictures_in(folder))
+    old = set(pictures_of_batch(folder))
     for name, figure in figures_of("fleet", numbers):
         for file in (folder / PLOTS / f"{name}.{form}" for form in picture_formats):
             formats.save_picture(figure, file, folder)

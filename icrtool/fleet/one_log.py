@@ -30,7 +30,7 @@ from icrtool.records.text import escaped
 if TYPE_CHECKING:
     from icrtool.records.dropout_document import ModelDocument
 
-HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
+FLEET_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
 """Distances whose errors a batch collects."""
 
 
@@ -147,6 +147,6 @@ def _errors(models: Iterable[ModelDocument]) -> dict[str, float | None]:
         f"{one.name}_{metric}_{row.horizon_m:g}m_m": number
         for one in models
         for row in one.by_horizon
-        if row.horizon_m in HORIZONS_M
+        if row.horizon_m in FLEET_HORIZONS_M
         for metric, number in (("p95", row.p95_m), ("expected", row.expected_error_m))
     }

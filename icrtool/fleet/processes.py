@@ -40,7 +40,7 @@ from icrtool.records.requests import LogRequest, decode_request
 if TYPE_CHECKING:
     from distributed import Client
 
-GRACE_S = 0.3
+KILL_GRACE_S = 0.3
 """Time in which a process may remove what it is writing before it is killed [s]."""
 
 LONGEST_DETAILS = 4000
@@ -55,7 +55,7 @@ ENVIRONMENT = {
 NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
 """Dask sets it for its workers: memory then goes back to the system again and again, which doubles system time."""
 
-COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.processes")
+PROCESS_COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.processes")
 
 Lines = queue.SimpleQueue[bytes]
 
@@ -109,7 +109,7 @@ def close_all() -> None:
     _idle.clear()
     for worker in list(_all):
         worker.ask_to_end()
-    end_s = time.monotonic() + GRACE_S
+    end_s = time.monotonic() + KILL_GRACE_S
     for worker in list(_all):
         worker.close(max(end_s - time.monotonic(), 0.0))
 
@@ -205,7 +205,7 @@ class Worker:
         inherited = {name: value for name, value in os.environ.items() if name != NOT_INHERITED}
         # In a session of its own: Ctrl-C reaches the command, which ends its workers.
         self._process = subprocess.Popen(  # noqa: S603 - our own command
-            COMMAND,
+            PROCESS_COMMAND,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
             env={**inherited, **ENVIRONMENT, "PYTHONPATH": paths}, start_new_session=True,
         )  # fmt: skip
@@ -247,7 +247,7 @@ class Worker:
         with suppress(OSError):  # its other end is gone
             self._requests.close()
 
-    def close(self, grace_s: float = GRACE_S) -> None:
+    def close(self, grace_s: float = KILL_GRACE_S) -> None:
         """End the process, after some time whatever it does."""
         _all.discard(self)
         self.ask_to_end()

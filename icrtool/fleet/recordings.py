@@ -34,9 +34,8 @@ from icrtool.logs.containers.recording_files import (
 )
 from icrtool.logs.containers.source import find
 from icrtool.logs.containers.sqlite_bag import SqliteBag
+from icrtool.output.run_directory import RUN_FILE
 from icrtool.records.places import UrlPath, place_of, read_regular
-
-RUN_FILE = "run.json"
 
 OWN_FILES = (RUN_FILE, "fleet.json", "study.json")
 """A folder that holds one of these is a result, not a place of recordings."""
@@ -44,7 +43,7 @@ OWN_FILES = (RUN_FILE, "fleet.json", "study.json")
 LONGEST_RESTART_S = 60.0
 """A recorder that was restarted begins again within this time; two drives are further apart."""
 
-FIRST_BYTES = 65536
+SQLITE_PAGE_BYTES = 65536
 """The tables of an SQLite file are named on its first page, which is at most this long."""
 
 
@@ -201,7 +200,7 @@ def is_recording(file: Path) -> bool:
                 return container is not None
             stream.seek(0)
             # Other programs keep SQLite files too.
-            first = stream.read(FIRST_BYTES)
+            first = stream.read(SQLITE_PAGE_BYTES)
             return b"messages" in first and b"topics" in first
     except OSError:
         return False
@@ -265,7 +264,7 @@ def as_text(path: object) -> str:
     return str(path).encode("utf-8", errors="backslashreplace").decode()
 
 
-COLUMNS = ("log", "robot", "config", "group", "tags")
+MANIFEST_COLUMNS = ("log", "robot", "config", "group", "tags")
 
 MANIFEST_SUFFIXES = {".csv", ".toml"}
 
@@ -316,7 +315,7 @@ def is_manifest(path: Path) -> bool:
 
 
 def read_manifest(path: Path) -> list[ManifestEntry]:
-    """Read a manifest: CSV with the columns of `COLUMNS`, or TOML with a table ``[[logs]]`` each.
+    """Read a manifest: CSV with the columns of `MANIFEST_COLUMNS`, or TOML with a table ``[[logs]]`` each.
 
     Paths and patterns are relative to the manifest's folder. Tags in a CSV are separated by semicolons.
 
@@ -343,7 +342,7 @@ def read_manifest(path: Path) -> list[ManifestEntry]:
     return [_entry(path, row) for row in rows]
 
 
-def about(path: Path, entries: Sequence[ManifestEntry]) -> About:
+def about_recording(path: Path, entries: Sequence[ManifestEntry]) -> About:
     """Return what a manifest states about a recording; a later line adds to and replaces an earlier one."""
     found = About()
     whole = _target(path)
@@ -363,7 +362,9 @@ def _target(place: Path) -> Path:
 def _csv_rows(path: Path, text: str) -> list[Mapping[str, Any]]:
     reader = csv.DictReader(text.splitlines(), strict=True)
     if "log" not in (reader.fieldnames or ()):
-        raise ConfigError(path, "not a manifest", f"its first line must name the column log, of {', '.join(COLUMNS)}")
+        raise ConfigError(
+            path, "not a manifest", f"its first line must name the column log, of {', '.join(MANIFEST_COLUMNS)}"
+        )
     rows: list[Mapping[str, Any]] = []
     for number, row in enumerate(reader, start=2):
         if None in row or None in row.values():
@@ -377,7 +378,7 @@ def _entry(path: Path, row: Mapping[str, Any]) -> ManifestEntry:
     try:
         line = msgspec.convert(row, _Line)
     except msgspec.ValidationError as err:
-        what = f"each line has a log or a pattern, and texts; of {', '.join(COLUMNS)}"
+        what = f"each line has a log or a pattern, and texts; of {', '.join(MANIFEST_COLUMNS)}"
         raise ConfigError(f"{path}: log", what, str(err)) from err
     config = path.parent / line.config.strip() if line.config.strip() else None
     about = About(line.robot.strip(), config, line.group.strip(), tuple(line.tags))

@@ -181,7 +181,7 @@ class Kernel:
         """Return the machine code that is kept, or that numba makes now; None where numba alone can run it."""
         name = f"{self.py_func.__module__.rpartition('.')[2]}.{self.py_func.__qualname__}"
         file = f"{name}-{hashlib.sha256(repr((_stamp(), types)).encode()).hexdigest()[:24]}.o"
-        for place in places() if _stamp() else ():
+        for place in cache_places() if _stamp() else ():
             if kept := MachineCode.read(place / file):
                 return kept
         self.compiled += 1
@@ -275,7 +275,7 @@ def _stamp() -> tuple[str, ...]:
     return sources, llvmlite.__version__, llvm.get_default_triple(), *processor()
 
 
-def places() -> list[Path]:
+def cache_places() -> list[Path]:
     """Return where machine code may be kept: ``NUMBA_CACHE_DIR``, else beside the package, or in the user's cache."""
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(given)]
@@ -289,7 +289,7 @@ def places() -> list[Path]:
 
 def writable_place() -> Path | None:
     """Return the first place that can be written, made where it is not there; None where none can."""
-    for place in places():
+    for place in cache_places():
         with suppress(OSError):
             place.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=place).close()

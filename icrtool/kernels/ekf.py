@@ -344,7 +344,7 @@ def compiled_inputs(data: FilterInputs) -> FilterInputs:
     return FilterInputs._make(np.require(column, requirements=["C", "A", "W"]) for column in data)
 
 
-CHUNK_ROWS = 8192
+CHUNK_SAMPLES = 8192
 """Wheel samples whose nodes are kept at once: some 30 MB."""
 
 
@@ -356,7 +356,7 @@ class Smoothed(NamedTuple):
 
 
 def run_smoother(
-    data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, chunk_rows: int = CHUNK_ROWS
+    data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, chunk_rows: int = CHUNK_SAMPLES
 ) -> Smoothed:
     """Smooth the run that `icrtool.kernels.ekf.run_ekf` makes of the same arguments.
 

@@ -42,7 +42,7 @@ class Histogram(NamedTuple):
 
 SHARES = {"p50": 0.5, "p95": 0.95}
 
-FEWEST_BLOCKS, MOST_BLOCKS, HORIZONS_A_BLOCK = 3, 8, 4
+FEWEST_PATH_BLOCKS, MOST_PATH_BLOCKS, HORIZONS_A_BLOCK = 3, 8, 4
 """Blocks of at least so many horizons: what wanders over some horizons makes shorter ones alike. A path of less than
 twelve horizons is too short for an interval. More than eight blocks would be narrower by a sixth at most (Student's
 factor is 2.36, without limit 1.96), and less independent."""
@@ -231,7 +231,7 @@ def block_sums(
     return BlockSums(trials, sums, above[0], above[1], *growth)
 
 
-CELLS = 1024
+PERCENTILE_CELLS = 1024
 """So many that few errors are in one."""
 
 
@@ -264,7 +264,7 @@ class RankedTrials(NamedTuple):
     def of(cls, errors_m: Floats) -> RankedTrials:
         """Return the trials among errors (n,) [m], NaN where there was none."""
         trials = errors_m[~np.isnan(errors_m)]
-        cell, counts = count_cells(trials, trials.max(initial=0.0) / CELLS or 1.0)
+        cell, counts = count_cells(trials, trials.max(initial=0.0) / PERCENTILE_CELLS or 1.0)
         return cls(trials, cell, np.append(0, np.cumsum(counts)))
 
     def quantile(self, share: float) -> float:
@@ -295,7 +295,7 @@ class RankedTrials(NamedTuple):
 
 BLOCK_PARTS = 4
 """Blocks begin at every quarter of a horizon."""
-BINS = 50
+HISTOGRAM_BINS = 50
 """Of a histogram, up to its largest error or less."""
 
 
@@ -322,7 +322,7 @@ def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
 
     Returns
     -------
-    None where there are fewer than `FEWEST_BLOCKS`. Path without trials is left out.
+    None where there are fewer than `FEWEST_PATH_BLOCKS`. Path without trials is left out.
     """
     if not (count := int(np.count_nonzero(tried))):
         return None
@@ -331,17 +331,17 @@ def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
     rows = slice(begin, end) if end - begin == count else tried
     path = path_m[rows]
     first = rows_of_cells(path, lambda part: np.floor((part - path[0]) * (BLOCK_PARTS / horizon_m)))
-    if len(first) < FEWEST_BLOCKS * HORIZONS_A_BLOCK * BLOCK_PARTS:
+    if len(first) < FEWEST_PATH_BLOCKS * HORIZONS_A_BLOCK * BLOCK_PARTS:
         return None
-    count = min(MOST_BLOCKS, len(first) // (BLOCK_PARTS * HORIZONS_A_BLOCK))
+    count = min(MOST_PATH_BLOCKS, len(first) // (BLOCK_PARTS * HORIZONS_A_BLOCK))
     return Blocks(rows, first[-(-np.arange(count) * len(first) // count)])
 
 
 def round_bin_width(largest_m: float) -> float:
-    """Return the smallest of 1, 2, 5 times a power of ten [m] with which `BINS` bins reach `largest_m`."""
+    """Return the smallest of 1, 2, 5 times a power of ten [m] with which `HISTOGRAM_BINS` bins reach `largest_m`."""
     if not largest_m > 0.0:
         return 0.01
-    least = largest_m / BINS
+    least = largest_m / HISTOGRAM_BINS
     power = 10.0 ** math.floor(math.log10(least))
     return next((factor * power for factor in (1.0, 2.0, 5.0) if factor * power >= least), 10.0 * power)
 

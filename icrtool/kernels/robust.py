@@ -26,12 +26,12 @@ SMALLEST_SCALE = 1e-5
 """Residuals of an exact fit have no spread. No sensor is as exact as this [m, rad]; with less, the information of what
 exact data show is beyond 16 digits of that of a prior, and the covariance of what they do not show is of rounding."""
 
-SETTLED = 0.03
+LAST_STEP_SIGMAS = 0.03
 """A Gauss-Newton step shorter than this in standard deviations, all parameters together, is the last one."""
 
 MOST_HALVINGS = 6
 
-FEWEST_BLOCKS, LARGEST_CORRELATION = 8, 0.9
+FEWEST_CORRELATED_BLOCKS, LARGEST_CORRELATION = 8, 0.9
 """A correlation between neighbours is estimated from at least so many, and limited to this."""
 
 
@@ -140,7 +140,7 @@ def robust_least_squares(
     parts: Parts | None = None,
     overlap: float = 1.0,
     most_steps: int = 15,
-    settled: float = SETTLED,
+    settled: float = LAST_STEP_SIGMAS,
 ) -> RobustFit:
     """Minimise a soft-L1 loss of residuals under a normal prior by Gauss-Newton steps.
 
@@ -337,7 +337,7 @@ def long_run_factor(series: Floats) -> Floats:
     """
     total = np.maximum((series**2).sum(axis=0), 1e-300)
     factor = np.ones(series.shape[1])
-    while (count := len(series)) >= FEWEST_BLOCKS:
+    while (count := len(series)) >= FEWEST_CORRELATED_BLOCKS:
         square = np.maximum((series**2).sum(axis=0), 1e-300)
         rho = (series[1:] * series[:-1]).sum(axis=0) / square
         rho = np.clip(rho + (1.0 + 3.0 * rho) / count, 0.0, LARGEST_CORRELATION)

@@ -23,7 +23,7 @@ from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError, LogError
 from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
-from icrtool.logs.containers.recording_files import PACKED, log_name
+from icrtool.logs.containers.recording_files import PACKED_SUFFIX, log_name
 from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.logs.messages.definitions import definition_note
 from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, collector_for
@@ -44,7 +44,7 @@ Progress = Callable[[float], None]
 Moment = float | str | datetime
 """Seconds since the log's first message, or a time of day: a `datetime`, or a text in ISO 8601."""
 
-_NAME = re.compile(rf"\.csv(?:{PACKED})?$", re.IGNORECASE)
+_CSV_NAME = re.compile(rf"\.csv(?:{PACKED_SUFFIX})?$", re.IGNORECASE)
 
 LONGEST_HEAD_BYTES = 1 << 18
 """Of the line that names the columns: pandas takes a minute for a million of them."""
@@ -251,7 +251,7 @@ def nanoseconds(given: float | datetime, first_ns: int) -> int:
 
 def is_table(path: Path) -> bool:
     """Return whether a path, or an address, names a table."""
-    return _NAME.search(path.name) is not None and (path.is_file() or isinstance(path, UrlPath))
+    return _CSV_NAME.search(path.name) is not None and (path.is_file() or isinstance(path, UrlPath))
 
 
 def csv_frame(path: Path) -> pd.DataFrame:
@@ -311,7 +311,7 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
     return longest_part(replace(log, inputs=(read,)))
 
 
-GAP_IN_INTERVALS, SHORTEST_GAP_S = 5.0, 0.1
+TOPIC_GAP_IN_INTERVALS, SHORTEST_GAP_S = 5.0, 0.1
 """A gap is longer than so many times the median interval, and than this."""
 
 
@@ -367,7 +367,7 @@ def survey_document(survey: Survey) -> SurveyDocument:
         stamps = np.empty(0, np.int64) if table is None else table.log_time_ns
         interval, long = np.diff(stamps) / 1e9, np.zeros(0, np.bool_)
         if len(interval) > 1:
-            long = interval > max(GAP_IN_INTERVALS * float(np.median(interval)), SHORTEST_GAP_S)
+            long = interval > max(TOPIC_GAP_IN_INTERVALS * float(np.median(interval)), SHORTEST_GAP_S)
         topics.append(
             SurveyedTopic(
                 topic=str(channel.topic), message_type=str(channel.message_type),

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 
 from icrtool.errors import ConfigError, OutputError
+from icrtool.kernels.friction import GRAVITY_MPS2
 from icrtool.logs.messages.definitions import bundled_definitions
 from icrtool.records.choices import HeadingConvention, WheelMessages
 from icrtool.records.process_resources import unfinished
@@ -75,7 +76,6 @@ class WriteOptions:
                 raise ConfigError(name, f"{getattr(self, name)} is not a positive number")
 
 
-GRAVITY_MPS2 = 9.81
 HEIGHT_STD_RATIO = 2.0
 """Vertical over horizontal GNSS noise, a rule of thumb of GNSS geometry."""
 

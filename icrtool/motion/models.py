@@ -222,7 +222,7 @@ class TrackGeometry(NamedTuple):
     radius_right: float
 
 
-ICRS = 3
+ICR_VALUES = 3
 """So many values of a `TrackGeometry`, the first, are ICRs."""
 
 

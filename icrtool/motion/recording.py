@@ -22,7 +22,7 @@ from icrtool.records.measurements import TURNING_MPS
 WINDOWS_M = (5.0, 10.0)
 """Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
 
-USUAL_WIDTH_M = 0.5
+FULL_SIZE_WIDTH_M = 0.5
 """Windows, their distances and stretches are those of robots of this track width and wider; smaller ones drive, and
 err, in proportion."""
 
@@ -32,16 +32,16 @@ EVERY_M = 0.5
 MOST_STARTS, LEAST_OFTEN_M = 800, 2.5
 """Windows of long drives start further apart: about so many of a length in all logs, but at least every half window."""
 
-STEP_S = 0.1
+RECORDING_STEP_S = 0.1
 """Wheel samples are joined to steps of this length."""
 
-MOST_STEPS, LONGEST_STEP_S, LONGEST_STEP_M = 10_000, 0.4, 0.25
+MOST_RECORDING_STEPS, LONGEST_RECORDING_STEP_S, LONGEST_STEP_M = 10_000, 0.4, 0.25
 """Steps are longer where there would be more of them, but not longer than this in time and distance."""
 
 STRETCH_M = 20.0
 """Distance whose errors depend on one another, for the covariance: twice the longest window."""
 
-FEWEST_WINDOWS = 10
+FEWEST_FIT_WINDOWS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ def totals_of(*recordings: Recording) -> Totals:
 
 def size_of(width_m: float) -> float:
     """Return the part of the usual distances that is used for a robot of track width b [m], at most 1."""
-    return min(1.0, width_m / USUAL_WIDTH_M)
+    return min(1.0, width_m / FULL_SIZE_WIDTH_M)
 
 
 def cut_windows(
@@ -132,13 +132,13 @@ def cut_windows(
     Raises
     ------
     DataError
-        There are fewer than `FEWEST_WINDOWS`.
+        There are fewer than `FEWEST_FIT_WINDOWS`.
     """
     track, pooled, size = recording.track, pooled or totals_of(recording), size_of(recording.width_m)
     lengths_m = [size * one for one in WINDOWS_M] if lengths_m is None else lengths_m
     every = min(max(size * EVERY_M, pooled.metres / MOST_STARTS), size * LEAST_OFTEN_M)
     windows = cut(track, lengths_m, every)
-    if len(windows.begin) < FEWEST_WINDOWS:
+    if len(windows.begin) < FEWEST_FIT_WINDOWS:
         why = f"only {len(windows.begin)} windows of {min(lengths_m):g} m of driven distance"
         raise DataError(recording.name, why, "a calibration needs a longer drive")
     return replace(windows, track=steps_of(recording, pooled.seconds))
@@ -161,9 +161,11 @@ def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
         travel[some] = wheels.held * (np.abs(wheels.v_left) + np.abs(wheels.v_right))
     speed_mps = float(travel.sum()) / 2.0 / total_s
     step_s = min(
-        (total_s if pooled_s is None else pooled_s) / MOST_STEPS, LONGEST_STEP_M / max(speed_mps, 1e-3), LONGEST_STEP_S
+        (total_s if pooled_s is None else pooled_s) / MOST_RECORDING_STEPS,
+        LONGEST_STEP_M / max(speed_mps, 1e-3),
+        LONGEST_RECORDING_STEP_S,
     )
-    return max(int(max(step_s, STEP_S) / float(np.median(held[lasting], overwrite_input=True))), 1)
+    return max(int(max(step_s, RECORDING_STEP_S) / float(np.median(held[lasting], overwrite_input=True))), 1)
 
 
 def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:

@@ -35,7 +35,7 @@ from icrtool.kernels.window_residuals import OMEGA, path_at, turn_residuals, win
 from icrtool.motion.models import FittedModel, MotionModel, model_columns, wheel_motion
 from icrtool.motion.recording import STRETCH_M, LogConstants, size_of
 
-SETTLED = 0.1
+LAST_DELAY_STEP_SIGMAS = 0.1
 """Delays have kinks, where a shorter last step is not found."""
 
 REWEIGHTS = 2
@@ -47,19 +47,19 @@ FEWEST_TO_SUBTRACT = 4
 CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
 """Prior of `LogConstants` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
 
-OF_WHEELS = 2
+CONSTANTS_OF_WHEELS = 2
 """So many of them, the first, are there without a gyro, too."""
 
-KINDS = (0, 0, 1)
+RESIDUAL_KINDS = (0, 0, 1)
 """Residuals of a window: forward and right, whose spread is one, and turn."""
 
-FEWEST_RESIDUALS = 10 * len(KINDS)
+FEWEST_RESIDUALS = 10 * len(RESIDUAL_KINDS)
 """Fewer that are left beside a fold give no parameters."""
 
 
 def constant_std(model: MotionModel) -> Floats:
     """Return the prior of the constants of each recording that a model has."""
-    return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:OF_WHEELS]
+    return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:CONSTANTS_OF_WHEELS]
 
 
 def shortening(turned: Floats, length_m: Floats) -> Floats:
@@ -119,10 +119,10 @@ def residuals_of(
     gains = np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
 
     def evaluate(parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
-        offset, delay = constants[:OF_WHEELS].tolist()
+        offset, delay = constants[:CONSTANTS_OF_WHEELS].tolist()
         fixed, columns, values = of_model, of_terms, parameters
         if model.uses_gyro:
-            bias, later = constants[OF_WHEELS:].tolist()
+            bias, later = constants[CONSTANTS_OF_WHEELS:].tolist()
             shift = later * gyro_change
             fixed, columns, values = fixed.copy(), columns.copy(), np.concatenate([parameters, [bias, 0.0]])
             fixed[OMEGA] += shift
@@ -326,7 +326,7 @@ def own_constants(windows: Windows, fitted: FittedModel, width_m: float) -> LogC
         residuals, by = of_both(fitted.parameters, constants)
         return residuals, by[:, len(fitted.parameters) :]
 
-    zero, kind = np.zeros(len(std)), np.repeat(KINDS, len(windows.begin))
+    zero, kind = np.zeros(len(std)), np.repeat(RESIDUAL_KINDS, len(windows.begin))
     overlap = len(windows.begin) / 5.0
     return LogConstants(*robust_least_squares(evaluate, zero, zero, std, kind=kind, overlap=overlap).x.tolist())
 
@@ -342,16 +342,16 @@ class Pool:
     ----------
     recording, start_m, end_m, length_m : (m,) of the window of each residual
     first : (recordings + 1,) first residual of each, and the number of all
-    kind : (m,) of `KINDS`
+    kind : (m,) of `RESIDUAL_KINDS`
     group : (m,) stretches of distance whose residuals depend on one another
     overlap : how many windows cover a place on average
     """
 
     def __init__(self, windows: Sequence[Windows], widths_m: Sequence[float]) -> None:
         self.windows, self.widths_m = windows, widths_m
-        by_window = [np.tile([*w.track.distance[[w.begin, w.end]], w.length_m], len(KINDS)) for w in windows]
+        by_window = [np.tile([*w.track.distance[[w.begin, w.end]], w.length_m], len(RESIDUAL_KINDS)) for w in windows]
         self.start_m, self.end_m, self.length_m = np.concatenate(by_window, axis=1)
-        self.kind = np.concatenate([np.repeat(KINDS, len(w.begin)) for w in windows])
+        self.kind = np.concatenate([np.repeat(RESIDUAL_KINDS, len(w.begin)) for w in windows])
         sizes = [one.shape[1] for one in by_window]
         self.first = np.cumsum([0, *sizes])
         self.recording = np.repeat(np.arange(len(windows)), sizes)
@@ -360,7 +360,7 @@ class Pool:
         stretches, group = np.unique(stretch, axis=0, return_inverse=True)
         self.group = group.reshape(-1)
         covered_m = float(stretch_m[stretches[:, 0].astype(np.int64)].sum())
-        self.overlap = max(float(self.length_m.sum()) / len(KINDS) / covered_m, 1.0)
+        self.overlap = max(float(self.length_m.sum()) / len(RESIDUAL_KINDS) / covered_m, 1.0)
 
     def prior(self, model: MotionModel) -> tuple[Floats, Floats]:
         """Return mean and standard deviation of all parameters, model first, then the constants of each recording."""
@@ -411,7 +411,7 @@ class Pool:
 
         found = robust_least_squares(
             evaluate, mean, mean, std, kind=self.kind, parts=Parts(self.first, own if count > 1 else 0),
-            overlap=self.overlap, settled=SETTLED,
+            overlap=self.overlap, settled=LAST_DELAY_STEP_SIGMAS,
         )  # fmt: skip
         levels = [self.group, *([self.recording] if count > 1 else [])]
         covariance = student_covariance(found, levels)[:k, :k]

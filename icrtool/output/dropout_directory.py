@@ -36,7 +36,7 @@ REPORT_FILE = "report.json"
 TRIALS_FILE = "trials.parquet"
 DROPOUT_DIRECTORY = "dropout"
 """Where a report stands in its run directory."""
-SCHEMA_FAMILY = "icrtool/dropout/"
+DROPOUT_FAMILY = "icrtool/dropout/"
 
 
 def write_report(
@@ -79,7 +79,7 @@ def write_report(
 
 def is_dropout_directory(directory: Path) -> bool:
     """Return whether a directory is a dropout report of ours."""
-    return schema_of(directory / REPORT_FILE, directory).startswith(SCHEMA_FAMILY)
+    return schema_of(directory / REPORT_FILE, directory).startswith(DROPOUT_FAMILY)
 
 
 REPORT = Kind(
@@ -110,7 +110,7 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
     for rank, trial in enumerate(document.worst, start=1):
         *columns, errors = msgspec.structs.astuple(trial)
         worst.append((rank, *columns, *(errors.get(model) for model in IN_CSV)))
-    (directory / "worst.csv").write_bytes(csv_bytes(WORST_COLUMNS, worst))
+    (directory / "worst.csv").write_bytes(csv_bytes(WORST_CSV_COLUMNS, worst))
     if document.ladder.models:
         (directory / "ladder.csv").write_bytes(csv_bytes(COMPARISON_COLUMNS, comparison_rows(document)))
     (directory / REPORT_FILE).write_bytes(json_bytes(document))
@@ -118,7 +118,7 @@ def write_tables(report: DropoutReport, directory: Path) -> None:
 
 HISTOGRAM_COLUMNS = ("model", "horizon_m", "bin_left_m", "bin_right_m", "percent")
 
-WORST_COLUMNS = (
+WORST_CSV_COLUMNS = (
     "rank", "model", "stamp_ns", "t_s", "north_m", "east_m", "horizon_m", "heading_change_deg", "speed_mean_mps",
     *(f"{model}_error_m" for model in IN_CSV),
 )  # fmt: skip
@@ -230,7 +230,7 @@ class Baseline:
         if found is None and self.path.is_file():
             found = next(iter(self.reports))
         found = found if found is not None else name if name in self.reports else None
-        return read_report(self.reports[found], found, self.folder) if found is not None else None
+        return read_baseline(self.reports[found], found, self.folder) if found is not None else None
 
 
 def open_baseline(path: Path) -> Baseline:
@@ -258,7 +258,7 @@ def open_baseline(path: Path) -> Baseline:
         one_file = path if path.is_file() else path / REPORT_FILE
         below = f"**/{DROPOUT_DIRECTORY}/{REPORT_FILE}"
         for file in [one_file] if one_file.is_file() else sorted(path.glob(below)):
-            one = read_report(file, inside=None if file == path else path)
+            one = read_baseline(file, inside=None if file == path else path)
             if one.log in reports:
                 why = f"two reports of logs named {one.log}"
                 raise ConfigError(f"--baseline {path}", why, f"{reports[one.log]} and {file}")
@@ -269,7 +269,7 @@ def open_baseline(path: Path) -> Baseline:
     return Baseline(path, reports, files, sources)
 
 
-def read_report(path: Path, log: str = "", inside: Path | None = None) -> BaselineReport:
+def read_baseline(path: Path, log: str = "", inside: Path | None = None) -> BaselineReport:
     """Read a report.json as a baseline.
 
     Parameters
@@ -284,7 +284,7 @@ def read_report(path: Path, log: str = "", inside: Path | None = None) -> Baseli
     """
     try:
         document = read_document(path, DropoutDocument, inside, escape=False)
-        if not document.schema.startswith(SCHEMA_FAMILY):
+        if not document.schema.startswith(DROPOUT_FAMILY):
             raise ValueError(document.schema)
         return BaselineReport(escaped(log or document.run.log), str(path), document)
     except OSError as err:

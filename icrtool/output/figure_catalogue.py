@@ -193,10 +193,10 @@ def draw_figures(
         A file cannot be written.
     """
     directory.mkdir(exist_ok=True)
-    from icrtool.output.figures.style import save
+    from icrtool.output.figures.style import save_figure
 
     for name, figure in figures_of(of, subject, figures):
-        save(figure, directory / name, formats)
+        save_figure(figure, directory / name, formats)
         give_back_freed()
 
 

@@ -41,14 +41,14 @@ STATES_FORMATS: tuple[StatesFormat, ...] = get_args(StatesFormat)
 MOST_CSV_STATES = 1_000_000
 """With more states, states.csv would have over 300 MB, and take longer to read than the log."""
 
-SCHEMA_FAMILY = "icrtool/run/"
+RUN_FAMILY = "icrtool/run/"
 
 _FIGURES = "|".join(f"{name}[0-9]+m" if name.endswith("_") else name for name in FIGURES)
-PICTURES = rf"plots/(({_FIGURES})\.(png|svg|pdf))?"
-REPORT_FILES = rf"report\.json|(summary|histogram|worst|ladder)\.csv|trials\.parquet|{PICTURES}"
+PICTURE_FILES = rf"plots/(({_FIGURES})\.(png|svg|pdf))?"
+REPORT_FILES = rf"report\.json|(summary|histogram|worst|ladder)\.csv|trials\.parquet|{PICTURE_FILES}"
 RUN_FILES = (
     r"run\.json|events\.csv|measurements\.npz|(states|smoothed)\.(csv|parquet)|B2SUMS"
-    rf"|report\.html|{PICTURES}|dropout/({REPORT_FILES})?"
+    rf"|report\.html|{PICTURE_FILES}|dropout/({REPORT_FILES})?"
 )
 """Names of the files in a run directory; a directory with a file of another name is not replaced."""
 
@@ -190,7 +190,7 @@ def is_run_directory(directory: Path) -> bool:
     """Return whether a directory, or an address, is a run of ours."""
     if isinstance(directory, UrlPath):
         return lies_there(directory, RUN_FILE)
-    return formats.schema_of(directory / RUN_FILE, directory).startswith(SCHEMA_FAMILY)
+    return formats.schema_of(directory / RUN_FILE, directory).startswith(RUN_FAMILY)
 
 
 RUN = Kind(
@@ -213,7 +213,7 @@ def events_csv(events: Sequence[EventDocument]) -> bytes:
 
 FIT_AGAIN = "fit the log again"
 
-NAMES = ("topic", "message_type")
+NAMES_IN_THE_LOG = ("topic", "message_type")
 """Keys of run.json whose texts stand there as in the log."""
 
 
@@ -331,13 +331,15 @@ def _read_document(directory: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as err:
         raise RunError(directory, f"{RUN_FILE} is not JSON", FIT_AGAIN) from err
     schema = document.get("schema") if isinstance(document, dict) else None
-    if not (isinstance(schema, str) and schema.startswith(SCHEMA_FAMILY)):
+    if not (isinstance(schema, str) and schema.startswith(RUN_FAMILY)):
         raise RunError(directory, "not a run directory", f"its {RUN_FILE} is not icrtool's")
     if schema != RUN_SCHEMA:
         why = f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}"
         raise RunError(directory, why, FIT_AGAIN)
     # What a log wrote there is printed from here on.
-    return {key: value if key == "inputs" else escaped_texts(value, NAMES) for key, value in document.items()}
+    return {
+        key: value if key == "inputs" else escaped_texts(value, NAMES_IN_THE_LOG) for key, value in document.items()
+    }
 
 
 def _read_states(directory: Path, stem: str, sums: Mapping[str, str], *, whole: bool) -> States | None:

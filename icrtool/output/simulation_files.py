@@ -15,7 +15,7 @@ import numpy as np
 
 from icrtool import __version__
 from icrtool.errors import DataError, OutputError
-from icrtool.output.files.atomic import Kind, atomic_directory, beside, check_directory, put, reported, sync_tree
+from icrtool.output.files.atomic import Kind, atomic_directory, beside, check_directory, place_errors, put, sync_tree
 from icrtool.output.files.formats import csv_bytes, json_bytes, read_numbers, schema_of
 from icrtool.records.choices import StudyName
 from icrtool.records.process_resources import remove
@@ -49,7 +49,7 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
     truth = truth_path(log)
     if not log.is_file():
         check_directory(log, BAG)
-    with reported(log):
+    with place_errors(log):
         for place in (log, truth):
             if place.exists() and not force:
                 raise OutputError(place, "exists already", "--force replaces it")
@@ -107,7 +107,7 @@ def read_speeds(path: Path) -> TrackSpeeds:
 
 STUDY_SCHEMA = "icrtool/study/1"
 STUDY_FILE = "study.json"
-SCHEMA_FAMILY = "icrtool/study/"
+STUDY_FAMILY = "icrtool/study/"
 
 
 def check_study_target(directory: Path) -> None:
@@ -152,13 +152,13 @@ def write_study(result: StudyResult, directory: Path, *, plots: tuple[str, ...] 
         (partial / f"{name}.csv").write_bytes(csv_bytes(result.columns, rows))
         if plots:
             from icrtool.output.figures.study import study_figure
-            from icrtool.output.figures.style import save
+            from icrtool.output.figures.style import save_figure
 
-            save(study_figure(result), partial / name, plots)
+            save_figure(study_figure(result), partial / name, plots)
 
 
 STUDY = Kind(
     "study directory",
-    lambda place: schema_of(place / STUDY_FILE, place).startswith(SCHEMA_FAMILY),
+    lambda place: schema_of(place / STUDY_FILE, place).startswith(STUDY_FAMILY),
     re.compile(rf"study\.json|({'|'.join(get_args(StudyName))})\.(csv|png|svg|pdf)"),
 )

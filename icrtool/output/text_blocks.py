@@ -221,8 +221,8 @@ def format_blocks(blocks: Iterable[Block], *, verbose: bool = True) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-LOOKS: dict[Grade, Look] = {"good": "good", "care": "as is", "bad": "bad", "fact": "as is"}
-MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": ""}
+GRADE_LOOKS: dict[Grade, Look] = {"good": "good", "care": "as is", "bad": "bad", "fact": "as is"}
+GRADE_MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": ""}
 
 
 def printed(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:
@@ -257,7 +257,7 @@ def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
         yield from [Line(section.title, "title")] if section.title else []
     if section.label:
         label, text = f"{section.label:{LABEL + 2}}", f"{section.lead} {section.text}".strip()
-        yield _sentence(label, text, 3, LOOKS[section.grade], verbose=verbose)
+        yield _sentence(label, text, 3, GRADE_LOOKS[section.grade], verbose=verbose)
     yield from printed(section.blocks, verbose=verbose)
 
 
@@ -270,7 +270,7 @@ def _labelled(block: Facts | Checks, verbose: bool) -> Iterator[tuple[str, str, 
             yield of_all if block.label else f"{name:{LABEL + 2}}", text, BRIEF_LINES
         return
     for number, one in enumerate(one for one in block.rows if verbose or one.grade != "fact"):
-        first = f"{'' if number else 'checks':{LABEL + 2}}{MARKS[one.grade]:4}{one.what:{LABEL + 3}}"
+        first = f"{'' if number else 'checks':{LABEL + 2}}{GRADE_MARKS[one.grade]:4}{one.what:{LABEL + 3}}"
         yield first, one.text, 1 if one.grade == "good" else BRIEF_LINES
         yield from ((" " * len(first), more, BRIEF_LINES) for more in (one.more if verbose else ()))
 
@@ -282,7 +282,7 @@ def _sentence(first: str, text: str, most: int, look: Look = "as is", *, verbose
     return Line("\n".join(_wrap(text, first, " " * len(first), BRIEF_WIDTH, most)) or first.rstrip(), look)
 
 
-def fitted(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
+def fitted_to(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
     """Return a table with one line a row that fits a width as far as it can, and the columns that are left out for it.
 
     The widest cells of text are shortened first; then columns are left out, from the middle, until `fewest` are left. A
@@ -310,7 +310,7 @@ def fitted(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
 
 def _table_lines(table: Table) -> Iterator[str]:
     sides = table.sides()
-    table, _ = fitted(table, TEXT_WIDTH, len(sides))
+    table, _ = fitted_to(table, TEXT_WIDTH, len(sides))
     rows = [[str(cell) for cell in row] for row in ((table.head, *table.rows) if table.head else table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:

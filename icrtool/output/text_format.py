@@ -20,7 +20,7 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 PATH_WORDS = {"filter": "filter", "smoothed": "smoother", "icr": "ICR odometry", "no_slip": "no-slip odometry"}
 
-WORDS = {
+GLOSSARY = {
     "ICR": "Instantaneous centre of rotation of a track: the point of the ground, seen from the robot, about which it "
     "turns. A robot that slips turns about points further out than its tracks.",
     "trial": "From one recorded state, drive on with wheel speeds alone. The error is the distance to the reference "

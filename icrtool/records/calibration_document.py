@@ -16,7 +16,7 @@ from icrtool.records.samples import InputFile
 CALIBRATION_SCHEMA: Literal["icrtool/calibration/1"] = "icrtool/calibration/1"
 """Version of calibration files."""
 
-FRAME = "x forward, y right, turn rate clockwise; wheel speeds at the configured radius"
+CALIBRATION_FRAME = "x forward, y right, turn rate clockwise; wheel speeds at the configured radius"
 
 WIDEST_M = 20.0
 """Bound of `robot.track_width_m` in a configuration."""
@@ -225,7 +225,7 @@ class CalibrationDocument(CalibrationFile, frozen=True, kw_only=True):
     tool_version: str
     created: str | UnsetType = UNSET
     robot: CalibratedRobot
-    frame: str = FRAME
+    frame: str = CALIBRATION_FRAME
     recommended: str
     model: str
     terms: tuple[str, ...]

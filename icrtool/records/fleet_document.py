@@ -24,7 +24,7 @@ RUNS, ROWS = "runs", ".rows"
 """Folders of a batch: of the runs, and of the rows of the logs, written as they come."""
 
 BUDGET_M = 0.5
-"""Error within which the distance of a pooled calibration counts."""
+"""Position error of the distance that a calibration is stated to keep within [m]."""
 
 SHOWN_ERROR, SHOWN_WITHOUT = f"{MOST_USEFUL}_p95_10m_m", f"{WITHOUT_IT}_p95_10m_m"
 """The error of each log that is printed, drawn, and compared with the baseline; without a held-out one the second."""

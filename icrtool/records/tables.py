@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 Icrs = tuple[float, float, float]
 """y_icr_right, y_icr_left, x_icr [m]."""
 
-LARGEST = 1e30
+LARGEST_STATE = 1e30
 """Of a state or a measurement: squares of larger numbers overflow."""
 
-WHEELS: dict[tuple[str, ...], tuple[WheelUnit, bool]] = {
+WHEEL_COLUMN_UNITS: dict[tuple[str, ...], tuple[WheelUnit, bool]] = {
     ("v_left_mps", "v_right_mps"): ("m", False),
     ("v_left_radps", "v_right_radps"): ("rad", False),
     ("pos_left_m", "pos_right_m"): ("m", True),
@@ -49,8 +49,8 @@ WHEELS: dict[tuple[str, ...], tuple[WheelUnit, bool]] = {
 
 POSITION = (("north_m", "east_m"), ("latitude_deg", "longitude_deg"))
 POSITION_STD = (("north_std_m", "east_std_m"), ("position_std_m", "position_std_m"))
-HEADING = (("heading_rad",), ("heading_deg",), ("yaw_rad",), ("yaw_deg",))
-GYRO = (("turn_rate_radps",), ("yaw_rate_radps",))
+HEADING_COLUMNS = (("heading_rad",), ("heading_deg",), ("yaw_rad",), ("yaw_deg",))
+GYRO_COLUMNS = (("turn_rate_radps",), ("yaw_rate_radps",))
 
 LATEST_S = 4e9
 """Limit of stamps, the year 2096: differences of larger stamps may overflow 64 bits of nanoseconds."""
@@ -126,10 +126,10 @@ class RobotLog:
         fixes, datum, of_position = _position(position, name)
         headings, of_heading = _heading(heading, name)
         rates = None
-        if gyro is not None and any(column in gyro for (column,) in GYRO):
-            column = _chosen(gyro, GYRO, "gyro", name)
+        if gyro is not None and any(column in gyro for (column,) in GYRO_COLUMNS):
+            column = _chosen(gyro, GYRO_COLUMNS, "gyro", name)
             stamps, (rate,) = _rows(gyro, column, "gyro", name)
-            rates = GyroSamples(column[0], stamps, rate if column == GYRO[0] else -rate)
+            rates = GyroSamples(column[0], stamps, rate if column == GYRO_COLUMNS[0] else -rate)
         wheel_kind = "position" if samples.from_position else "speed"
         roles: tuple[tuple[Role, str, pd.DataFrame, tuple[str, ...], Ints, str], ...] = (
             ("wheels", "wheels", wheels, of_wheels, samples.stamp_ns, wheel_kind),
@@ -231,8 +231,8 @@ def _stamped(frame: pd.DataFrame, columns: Sequence[str], group: str, name: str)
 
 
 def _wheels(frame: pd.DataFrame, name: str) -> tuple[WheelSamples, tuple[str, ...]]:
-    columns = _chosen(frame, tuple(WHEELS), "wheels", name)
-    unit, is_position = WHEELS[columns]
+    columns = _chosen(frame, tuple(WHEEL_COLUMN_UNITS), "wheels", name)
+    unit, is_position = WHEEL_COLUMN_UNITS[columns]
     stamps, (left, right) = _rows(frame, columns, "wheels", name)
     if is_position:
         interval = np.diff(stamps) / 1e9
@@ -275,7 +275,7 @@ def _at(frame: pd.DataFrame, column: str, group: Sequence[str], stamps: Ints, na
 
 
 def _heading(frame: pd.DataFrame, name: str) -> tuple[HeadingSamples, tuple[str, ...]]:
-    columns = _chosen(frame, HEADING, "heading", name)
+    columns = _chosen(frame, HEADING_COLUMNS, "heading", name)
     stamps, (angle,) = _rows(frame, columns, "heading", name)
     angle = np.radians(angle) if columns[0].endswith("_deg") else angle
     heading = math.pi / 2 - angle if columns[0].startswith("yaw") else angle
@@ -346,9 +346,10 @@ class States:
         if np.any(self.distance_m[1:] < self.distance_m[:-1]):
             return "the distance of its states decreases"
         for name in (field.name for field in fields(self)):
-            possible = np.abs(getattr(self, name)) < LARGEST
+            possible = np.abs(getattr(self, name)) < LARGEST_STATE
             if name != "stamp_ns" and not possible.all():
-                return f"row {possible.argmin()} of its states has {name} that is not a finite number below {LARGEST:g}"
+                what = f"{name} that is not a finite number below {LARGEST_STATE:g}"
+                return f"row {possible.argmin()} of its states has {what}"
         return ""
 
     def __len__(self) -> int:

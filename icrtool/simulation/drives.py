@@ -12,6 +12,7 @@ import numpy as np
 from icrtool.errors import ConfigError
 from icrtool.kernels.arrays import Floats, Ints, wrapped
 from icrtool.kernels.kinematics import drive, follow
+from icrtool.logs.write_log import HEIGHT_STD_RATIO
 from icrtool.records.choices import PathKind
 from icrtool.records.samples import SensorColumns
 from icrtool.records.tables import Icrs
@@ -30,17 +31,16 @@ PAPER_ICRS_M: Icrs = (0.5, -0.75, -0.25)
 
 GYRO_STD_RADPS = 0.003
 
-MOST_SAMPLES = 20_000_000
+MOST_SIMULATED_SAMPLES = 20_000_000
 """Of a sensor, and steps of the truth: five and a half hours at the default step."""
 
-LARGEST, SMALLEST = 1e6, 1e-9
+LARGEST_SETTING, SMALLEST_SETTING = 1e6, 1e-9
 """Magnitudes of the numbers of a drive and its sensors, in their units; 0 is allowed where it has a meaning."""
 
 START_NS = 1_760_000_000_000_000_000
 DATUM = (40.7934, -77.86, 350.0)
 """Where and when: latitude, longitude [deg], height [m] of the first pose, and the stamp of time 0."""
 
-HEIGHT_STD_RATIO = 2.0
 LARGEST_RTK_STD_M, LARGEST_SBAS_STD_M = 0.05, 0.6
 """NavSatStatus of a receiver by its noise: GBAS, SBAS, or a plain fix."""
 
@@ -176,14 +176,14 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
     for part in (plan, sensors, plan.path, *([] if plan.robot is None else [plan.robot])):
         for name in (each.name for each in fields(part) if not isinstance(part, TrackSpeeds)):
             for number in _numbers_in(getattr(part, name)):
-                if number and not SMALLEST <= abs(number) <= LARGEST:
-                    why = f"{number:g} is not of a magnitude from {SMALLEST:g} to {LARGEST:g}"
+                if number and not SMALLEST_SETTING <= abs(number) <= LARGEST_SETTING:
+                    why = f"{number:g} is not of a magnitude from {SMALLEST_SETTING:g} to {LARGEST_SETTING:g}"
                     raise ConfigError(name, why, "give a number in the unit of its name")
     rates = (sensors.wheel_rate_hz, sensors.gnss_rate_hz, sensors.heading_rate_hz)
     fastest, slowest = max(1.0 / plan.step_s, *rates), min(rates)
-    if not 0.0 < (samples := plan.duration_s * fastest) <= MOST_SAMPLES:
+    if not 0.0 < (samples := plan.duration_s * fastest) <= MOST_SIMULATED_SAMPLES:
         why = f"{plan.duration_s:g} s at {fastest:g} Hz are {samples:.3g} samples"
-        raise ConfigError("duration", why, f"at most {MOST_SAMPLES:,} are simulated")
+        raise ConfigError("duration", why, f"at most {MOST_SIMULATED_SAMPLES:,} are simulated")
     for number, (right, left, _) in enumerate([plan.icrs_m, *(icrs for _, icrs in plan.changes)]):
         if not right > left:
             why = f"y_icr_right {right:g} is not right of y_icr_left {left:g}"
@@ -376,10 +376,10 @@ def simulate(plan: DrivePlan, sensors: Sensors, seed: int) -> tuple[SensorColumn
     columns |= zip(("north_m", "east_m", "heading_rad"), truth.poses(times).T, strict=True)
     columns |= zip(("y_icr_right_m", "y_icr_left_m", "x_icr_m"), truth.icrs(times).T, strict=True)
     columns |= {"v_left_mps": truth.v_left_mps[row], "v_right_mps": truth.v_right_mps[row]}
-    return record(readings, sensors, np.random.default_rng((seed, 1))), columns
+    return record_drive(readings, sensors, np.random.default_rng((seed, 1))), columns
 
 
-def record(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> SensorColumns:
+def record_drive(readings: Readings, sensors: Sensors, rng: np.random.Generator) -> SensorColumns:
     """Stamp readings from `START_NS` on, delays included, and put the fixes on the globe about `DATUM`."""
     from pymap3d import ned2geodetic
 

@@ -49,7 +49,7 @@ GUARDS = {"no guard": UNGUARDED, "guard, printed derivatives": PRINTED, "guard":
 MODEL_ICR_STD_M = 0.1
 """Initial standard deviation of the ICRs in case ``model``: small enough for an EKF to be nearly linear."""
 
-WORDS = {"nees": "NEES", "nis_gnss": "NIS of fixes", "nis_heading": "NIS of headings"}
+CONSISTENCY_WORDS = {"nees": "NEES", "nis_gnss": "NIS of fixes", "nis_heading": "NIS of headings"}
 
 
 # What varies
@@ -180,7 +180,7 @@ def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
     numbers = []
     for level in levels:
         name, case, by_run = level.setting.series, consistency_of(level.found), level.metrics()
-        for what, words in WORDS.items():
+        for what, words in CONSISTENCY_WORDS.items():
             low, high = case[what]["band"]
             expected = f"{case[what]['expected']:g}, {low:.3f}-{high:.3f} in 95 %"
             numbers.append(StudyNumber(f"{name}: {words}, mean", (case[what]["mean"],), "", expected))
@@ -192,8 +192,8 @@ def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
 
 
 WINDING = replace(PLAN, path=PathPlan("curved", radius_m=2.0), duration_s=200.0)
-NOISES = tuple(round(0.05 * step, 2) for step in range(11))
-ERROR = "error_{icr}_m"
+STUDY_NOISES = tuple(round(0.05 * step, 2) for step in range(11))
+ERROR_COLUMN = "error_{icr}_m"
 
 
 def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> Study:
@@ -204,11 +204,11 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
         varies=f"input {word} [m/s]",
         varied=sensors_field,
         runs=20,
-        values=NOISES,
+        values=STUDY_NOISES,
         plan=WINDING,
         vary=by_preset(lambda base, value: sensing(base, **{sensors_field: value})),
-        measures=(measured.measure_errors,),
-        numbers=(Number("{series}: error of {icr} at {value:g} m/s", ERROR, "spread", "m", paper, largest),),
+        measures=(measured.measure_estimates,),
+        numbers=(Number("{series}: error of {icr} at {value:g} m/s", ERROR_COLUMN, "spread", "m", paper, largest),),
         title=f"{{value:g}} m/s of {word} moves y right by {{answer}}",
         answer=Number("{series}", "error_y_icr_right_m", "median", "m", at=largest),
     )
@@ -237,7 +237,7 @@ STUDIES: dict[str, Study] = {
         runs=200,
         paths=PATHS,
         vary=by_preset(lambda base, kind: driving(base, kind=kind)),
-        measures=(measured.measure_times, measured.measure_errors, trace(end_s=SHOWN_S)),
+        measures=(measured.measure_times, measured.measure_estimates, trace(end_s=SHOWN_S)),
         numbers=(Number("{value} ({series}): all three ICRs converged after", "settle_s", "spread", "s", PATH_TIMES),),
         title="Time to settle on a path of kind {value}: {answer}",
         answer=Number("{series}", "settle_s", "median", "s", at=shown_path),
@@ -303,8 +303,8 @@ STUDIES: dict[str, Study] = {
         plan=replace(WINDING, command_rate_hz=10.0, motor_lag_s=0.1),
         sensors=replace(IDEAL, input_bias_mps=0.03),
         vary=by_preset(from_source, ("encoder", "commanded")),
-        measures=(measured.measure_errors, trace()),
-        numbers=(Number("{series}: error of {icr}, {value} speeds", ERROR, "spread", "m"),),
+        measures=(measured.measure_estimates, trace()),
+        numbers=(Number("{series}: error of {icr}, {value} speeds", ERROR_COLUMN, "spread", "m"),),
         title="Commanded speeds move y right by {answer}",
         answer=Number("{series}", "error_y_icr_right_m", "median", "m", at=("commanded",)),
     ),
@@ -317,7 +317,7 @@ STUDIES: dict[str, Study] = {
         values=(0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0),
         plan=replace(PLAN, path=PathPlan("lawnmower"), duration_s=300.0),
         vary=by_preset(lambda base, value: sensing(base, gnss_std_m=value)),
-        measures=(measured.measure_errors, measured.measure_times, measured.measure_open_loop),
+        measures=(measured.measure_estimates, measured.measure_times, measured.measure_open_loop),
         numbers=(
             Number("no slip: open loop after 10 m, p95", "blind_no_slip_10m_p95_m", "first", "m"),
             Number("{series}: GNSS {value:g} m: open loop after 10 m, p95", "blind_icr_10m_p95_m", "spread", "m",
@@ -359,9 +359,9 @@ STUDIES: dict[str, Study] = {
         values=(10.0, 20.0, 50.0, 100.0, 200.0),
         sensors=replace(IDEAL, wheels="encoder"),
         vary=by_preset(at_rate),
-        measures=(measured.measure_errors,),
+        measures=(measured.measure_estimates,),
         numbers=(
-            Number("{series}: {icr} differs between rates by at most", ERROR, "range of means", "m"),
+            Number("{series}: {icr} differs between rates by at most", ERROR_COLUMN, "range of means", "m"),
             Number("{series}: stated std of {icr}, least and greatest", "std_{icr}_m", "extreme medians", "m"),
         ),
         title="Between rates, x_icr differs by {answer}",

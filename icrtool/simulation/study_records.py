@@ -15,7 +15,7 @@ from icrtool.config import Config
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.records.choices import PathKind, PresetName
 from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
-from icrtool.simulation.study_runs import ICR_NAMES, STATES, Measure, Scenario
+from icrtool.simulation.study_runs import ICR_NAMES, STUDY_STATES, Measure, Scenario
 
 PLAN = DrivePlan(step_s=0.005)
 """A study holds track speeds no longer than any wheel interval."""
@@ -129,7 +129,7 @@ def consistency_of(found: Mapping[str, Floats]) -> dict[str, Any]:
         band = chi2_band(degrees * len(finite), len(finite))
         case[what] = {"mean": float(finite.mean()), "expected": float(degrees), "band": band}
     return case | {
-        "states": list(STATES),
+        "states": list(STUDY_STATES),
         "by_run": {what: statistics(found[what]) for what in case},
         "coverage_pct": (100 * (np.abs(ratio) <= 2).mean(axis=(0, 1))).tolist(),
         "rms_error_over_std": np.sqrt((ratio**2).mean(axis=(0, 1))).tolist(),

@@ -34,7 +34,7 @@ STOP_EVERY_S = 5.0
 
 
 ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")
-STATES = ("north", "east", "heading", *ICR_NAMES)
+STUDY_STATES = ("north", "east", "heading", *ICR_NAMES)
 FATES = ("converged", "inverted", "elsewhere")
 
 SETTLED_SHARE = 0.1
@@ -53,7 +53,7 @@ TRIAL_M = 10.0
 TRIAL_STARTS = 40
 """Open-loop trials per run; their starts are evenly spaced."""
 
-SETTLED_S = 10.0
+COVARIANCE_FROM_S = 10.0
 """Covariances count after this time: before, the initial values of the presets still have an effect."""
 
 LEAST_STD = 1e-12
@@ -233,7 +233,7 @@ def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
     )
 
 
-def measure_errors(run: StudyRun) -> Found:
+def measure_estimates(run: StudyRun) -> Found:
     """Return, over the second half of a run, mean error and its rms, with the stated std, by ICR; and NIS."""
     half = len(run.t_s) // 2
     error = run.x[half:, 3:] - run.truth[half:, 3:]
@@ -396,8 +396,8 @@ def measure_consistency(run: StudyRun) -> Found:
     """
     stops_s = run.t_s[run.stops]
     nees, ratio = errors_over_std(run.x[run.stops] - run.truth[run.stops], run.P)
-    settled = stops_s >= min(SETTLED_S, stops_s[-1])
-    at_end = {f"end_error_over_std_{state}": float(error) for state, error in zip(STATES, ratio[-1], strict=True)}
+    settled = stops_s >= min(COVARIANCE_FROM_S, stops_s[-1])
+    at_end = {f"end_error_over_std_{state}": float(error) for state, error in zip(STUDY_STATES, ratio[-1], strict=True)}
     return {
         "nees": float(nees[settled].mean()), **_mean_nis(run), **at_end,
         "stops_s": stops_s, "all nees": nees, "settled nees": nees[settled], "ratio": ratio[settled],

@@ -208,7 +208,7 @@ def test_the_paths_of_a_page_end_where_those_of_the_library_do(page: Page, run: 
 def test_paths_of_joined_samples_are_close_to_those_of_the_library(
     chrome: Browser, run: Run, report: DropoutReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drive_data, "MOST_STEPS", 1000)
+    monkeypatch.setattr(drive_data, "MOST_PAGE_STEPS", 1000)
     file = tmp_path / "joined.html"
     file.write_text(run_page(run, report.document, {}), encoding="utf-8")
     page = chrome.page()

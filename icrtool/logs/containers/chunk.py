@@ -36,7 +36,7 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 PIECE_BYTES = 1 << 24
 """Decompressed at once: libraries hold twice as much while they do. Of a message that states no size: at most."""
 
-MOST_ROWS = 1 << 18
+MOST_RECORDS = 1 << 18
 """Records that are followed at a time."""
 
 _MOST_GAPS = 1 << 8
@@ -222,22 +222,27 @@ def record_starts(
     ends : returns where messages (n,) end; their begin where there is none
     """
     view = data.data
-    if hint is not None and 0 < len(hint) <= MOST_ROWS and hint[0] >= begin:
+    if hint is not None and 0 < len(hint) <= MOST_RECORDS and hint[0] >= begin:
         first, last = np.append(begin, ends(data, hint)), np.append(hint, len(data))
         gaps = np.flatnonzero(first != last)
         if (first <= last).all() and (last[:-1] < first[1:]).all() and len(gaps) <= _MOST_GAPS:
-            found = [follow(view, *gap, behind) for gap in zip(first[gaps].tolist(), last[gaps].tolist(), strict=True)]
+            found = [
+                follow_records(view, *gap, behind)
+                for gap in zip(first[gaps].tolist(), last[gaps].tolist(), strict=True)
+            ]
             if all(stop == last[gap] for gap, (_, stop) in zip(gaps, found, strict=True)):
                 others = np.array([at for some, _ in found for at in some], np.int64)
                 return (np.sort(np.append(hint, others)) if len(others) else hint), len(data)
-    starts, stop = follow(view, begin, len(data), behind)
+    starts, stop = follow_records(view, begin, len(data), behind)
     return np.array(starts, np.int64), stop
 
 
-def follow(data: memoryview, at: int, end: int, behind: Callable[[memoryview, int, int], int]) -> tuple[list[int], int]:
+def follow_records(
+    data: memoryview, at: int, end: int, behind: Callable[[memoryview, int, int], int]
+) -> tuple[list[int], int]:
     """Return where the records [at, end) begin, one after the other, and where they stop."""
     starts: list[int] = []
-    while len(starts) < MOST_ROWS and (after := behind(data, at, end)) > at:
+    while len(starts) < MOST_RECORDS and (after := behind(data, at, end)) > at:
         starts.append(at)
         at = after
     return starts, at

@@ -24,7 +24,7 @@ from icrtool.logs.containers.chunk import (
 from icrtool.logs.containers.container import Channel, Container, Cut, MessageBlock, ahead, made_ahead
 from icrtool.logs.containers.source import NEAR_BYTES, Held, LocalFile, RemoteFile
 
-THREADS, BLOCKS_AHEAD = 2, 3
+CHUNK_THREADS, BLOCKS_AHEAD = 2, 3
 """Threads that make blocks of chunks, and blocks that they make while one is used."""
 
 READERS, SPANS_AHEAD, BYTES_AHEAD = 8, 16, 1 << 26
@@ -184,7 +184,7 @@ class ChunkedFile(Container):
         located = (self._located(chunk, wanted) for chunk in needed)
         parts = located if self._remote is None else self._read_ahead(self._remote, needed, wanted)
         groups = zip(_groups(parts), reused_spaces(), strict=False)
-        for (group, spaces), made in ahead(lambda one: self._joined(*one), groups, THREADS, BLOCKS_AHEAD):
+        for (group, spaces), made in ahead(lambda one: self._joined(*one), groups, CHUNK_THREADS, BLOCKS_AHEAD):
             self._at = group[-1].chunk.at
             try:
                 block, inflation = made()

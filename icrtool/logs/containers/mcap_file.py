@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from mcap.records import Channel as McapChannel
     from mcap.records import Schema, Statistics
 
-MAGIC = b"\x89MCAP0\r\n"
-PIECE_BYTES = 1 << 22
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+MCAP_PIECE_BYTES = 1 << 22
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 _FOOTER, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX, _STATISTICS, _DATA_END = 2, 6, 7, 8, 11, 15
 """Operation codes of records."""
@@ -164,7 +164,7 @@ class McapFile(ChunkedFile):
         return described
 
     def _read_index(self) -> list[Chunk] | None:
-        if self._source.read_at(0, len(MAGIC)) != MAGIC:
+        if self._source.read_at(0, len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise LogError(self.path, "not an MCAP file", "its first bytes are not those of MCAP")
         # those that the index describes; without one, the records do
         self._schemas, self._channels, self._counts, self._described_bytes = {}, {}, {}, 0
@@ -201,12 +201,12 @@ class McapFile(ChunkedFile):
 
     def _summary(self) -> tuple[int, bytes]:
         """Return where the summary begins, and its records; none where it is damaged."""
-        end = self._size - len(MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
+        end = self._size - len(MCAP_MAGIC) - _FOOTER_BYTES - _HEAD_BYTES
         footer = self._source.read_at(max(end, 0), _HEAD_BYTES + _FOOTER_BYTES)
         start = int.from_bytes(footer[9:17], "little")
         if (
             footer[:1] != bytes([_FOOTER])
-            or self._source.read_at(self._size - len(MAGIC), len(MAGIC)) != MAGIC
+            or self._source.read_at(self._size - len(MCAP_MAGIC), len(MCAP_MAGIC)) != MCAP_MAGIC
             or not 0 < start <= end
             or end - start > LARGEST_CHUNK_BYTES
         ):
@@ -223,7 +223,7 @@ class McapFile(ChunkedFile):
         A chunk that is not where the index lists it is damage; or the index is wrong, where as many chunks are found
         without it.
         """
-        at, damaged = len(MAGIC), []
+        at, damaged = len(MCAP_MAGIC), []
         ranges = [(chunk.at - _HEAD_BYTES, chunk.at + chunk.length + chunk.index_length) for chunk in chunks]
         for begin, behind in [*ranges, (end, end)]:
             if at > begin:
@@ -248,7 +248,7 @@ class McapFile(ChunkedFile):
 
     def _chunks_in_order(self, end: int) -> int:
         """Return how many chunks are among the records that follow one another up to `end`, 0 where they do not."""
-        at, count = len(MAGIC), 0
+        at, count = len(MCAP_MAGIC), 0
         while at < end:
             opcode, length = self._head(at)
             if opcode == 0:
@@ -263,7 +263,7 @@ class McapFile(ChunkedFile):
 
     def _read_in_order(self) -> Iterator[MessageBlock]:
         """Yield the messages record by record, up to the first place that holds none."""
-        at, spaces = len(MAGIC), reused_spaces()
+        at, spaces = len(MCAP_MAGIC), reused_spaces()
         memory = next(spaces)
         while True:
             opcode, length = self._head(at)
@@ -288,7 +288,7 @@ class McapFile(ChunkedFile):
         stop = 0
         if length <= LARGEST_CHUNK_BYTES:
             self._at = at
-            piece = np.frombuffer(self._source.read_at(at, max(PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
+            piece = np.frombuffer(self._source.read_at(at, max(MCAP_PIECE_BYTES, _HEAD_BYTES + length)), np.uint8)
             block, stop = self._scanned(piece)
             if stop:
                 return block, stop - _HEAD_BYTES

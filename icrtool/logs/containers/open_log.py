@@ -34,7 +34,7 @@ from icrtool.logs.containers.recording_files import (
 from icrtool.logs.containers.ros1_bag import Ros1Bag
 from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, read_by_ranges
 from icrtool.logs.containers.sqlite_bag import SqliteBag
-from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save, unpack
+from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save_unpacked, unpack
 from icrtool.records.notes import Note
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
 from icrtool.records.samples import InputFile
@@ -47,9 +47,9 @@ MOST_FILES = 5000
 
 # A bag of any version: one of another than 2.0 is refused by name.
 _CONTAINERS: dict[bytes, type[McapFile | Ros1Bag | SqliteBag]] = {
-    mcap_file.MAGIC: McapFile,
-    ros1_bag.MAGIC[:9]: Ros1Bag,
-    sqlite_bag.MAGIC: SqliteBag,
+    mcap_file.MCAP_MAGIC: McapFile,
+    ros1_bag.BAG_MAGIC[:9]: Ros1Bag,
+    sqlite_bag.SQLITE_MAGIC: SqliteBag,
 }
 
 _NOT_A_LOG = (
@@ -220,7 +220,7 @@ def _brought(
     if sys.stdin.isatty():
         raise LogError(path, "standard input is a terminal", "pipe a log into it, or name one")
     log = folder / "stdin"
-    digest = save(sys.stdin.buffer, log)
+    digest = save_unpacked(sys.stdin.buffer, log)
     return log, Origin((InputFile(str(path), log.stat().st_size, digest),)), distant
 
 

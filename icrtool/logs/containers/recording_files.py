@@ -21,18 +21,18 @@ from icrtool.records.text import listed
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
 """A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
 
-PACKED = r"\.(?:zstd|zst|gz|lz4|bz2|xz)"
+PACKED_SUFFIX = r"\.(?:zstd|zst|gz|lz4|bz2|xz)"
 """What the names of compressed files end with."""
 
-_PACKED_END = re.compile(rf"{PACKED}$", re.IGNORECASE)
+_PACKED_END = re.compile(rf"{PACKED_SUFFIX}$", re.IGNORECASE)
 _ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
 
-STORAGE = re.compile(rf"\.(mcap|db3)(?:{PACKED})?$")
+STORAGE = re.compile(rf"\.(mcap|db3)(?:{PACKED_SUFFIX})?$")
 
 LARGEST_METADATA_BYTES, _DEEPEST = 1 << 18, 20
 """Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""
 
-LONGEST_PAUSE_S = 3600.0
+LONGEST_SPLIT_GAP_S = 3600.0
 """The files of a split recording follow one another without a gap. A longer gap: they are separate recordings."""
 
 LEAST_OVERLAP_S = 1.0
@@ -218,7 +218,7 @@ def check_spans(directory: Path, spans: Sequence[FileTimes]) -> list[str]:
     ordered, odd = sorted(spans), []
     for number, (before, after) in enumerate(pairwise(ordered)):
         pause_s = (after.begin_ns - max(span.end_ns for span in ordered[: number + 1])) / 1e9
-        if pause_s > LONGEST_PAUSE_S:
+        if pause_s > LONGEST_SPLIT_GAP_S:
             why = f"not one recording: {pause_s / 3600:.1f} h pass between {before.file} and {after.file}"
             raise LogError(directory, why, f"name one of {listed([span.file for span in ordered])}")
         overlap_s = (min(before.end_ns, after.end_ns) - after.begin_ns) / 1e9
@@ -240,7 +240,7 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", str(path))]
 
 
-_NAME = re.compile(r"^(|.*?[_\-. ])((?:19|20)\d\d[\d_.\-T]*|\d+)(\.[A-Za-z]\w*)$")
+_SERIES_NAME = re.compile(r"^(|.*?[_\-. ])((?:19|20)\d\d[\d_.\-T]*|\d+)(\.[A-Za-z]\w*)$")
 """What comes before a count or a date, the count or date (and count), the suffix."""
 
 STANDARD_INPUT = Path("-")
@@ -272,7 +272,7 @@ class NumberedFile(NamedTuple):
 
 def numbered_file(path: Path) -> NumberedFile | None:
     """Return a file's place in a series; None where its name has no count and no date."""
-    match = _NAME.match(path.name)
+    match = _SERIES_NAME.match(path.name)
     if match is None:
         return None
     order = tuple(int(part) for part in re.findall(r"\d+", match[2]))

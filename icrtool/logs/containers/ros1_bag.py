@@ -27,8 +27,8 @@ from icrtool.logs.containers.chunked_file import ChunkedFile, Part, reused_space
 from icrtool.logs.containers.container import LARGEST_DESCRIPTIONS_BYTES, Channel, MessageBlock, ros_type_name
 from icrtool.records.text import LogText
 
-MAGIC = b"#ROSBAG V2.0\n"
-_MESSAGE, _BAG_HEADER, _INDEX_DATA, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
+BAG_MAGIC = b"#ROSBAG V2.0\n"
+_BAG_MESSAGE, _BAG_HEADER, _INDEX_DATA, _BAG_CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 """Operation codes of records."""
 
 _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
@@ -43,7 +43,7 @@ _MOST_FIELDS = 100
 _MOST_HEADERS = 1 << 4
 """Kinds of headers in a chunk that all records are compared with; further ones are read one by one."""
 
-_VALUES = {b"op": 1, b"conn": 4, b"time": 8}
+_VALUE_BYTES = {b"op": 1, b"conn": 4, b"time": 8}
 """Bytes of the values in the headers of a chunk's records."""
 
 
@@ -108,15 +108,15 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
         fits = sizes[left] == size if rounds < _MOST_HEADERS else np.arange(len(left)) == 0
         heads = unaligned(data, f"V{size}")[starts[left if fits.all() else left[fits]]]
         header = heads[0].tobytes()[4:-4]
-        values = [(name, begin + 4) for name, begin, end in _fields(header) if end - begin == _VALUES.get(name)]
-        fields = {name: at for name, at in values if at + _VALUES[name] <= size - 4}
+        values = [(name, begin + 4) for name, begin, end in _fields(header) if end - begin == _VALUE_BYTES.get(name)]
+        fields = {name: at for name, at in values if at + _VALUE_BYTES[name] <= size - 4}
         same, end = np.ones(len(heads), np.bool_), 0
         # Sorted: a name that stands there twice is where it came first in the dict, with the place of its last value.
         for name, at in [*sorted(fields.items(), key=lambda one: one[1]), (b"", size - 4)]:
             if at > end:
                 parts = _strided(heads, end, f"V{at - end}")
                 same &= parts == parts[0]
-            end = at + _VALUES.get(name, 0)
+            end = at + _VALUE_BYTES.get(name, 0)
         if not same.all():
             fits[fits] = same
             heads = heads[same]
@@ -131,7 +131,7 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
         table[4, rows] = table[3, rows] + _strided(heads, size - 4, "<u4")
         left, rounds = left[~fits], rounds + 1
     codes, messages = table[0], table[1:]
-    is_message = codes == _MESSAGE
+    is_message = codes == _BAG_MESSAGE
     others = [
         (_CONNECTION, int(starts[row]), *messages[2:, row].tolist()) for row in np.flatnonzero(codes == _CONNECTION)
     ]
@@ -178,11 +178,11 @@ class Ros1Bag(ChunkedFile):
         return list(self._connections.values())
 
     def _read_index(self) -> list[Chunk] | None:
-        start = self._source.read_at(0, len(MAGIC))
-        if start != MAGIC and start.startswith(MAGIC[:9]):
+        start = self._source.read_at(0, len(BAG_MAGIC))
+        if start != BAG_MAGIC and start.startswith(BAG_MAGIC[:9]):
             advice = "only 2.0 can be read; `rosbag fix` converts older ones"
             raise LogError(self.path, "a bag of another version", advice)
-        if start != MAGIC:
+        if start != BAG_MAGIC:
             raise LogError(self.path, "not a ROS 1 bag", "its first bytes are not a bag's")
         self._connections, self._described_bytes = {}, 0
         chunks = self._listed_chunks()
@@ -194,7 +194,7 @@ class Ros1Bag(ChunkedFile):
         if self._remote is not None and chunk.is_stored:
             self._remote.hold(chunk.at, _HEADER_BYTES)
         record = self._record(chunk.at)
-        if record is None or record.op != _CHUNK:
+        if record is None or record.op != _BAG_CHUNK:
             return Chunk(chunk.at, size=-1)
         found = _chunk_of(record)
         index_length = max(chunk.at + chunk.index_length - found.at - found.length, 0)
@@ -214,7 +214,7 @@ class Ros1Bag(ChunkedFile):
 
     def _listed_chunks(self) -> list[Chunk] | None:
         """Return the chunks listed in the bag's index; None where there is none, or it is damaged."""
-        first = self._record(len(MAGIC))
+        first = self._record(len(BAG_MAGIC))
         if first is None or first.op != _BAG_HEADER:
             return None
         if first.text(b"encryptor"):
@@ -255,14 +255,14 @@ class Ros1Bag(ChunkedFile):
         ]
 
     def _read_in_order(self) -> Iterator[MessageBlock]:
-        at, spaces = len(MAGIC), reused_spaces()
+        at, spaces = len(BAG_MAGIC), reused_spaces()
         memory = next(spaces)
         while at < self._size:
             record = self._record(at)
             if record is None or not 0 < record.op <= _CONNECTION:
                 break
             is_cut = record.length > self._size - record.at
-            if record.op == _CHUNK:
+            if record.op == _BAG_CHUNK:
                 chunk = _chunk_of(record)._replace(is_cut=is_cut)
                 if (yield from self._read_chunk(Part(chunk), memory)):
                     memory = next(spaces)

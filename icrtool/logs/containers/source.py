@@ -51,7 +51,7 @@ NEAR_BYTES = 1 << 15
 _LEAST_BYTES = 1 << 18
 """That are read at once: the records of an index follow one another."""
 
-_PIECE_BYTES, PIECES_AHEAD = 1 << 24, 4
+_FETCHED_BYTES, PIECES_AHEAD = 1 << 24, 4
 
 
 def filesystem(path: UrlPath) -> tuple[Any, str]:
@@ -262,11 +262,11 @@ class RemoteFile:
         """Yield the content from start to end; the next pieces are read meanwhile."""
         if not self.has_ranges:
             with asked(self.path, lambda: self._files.open(self._name, block_size=0)) as stream:
-                while piece := asked(self.path, lambda: stream.read(_PIECE_BYTES), again=False):
+                while piece := asked(self.path, lambda: stream.read(_FETCHED_BYTES), again=False):
                     yield piece
             return
-        places = range(0, self.size, _PIECE_BYTES)
-        for _, piece in ahead(lambda at: self._range(at, _PIECE_BYTES), places, PIECES_AHEAD, PIECES_AHEAD):
+        places = range(0, self.size, _FETCHED_BYTES)
+        for _, piece in ahead(lambda at: self._range(at, _FETCHED_BYTES), places, PIECES_AHEAD, PIECES_AHEAD):
             yield piece()
 
     def close(self) -> None:

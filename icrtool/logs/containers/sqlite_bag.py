@@ -29,18 +29,18 @@ from icrtool.logs.containers.container import (
 )
 from icrtool.records.text import LogText
 
-MAGIC = b"SQLite format 3\0"
+SQLITE_MAGIC = b"SQLite format 3\0"
 _TABLES = frozenset({"topics", "messages", "message_definitions"})
 _FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "count"})
 """The tables, columns and functions that our queries use; SQLite refuses everything else."""
 
 _MOST_TOPICS = 1 << 17
-_STEPS, _LEAST_STEPS, _STEPS_PER_BYTE = 1 << 16, 1 << 26, 16
+_STEPS, _QUERY_STEPS, _QUERY_STEPS_PER_BYTE = 1 << 16, 1 << 26, 16
 """Steps of SQLite's virtual machine: between two checks whether to stop; the most that a query may take; and so many
 more per byte of the file. The pages of a damaged table may refer to one another without end."""
 
 _FIRST_ROWS, _MOST_ROWS = 64, 1 << 14
-_BLOCK_BYTES = _LARGEST_MESSAGE_BYTES = 1 << 24
+_GROUP_BYTES = _LARGEST_MESSAGE_BYTES = 1 << 24
 """Of several messages together, and of one: those that icrtool uses have some kilobytes."""
 
 _UNKNOWN_ROWS = 1 << 40
@@ -152,7 +152,7 @@ class SqliteBag(Container):
     def _open(self, mode: str) -> sqlite3.Connection:
         name = quote(os.fsencode(self._file.resolve()))
         database = sqlite3.connect(f"file:{name}?{mode}", uri=True, check_same_thread=False)
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * _BLOCK_BYTES)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * _GROUP_BYTES)
         database.text_factory = lambda text: text.decode("utf-8", "replace")
         return database
 
@@ -186,7 +186,7 @@ class SqliteBag(Container):
 
     def _query(self, query: str, parameters: tuple[int, ...] = ()) -> sqlite3.Cursor:
         """Run a query, with its own limit of steps."""
-        self._steps_left = _LEAST_STEPS + _STEPS_PER_BYTE * self._file.stat().st_size
+        self._steps_left = _QUERY_STEPS + _QUERY_STEPS_PER_BYTE * self._file.stat().st_size
         return self._database.execute(query, parameters)
 
     def _first_row(self, query: str) -> tuple[Any, ...] | None:
@@ -287,7 +287,7 @@ class SqliteBag(Container):
             end = np.cumsum(sizes)
             block = MessageBlock(np.frombuffer(content, np.uint8), topics, times, end - sizes, end)
             yield self._with_possible_times(block)
-            by_size = _BLOCK_BYTES * len(block.start) // max(len(block.data), 1)
+            by_size = _GROUP_BYTES * len(block.start) // max(len(block.data), 1)
             count = max(1, min(4 * count, _MOST_ROWS, by_size))
 
     def _cut_inside_page(self) -> int:

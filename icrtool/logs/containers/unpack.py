@@ -33,13 +33,13 @@ import zstandard
 
 from icrtool.errors import LogError
 from icrtool.logs.containers.chunk import LARGEST_CHUNK_BYTES, LARGEST_RATIO, ZSTD_MAGIC
-from icrtool.logs.containers.recording_files import LOG_SUFFIXES, PACKED, is_bag_directory, unpacked_name
+from icrtool.logs.containers.recording_files import LOG_SUFFIXES, PACKED_SUFFIX, is_bag_directory, unpacked_name
 from icrtool.records import process_resources
 from icrtool.records.notes import Note, note
 from icrtool.records.places import open_regular
 from icrtool.records.text import listed
 
-_PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED})?$|\.db3-wal$|^metadata\.yaml$")
+_PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED_SUFFIX})?$|\.db3-wal$|^metadata\.yaml$")
 
 _PIECE_BYTES, _DECODER_BYTES = 1 << 20, LARGEST_CHUNK_BYTES
 """That are unpacked at a time, and that a decoder may hold."""
@@ -51,7 +51,7 @@ _LARGEST_EXTRA_BYTES, _LARGEST_READ_BYTES = 1 << 16, 1 << 22
 """Of a long name in a tar archive; of what zipfile reads at once, such as the directory of an archive."""
 
 _BEHIND = b"icrtool: behind the last frame"
-_BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
+_TAR_BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
 _TAR, _TAR_MARK = b"ustar", slice(257, 262)
 """What a tar archive has in its first block, and where."""
 
@@ -150,7 +150,7 @@ def is_packed(start: bytes) -> bool:
     return start.startswith((_ZIP, *DECODERS)) or start[_TAR_MARK] == _TAR
 
 
-def save(source: Readable, place: Path) -> str:
+def save_unpacked(source: Readable, place: Path) -> str:
     """Write a stream to a file, and return the SHA-256 of it (hex).
 
     Raises
@@ -261,7 +261,7 @@ class _Stream:
 
     def start(self) -> bytes:
         """Return the first 512 bytes, which stay there to be read."""
-        self._head = self.exactly(_BLOCK_BYTES)
+        self._head = self.exactly(_TAR_BLOCK_BYTES)
         return self._head
 
     def decompressed(self) -> _Stream:
@@ -333,7 +333,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
     """
     name, stated = "", None
     for _ in range(_MOST_ENTRIES):
-        head = stream.exactly(_BLOCK_BYTES)
+        head = stream.exactly(_TAR_BLOCK_BYTES)
         if not any(head):
             return
         try:
@@ -343,7 +343,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
         if info.type in {b"L", b"x"}:
             # A name, or a size, that the header of the next entry has no space for.
             fields = _extra_fields(info.type, stream.exactly(min(info.size, _LARGEST_EXTRA_BYTES)))
-            stream.skip(max(info.size - _LARGEST_EXTRA_BYTES, 0) + -info.size % _BLOCK_BYTES)
+            stream.skip(max(info.size - _LARGEST_EXTRA_BYTES, 0) + -info.size % _TAR_BLOCK_BYTES)
             name = fields.get(b"path", name.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
             stated = int(fields[b"size"]) if fields.get(b"size", b"").isdigit() else stated
             continue
@@ -352,9 +352,9 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
             entry = _Stream(stream, budget, size)
             yield name or info.name, entry
             entry.skip()
-            stream.skip(-size % _BLOCK_BYTES)
+            stream.skip(-size % _TAR_BLOCK_BYTES)
         elif info.type not in SUPPORTED_TYPES or info.type == b"g":
-            stream.skip(size + -size % _BLOCK_BYTES)
+            stream.skip(size + -size % _TAR_BLOCK_BYTES)
         name, stated = "", None
     return budget.stop("log_limit_reached", f"more than {_MOST_ENTRIES} entries")
 

@@ -34,9 +34,9 @@ from icrtool.logs.messages.definitions import (
     SIZES,
     Definitions,
     Step,
+    decoding_steps,
     kind_at,
     ros_definitions,
-    steps_of,
 )
 from icrtool.logs.messages.protobuf import definitions_in, descriptors_of, field_of, protobuf_parser
 from icrtool.records.text import LONGEST_TEXT, LogText
@@ -109,7 +109,7 @@ class ValueDecoder:
 
 def _taker(path: str, kind: str, field_of: Callable[[Any, str], object]) -> Callable[[object], Any]:
     """Return a function of a message that takes the value, or the list of values, at a path."""
-    steps = steps_of(path)
+    steps = decoding_steps(path)
     convert = _text if kind == "string" else _float if kind in _FLOATS else _integer
 
     def take(message: object) -> Any:  # noqa: ANN401 - a number, a text, or a list of either
@@ -121,7 +121,7 @@ def _taker(path: str, kind: str, field_of: Callable[[Any, str], object]) -> Call
     return take
 
 
-def parse_json(data: bytes) -> dict[str, Any] | None:
+def parse_json_message(data: bytes) -> dict[str, Any] | None:
     """Return a message, None where it cannot be read. NaN and Infinity, which Python writes, are numbers."""
     try:
         value = orjson.loads(data)
@@ -195,7 +195,7 @@ NMEA_FIELDS = ("latitude", "longitude", "altitude", "heading", "north_std", "eas
 
 _KINDS_OF_NMEA = {"sentence_kind": "int32", "quality": "int32", **dict.fromkeys(NMEA_FIELDS, "float64")}
 _SENTENCE = re.compile(rb"\s*[$!]([ -)+-~]{5,})\*([0-9A-Fa-f]{2})\s*")
-_NUMBER = re.compile(r"-?\d{1,12}(?:\.\d{0,12})?")
+_PLAIN_NUMBER = re.compile(r"-?\d{1,12}(?:\.\d{0,12})?")
 
 
 @dataclass(slots=True)
@@ -266,7 +266,7 @@ def parse_sentence(text: bytes) -> dict[str, Any] | None:
 
 
 def _number(text: str) -> float:
-    return float(text) if _NUMBER.fullmatch(text) else float("nan")
+    return float(text) if _PLAIN_NUMBER.fullmatch(text) else float("nan")
 
 
 def _degrees(text: str, side: str, sides: str) -> float:
@@ -297,9 +297,9 @@ def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
     """Return the decoder of Protobuf or JSON; a JSON schema without fields leaves it to the messages what they hold."""
     paths, kinds = _columns_of(replace(channel, id=0, topic=LogText(""), count=None), wanted)
     if channel.encoding == "json":
-        return ValueDecoder(kinds, paths, parse_json, property_of)
+        return ValueDecoder(kinds, paths, parse_json_message, property_of)
     descriptors = descriptors_of(channel.definition, channel.message_type)
-    parse = protobuf_parser(descriptors, channel.message_type, map(steps_of, paths.values()))
+    parse = protobuf_parser(descriptors, channel.message_type, map(decoding_steps, paths.values()))
     return ValueDecoder(kinds, paths, parse, field_of)
 
 
@@ -313,7 +313,7 @@ def _columns_of(alike: Channel, wanted: tuple[str, ...]) -> tuple[dict[str, str]
         others = _OTHER_NAMES.get(column, ())
         for path in (column, *others) if definitions else others[:1] or (column,):
             if definitions:
-                kind = kind_at(definitions, full_name(alike.message_type), steps_of(path))
+                kind = kind_at(definitions, full_name(alike.message_type), decoding_steps(path))
             else:
                 kind = _FOXGLOVE_KINDS.get(path.rpartition(".")[2], "float64")
             if kind is not None:

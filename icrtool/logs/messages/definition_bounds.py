@@ -27,7 +27,8 @@ many; so many characters of JSON or bytes of Protobuf take as long as one."""
 _IDL_NUMBER = re.compile(r"[\[<]|(?<!=)=(?!=)")
 _LONG_WORD = re.compile(rf"[\w/]{{{LONGEST_TEXT + 1}}}")
 _MODULE = re.compile(r"\bmodule\s+(\w+)\s*\{|[{}]")
-_COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
+COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
+"""A comment or a string in the text of a definition; one that does not end reaches to the end of the text."""
 
 
 @dataclass(slots=True)
@@ -71,7 +72,7 @@ class FieldNames:
         DefinitionError
             There is one.
         """
-        if (word := _LONG_WORD.search(_COMMENT_OR_STRING.sub(" ", text))) is not None:
+        if (word := _LONG_WORD.search(COMMENT_OR_STRING.sub(" ", text))) is not None:
             self.add(word[0])
 
     def add_modules(self, idl: str) -> None:

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Any, Literal
 
 from icrtool.errors import DefinitionError
-from icrtool.logs.messages.definition_bounds import FieldNames
+from icrtool.logs.messages.definition_bounds import COMMENT_OR_STRING, FieldNames
 from icrtool.records.text import LONGEST_NAME, shortened
 
 SEPARATOR = "=" * 80
@@ -16,7 +16,7 @@ SEPARATOR = "=" * 80
 _FEWEST_SIGNS = 20
 """A line before the name of a type that ends in this many ``=`` ends in a separator."""
 
-_HEAD = re.compile(r"\s*(MSG|IDL)\s*:\s*([\w/]*)\s*")
+_SECTION_HEAD = re.compile(r"\s*(MSG|IDL)\s*:\s*([\w/]*)\s*")
 _NAMED = re.compile(r"\s*Definition of\b\s*([\w/]*).*", re.IGNORECASE)
 """A line such as ``Definition of sensor_msgs/JointState:``, which some recorders write before a type."""
 
@@ -26,7 +26,6 @@ LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
 LONGEST_IDL, MOST_IDL_NUMBERS = 1 << 16, 256
 """Characters and lengths, bounds and constants of a definition in IDL; the parser takes 5 ms for each number."""
 
-_COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])*(?:"|\Z)', re.DOTALL)
 _ANNOTATION = re.compile(r"@\s*[\w:]+(?:\s*\([^()]*\))?")
 _VALUE = re.compile(r"=(?!\s*\w+\s*;)[^;=]*")
 _EXPRESSION = re.compile(r"[()+\-*/%|^&~]|<[^<>]*<[^<>]*<")
@@ -52,7 +51,7 @@ def plain_definition(text: str, own_name: str) -> str:
     lines: list[str] = []
     states = False  # whether some line states a field, a constant or a name
     for line in text.removeprefix("\ufeff").removeprefix("\xef\xbb\xbf").split("\n"):
-        head, named = _HEAD.fullmatch(line), _NAMED.fullmatch(line)
+        head, named = _SECTION_HEAD.fullmatch(line), _NAMED.fullmatch(line)
         if head is None and named is None:
             lines.append(line.rstrip())
             states = states or line.lstrip("= \t")[:1] not in ("", "#")
@@ -139,5 +138,5 @@ def _plain_idl(text: str) -> str:
     The parser of rosbags reads each number 128 times, and again for each pair of parentheses: three take hours. It
     reads the inner one of two sequences twice.
     """
-    text = _COMMENT_OR_STRING.sub(lambda found: '""' if found[0].startswith('"') else " ", text)
+    text = COMMENT_OR_STRING.sub(lambda found: '""' if found[0].startswith('"') else " ", text)
     return _VALUE.sub("= 0", _ANNOTATION.sub(" ", text))

@@ -247,7 +247,7 @@ class Layout:
     fields: int = 0
 
 
-def steps_of(path: str) -> tuple[Step, ...]:
+def decoding_steps(path: str) -> tuple[Step, ...]:
     """Return the steps of a path such as ``joints[*].name`` or ``position_covariance[4]``."""
     found = (match.groups() for match in _STEP.finditer(path))
     return tuple(name or (None if place == "*" else int(place)) for name, place in found)

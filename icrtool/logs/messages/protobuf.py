@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 LONGEST_DESCRIPTORS = 1 << 20
 """Bytes of a FileDescriptorSet; that of all schemas of Foxglove has 60,000."""
 
-KINDS = {
+SCALAR_TYPES = {
     1: "float64", 2: "float32", 3: "int64", 4: "uint64", 5: "int32", 6: "uint64", 7: "uint32", 8: "bool", 9: "string",
     13: "uint32", 14: "int32", 15: "int32", 16: "int64", 17: "int32", 18: "int64",
 }  # fmt: skip
 """By the number of a type in FieldDescriptorProto; 14 is an enumeration. Groups and bytes are not read."""
 
-_MESSAGE, _OPTIONAL, _REPEATED = 11, 1, 3
+_MESSAGE_TYPE, _OPTIONAL, _REPEATED = 11, 1, 3
 _READ_AS = {9: 12, 14: 5}
 """Types that are read as others of the same bytes: texts as bytes, which may be no UTF-8, enumerations as int32."""
 
@@ -107,7 +107,7 @@ def descriptors_of(text: str, message_type: str) -> Descriptors:
                     is_default=file.syntax == "proto3" and not one.HasField("oneof_index"),
                 )
                 for one in message.field
-                if one.HasField("type") and (one.type in KINDS or one.type == _MESSAGE)
+                if one.HasField("type") and (one.type in SCALAR_TYPES or one.type == _MESSAGE_TYPE)
             ]
     if message_type not in found:
         raise DefinitionError(message_type, "the schema in the log lacks it")
@@ -138,7 +138,7 @@ def definitions_in(descriptors: Descriptors) -> Definitions:
     for name, fields in descriptors.items():
         known: list[tuple[str, tuple[int, Any]]] = []
         for one in fields:
-            kind = (NAME, one.refers) if one.type == _MESSAGE else (BASE, (KINDS[one.type], 0))
+            kind = (NAME, one.refers) if one.type == _MESSAGE_TYPE else (BASE, (SCALAR_TYPES[one.type], 0))
             known.append((one.name, (SEQUENCE, (kind, 0)) if one.repeated else kind))
         definitions[name] = ([], known)
     return definitions
@@ -190,7 +190,7 @@ def _add_wanted(
         if one.name in rests:
             field = node.field.add(name=one.name, number=one.number, type=_READ_AS.get(one.type, one.type))
             field.label = _REPEATED if one.repeated else _OPTIONAL
-            if one.type == _MESSAGE:
+            if one.type == _MESSAGE_TYPE:
                 inner = [rest for rest in rests[one.name] if rest]
                 field.type_name = _add_wanted(file, descriptors, one.refers, inner)
             elif not one.repeated and not one.is_default:

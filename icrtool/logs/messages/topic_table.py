@@ -25,7 +25,7 @@ _MOST_EXPECTED = 1 << 22
 _MESSAGES_AT_ONCE = 1 << 14
 """That are decoded together."""
 
-LARGEST = 1e30
+LARGEST_VALUE = 1e30
 """No quantity of a robot is larger, in any unit: what is counts as infinite, so that no power of numbers overflows."""
 
 
@@ -89,8 +89,8 @@ def _copy(source: NDArray[Any], target: NDArray[Any]) -> None:
         return
     with np.errstate(invalid="ignore"):
         np.multiply(source, 1.0, out=target)
-    if target.size and not (target.min() >= -LARGEST and target.max() <= LARGEST):  # NaN compares false
-        np.copyto(target, np.copysign(np.inf, target), where=np.abs(target) > LARGEST)
+    if target.size and not (target.min() >= -LARGEST_VALUE and target.max() <= LARGEST_VALUE):  # NaN compares false
+        np.copyto(target, np.copysign(np.inf, target), where=np.abs(target) > LARGEST_VALUE)
 
 
 class SetBack(NamedTuple):
@@ -111,14 +111,14 @@ class SetBack(NamedTuple):
 
 NOT_SET_BACK = SetBack(0, 0.0)
 
-FRAME = "header.frame_id"
+FRAME_FIELD = "header.frame_id"
 STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
 """Fields of a message's stamp: in its header, or where it has none beside its values."""
 
-HEADER = (*STAMPS[0], FRAME, *STAMPS[1])
+HEADER = (*STAMPS[0], FRAME_FIELD, *STAMPS[1])
 """Fields of a message's header, which are read of every topic."""
 
-NEAR_NS = 2_000_000_000
+DISORDER_NS = 2_000_000_000
 """Messages may be stored out of order by less; a header stamp further from log time is another clock's."""
 
 OUT_OF_ORDER_NS = 200_000_000
@@ -273,7 +273,7 @@ def set_back_of(times: Ints) -> SetBack:
         return NOT_SET_BACK
     steps = np.diff(times)
     step_ns = int(-steps.min())
-    stretch = np.concatenate([[0], np.cumsum(steps < -(NEAR_NS if step_ns > NEAR_NS else OUT_OF_ORDER_NS))])
+    stretch = np.concatenate([[0], np.cumsum(steps < -(DISORDER_NS if step_ns > DISORDER_NS else OUT_OF_ORDER_NS))])
     pieces = 1 + np.count_nonzero(np.diff(stretch[np.argsort(times, kind="stable")]))
     return SetBack(step_ns, float(pieces / (stretch[-1] + 1)), int(times[np.argmin(steps)]))
 

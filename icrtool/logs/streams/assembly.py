@@ -14,7 +14,7 @@ from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError, LogError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.topic_table import NEAR_NS, TopicTable
+from icrtool.logs.messages.topic_table import DISORDER_NS, TopicTable
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE, find_gyro, inertial_units
 from icrtool.logs.streams.positions import antenna_place
 from icrtool.logs.streams.select import Candidates, Choice, choose_streams, ignored_joints, other_references
@@ -165,7 +165,7 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
     back = [
         (rows.set_back, role)
         for role, rows in streams
-        if rows.set_back.pieces > MOST_PIECES or rows.set_back.step_ns > NEAR_NS
+        if rows.set_back.pieces > MOST_PIECES or rows.set_back.step_ns > DISORDER_NS
     ]
     if back:
         # Of streams in which times come again, the largest step: they decide what can be done.
@@ -175,7 +175,7 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         if largest.pieces <= MOST_PIECES:
             cause = "the clock was set back, or messages are stored out of order; all are used, sorted by time"
             yield note("clock_set", f"{why}: {cause}; if it was set back, fit each part alone (--from, --to)")
-        elif largest.step_ns <= NEAR_NS:
+        elif largest.step_ns <= DISORDER_NS:
             mixed = "samples of that time are mixed, which makes errors there too large"
             reported = f"{why}: the clock was set back while recording, and {mixed}; fit each part alone (--from, --to)"
             yield note("clock_set", reported)

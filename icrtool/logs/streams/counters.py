@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import Floats
 
-TURNS = (360.0, 2 * np.pi)
+TURN_MODULI = (360.0, 2 * np.pi)
 """Moduli of angles [deg, rad]."""
 
 FEWEST_STEPS = 20
@@ -106,7 +106,7 @@ def find_modulus(columns: Iterable[NDArray[Any]], given: float | None = None) ->
 
 def _known_between(least: float, most: float, given: float | None, *, whole: bool) -> float | None:
     """Return the first known modulus in a range: a turn, that of the configured encoder, a power of two."""
-    turn = next((one for one in TURNS if least <= (1 + TURN_TOLERANCE) * one and one <= most), None)
+    turn = next((one for one in TURN_MODULI if least <= (1 + TURN_TOLERANCE) * one and one <= most), None)
     if turn is not None or not whole:
         return turn
     counts = [*([] if given is None else [given]), *(float(1 << bits) for bits in range(*POWERS))]

@@ -12,7 +12,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, turned_axis, unwrapped
-from icrtool.logs.messages.topic_table import FRAME, TopicTable
+from icrtool.logs.messages.topic_table import FRAME_FIELD, TopicTable
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
 from icrtool.logs.streams.sources import (
     Clock,
@@ -208,7 +208,7 @@ TILTED_SHARE = 0.01
 
 CLEAR_CORRELATION = 0.5
 STRETCHES = 200
-MOST_LOOKED_AT = 5000
+MOST_ORIENTATIONS = 5000
 
 ORDERS: tuple[tuple[tuple[int, int, int, int], str], ...] = (
     ((1, 2, 3, 0), "its quaternion is written w first: read as w, x, y, z"),
@@ -219,7 +219,7 @@ ORDERS: tuple[tuple[tuple[int, int, int, int], str], ...] = (
 
 def frame_convention(table: TopicTable) -> tuple[Convention, str]:
     """Return the convention of a message's frame, and how it is known."""
-    frame = table.text(FRAME)
+    frame = table.text(FRAME_FIELD)
     if frame.lower().endswith("_ned") or frame.lower() == "ned":
         return "ned", f"frame {frame} (REP-145)"
     return "enu", "REP-103"
@@ -285,7 +285,7 @@ def _written_order(
     def unit(chosen: Ints) -> Floats:
         return np.column_stack([field[chosen] for field in q]) / norm[chosen, None]
 
-    as_named, some = (0, 1, 2, 3), unit(rows[:: max(1, len(rows) // MOST_LOOKED_AT)])
+    as_named, some = (0, 1, 2, 3), unit(rows[:: max(1, len(rows) // MOST_ORIENTATIONS)])
     # Of each axis of the sensor, the share of the time in which it is not upright.
     upward = np.array([turned_axis(axis, *some.T)[2] for axis in range(3)])
     if len(some) < 2 or ((np.abs(upward) < UPRIGHT_COSINE).mean(axis=1) < TILTED_SHARE).any():

@@ -113,14 +113,16 @@ _SOLVED = "SOL_COMPUTED|0"
 _INS_SOLVED = "INS_SOLUTION_GOOD|INS_SOLUTION_FREE|INS_ALIGNMENT_COMPLETE|3|6|7"
 """What NovAtel calls a solution, in words (novatel_gps_msgs) and as numbers (novatel_oem7_msgs)."""
 
-_WORD, _NUMBER = (Solution(name, _NOVATEL_TYPES, OTHER_FIX) for name in ("position_type", "pos_type.type"))
+_WORD_SOLUTION, _NUMBER_SOLUTION = (
+    Solution(name, _NOVATEL_TYPES, OTHER_FIX) for name in ("position_type", "pos_type.type")
+)
 _BESTPOS = Fix(
     "NovAtel position", 85.0, ("lat", "lon", "hgt + undulation"), ("lat_stdev", "lon_stdev"),
-    valid=(f"sol_status.status == {_SOLVED}",), solution=_NUMBER,
+    valid=(f"sol_status.status == {_SOLVED}",), solution=_NUMBER_SOLUTION,
 )  # fmt: skip
 _INSPVAX = Fix(
     "NovAtel INS position", 84.0, ("latitude", "longitude", "height + undulation"),
-    ("latitude_stdev", "longitude_stdev"), valid=(f"ins_status.status == {_INS_SOLVED}",), solution=_NUMBER,
+    ("latitude_stdev", "longitude_stdev"), valid=(f"ins_status.status == {_INS_SOLVED}",), solution=_NUMBER_SOLUTION,
 )  # fmt: skip
 _METRIC = Fix("metric pose", 70.0, ("pose.position.x", "pose.position.y", "pose.position.z"), metric=True)
 _METRIC_OF_POSE = replace(
@@ -168,7 +170,7 @@ def _read_true_headings(table: TopicTable, config: Config) -> Source:
     return _TRUE_HEADING.read(true, config)
 
 
-_AZIMUTH = OwnRow(headings.AZIMUTH_FIELDS, headings.read_azimuths)
+_AZIMUTH_ROW = OwnRow(headings.AZIMUTH_FIELDS, headings.read_azimuths)
 # ENU unless `use_ros_axis_orientation` was off, which no message states.
 _ATTITUDE = Bearing(
     "Septentrio attitude", 88.0, valid=("error == 0", "mode != 0"), convention="enu",
@@ -244,11 +246,11 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         ),
         "novatel_gps_msgs/NovatelPosition": replace(
             _BESTPOS, place=("lat", "lon", "height + undulation"), std=("lat_sigma", "lon_sigma"),
-            valid=(f"solution_status == {_SOLVED}",), solution=_WORD,
+            valid=(f"solution_status == {_SOLVED}",), solution=_WORD_SOLUTION,
         ),
         "novatel_gps_msgs/Inspvax": replace(
             _INSPVAX, place=("latitude", "longitude", "altitude + undulation"), std=("latitude_std", "longitude_std"),
-            valid=(f"ins_status == {_INS_SOLVED}",), solution=_WORD,
+            valid=(f"ins_status == {_INS_SOLVED}",), solution=_WORD_SOLUTION,
         ),
         "novatel_oem7_msgs/BESTPOS": _BESTPOS,
         "novatel_oem7_msgs/BESTGNSSPOS": _BESTPOS,
@@ -294,8 +296,8 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
             "OpenMower's heading", 90.0, "vehicle_heading", "orientation_accuracy", valid=("orientation_valid != 0",),
             convention="enu", known_by="REP-103", independent=_XBOT_INDEPENDENT,
         ),
-        "compass_msgs/Azimuth": _AZIMUTH,
-        "compass_interfaces/Azimuth": _AZIMUTH,
+        "compass_msgs/Azimuth": _AZIMUTH_ROW,
+        "compass_interfaces/Azimuth": _AZIMUTH_ROW,
         "ublox_msgs/NavRELPOSNED9": headings.BASELINE,
         "ublox_msgs/NavRELPOSNED": OwnRow(headings.BASELINE_FIELDS, headings.read_baselines),
         "septentrio_gnss_driver/AttEuler": _ATTITUDE,

@@ -14,7 +14,7 @@ from icrtool.config import Config
 from icrtool.errors import DefinitionError
 from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints, quaternion_product, turned_axis
 from icrtool.logs.containers.container import Channel
-from icrtool.logs.messages.topic_table import FRAME, STAMPS, TopicTable
+from icrtool.logs.messages.topic_table import FRAME_FIELD, STAMPS, TopicTable
 from icrtool.logs.streams.sources import NEVER_MOVES, PositionSource, all_valid, fields_in, number, of_topic
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, NOT_STATED, OTHER_FIX, RTK_FIX
 from icrtool.records.text import LogText
@@ -71,7 +71,7 @@ REFERENCE_FRAMES = {"world", "earth", "ecef", "local_enu", "enu", "camera_init"}
 GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
 GOAL = "its name is that of a goal, not of a measurement"
 
-LEAST_AREA_M, FLAT, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
+LEAST_AREA_M, FLAT_RATIO, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
 """A drive this wide (standard deviation) shows its plane where it is no thicker than a tenth of that."""
 
 LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
@@ -200,7 +200,7 @@ class Fix:
 
     def _problem(self, table: TopicTable, places: Floats) -> str:
         """Return why positions x, y, z (n, 3) are no reference, empty where they may be one."""
-        frame = table.text(FRAME).lstrip("/")
+        frame = table.text(FRAME_FIELD).lstrip("/")
         named = REFERENCE_WORDS.search(f"{table.topic} {frame}") or frame in REFERENCE_FRAMES
         problem = ""
         if not len(places):
@@ -247,7 +247,7 @@ def _is_level(places_m: Floats) -> bool:
     kept = np.clip(some, *np.percentile(some, [2.5, 97.5], axis=0))
     _, size, axes = np.linalg.svd(kept - kept.mean(axis=0), full_matrices=False)
     _, across_m, off_m = size / math.sqrt(len(some))
-    return bool(across_m < LEAST_AREA_M or off_m > FLAT * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
+    return bool(across_m < LEAST_AREA_M or off_m > FLAT_RATIO * across_m or abs(axes[2, 2]) > math.sqrt(0.5))
 
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
@@ -286,7 +286,7 @@ def antenna_place(tables: Sequence[TopicTable], antenna_topic: str) -> tuple[flo
     ----------
     antenna_topic : topic of the fixes; its header names the antenna's frame
     """
-    frame = next((table.text(FRAME).strip("/") for table in tables if table.topic == antenna_topic), "")
+    frame = next((table.text(FRAME_FIELD).strip("/") for table in tables if table.topic == antenna_topic), "")
     links: dict[str, _Link] = {}
     for table in tables:
         if table.message_type in TRANSFORM_TYPES and all(path in table.columns for path in TRANSFORM_FIELDS):
@@ -381,10 +381,10 @@ def transform_pose(table: TopicTable) -> TopicTable:
     stamps = (table.column(path)[rows[step], places[step]] for path in TRANSFORM_STAMP)
     frame = np.zeros(np.count_nonzero(step), np.int64)
     values = [*stamps, frame, *place[step].T, *turn[step].T]
-    columns = dict(zip((*STAMPS[0], FRAME, *_POSE), values, strict=True))
+    columns = dict(zip((*STAMPS[0], FRAME_FIELD, *_POSE), values, strict=True))
     return replace(
         table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[rows[step]],
-        columns=columns, texts={FRAME: [root]},
+        columns=columns, texts={FRAME_FIELD: [root]},
     )  # fmt: skip
 
 

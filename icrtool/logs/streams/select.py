@@ -47,7 +47,7 @@ WORTHY = 40.0
 SAME_MESSAGE = 100.0
 """Position and heading of one metric pose share a frame; a heading from elsewhere does not fit a local map."""
 
-MOST_LISTED = 40
+MOST_LISTED_TOPICS = 40
 MOST_REFERENCES = 3
 
 FUSED_WORDS = re.compile(r"ekf|ukf|fused|filtered|localization|global", re.IGNORECASE)
@@ -328,8 +328,8 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
             reason = f": serialization {str(channel.encoding)!r} is not read"
         entries[channel.topic] = f"{channel.topic} ({channel.message_type}{reason})"
     ordered = [entries[topic] for topic in sorted(entries, key=lambda topic: topic not in reasons)]
-    more = len(ordered) - MOST_LISTED
-    return ([*ordered[:MOST_LISTED], f"{more} more"] if more > 0 else ordered) or ["no topic at all"]
+    more = len(ordered) - MOST_LISTED_TOPICS
+    return ([*ordered[:MOST_LISTED_TOPICS], f"{more} more"] if more > 0 else ordered) or ["no topic at all"]
 
 
 JOINT_KEYS = ("left_joints", "right_joints")

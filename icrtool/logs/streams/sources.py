@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Bytes, Floats, Ints
-from icrtool.logs.messages.topic_table import NEAR_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, STAMPS, SetBack, TopicTable
+from icrtool.logs.messages.topic_table import DISORDER_NS, NOT_SET_BACK, OUT_OF_ORDER_NS, STAMPS, SetBack, TopicTable
 from icrtool.records.notes import Note
 from icrtool.records.samples import WheelUnit
 
@@ -83,12 +83,12 @@ def stamp_rows(table: TopicTable) -> StampedRows:
         return unusable(f"{100 * zeros / len(header):.0f} % of the header stamps are 0")
     header, clock_set = _without_clock_steps(header, log_ns)
     delay = int(np.median(log_ns - header, overwrite_input=True))
-    if abs(delay) > NEAR_NS:
+    if abs(delay) > DISORDER_NS:
         return unusable(f"header stamps are {delay / 1e9:+z.1f} s from log time", clock_set)
     # A few stamps of another clock (a first message at 0) are replaced by their log times.
     off = log_ns - header
     off -= delay
-    other = np.abs(off, out=off) > NEAR_NS
+    other = np.abs(off, out=off) > DISORDER_NS
     header[other] = log_ns[other] - delay
     backwards = np.count_nonzero(np.diff(header) < 0) / max(len(header) - 1, 1)
     if backwards > LARGEST_SHARE_BACKWARDS:

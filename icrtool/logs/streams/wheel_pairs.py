@@ -19,10 +19,10 @@ from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import number_fields
 from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.logs.messages.topic_table import TopicTable
-from icrtool.logs.streams.counters import TURNS, Modulus, continued, find_modulus, register_size
+from icrtool.logs.streams.counters import TURN_MODULI, Modulus, continued, find_modulus, register_size
 from icrtool.logs.streams.message_types import KNOWN_TYPES
 from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, stamp_rows
-from icrtool.logs.streams.wheels import COMMAND, COMMAND_NOTES, COMMANDED, MOST_WHEELS, WHEEL_WORDS, elements
+from icrtool.logs.streams.wheels import COMMAND_NOTES, COMMANDED, COMMANDED_PENALTY, MOST_WHEELS, WHEEL_WORDS, elements
 from icrtool.records.notes import note
 from icrtool.records.samples import WheelUnit
 from icrtool.records.text import LogText
@@ -299,7 +299,10 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
     topic = LogText(f"{left.name.raw} + {right.name.raw}")
     kind = LogText(" + ".join(dict.fromkeys(LogText(side.table.message_type).raw for side in (left, right))))
     commanded = bool(COMMANDED.search(left.name))
-    score, why = 80.0 - (COMMAND if commanded else 0.0), "a number of each side" + (" (commanded)" if commanded else "")
+    score, why = (
+        80.0 - (COMMANDED_PENALTY if commanded else 0.0),
+        "a number of each side" + (" (commanded)" if commanded else ""),
+    )
     stamps, times, held = _common_stamps(left.table, right.table)
     try:
         if not (len(times) and len(held)):
@@ -324,7 +327,7 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
         if modulus is not None:
             counted = f"its numbers begin again at {modulus.text}, as they show: counted on"
             notes = (note("counter_begins_again", counted), *notes)
-            if modulus.value in TURNS and not integer:
+            if modulus.value in TURN_MODULI and not integer:
                 unit, what = "rad", "angles"
                 radians = 2 * np.pi / modulus.value
                 position = first * radians, np.interp(moments, held, rights) * radians

@@ -193,7 +193,7 @@ COMMAND_NOTES = (
         "commanded speeds, not measured ones: what the wheels did not do of them is in the ICRs and delays",
     ),
 )
-COMMAND = 40.0
+COMMANDED_PENALTY = 40.0
 """Taken off of a topic with commanded speeds."""
 
 _FUSED = re.compile(
@@ -243,7 +243,7 @@ class Twist:
         )
         score -= self.fused if _FUSED.search(table.topic) else 0.0
         if COMMANDED.search(table.topic):
-            score, why, known = score - COMMAND, f"{why} (commanded)", COMMAND_NOTES
+            score, why, known = score - COMMANDED_PENALTY, f"{why} (commanded)", COMMAND_NOTES
         problem = ""
         if not moves(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
             problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"

@@ -24,7 +24,7 @@ from icrtool.records.choices import ControllerTarget
 from icrtool.records.plain_data import plain
 from icrtool.records.run import ICR_COLUMNS
 
-TARGETS: tuple[ControllerTarget, ...] = get_args(ControllerTarget)
+CONTROLLER_TARGETS: tuple[ControllerTarget, ...] = get_args(ControllerTarget)
 
 EXPORT_SCHEMA = "icrtool/export/1"
 

@@ -57,19 +57,23 @@ GBAS_FIX, PLAIN_FIX = 2, 0
 DIAGONAL_KNOWN = 2
 """Code of NavSatFix for a covariance of which the diagonal is known."""
 
-ICRS, ERROR, EVENT = "icrtool_msgs/msg/TrackIcrs", "icrtool_msgs/msg/OpenLoopError", "icrtool_msgs/msg/Event"
+ICRS_TYPE, ERROR_TYPE, EVENT_TYPE = (
+    "icrtool_msgs/msg/TrackIcrs",
+    "icrtool_msgs/msg/OpenLoopError",
+    "icrtool_msgs/msg/Event",
+)
 
 _ICR_FIELDS = "".join(
     f"float64 {name}\nfloat64 std_{name}\nfloat64 {name[:-2]}_minus_std_m\nfloat64 {name[:-2]}_plus_std_m\n"
     for name in ICR_COLUMNS
 )
 DEFINITIONS = {
-    ICRS: f"# Track ICRs [m]; body frame: x forward, y right.\nstd_msgs/Header header\n{_ICR_FIELDS}",
-    ERROR: (
+    ICRS_TYPE: f"# Track ICRs [m]; body frame: x forward, y right.\nstd_msgs/Header header\n{_ICR_FIELDS}",
+    ERROR_TYPE: (
         "# Open-loop error [m] after horizon_m of driving from this state; NaN where a model has none.\n"
         "std_msgs/Header header\nfloat64 horizon_m\nfloat64 icr_m\nfloat64 icr_final_m\nfloat64 no_slip_m\n"
     ),
-    EVENT: (
+    EVENT_TYPE: (
         "# Begin of a slip event or an outage; kind is none at its end. x_m, y_m in the world frame.\n"
         "std_msgs/Header header\nstring kind\nfloat64 duration_s\nfloat64 x_m\nfloat64 y_m\nfloat64 distance_m\n"
         "float64 severity\nfloat64 confidence\n"
@@ -108,7 +112,7 @@ def write_foxglove(run: Run, path: Path) -> None:
         _transforms(paths, rows, store),
         *(_odometry(run, path, rows) for path in paths),
         *(_fixes(run, rows, globe) if globe is not None else ()),
-        _plan("/icrs", ICRS, run.table.stamp_ns[rows], BODIES["filter"], icrs),
+        _plan("/icrs", ICRS_TYPE, run.table.stamp_ns[rows], BODIES["filter"], icrs),
         _errors(run, rows),
     ]
     topics = [write_log.serialise_topic(plan, store) for plan in plans if len(plan.stamp_ns)]
@@ -241,7 +245,7 @@ def _errors(run: Run, rows: Ints) -> write_log.TopicPlan:
     rows = rows[np.isfinite(errors["icr"][rows])]
     columns = {f"{name}_m": errors.get(name, unknown)[rows] for name in ("icr", "icr_final", "no_slip")}
     stamps = run.table.stamp_ns[rows]
-    return _plan("/open_loop_error", ERROR, stamps, BODIES["filter"], columns, {"horizon_m": ERROR_HORIZON_M})
+    return _plan("/open_loop_error", ERROR_TYPE, stamps, BODIES["filter"], columns, {"horizon_m": ERROR_HORIZON_M})
 
 
 def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore) -> write_log.TopicMessages:
@@ -249,22 +253,22 @@ def _event_topic(topic: str, events: Iterable[dict[str, Any]], store: Typestore)
     stamps, payload = [], []
     for event in events:
         for kind, stamp in ((event["kind"], event["begin_ns"]), ("none", event["end_ns"])):
-            message: Any = write_log.blank_message(store, EVENT)
+            message: Any = write_log.blank_message(store, EVENT_TYPE)
             message.header.frame_id, message.kind = WORLD, kind
             _set_stamp(message, stamp)
             for name in ("x_m", "y_m", "distance_m", "severity", "confidence"):
                 setattr(message, name, event.get(name, 0.0))
             message.duration_s = (event["end_ns"] - event["begin_ns"]) / 1e9
             stamps.append(stamp)
-            payload.append(bytes(store.serialize_cdr(message, EVENT)))
-    return write_log.TopicMessages(topic, EVENT, np.array(stamps, np.int64), payload)
+            payload.append(bytes(store.serialize_cdr(message, EVENT_TYPE)))
+    return write_log.TopicMessages(topic, EVENT_TYPE, np.array(stamps, np.int64), payload)
 
 
 def _set_stamp(message: Any, stamp_ns: int) -> None:  # noqa: ANN401 - a message with a header
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
 
 
-SMALLEST_VIEW_M = 5.0
+SMALLEST_SCENE_M = 5.0
 VIEW_IN_EXTENT = 1.4
 """Distance of the camera, in sizes of the filter's path."""
 
@@ -278,7 +282,7 @@ def foxglove_layout(run: Run) -> dict[str, Any]:
     layout: dict[str, Any] = json.loads(text)
     panels = layout["configById"]
     east, north = ((float(column.min()), float(column.max())) for column in (run.table.east_m, run.table.north_m))
-    extent_m = max(SMALLEST_VIEW_M, east[1] - east[0], north[1] - north[0])
+    extent_m = max(SMALLEST_SCENE_M, east[1] - east[0], north[1] - north[0])
     middle = [sum(east) / 2, sum(north) / 2, 0.0]
     panels["3D!paths"]["cameraState"] |= {"distance": VIEW_IN_EXTENT * extent_m, "targetOffset": middle}
     if (globe := globe_of(run)) is not None:

@@ -311,7 +311,7 @@ KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 TRACK_INTERVAL_S = 1.0
 """The drive over time has a place each second."""
 
-COLORS: dict[PathName | str, str] = {
+EXPORT_COLORS: dict[PathName | str, str] = {
     "filter": "#000000", "smoothed": "#606060", "icr": BLUE, "no_slip": ORANGE, "outage": "#ffff00",
 }  # fmt: skip
 
@@ -330,7 +330,7 @@ def format_kml(run: Run) -> str:
     about = f"{utc_text(run.table.stamp_ns[:1])[0]}: {driven_text(run.document.drive)}"
     about = about if run.usable else f"{about}. Not usable: {run.document.unusable_because}"
     styles = []
-    for name, color in COLORS.items():
+    for name, color in EXPORT_COLORS.items():
         red, green, blue = color[1:3], color[3:5], color[5:7]
         width = _element("width", "6" if name == "outage" else "3")
         styles.append(

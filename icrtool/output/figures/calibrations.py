@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 CIRCLES = 20
 
-KEY_COLUMNS = 4
+FORECAST_KEY_COLUMNS = 4
 """Of the legend of a forecast."""
 
 
@@ -43,7 +43,7 @@ def forecast_figure(
     subtitle = f"{title}: forecast error without GNSS from the start: {by}, by the calibration"
     # Of both errors of each forecast, budgets, and up to three more.
     entries = 2 * (1 if gyro is None else 2) + len(budgets_m) + 3
-    keys_in = style.KEY_ROW_IN * max(-(-entries // KEY_COLUMNS) - 2, 0)
+    keys_in = style.KEY_ROW_IN * max(-(-entries // FORECAST_KEY_COLUMNS) - 2, 0)
     height_in, margins_in = 4.2 + keys_in, (0.7, 0.25, 0.75, 0.95 + keys_in)
     figure = style.new_figure(answer, subtitle, width_in=9.0, height_in=height_in, margins_in=margins_in, wspace=0.28)
     grown, path = figure.subplots(1, 2)
@@ -68,18 +68,18 @@ def forecast_figure(
     path.autoscale_view()
     path.set_aspect("equal", adjustable="datalim")
     name_directions(path)
-    style.add_legend(figure, ncols=KEY_COLUMNS)
+    style.add_legend(figure, ncols=FORECAST_KEY_COLUMNS)
     return figure
 
 
 SHOWN_PERCENT = 97.0
 """The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
 
-BEFORE: style.Look = style.spot("0.62", 3.2, "s", "0.62") | {
+BEFORE_LOOK: style.Look = style.spot("0.62", 3.2, "s", "0.62") | {
     "markeredgewidth": 0.0,
     "label": "before: as configured, ICR separation estimated",
 }
-AFTER: style.Look = style.spot(style.ICR["color"], 2.8, "o", style.ICR["color"]) | {
+AFTER_LOOK: style.Look = style.spot(style.ICR["color"], 2.8, "o", style.ICR["color"]) | {
     "markeredgewidth": 0.0,
     "label": "after: calibrated",
 }
@@ -97,7 +97,7 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     margins_in = (0.75, 0.2, 0.7, 1.0)
     figure = style.new_figure(answer, f"{name}: {windows}", height_in=4.2, margins_in=margins_in, wspace=0.32)
     place, turn = figure.subplots(1, 2)
-    for part, turned, look in zip(places, turns, (BEFORE, AFTER), strict=True):
+    for part, turned, look in zip(places, turns, (BEFORE_LOOK, AFTER_LOOK), strict=True):
         place.plot(part[1], part[0], **look)
         turn.plot(np.degrees(residuals.turn_rad), np.degrees(turned), **look)
     for axes, sizes, unit in ((place, off_m, "m"), (turn, off_deg, "°")):
@@ -111,7 +111,7 @@ def residuals_figure(name: str, residuals: ResidualsByEstimate) -> Figure:
     return figure
 
 
-LONGEST_NAME = 14
+LONGEST_CELL_NAME = 14
 
 
 @style.styled
@@ -139,7 +139,7 @@ def transfer(found: GroupComparison) -> Figure:
     for (row, column), error in np.ndenumerate(errors):
         text = f"{error:.2f} m" if np.isfinite(error) else "–"
         matrix.text(column, row, text, ha="center", va="center", fontsize=8.5)
-    short = [style.drawable(name, LONGEST_NAME) for name in names]
+    short = [style.drawable(name, LONGEST_CELL_NAME) for name in names]
     matrix.xaxis.tick_top()
     matrix.set_xticks(range(len(names)), short, fontsize=8, parse_math=False, rotation=30, ha="left")
     matrix.set_yticks(range(len(names)), short, fontsize=8, parse_math=False)
@@ -147,7 +147,7 @@ def transfer(found: GroupComparison) -> Figure:
     matrix.grid(visible=False)
     labels = []
     for y, one in enumerate(rows):
-        calibrated, tested = (style.drawable(name, LONGEST_NAME) for name in (one.calibrated_on, one.tested_on))
+        calibrated, tested = (style.drawable(name, LONGEST_CELL_NAME) for name in (one.calibrated_on, one.tested_on))
         labels.append(f"{calibrated} on {tested}, {one.horizon_m:g} m")
         if one.p95_low_m is not None and one.p95_high_m is not None:
             costs.plot([one.p95_low_m, one.p95_high_m], [y, y], **style.ICR | {"linestyle": "-"})
@@ -160,7 +160,7 @@ def transfer(found: GroupComparison) -> Figure:
 
 
 ROW_IN = 0.22
-MOST_ROWS = 40
+MOST_CALENDAR_ROWS = 40
 LEAST_DAYS = 1.0
 """Shown of the calendar: matplotlib gives a single date four years."""
 LONGEST_ROBOT, LONGEST_GROUP, LONGEST_LOG = 24, 24, 34
@@ -230,9 +230,9 @@ def fleet_errors(fleet: FleetNumbers) -> Figure:
         for group, logs in fleet.errors_m.items()
         for log, error in sorted(logs.items(), key=lambda one: -one[1])
     ]
-    largest = sorted(errors, key=lambda one: -one[2])[:MOST_ROWS]
+    largest = sorted(errors, key=lambda one: -one[2])[:MOST_CALENDAR_ROWS]
     shown = [one for one in errors if one in largest]
-    cut = f", the {MOST_ROWS} largest" if len(errors) > MOST_ROWS else ""
+    cut = f", the {MOST_CALENDAR_ROWS} largest" if len(errors) > MOST_CALENDAR_ROWS else ""
     median = error_text(float(np.median([error for *_, error in errors])))
     labels = [style.drawable(log, LONGEST_LOG) for _, log, _ in shown]
     title = f"After 10 m 95 % stay within {median} in the median of {counted(len(errors), 'log')}"

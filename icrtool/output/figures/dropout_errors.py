@@ -40,7 +40,7 @@ LEAST_HISTOGRAM_IN_P95, MOST_HISTOGRAM_IN_P95 = 1.3, 4.0
 """The histograms of a picture share one scale: up to the largest p95 and a margin, but at most so many times that of
 the first model. The share of trials beyond it is written at its end."""
 
-KEY_COLUMNS = 3
+SUMMARY_KEY_COLUMNS = 3
 """Of the legend of the summary."""
 
 MOSTLY_BEYOND_PCT = 90.0
@@ -66,7 +66,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
         title = f"{refused}{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
     # Beside the models: the mean of the first, budget, outages.
     most = max(row.trials for row in report.document.trials)
-    keys_in = style.KEY_ROW_IN * max(-(-(len(models) + 3) // KEY_COLUMNS) - 2, 0)
+    keys_in = style.KEY_ROW_IN * max(-(-(len(models) + 3) // SUMMARY_KEY_COLUMNS) - 2, 0)
     subtitle = f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals"
     margins_in = (0.75, 0.25, 0.65, 0.95 + keys_in)
     figure = style.new_figure(title, subtitle, height_in=4.6 + keys_in, margins_in=margins_in)
@@ -95,7 +95,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
         axes.axhline(budget, label=label, **style.BUDGET)
         marked = [one for one in reached if one.budget_m == budget and not (one.beyond or row_of(one.model).compared)]
         _mark_reaches(axes, marked, pens, low)
-    style.add_legend(figure, ncols=KEY_COLUMNS)
+    style.add_legend(figure, ncols=SUMMARY_KEY_COLUMNS)
     return figure
 
 

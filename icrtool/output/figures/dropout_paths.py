@@ -13,7 +13,14 @@ from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.output.figures import style
-from icrtool.output.figures.trajectory import CELLS, JUMP_LOOK, draw_path, fitted_box_in, look_down, name_directions
+from icrtool.output.figures.trajectory import (
+    CELLS_A_VIEW,
+    JUMP_LOOK,
+    draw_path,
+    fitted_box_in,
+    look_down,
+    name_directions,
+)
 from icrtool.output.series import places, round_steps
 from icrtool.output.text_format import duration_text, error_text, run_title, turn_text
 from icrtool.records.dropout_document import ExampleTrial, Outage, TrialDocument
@@ -47,7 +54,7 @@ FRAME_COLOR = "0.75"
 LOST_LOOK: style.Look = {"color": "0.82", "linewidth": 6.0, "solid_capstyle": "butt", "zorder": 1}
 """Beneath the paths, where no fix corrected the reference."""
 
-SLOWEST_MPS = 0.001
+SLOWEST_SHOWN_MPS = 0.001
 
 
 @style.styled
@@ -117,7 +124,7 @@ def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, 
     cell = look_down(axes, north_m, east_m, 1.0, ticks=0)
     draw_path(axes, north_m, east_m, cell, PATH, zorder=2)
     number_pt, line_pt = 1.1 * CHARACTER_PT, 0.8 * LINE_PT
-    point_m = cell * CELLS / (72.0 * WORST_CELL_IN)
+    point_m = cell * CELLS_A_VIEW / (72.0 * WORST_CELL_IN)
     together: list[tuple[float, float, list[int]]] = []
     for rank, trial in enumerate(worst, start=1):
         for north, east, ranks in together:
@@ -218,7 +225,7 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
     for north, east, pen, _ in lines:
         look = style.spot(pen["color"], 4.5, "D", pen["color"])
         axes.plot(east[-1:], north[-1:], zorder=5, label="where each ends", **look)
-    end_s = trial.t_s + trial.horizon_m / max(trial.speed_mean_mps, SLOWEST_MPS)
+    end_s = trial.t_s + trial.horizon_m / max(trial.speed_mean_mps, SLOWEST_SHOWN_MPS)
     for one in report.outages:
         span = one.document
         if span.kind == "real" and trial.t_s <= span.end_s and span.begin_s <= end_s:

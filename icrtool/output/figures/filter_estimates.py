@@ -43,7 +43,7 @@ LONG_RUN = 2.5
 LEARNING_MARGIN = 0.6
 LEAST_MARGIN_S = 10.0
 
-BINS = 30
+ICR_BINS = 30
 
 
 def _time_axis(span_s: float) -> tuple[str, float]:
@@ -141,7 +141,7 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     axes.set_ylim(*scale_of(spread))
     axes.locator_params(axis="y", nbins=5)
     for change in run.changes_s:
-        axes.axvline(change / unit, zorder=2.6, label="terrain change", **style.CHANGE)
+        axes.axvline(change / unit, zorder=2.6, label="terrain change", **style.CHANGE_LINE)
     for segment in run.document.segments:
         if (mean := segment.mean[column]) is not None:
             stretch = segment.begin_s / unit, segment.end_s / unit
@@ -168,8 +168,8 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
     """Draw percent of time over value, and show `span_m` of it."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
-    # The round width of about `BINS` bins.
-    target = span_m / BINS
+    # The round width of about `ICR_BINS` bins.
+    target = span_m / ICR_BINS
     width = float(min(round_steps(target), key=lambda step: abs(step - target)))
     first, last = int(np.floor(low / width)), int(np.ceil(high / width))
     share, edges = np.histogram(value, bins=last - first, range=(first * width, last * width), weights=weight)
@@ -195,7 +195,7 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
 MOST_SINGLE = 1500
 TIME_BINS = 300
 """More used fixes than `MOST_SINGLE` are drawn by their range and median in so many equal times."""
-MARKS = 400
+MOST_CROSSES = 400
 """Rejected fixes drawn one by one; of more, the extremes."""
 
 
@@ -255,6 +255,6 @@ def _mark(
     beyond = difference > top
     for chosen, shape, where in ((rows & ~beyond, marker, ""), (rows & beyond, "^", ", above")):
         if chosen.any():
-            shown = extremes(difference[chosen], points=MARKS)
+            shown = extremes(difference[chosen], points=MOST_CROSSES)
             y, words = np.minimum(difference[chosen][shown], top), f"{np.count_nonzero(chosen):,} {label}{where}"
             axes.plot(t[chosen][shown], y, marker=shape, linestyle="none", clip_on=False, label=words, **look)

@@ -19,7 +19,7 @@ from icrtool.output.text_format import signed
 from icrtool.records.presets import PRESETS
 from icrtool.simulation.studies import shown_path
 from icrtool.simulation.study_records import Level, StudyResult, chi2_band, consistency_of
-from icrtool.simulation.study_runs import FATES, STATES
+from icrtool.simulation.study_runs import FATES, STUDY_STATES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +46,7 @@ def study_subtitle(result: StudyResult) -> str:
 
 PANEL_IN = 2.1
 
-MARKS = 9
+MARKS_A_LINE = 9
 """Marks on a line, so that lines are distinguished without colours."""
 
 LEAST_RANGE_M, LEAST_VIEW_M = 0.02, 0.6
@@ -56,14 +56,14 @@ BEYOND = 1.6
 FATE_COLORS = np.array([(0.57, 0.77, 0.93), (0.50, 0.0, 0.10), (0.90, 0.90, 0.90)])
 """Red, green, blue by `FATES`, mixed by the share of the runs."""
 
-LOOKS: tuple[style.Look, ...] = (
+STUDY_LOOKS: tuple[style.Look, ...] = (
     *({key: value for key, value in look.items() if key != "label"} for look in style.ICR_LOOKS.values()),
     {"color": GREEN, "linestyle": "-", "marker": "D", "markersize": 3.5},
 )
 """Of lines that are no ICRs, in turn."""
 
-OPEN_LOOP = {"label": "open loop, final ICRs", **LOOKS[3]}
-OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP}
+OPEN_LOOP = {"label": "open loop, final ICRs", **STUDY_LOOKS[3]}
+OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP_LINE}
 PATH_COLORS = (BLUE, ORANGE, GREEN, RED)
 WIDE: style.Look = {"linewidth": 1.5}
 TRUTH: style.Look = {"linewidth": 0.9, "linestyle": (0, (4, 2))}
@@ -75,7 +75,7 @@ Draw = Callable[["Axes", StudyResult, list[Level]], None]
 @style.styled
 def study_figure(result: StudyResult) -> Figure:
     """Return the picture of a study."""
-    rows = PICTURES[result.request.name]
+    rows = STUDY_PICTURES[result.request.name]
     names = dict.fromkeys(level.setting.series for level in result.levels)
     of_series = [[level for level in result.levels if level.setting.series == name] for name in names]
     columns = [list(result.levels)] if result.request.name in TOGETHER else of_series
@@ -160,7 +160,7 @@ def along(axes: Axes, t: Floats, values: Floats, look: style.Look) -> None:
     low, middle, high = np.nanpercentile(values, [5, 50, 95], axis=0)
     if len(values) > 1:
         axes.fill_between(t, low, high, color=look["color"], alpha=0.18, linewidth=0)
-    axes.plot(t, middle, linewidth=1.2, markevery=max(1, len(t) // MARKS), **look)
+    axes.plot(t, middle, linewidth=1.2, markevery=max(1, len(t) // MARKS_A_LINE), **look)
     axes.set_xlabel("Time [s]")
     if len(t) > 1:
         axes.set_xlim(t[0], t[-1])
@@ -189,7 +189,7 @@ def starts(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
         if level.names["start_y_icr_left_m"] == near:
             trace = level.found["trace"][:1]
             along(axes, trace[0, :, 0], trace[..., 1], {"color": "0.35"})
-    axes.axhline(right, color=LOOKS[0]["color"], **TRUTH)
+    axes.axhline(right, color=STUDY_LOOKS[0]["color"], **TRUTH)
     reach = BEYOND * max(LEAST_VIEW_M, *map(abs, result.request.values))
     axes.set_ylim(-reach, reach)
     axes.set_title(f"start y left {near:g} m", loc="left")
@@ -215,7 +215,7 @@ def fates(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
 
 def speeds(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the left track speed of one run along time, as the filter gets it."""
-    for level, look in zip(levels, LOOKS, strict=False):
+    for level, look in zip(levels, STUDY_LOOKS, strict=False):
         trace = level.found["trace"][:1]
         along(axes, trace[0, :, 0], trace[..., 4], look | {"label": level.setting.value, "marker": ""})
 
@@ -236,7 +236,7 @@ def nees(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw the mean NEES along time, and its 95 % band."""
     runs = len(levels[0].found["nees"])
     axes.axhspan(*chi2_band(6 * runs, runs), color="#d9ead3", zorder=0.5, label="95 % band")
-    for level, look in zip(levels, LOOKS, strict=False):
+    for level, look in zip(levels, STUDY_LOOKS, strict=False):
         mean = level.found["all nees"].mean(axis=0, keepdims=True)
         along(axes, level.found["stops_s"][0], mean, look | {"label": level.setting.series})
     axes.set_yscale("log")
@@ -244,28 +244,28 @@ def nees(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
 
 def coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
     """Draw how much of the time 2 sigma hold the truth, by state."""
-    for place, (level, look) in enumerate(zip(levels, LOOKS, strict=False)):
+    for place, (level, look) in enumerate(zip(levels, STUDY_LOOKS, strict=False)):
         held = consistency_of(level.found)["coverage_pct"]
-        _points(axes, STATES, [(one, one, one) for one in held], look, 0.15 * (place - 1))
+        _points(axes, STUDY_STATES, [(one, one, one) for one in held], look, 0.15 * (place - 1))
     axes.axhline(95.4, color="black", **TRUTH)
 
 
-SETTLED: Draw = partial(over, columns=_by_icr("settle_{icr}_s"))
+SETTLING_LINES: Draw = partial(over, columns=_by_icr("settle_{icr}_s"))
 MEANS, SCATTER = (partial(over, columns=_by_icr(f"{what}_{{icr}}_m")) for what in ("mean", "scatter"))
 RMS: Draw = partial(over, columns=_by_icr("rms_{icr}_m"), log="xy")
 WITHOUT_GNSS: Draw = partial(
     over, columns={"blind_icr_10m_p95_m": OPEN_LOOP, "blind_no_slip_10m_p95_m": OPEN_LOOP_NO_SLIP}, log="xy"
 )
-BEFORE, AFTER = (partial(estimates, value=value) for value in ("not inflated", "inflated"))
+NOT_INFLATED, INFLATED = (partial(estimates, value=value) for value in ("not inflated", "inflated"))
 
-PICTURES: dict[str, tuple[tuple[str, Draw], ...]] = {
+STUDY_PICTURES: dict[str, tuple[tuple[str, Draw], ...]] = {
     "convergence": (("ICR estimate [m]", estimates), ("Runs [%]", shares)),
     "initial": (("Initial y right [m]", fates), ("y right [m]", starts)),
     "icr-change": (
-        ("ICRs, not inflated [m]", BEFORE), ("ICRs, inflated [m]", AFTER),
-        ("… first change [m]", partial(AFTER, name="zoom")),
+        ("ICRs, not inflated [m]", NOT_INFLATED), ("ICRs, inflated [m]", INFLATED),
+        ("… first change [m]", partial(INFLATED, name="zoom")),
     ),
-    "turn-radius": (("Within 10 % after [s]", SETTLED), ("Ends inverted [%]", inversions)),
+    "turn-radius": (("Within 10 % after [s]", SETTLING_LINES), ("Ends inverted [%]", inversions)),
     "input-noise": (("ICR error [m]", errors),),
     "input-bias": (("ICR error [m]", errors),),
     "input-source": (("Left track speed [m/s]", speeds), ("ICR error [m]", errors)),

@@ -103,9 +103,9 @@ BAR_COLOR = "#5b8db8"
 BAND_COLOR = "#a6c4e0"
 FILTER = line("black", width=1.1)
 ICR = line(BLUE, (0, (6, 2)), 1.5)
-NO_SLIP = line(ORANGE, (0, (6, 1.5, 1.2, 1.5)), 1.5)
+NO_SLIP_LINE = line(ORANGE, (0, (6, 1.5, 1.2, 1.5)), 1.5)
 HALF_WIDTH = line("0.35", (0, (1.5, 2.0)), 1.1)
-CHANGE = line(RED, (0, (3, 1.5)), 1.1)
+CHANGE_LINE = line(RED, (0, (3, 1.5)), 1.1)
 MEAN = line("black", (0, (5, 2)), 1.1)
 BUDGET = line(RED, (0, (1.5, 2.0)), 1.2)
 COLORS: dict[Color, str] = {
@@ -242,7 +242,7 @@ def picture_bytes(figure: Figure, form: str) -> bytes:
     return memory.getvalue()
 
 
-def save(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
+def save_figure(figure: Figure, stem: Path, formats: tuple[str, ...]) -> None:
     """Write a figure as ``stem.format`` in each of `formats`."""
     for form in formats:
         stem.with_name(f"{stem.name}.{form}").write_bytes(picture_bytes(figure, form))

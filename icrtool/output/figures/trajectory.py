@@ -29,7 +29,7 @@ LARGEST_DETOUR = 0.75
 SMALLEST_DRIVE_M = 2.0
 TIME_STEPS_S = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 7200.0, 14400.0)
 MOST_TIMES = 12
-MOST_JUMPS = 5
+MOST_MARKED_JUMPS = 5
 REJECTED_CELLS = 40.0
 MOST_REJECTED = 60
 """Rejected fixes closer together than this part of the view are one cross, and there are at most so many: they would
@@ -51,7 +51,7 @@ SLIP_LOOK: style.Look = style.spot("none", 6.5, "D", style.FLOAT_COLOR) | {"mark
 REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
 """Markers by class: shape and luminance distinguish them."""
 
-ODOMETRIES = {"icr": (style.ICR, 3), "no_slip": (style.NO_SLIP, 2)}
+ODOMETRIES = {"icr": (style.ICR, 3), "no_slip": (style.NO_SLIP_LINE, 2)}
 """Pen and order of the paths that wheel speeds alone lead along."""
 
 MOST_STATES = 500_000
@@ -127,7 +127,7 @@ def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Fl
     for chosen, look, label in (*groups, rejected):
         if chosen.any():
             north, east = place[chosen & seen].T
-            shown = places(north, east, cell_m if look is not REJECTED_LOOK else cell_m * CELLS / REJECTED_CELLS)
+            shown = places(north, east, cell_m if look is not REJECTED_LOOK else cell_m * CELLS_A_VIEW / REJECTED_CELLS)
             if look is REJECTED_LOOK:
                 shown = shown[:: 1 + len(shown) // MOST_REJECTED]
             axes.plot(east[shown], north[shown], linestyle="none", zorder=1.5, label=label, **look)
@@ -136,9 +136,9 @@ def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Fl
 def _draw_jumps(axes: Axes, run: Run) -> None:
     """Mark the largest jumps of the reference, each where it was before."""
     jumps = [jump for jump in run.sensors.jumps if not jump.undecided]
-    largest = sorted(jumps, key=lambda jump: -jump.size_m)[:MOST_JUMPS]
+    largest = sorted(jumps, key=lambda jump: -jump.size_m)[:MOST_MARKED_JUMPS]
     if largest:
-        marked = f", the {MOST_JUMPS} largest of {len(jumps)} marked" if len(jumps) > MOST_JUMPS else ""
+        marked = f", the {MOST_MARKED_JUMPS} largest of {len(jumps)} marked" if len(jumps) > MOST_MARKED_JUMPS else ""
         east, north = [jump.east_m for jump in largest], [jump.north_m for jump in largest]
         axes.plot(east, north, label=f"jump, up to {error_text(largest[0].size_m)}{marked}", **JUMP_LOOK)
 
@@ -148,7 +148,7 @@ def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
     table = run.table
     span = float(table.t_s[-1])
     every = next((step for step in TIME_STEPS_S if span / step <= MOST_TIMES), TIME_STEPS_S[-1])
-    clear = TIME_CLEARANCE * cell_m * CELLS
+    clear = TIME_CLEARANCE * cell_m * CELLS_A_VIEW
     written = [np.array([table.east_m[0], table.north_m[0]]), np.array([table.east_m[-1], table.north_m[-1]])]
     for time in np.arange(every, span, every):
         row = int(np.searchsorted(table.t_s, time))
@@ -166,7 +166,7 @@ BOX_HEIGHT_IN = (2.4, 5.4)
 
 SMALLEST_VIEW_M = 0.5
 FAR_M = 20_000.0
-CELLS = 1500.0
+CELLS_A_VIEW = 1500.0
 """Points closer than this fraction of the view are one point: about a pixel."""
 
 
@@ -195,7 +195,7 @@ def look_down(axes: Axes, norths: Floats, easts: Floats, shape: float, margin: f
         axes.locator_params(nbins=ticks, steps=[1, 2, 5, 10])
     else:
         axes.set(xticks=[], yticks=[])
-    return height * shape / CELLS
+    return height * shape / CELLS_A_VIEW
 
 
 def name_directions(axes: Axes) -> None:

@@ -33,10 +33,10 @@ IsOurFile = Callable[[bytes], bool]
 EXPORTED_MCAP = b"icrtool export"
 """Library in the header of an MCAP file that `icrtool export` wrote: it is no log of somebody's."""
 
-PACKED = (b"\x28\xb5\x2f\xfd", b"\x1f\x8b", b"BZh", b"\x04\x22\x4d\x18")
+PACKED_BEGINNINGS = (b"\x28\xb5\x2f\xfd", b"\x1f\x8b", b"BZh", b"\x04\x22\x4d\x18")
 """How files packed with zstd, gzip, bzip2 and lz4 begin: nothing that icrtool writes, and perhaps a log."""
 
-FIRST_BYTES = 4096
+RECOGNISED_BYTES = 4096
 
 HIDDEN = ".icrtool-"
 """How the names of all files begin that are icrtool's and no results."""
@@ -44,7 +44,7 @@ HIDDEN = ".icrtool-"
 OF_NOBODY = {".DS_Store", "Thumbs.db", "desktop.ini"}
 """What file managers leave in a folder that they show."""
 
-PARTIAL, ASIDE = ".partial", ".old"
+PARTIAL_SUFFIX, OLD_SUFFIX = ".partial", ".old"
 """Suffixes of those that are being written, and of old directories that were renamed aside."""
 
 ABANDONED_S = 3600.0
@@ -75,7 +75,7 @@ class Kind(NamedTuple):
 
 
 @contextmanager
-def reported(path: Path) -> Iterator[None]:
+def place_errors(path: Path) -> Iterator[None]:
     """Raise an OSError of the block as an OutputError of a place."""
     try:
         yield
@@ -96,7 +96,7 @@ def check_place(path: Path, inside: Path | None = None, ours: IsOurFile | None =
         The directory is missing, or a link below `inside`; a log, a directory, a device or a pipe is there, or another
         file than one of ours.
     """
-    with reported(path):
+    with place_errors(path):
         if not _place_of_file(path, inside, ours).parent.is_dir():
             raise OutputError(path, "its directory does not exist", "make it first, or name another file")
 
@@ -116,9 +116,9 @@ def _place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> P
     from icrtool.logs.containers.open_log import container_of
 
     with open_regular(place) as stream:
-        first = stream.read(FIRST_BYTES)
+        first = stream.read(RECOGNISED_BYTES)
         is_log = container_of(stream) is not None and EXPORTED_MCAP not in first[:64]
-    if is_log or first.startswith(PACKED):
+    if is_log or first.startswith(PACKED_BEGINNINGS):
         raise OutputError(path, "a log is there", "it is left alone; name another file")
     if ours is not None and first and not ours(first):
         raise OutputError(path, "a file that icrtool did not write is there", "it is left alone; name another place")
@@ -141,7 +141,7 @@ def atomic_file(file: Path, inside: Path | None = None, ours: IsOurFile | None =
     OutputError
         As `check_place`, and for every OSError of the block (disk full, no permission); what was there before still is.
     """
-    with reported(file), beside(_place_of_file(file, inside, ours), Path.touch) as partial:
+    with place_errors(file), beside(_place_of_file(file, inside, ours), Path.touch) as partial:
         yield partial
         sync(partial)
         put(partial, _place_of_file(file, inside, ours))
@@ -171,7 +171,7 @@ def make_folders(folder: Path, inside: Path) -> None:
     OutputError
         A link or a file is in its place, or it cannot be made.
     """
-    with reported(folder):
+    with place_errors(folder):
         check_links(folder, inside)
         folder.mkdir(parents=True, exist_ok=True)
 
@@ -191,12 +191,12 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
         removed; it is a mount point; or nothing can be known about the place.
     """
     why, advice = "", "it is left alone; name another place"
-    with reported(directory):
+    with place_errors(directory):
         if inside is not None:
             check_links(directory, inside)
         # Unlike `Path.resolve`, this takes a link that leads to itself as it is.
         place = Path(os.path.realpath(directory))
-        aside = [path for path in place.parent.glob(_hidden_name(place, "*", ASIDE)) if not path.is_symlink()]
+        aside = [path for path in place.parent.glob(_hidden_name(place, "*", OLD_SUFFIX)) if not path.is_symlink()]
         if aside and not os.path.lexists(place):
             max(aside, key=lambda path: path.stat().st_mtime_ns).rename(place)
         names = names_in(place)
@@ -264,7 +264,7 @@ def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) ->
     """
     check_directory(directory, kind, inside)
     place = Path(os.path.realpath(directory))
-    with reported(directory):
+    with place_errors(directory):
         place.parent.mkdir(parents=True, exist_ok=True)
         with beside(place, Path.mkdir) as partial:
             yield partial
@@ -282,9 +282,9 @@ def beside(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
     for left in list(place.parent.glob(_hidden_name(place, "*-*-*"))):
         # What was renamed aside is needed as long as nothing is in its place.
         with suppress(FileNotFoundError):
-            if _is_left(left) and (left.suffix == PARTIAL or place.exists()):
+            if _is_left(left) and (left.suffix == PARTIAL_SUFFIX or place.exists()):
                 remove(left)
-    partial = place.with_name(_hidden_name(place, _writer(), PARTIAL))
+    partial = place.with_name(_hidden_name(place, _writer(), PARTIAL_SUFFIX))
     with unfinished(partial):
         try:
             make(partial)
@@ -323,7 +323,7 @@ def put(partial: Path, place: Path) -> None:
     if not place.is_dir():
         partial.replace(place)
     elif not _exchange(partial, place):
-        old = place.with_name(_hidden_name(place, _writer(), ASIDE))
+        old = place.with_name(_hidden_name(place, _writer(), OLD_SUFFIX))
         place.rename(old)
         try:
             partial.rename(place)

@@ -14,7 +14,7 @@ from typing import TypeVar
 from icrtool.errors import IcrToolError, LogError, OutputError
 from icrtool.logs.containers.source import asked, filesystem
 from icrtool.logs.containers.unpack import ScratchFolder
-from icrtool.output.files.atomic import make_folders, reported, write_file
+from icrtool.output.files.atomic import make_folders, place_errors, write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, SOURCES_FILE
 from icrtool.records.fleet_document import FLEET_FILE
 from icrtool.records.places import UrlPath
@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 COUNTS = (CHECKSUM_FILE, FLEET_FILE)
 """Files without which a run, or a batch, does not count: removed before anything is replaced, and uploaded last."""
 
-REQUESTS = 8
+MOST_REQUESTS = 8
 """That are made at the same time."""
 
 _PROBE = ".icrtool-upload"
@@ -146,7 +146,7 @@ class _Store:
             below = name and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
             if below and name != _PROBE:
                 names.append(name)
-        with reported(self._place):
+        with place_errors(self._place):
             for name in names:
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (folder / name).touch(exist_ok=False)
@@ -198,12 +198,12 @@ class _Store:
 
     def _each(self, request: Callable[[str], object], names: Iterable[str]) -> None:
         """Make a request for each file, several at the same time."""
-        with ThreadPoolExecutor(REQUESTS) as pool:
+        with ThreadPoolExecutor(MOST_REQUESTS) as pool:
             list(pool.map(lambda name: self._done(lambda: request(name)), names))
 
     def _done(self, request: Callable[[], Result]) -> Result:
         """Return the answer to a request."""
-        with reported(self._place), _as_output(self._place):
+        with place_errors(self._place), _as_output(self._place):
             return asked(self._place, request, done=self._what_is_done)
 
 

@@ -32,19 +32,19 @@ from icrtool.records.places import open_regular
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run
 from icrtool.records.run_document import RunDocument
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples, thin
-from icrtool.records.tables import LARGEST, States
+from icrtool.records.tables import LARGEST_STATE, States
 
 if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
 
-COLUMNS = tuple(field.name for field in fields(States))
+COLUMNS_OF_STATES = tuple(field.name for field in fields(States))
 INTEGER_COLUMNS = frozenset({"stamp_ns"})
-FLOAT_COLUMNS = tuple(name for name in COLUMNS if name not in INTEGER_COLUMNS)
+FLOAT_COLUMNS = tuple(name for name in COLUMNS_OF_STATES if name not in INTEGER_COLUMNS)
 DEVIATIONS = frozenset(f"std_{name}" for name in STATE_COLUMNS)
 
-CHUNK_ROWS = 1024
+FORMATTED_ROWS = 1024
 """Rows formatted at a time: their text stays in the processor's cache, and memory does not grow with the log."""
 
 PARQUET_ROWS = 1 << 17
@@ -113,30 +113,32 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None, *,
     """
     import pyarrow as pa
 
-    types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS}
+    types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS_OF_STATES}
     try:
         if states == "parquet":
             import pyarrow.parquet as pq
 
             with open_regular(path, inside) as source, pq.ParquetFile(source) as file:
-                numbers = file.metadata.num_rows * len(COLUMNS)
+                numbers = file.metadata.num_rows * len(COLUMNS_OF_STATES)
                 if 8 * numbers > FREE_STATES_BYTES + LARGEST_RATIO * os.fstat(source.fileno()).st_size:
                     raise ValueError(f"it claims {numbers} numbers, too many for its size")
                 _check_columns(file.schema_arrow, types)
-                held = {name: _parquet_column(file, name) for name in COLUMNS if whole or name not in DEVIATIONS}
+                held = {
+                    name: _parquet_column(file, name) for name in COLUMNS_OF_STATES if whole or name not in DEVIATIONS
+                }
                 read = partial(_read_again, path, inside, _identity(source))
             pa.default_memory_pool().release_unused()
             return States(**held) if whole else StoredStates(read, **held)
         import pyarrow.csv as pc
 
-        options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS), null_values=[])
+        options = pc.ConvertOptions(column_types=types, include_columns=list(COLUMNS_OF_STATES), null_values=[])
         with open_regular(path, inside) as source:
             stored = pc.read_csv(source, convert_options=options)
         _check_columns(stored.schema, types)
         columns = dict(zip(stored.schema.names, stored.columns, strict=True))
         del stored
         # Each column's memory goes back before the next is copied.
-        return States(**{name: _array(columns.pop(name)) for name in COLUMNS})
+        return States(**{name: _array(columns.pop(name)) for name in COLUMNS_OF_STATES})
     except pa.ArrowException as err:
         raise ValueError(" ".join(str(err).split())) from err
 
@@ -222,10 +224,10 @@ def _array(column: pa.ChunkedArray) -> NDArray[Any]:
 
 
 def _csv_chunks(table: States) -> Iterator[bytes]:
-    yield (",".join(COLUMNS) + "\n").encode()
+    yield (",".join(COLUMNS_OF_STATES) + "\n").encode()
     columns = table.columns()
-    for begin in range(0, len(table), CHUNK_ROWS):
-        rows = slice(begin, begin + CHUNK_ROWS)
+    for begin in range(0, len(table), FORMATTED_ROWS):
+        rows = slice(begin, begin + FORMATTED_ROWS)
         stamps = np.ascontiguousarray(table.stamp_ns[rows])
         numbers = np.stack([columns[name][rows] for name in FLOAT_COLUMNS], 1, dtype=np.float64)
         if np.isfinite(numbers).all():
@@ -241,7 +243,7 @@ MEASUREMENTS_FILE = "measurements.npz"
 
 OUTCOME_COLUMNS = ("nis", "code", "difference")
 
-KINDS = {
+COLUMN_TYPES = {
     "stamp_ns": np.int64,
     "fix_class": np.uint8,
     "misreported": np.bool_,
@@ -370,9 +372,9 @@ def _columns(columns: dict[str, NDArray[Any]], group: str, names: tuple[str, ...
 
 
 def _checked(columns: dict[str, NDArray[Any]], key: str, name: str) -> NDArray[Any]:
-    column, kind = columns[key], KINDS.get(name, np.float64)
+    column, kind = columns[key], COLUMN_TYPES.get(name, np.float64)
     if column.ndim != 1 or column.dtype != kind:
         raise ValueError(f"{key} is no column of {np.dtype(kind)}")
-    if kind is np.float64 and name not in OUTCOME_COLUMNS and (np.abs(column) > LARGEST).any():
-        raise ValueError(f"{key} holds a number beyond {LARGEST:g}")
+    if kind is np.float64 and name not in OUTCOME_COLUMNS and (np.abs(column) > LARGEST_STATE).any():
+        raise ValueError(f"{key} holds a number beyond {LARGEST_STATE:g}")
     return column

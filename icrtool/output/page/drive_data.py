@@ -2,7 +2,7 @@
 
 Time series keep the least and the greatest value of each interval. A path of constant parameters is turned to where an
 open-loop trial starts. ICRs that differ by start have no such path: the page drives the wheels, not thinned up to
-`MOST_STEPS`, with those of the start, and ends where the library does.
+`MOST_PAGE_STEPS`, with those of the start, and ends where the library does.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from icrtool.records.plain_data import Record
 from icrtool.records.rows import REST_OF_DRIVE, Row, rows_of, shown_rows
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, Run, track_of, width_or_usual_m
 
-MOST_STEPS = 150_000
+MOST_PAGE_STEPS = 150_000
 """Wheel samples of a page; of more, equally many are joined to one."""
 
 PATH_POINTS = 200_000
@@ -67,7 +67,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
     coordinates : whether the axes of the map count from the datum; else from the first state
     """
     table = run.table
-    rows, joined = every_so_many(len(table), MOST_STEPS)
+    rows, joined = every_so_many(len(table), MOST_PAGE_STEPS)
     north, east = float(table.north_m[0]), float(table.east_m[0])
     origin = (float(round(north)), float(round(east))) if coordinates else (north, east)
     half = None if run.track_width_m is None else run.track_width_m / 2

@@ -33,7 +33,7 @@ from icrtool.output.tables.errors import errors_section
 from icrtool.output.tables.run import advice, streams_section, unusable_line
 from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import (
-    WORDS,
+    GLOSSARY,
     driven_text,
     duration_text,
     error_text,
@@ -118,7 +118,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     )
     rows = rows_of(one.name for one in report.models)
     meanings = {name: f"{row.words}; learned from {row.knows}" for name, row in rows.items()}
-    words = Section("ICR, recommended, no_slip, trial, σ …", [Facts(list((meanings | WORDS).items()))], PAGE)
+    words = Section("ICR, recommended, no_slip, trial, σ …", [Facts(list((meanings | GLOSSARY).items()))], PAGE)
     blocks = [
         Title(run_title(summary), f"{driven_text(summary.drive)}, from {begun}. {about}"),
         *page_blocks(summary, stated),

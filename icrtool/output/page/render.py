@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 DOCUMENT_ERRORS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
 """What a page raises for a JSON document that was edited."""
 
-STYLES = ("vendor/uPlot.min.css", "page.css")
+STYLE_SHEETS = ("vendor/uPlot.min.css", "page.css")
 
 BEGIN = "document.documentElement.classList.replace('no-js', 'js');"
 """Carried out before anything is shown: what only a script can draw is hidden without one."""
@@ -60,7 +60,7 @@ def render(
     """
     from markupsafe import Markup
 
-    style = "\n".join(_static(name) for name in STYLES)
+    style = "\n".join(_static(name) for name in STYLE_SHEETS)
     code = [BEGIN, *(_static(name) for name in scripts)]
     # As a content security policy names a style or a script.
     of_style, *of_scripts = (

@@ -19,18 +19,16 @@ from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS
 from icrtool.output.files.formats import csv_bytes
 from icrtool.output.tables.dropout import parameter_table, reach_row
-from icrtool.output.tables.run import numbers_of
+from icrtool.output.tables.run import blocks_of_numbers
 from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
 from icrtool.output.text_format import model_text, plus_minus
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
+from icrtool.records.fleet_document import BUDGET_M
 from icrtool.records.plain_data import known
 from icrtool.records.rows import shown_rows
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.text import counted, distance_text, with_interval, with_std
-
-BUDGET_M = 0.5
-"""Error within which a distance counts."""
 
 
 def calibration_blocks(result: CalibrationResult | None, sensors: documents.SensorDocument | None) -> list[Block]:
@@ -57,7 +55,7 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
     ]
     return [
         Title(calibration.robot.name or "robot", f"{counted(len(calibration.logs), 'log')}, {driven}"),
-        *numbers_of(calibration.controller, calibration.width_m, icrs),
+        *blocks_of_numbers(calibration.controller, calibration.width_m, icrs),
         Table("lrl", rows, caption=f"How far within {BUDGET_M:g} m (95 %), each {what} left out in turn?"),
         Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
         Section(f"Motion model: {model_text(calibration.fitted)}", model, VERBOSE),

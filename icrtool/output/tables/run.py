@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from icrtool.alignment.corrections import SIGNIFICANT_SIGMAS
+from icrtool.alignment.corrections import CORRECTION_SIGMAS
 from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.observability import lacking_turns
 from icrtool.output.text_blocks import (
@@ -137,7 +137,7 @@ def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None)
     width_m, icrs = summary.config.robot.track_width_m, [summary.icr_of_drive(column) for column in ICR_COLUMNS]
     numbers = fitted or summary.controller
     if width_m is not None and numbers is not None:
-        return numbers_of(numbers, width_m, icrs)
+        return blocks_of_numbers(numbers, width_m, icrs)
     why = "no multiplier and no no-slip model: robot.track_width_m is not known (--robot, --set)"
     if width_m is not None:
         unknown = [ICR_WORDS[name] for name, icr in zip(ICR_COLUMNS[:2], icrs, strict=False) if icr is None]
@@ -145,7 +145,9 @@ def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None)
     return [Facts([("controller", why), _icr_row(icrs)])]
 
 
-def numbers_of(numbers: ControllerNumbers, width_m: float, icrs: Sequence[tuple[float, float] | None]) -> list[Block]:
+def blocks_of_numbers(
+    numbers: ControllerNumbers, width_m: float, icrs: Sequence[tuple[float, float] | None]
+) -> list[Block]:
     """Return the numbers of a controller with one standard deviation each, and the ICRs."""
     radii = f"{numbers.left_radius:.3f}, {numbers.right_radius:.3f}"
     std = max(numbers.left_radius_std, numbers.right_radius_std)
@@ -269,7 +271,7 @@ def _delay_checks(summary: RunDocument) -> Iterator[Check]:
     found = []
     for word, facts in (("headings", summary.heading), ("fixes", summary.gnss)):
         delay, std = facts.delay_s, facts.delay_std_s
-        if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, SIGNIFICANT_SIGMAS * std):
+        if delay is not None and std is not None and abs(delay) > max(SMALLEST_DELAY_S, CORRECTION_SIGMAS * std):
             found.append(
                 f"{word} {'lag' if delay > 0 else 'lead'} the wheels by {plus_minus(abs(delay), std, 2, '')} s"
             )

@@ -10,7 +10,7 @@ from icrtool.records.run import ICR_WORDS
 from icrtool.records.text import counted
 from icrtool.simulation.study_records import Level, StudyNumber, StudyRequest, StudyResult
 
-ERRORS = {f"error_{column}": word for column, word in ICR_WORDS.items()}
+ERROR_WORDS = {f"error_{column}": word for column, word in ICR_WORDS.items()}
 SETTLE = {"settle_s": "all within 10 % [s]"}
 INVERTED = {"inverted": "inverted"}
 
@@ -18,11 +18,11 @@ SHOWN: dict[str, dict[str, str]] = {
     "convergence": SETTLE | INVERTED,
     "icr-change": {"change1_settle_s": "change 1 [s]", "change2_settle_s": "change 2 [s]"} | INVERTED,
     "turn-radius": SETTLE | INVERTED,
-    "input-noise": ERRORS | INVERTED,
-    "input-bias": ERRORS | INVERTED,
-    "input-source": ERRORS | INVERTED,
+    "input-noise": ERROR_WORDS | INVERTED,
+    "input-bias": ERROR_WORDS | INVERTED,
+    "input-source": ERROR_WORDS | INVERTED,
     "gnss": {"rms_y_icr_right_m": "rms y right [m]", "blind_icr_10m_p95_m": "10 m without GNSS [m]"} | INVERTED,
-    "rate": ERRORS,
+    "rate": ERROR_WORDS,
     "speed": {f"mean_{column}": word for column, word in ICR_WORDS.items()} | INVERTED,
 }
 """Metrics by study, with the heading of their column; the studies left out have no settings to list."""
@@ -37,7 +37,7 @@ def study_blocks(result: StudyResult) -> list[Block]:
     blocks: list[Block] = [f"{request.name}{figures}: {study.about}"]
     blocks += [f"{runs_text(request)} each, seed {request.seed}; {driven}", ""]
     if shown := {name: head for name, head in SHOWN.get(request.name, {}).items() if name in result.columns}:
-        errors = "; errors [m]" if shown.keys() >= ERRORS.keys() else ""
+        errors = "; errors [m]" if shown.keys() >= ERROR_WORDS.keys() else ""
         varies = f"by preset and {study.varies or 'setting'}"
         levels = [row for level in result.levels for row in _level_rows(level, shown)]
         blocks += [Table("lr", levels, ("", varies.rpartition(" ")[2], *shown.values()))]
@@ -56,7 +56,7 @@ def _level_rows(level: Level, shown: dict[str, str]) -> list[list[str]]:
     first, second = [level.setting.series, value if isinstance(value, str) else f"{value:g}"], ["", ""]
     for name in shown:
         found = level.metrics()[name]
-        form, never = "+z.3f" if name in ERRORS else ".3g", len(level.found[name]) - found["count"]
+        form, never = "+z.3f" if name in ERROR_WORDS else ".3g", len(level.found[name]) - found["count"]
         if name == "inverted":
             middle, around = f"{100 * found['mean']:.0f} %", ""
         elif not found["count"]:

@@ -10,7 +10,7 @@ import pytest
 
 from icrtool.alignment.conventions import AS_NAMED, Convention, decide_conventions, senses_by_distance
 from icrtool.alignment.corrections import align_streams
-from icrtool.alignment.log_track import cut_windows, track_of_log
+from icrtool.alignment.log_track import cut_drive_windows, track_of_log
 from icrtool.kernels.track import Track
 from icrtool.records.notes import warnings_of
 from icrtool.records.samples import GyroSamples
@@ -50,7 +50,7 @@ def track() -> Track:
     "one", [Convention(*parts) for parts in product((False, True), (1, -1), (1, -1), (1, -1), (1, -1))]
 )
 def test_a_spoilt_log_is_recognised(track: Track, one: Convention) -> None:
-    found = decide_conventions(cut_windows(spoilt(track, one)), metric=True)
+    found = decide_conventions(cut_drive_windows(spoilt(track, one)), metric=True)
     assert found.convention in equivalents(one)
 
 
@@ -67,7 +67,7 @@ def test_a_spoilt_log_is_recognised(track: Track, one: Convention) -> None:
     ],
 )
 def test_a_single_fault_is_named_itself(track: Track, one: Convention) -> None:
-    found = decide_conventions(cut_windows(spoilt(track, one)), metric=True, gyro_sense=one.heading)
+    found = decide_conventions(cut_drive_windows(spoilt(track, one)), metric=True, gyro_sense=one.heading)
     assert found.convention == one
 
 
@@ -77,14 +77,14 @@ def test_what_drives_forward_is_likelier_than_what_drives_backwards(track: Track
     one = AS_NAMED._replace(swapped=swapped, heading=-1)
     log = spoilt(track, one)
     log = log._replace(heading=log.heading + np.pi / 2)
-    found = decide_conventions(cut_windows(log), metric=False)
+    found = decide_conventions(cut_drive_windows(log), metric=False)
     assert found.convention == one
     assert found.as_likely is None
 
 
 def test_a_mirrored_pose_is_likelier_than_swapped_sides(track: Track) -> None:
     one = AS_NAMED._replace(heading=-1, position=-1)
-    found = decide_conventions(cut_windows(spoilt(track, one)._replace(same_clock=True)), metric=True)
+    found = decide_conventions(cut_drive_windows(spoilt(track, one)._replace(same_clock=True)), metric=True)
     assert found.convention == one
     assert found.as_likely == AS_NAMED._replace(swapped=True)
 
@@ -109,13 +109,13 @@ def test_a_gyro_tells_swapped_sides_from_a_mirrored_pose(sense: int) -> None:
 
 def test_geodetic_positions_are_never_mirrored(track: Track) -> None:
     mirrored = spoilt(track, AS_NAMED._replace(position=-1))
-    assert decide_conventions(cut_windows(mirrored), metric=False).convention.position == 1
+    assert decide_conventions(cut_drive_windows(mirrored), metric=False).convention.position == 1
 
 
 def test_a_straight_drive_decides_nothing() -> None:
     track = track_of_log(simulate(1, path="straight", seconds=80.0))
     swapped = spoilt(track, AS_NAMED._replace(swapped=True))
-    assert decide_conventions(cut_windows(swapped), metric=True).convention == AS_NAMED
+    assert decide_conventions(cut_drive_windows(swapped), metric=True).convention == AS_NAMED
 
 
 @pytest.mark.parametrize("one", [AS_NAMED, AS_NAMED._replace(sign_left=-1), AS_NAMED._replace(sign_right=-1)])

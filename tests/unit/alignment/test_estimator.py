@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icrtool.alignment.estimator import AlignmentFit, estimate_alignment
-from icrtool.alignment.log_track import cut_windows, track_of_log
+from icrtool.alignment.log_track import cut_drive_windows, track_of_log
 from support.exact_drives import ICRS, simulate
 
 WIDTH_M, OFFSET_DEG, SCALES = 0.6, 5.0, (1.03, 0.98)
@@ -21,7 +21,7 @@ LEAST_COVERAGE, LEAST_OF_ONE = 0.9, 0.8
 def estimate(seed: int, **track: float) -> AlignmentFit:
     log = simulate(seed, lever=(0.0, 0.0), offset_deg=OFFSET_DEG, scales=SCALES, seconds=160.0, **track)
     arrays = track_of_log(log)
-    found = estimate_alignment(cut_windows(arrays), WIDTH_M)
+    found = estimate_alignment(cut_drive_windows(arrays), WIDTH_M)
     assert found is not None
     return found
 
@@ -62,13 +62,13 @@ def test_delays_of_either_stream_are_found(gnss: float, heading: float) -> None:
 def test_too_few_fixes_give_no_estimate(samples: int) -> None:
     track = track_of_log(simulate(0, seconds=20.0))
     short = track.places(slice(samples))
-    assert estimate_alignment(cut_windows(short), WIDTH_M) is None
+    assert estimate_alignment(cut_drive_windows(short), WIDTH_M) is None
 
 
 def test_a_straight_drive_knows_that_it_shows_no_separation() -> None:
     log = simulate(0, path="straight", lever=(0.0, 0.0), scales=(1.0, 1.0), seconds=80.0)
     track = track_of_log(log)
-    found = estimate_alignment(cut_windows(track), WIDTH_M)
+    found = estimate_alignment(cut_drive_windows(track), WIDTH_M)
     assert found is not None
     geometry, covariance = found.geometry()
     assert np.sqrt(covariance[3, 3]) > 0.3 * abs(geometry.multiplier)
@@ -79,7 +79,7 @@ def test_a_damaged_speed_makes_no_more_windows_than_there_are_fixes() -> None:
     log = simulate(0, seconds=20.0)
     left = log.wheels.left.copy()
     left[100] = 1e5
-    windows = cut_windows(track_of_log(replace(log, wheels=replace(log.wheels, left=left))))
+    windows = cut_drive_windows(track_of_log(replace(log, wheels=replace(log.wheels, left=left))))
     assert len(windows.begin) <= len(log.gnss.stamp_ns)
 
 
@@ -89,7 +89,7 @@ def test_outliers_among_the_fixes_do_not_move_the_estimate() -> None:
     north = log.gnss.north_m.copy()
     north[rng.choice(len(north), len(north) // 100, replace=False)] += 5.0
     track = track_of_log(replace(log, gnss=replace(log.gnss, north_m=north)))
-    found = estimate_alignment(cut_windows(track), WIDTH_M)
+    found = estimate_alignment(cut_drive_windows(track), WIDTH_M)
     assert found is not None
     assert np.abs(np.array(found.geometry()[0][:2]) - ICRS[:2]).max() < 0.02
     assert np.abs(np.array(found.geometry()[0][4:]) - SCALES).max() < 0.02

@@ -11,7 +11,7 @@ import pytest
 from icrtool.alignment.conventions import AS_NAMED, decide_conventions
 from icrtool.alignment.corrections import Delay, StreamDelays, _clear_delays
 from icrtool.alignment.estimator import estimate_alignment
-from icrtool.alignment.log_track import cut_windows, track_of_log
+from icrtool.alignment.log_track import cut_drive_windows, track_of_log
 from icrtool.config import load_config
 from icrtool.pipeline import fit
 from icrtool.records.run import Run
@@ -142,7 +142,7 @@ def test_last_bits_of_an_exact_circle_name_no_side_reversed(relative: float) -> 
         )
         moved = replace(log.gnss, north_m=north, east_m=east)
         track = track_of_log(replace(log, gnss=moved, heading=replace(log.heading, heading_rad=psi)))
-        assert decide_conventions(cut_windows(track), metric=False).convention == AS_NAMED
+        assert decide_conventions(cut_drive_windows(track), metric=False).convention == AS_NAMED
 
 
 @pytest.mark.parametrize("row", [0, -1])
@@ -155,7 +155,7 @@ def test_a_stamp_decades_away_neither_fills_the_memory_nor_changes_the_delay(row
     tracemalloc.start()
     try:
         track = track_of_log(replace(log, wheels=wheels, heading=heading))
-        found = estimate_alignment(cut_windows(track), 0.8)
+        found = estimate_alignment(cut_drive_windows(track), 0.8)
         most = tracemalloc.get_traced_memory()[1]
     except MemoryError:
         pytest.fail("an array over the time between first and last stamp")

@@ -24,7 +24,7 @@ from icrtool.kernels.error_statistics import (
     difference_half_width,
     error_summary,
 )
-from icrtool.output.dropout_directory import open_baseline, read_report
+from icrtool.output.dropout_directory import open_baseline, read_baseline
 from icrtool.output.files.formats import json_bytes
 from icrtool.records.fleet_document import FleetFile, FleetLog
 from icrtool.records.run import Run
@@ -139,7 +139,7 @@ def test_a_report_equals_its_own_baseline(report: DropoutReport, written: Path) 
 
 
 def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, written: Path) -> None:
-    baseline = read_report(written, "earlier")
+    baseline = read_baseline(written, "earlier")
     gate = parse_gate("icr.p95@2m <= 0.97 * baseline")
     verdict = check_gate(gate, report, other_document(baseline, inputs=(other_file(baseline),)))
     assert verdict.margin_m < 0 < verdict.margin_high_m
@@ -175,7 +175,7 @@ def other_document(baseline: BaselineReport, **changes: Any) -> BaselineReport:
 
 
 def test_what_changed_is_listed(run: Run, report: DropoutReport, written: Path) -> None:
-    baseline = read_report(written, "earlier")
+    baseline = read_baseline(written, "earlier")
     config = baseline.document.run.config.with_filter(gate_probability=0.5)
     other = other_document(baseline, config=config, inputs=(other_file(baseline),))
     other = replace(other, document=msgspec.structs.replace(other.document, tool_version="0.0"))
@@ -210,7 +210,7 @@ def test_a_baseline_is_found_by_content_then_by_name(run: Run, report: DropoutRe
 def test_what_is_no_report_is_refused(written: Path, old: str, new: str) -> None:
     written.write_text(written.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
     with pytest.raises(ConfigError, match="baseline"):
-        read_report(written, "x")
+        read_baseline(written, "x")
     with pytest.raises(ConfigError, match="baseline"):
         open_baseline(written.parent / "nothing")
 

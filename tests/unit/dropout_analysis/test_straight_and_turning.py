@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from icrtool.dropout_analysis.starts import CELLS, STRAIGHT_RAD, heading_range
+from icrtool.dropout_analysis.starts import CELLS_A_HORIZON, STRAIGHT_RAD, heading_range
 from icrtool.kernels.track import Track
 
 HORIZON_M, STEP_M = 5.0, 0.6
@@ -22,7 +22,7 @@ def test_the_range_is_that_of_the_way_to_a_cell(seed: int) -> None:
     # standstill, spins on the spot and steps longer than a cell, in which the heading is between its neighbours
     distance = np.cumsum(rng.choice([0.0, 0.01, 0.1, STEP_M], size=600))
     heading = np.cumsum(rng.normal(0, 0.05, 600))
-    found, cell = heading_range(drive_along(distance, heading), HORIZON_M), HORIZON_M / CELLS + STEP_M
+    found, cell = heading_range(drive_along(distance, heading), HORIZON_M), HORIZON_M / CELLS_A_HORIZON + STEP_M
     for k in np.flatnonzero(distance < distance[-1] - HORIZON_M - cell)[::7]:
         inner = heading[k:][distance[k:] <= distance[k] + HORIZON_M]
         outer = heading[(distance >= distance[k] - cell) & (distance <= distance[k] + HORIZON_M + cell)]

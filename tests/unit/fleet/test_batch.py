@@ -65,7 +65,7 @@ processes.main()
 @pytest.fixture
 def season(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "script.py").write_text(SCRIPT)
-    monkeypatch.setattr(processes, "COMMAND", (sys.executable, str(tmp_path / "script.py")))
+    monkeypatch.setattr(processes, "PROCESS_COMMAND", (sys.executable, str(tmp_path / "script.py")))
     (tmp_path / "season").mkdir()
     yield tmp_path / "season"
     processes.close_all()
@@ -183,7 +183,7 @@ def test_a_worker_ends_with_whoever_started_it(season: Path) -> None:
     add(season, "hang")
     request = plan([season], season.parent / "out", BatchRequest())[0]
     process = subprocess.Popen(
-        processes.COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3],
+        processes.PROCESS_COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=Path(__file__).parents[3],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
     )  # fmt: skip
     assert process.stdin is not None

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from icrtool.errors import ConfigError
-from icrtool.fleet.recordings import About, about, read_manifest
+from icrtool.fleet.recordings import About, about_recording, read_manifest
 
 
 @pytest.fixture
@@ -27,15 +27,15 @@ def test_csv_and_toml_state_the_same(logs: Path) -> None:
     )
     assert read_manifest(logs / "m.csv") == read_manifest(logs / "m.toml")
     entries = read_manifest(logs / "m.csv")
-    assert about(logs / "mon" / "b.mcap", entries) == About("husky-a200", None, "grass", ("wet", "dark"))
-    assert about(logs / "tue" / "c.mcap", entries) == About("", logs / "t.toml", "gravel", ())
+    assert about_recording(logs / "mon" / "b.mcap", entries) == About("husky-a200", None, "grass", ("wet", "dark"))
+    assert about_recording(logs / "tue" / "c.mcap", entries) == About("", logs / "t.toml", "gravel", ())
 
 
 def test_a_later_line_refines_an_earlier_one(logs: Path) -> None:
     (logs / "m.csv").write_text("log,robot,group,tags\n**/*.mcap,jackal,grass,season\nmon/b.mcap,,ice,cold\n")
     entries = read_manifest(logs / "m.csv")
-    assert about(logs / "mon" / "b.mcap", entries) == About("jackal", None, "ice", ("season", "cold"))
-    assert about(logs / "mon" / "a.mcap", entries) == About("jackal", None, "grass", ("season",))
+    assert about_recording(logs / "mon" / "b.mcap", entries) == About("jackal", None, "ice", ("season", "cold"))
+    assert about_recording(logs / "mon" / "a.mcap", entries) == About("jackal", None, "grass", ("season",))
 
 
 def test_a_name_with_brackets_is_a_name_where_it_is_there(logs: Path) -> None:
@@ -100,7 +100,7 @@ def test_an_edited_manifest_is_refused_in_one_line_or_read(logs: Path) -> None:
             (logs / "m.csv").write_text(f"{','.join(line)}\n{','.join(str(text) for text in texts.values())}\n")
             for name in ("m.toml", "m.csv"):
                 try:
-                    about(logs / "mon" / "a.mcap", read_manifest(logs / name))
+                    about_recording(logs / "mon" / "a.mcap", read_manifest(logs / name))
                     read += 1
                 except ConfigError as err:
                     refusals.append(str(err))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from icrtool.kernels import compiled
-from icrtool.kernels.compiled import all_kernels, njit, places
+from icrtool.kernels.compiled import all_kernels, cache_places, njit
 
 CALL = """
 import sys
@@ -100,7 +100,7 @@ def test_numba_runs_what_it_passes_arguments_to_otherwise(monkeypatch: pytest.Mo
     monkeypatch.setitem(compiled._LLVM_TYPES, compiled._INTEGER, "i128")
     kernel = njit(weigh)
     assert kernel(*arguments()) == pytest.approx(weigh(*arguments()), abs=1e-12)
-    assert not list(places()[0].glob("*"))
+    assert not list(cache_places()[0].glob("*"))
 
 
 def rise(value: float) -> float:
@@ -109,7 +109,7 @@ def rise(value: float) -> float:
 
 def test_numba_runs_what_calls_more_than_the_known_functions() -> None:
     assert njit(rise)(0.5) == pytest.approx(math.log1p(0.5))
-    assert not list(places()[0].glob("*"))
+    assert not list(cache_places()[0].glob("*"))
 
 
 def double(value: float) -> float:
@@ -120,7 +120,7 @@ def test_numbers_of_numpy_are_taken_as_those_of_python() -> None:
     kernel = njit(double)
     assert [kernel(one) for one in (np.uint64(3), -1, np.float32(0.5), 0.25)] == [6, -2, 1.0, 0.5]
     assert kernel.compiled == 2
-    assert len(list(places()[0].glob("*.o"))) == 2
+    assert len(list(cache_places()[0].glob("*.o"))) == 2
 
 
 @pytest.mark.parametrize("wrong", ["text", 2**63, [1.0]], ids=repr)
@@ -139,7 +139,7 @@ def test_nothing_is_kept_of_what_numba_does_to_find_faults(
     assert kernel(2.0) == 4.0
     compiled._stamp.cache_clear()
     assert kernel.compiled == compiles
-    assert not list(places()[0].glob("*"))
+    assert not list(cache_places()[0].glob("*"))
 
 
 def test_code_for_another_processor_or_target_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,13 +194,13 @@ def test_a_kernel_compiles_again_where_any_file_of_kernels_has_changed(
 def test_a_user_without_a_home_has_no_cache_there(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
-    assert len(places()) == 2
+    assert len(cache_places()) == 2
 
     def homeless(path: Path) -> Path:
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.setattr(Path, "expanduser", homeless)
-    assert places() == [Path(compiled.__file__).parent / "__pycache__"]
+    assert cache_places() == [Path(compiled.__file__).parent / "__pycache__"]
 
 
 def test_every_kernel_is_found() -> None:

@@ -375,7 +375,7 @@ def test_an_index_that_is_right_is_used(kind, monkeypatch):
     chunk = make(np.random.default_rng(7), 3)
     data = np.frombuffer(chunk, np.uint8)
     places = np.array([record[2] for record in records_one_by_one(kind, chunk)[0]]) - HEAD_BYTES[kind]
-    monkeypatch.setattr("icrtool.logs.containers.chunk.follow", None)
+    monkeypatch.setattr("icrtool.logs.containers.chunk.follow_records", None)
     assert scan(data, 0, places).messages.shape == (4, 3)
 
 
@@ -394,7 +394,7 @@ def test_scan_refuses_a_length_that_the_chunk_does_not_have(kind, number):
 
 
 def test_a_chunk_of_more_records_than_the_table_has_rows_is_scanned_in_pieces(tmp_path, monkeypatch):
-    monkeypatch.setattr("icrtool.logs.containers.chunk.MOST_ROWS", 7)
+    monkeypatch.setattr("icrtool.logs.containers.chunk.MOST_RECORDS", 7)
     path = tmp_path / "log.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream, index_types=IndexType.ALL & ~IndexType.MESSAGE)

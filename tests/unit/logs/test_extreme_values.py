@@ -10,7 +10,7 @@ import pytest
 from icrtool.config import load_config
 from icrtool.errors import IcrToolError
 from icrtool.kernels.arrays import Floats
-from icrtool.logs.messages.topic_table import LARGEST, GrowingColumn, TopicTable
+from icrtool.logs.messages.topic_table import LARGEST_VALUE, GrowingColumn, TopicTable
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
 from icrtool.logs.streams.sources import HeadingSource, PositionSource
 from icrtool.records.samples import ROLE_WORDS, Role
@@ -18,7 +18,21 @@ from icrtool.records.text import LogText
 from support.tables import fields_of, read_source
 
 CONFIG = load_config(sets=["robot.track_width_m=0.55"])
-EXTREME = [0.0, -1.0, 1.0, np.nan, np.inf, -np.inf, LARGEST, -LARGEST, 1.7e308, -1.7e308, 1e155, 5e-324, 1e-310]
+EXTREME = [
+    0.0,
+    -1.0,
+    1.0,
+    np.nan,
+    np.inf,
+    -np.inf,
+    LARGEST_VALUE,
+    -LARGEST_VALUE,
+    1.7e308,
+    -1.7e308,
+    1e155,
+    5e-324,
+    1e-310,
+]
 WHEELS = [LogText(f"{end}_{side}_wheel") for end in ("front", "rear") for side in ("left", "right")]
 CODES = ("status", "flags", "mode", "error", "orientation", "unit", "reference", "type")
 """Last words of the fields that are whole numbers."""
@@ -53,8 +67,8 @@ def table_of(message_type: str, fields: tuple[str, ...], rng: np.random.Generato
 
 
 def test_what_is_too_large_is_infinite_in_a_column_and_all_else_is_kept() -> None:
-    values = np.array([1.0, LARGEST, -LARGEST, 1.7e308, -1e31, np.inf, -np.inf, np.nan, 5e-324, -0.0])
-    expected = [1.0, LARGEST, -LARGEST, np.inf, -np.inf, np.inf, -np.inf, np.nan, 5e-324, -0.0]
+    values = np.array([1.0, LARGEST_VALUE, -LARGEST_VALUE, 1.7e308, -1e31, np.inf, -np.inf, np.nan, 5e-324, -0.0])
+    expected = [1.0, LARGEST_VALUE, -LARGEST_VALUE, np.inf, -np.inf, np.inf, -np.inf, np.nan, 5e-324, -0.0]
     np.testing.assert_array_equal(held(values), expected)
     np.testing.assert_array_equal(held(np.full(5, -1.7e308)), np.full(5, -np.inf))
 

@@ -22,7 +22,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from icrtool.errors import DefinitionError
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import LONGEST_MESSAGE_BYTES, number_fields
-from icrtool.logs.messages.definitions import DEEPEST, steps_of
+from icrtool.logs.messages.definitions import DEEPEST, decoding_steps
 from icrtool.logs.messages.protobuf import LONGEST_DESCRIPTORS, descriptors_of, protobuf_parser
 from icrtool.logs.messages.topic_table import TopicTable, collector_for
 from icrtool.records.text import LONGEST_TEXT, LogText
@@ -328,7 +328,7 @@ def test_a_message_made_to_take_time_takes_none(raw: bytes) -> None:
 
 def test_a_message_is_read_by_its_wanted_fields_alone() -> None:
     """With all fields of a type that has thousands, each of a million empty messages in a list would take 40 kB."""
-    paths = [steps_of(path) for path in ("many[*].double", "again.again.sint32", "again.double")]
+    paths = [decoding_steps(path) for path in ("many[*].double", "again.again.sint32", "again.double")]
     message = protobuf_parser(descriptors_of(channel_of(schema()).definition, "t.All"), "t.All", paths)(b"")
     known: list[tuple[str, list[str]]] = []
 

@@ -15,7 +15,15 @@ from icrtool.kernels.robust import LOSS_SIGMAS
 from icrtool.kernels.track import Track
 from icrtool.motion.models import MODELS, TERMS, FittedModel, MotionModel, find_model, wheel_motion
 from icrtool.motion.recording import LogConstants, Recording, cut_trials, cut_windows, predicted_path
-from icrtool.motion.window_fit import SETTLED, Fold, Pool, PooledFit, own_constants, residuals_of, shortening
+from icrtool.motion.window_fit import (
+    LAST_DELAY_STEP_SIGMAS,
+    Fold,
+    Pool,
+    PooledFit,
+    own_constants,
+    residuals_of,
+    shortening,
+)
 from support.recordings import FAMILY, WIDTH_M, draw_parameters, make_recording, table_errors, trials_from_all, twist
 
 EIGHT = MODELS["recommended"]
@@ -212,7 +220,7 @@ def test_a_pooled_fit_is_that_of_the_dense_least_squares() -> None:
         return np.concatenate([np.sqrt(loss / pool.overlap), (x - mean) / std])
 
     theirs = least_squares(roots, mean, x_scale=std).x
-    assert np.all(np.abs(found.parameters - theirs[:k]) < SETTLED * found.std)
+    assert np.all(np.abs(found.parameters - theirs[:k]) < LAST_DELAY_STEP_SIGMAS * found.std)
 
 
 def test_what_is_left_beside_a_fold_is_not_enough() -> None:

@@ -13,7 +13,7 @@ from icrtool.calibration.pooled import calibrate
 from icrtool.calibration.record import Calibration, factor_to_old, fitted_model, parameter_documents, unfit_reasons
 from icrtool.errors import ConfigError, DataError
 from icrtool.motion.models import MODELS, FittedModel, Lever, controller_model, wheel_motion
-from icrtool.output.exports.controllers import TARGETS, format_export
+from icrtool.output.exports.controllers import CONTROLLER_TARGETS, format_export
 from icrtool.output.text_blocks import TEXT_WIDTH
 from icrtool.records.calibration_document import ControllerDocument
 from icrtool.records.run_document import ControllerNumbers
@@ -71,7 +71,7 @@ def test_json_holds_every_number(calibration: Calibration) -> None:
     assert document["schema"] == "icrtool/export/1"
 
 
-@pytest.mark.parametrize("target", [target for target in TARGETS if target not in {"json", "icr"}])
+@pytest.mark.parametrize("target", [target for target in CONTROLLER_TARGETS if target not in {"json", "icr"}])
 def test_comments_say_log_date_doubt_and_what_is_lost(calibration: Calibration, target: str) -> None:
     text = " ".join(
         line.removeprefix("# ") for line in format_export(calibration, target).splitlines() if line[0] == "#"

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from icrtool.output.figures.calibrations import FleetNumbers, fleet_errors, fleet_icrs
-from icrtool.output.figures.style import drawable, new_figure, picture_bytes, save, style
+from icrtool.output.figures.style import drawable, new_figure, picture_bytes, save_figure, style
 from icrtool.records.fleet_document import FleetLog
 
 HOSTILE = ("a$b^{$", "$\\frac{$", "\u6f22\u5b57", "\x1b[2J", "\udc80.mcap", "line\nbreak", "\U0010ffff", "\u202egpj")
@@ -23,7 +23,7 @@ HOSTILE = ("a$b^{$", "$\\frac{$", "\u6f22\u5b57", "\x1b[2J", "\udc80.mcap", "lin
 def test_a_hostile_name_is_drawn_as_text(tmp_path: Path, name: str) -> None:
     with warnings.catch_warnings(), style():
         warnings.simplefilter("error")
-        save(new_figure(name, name, width_in=3.0, height_in=2.0), tmp_path / "title", ("png", "svg", "pdf"))
+        save_figure(new_figure(name, name, width_in=3.0, height_in=2.0), tmp_path / "title", ("png", "svg", "pdf"))
     assert drawable(name).isprintable()
 
 
@@ -45,7 +45,7 @@ def test_every_robot_of_a_fleet_has_its_name_in_the_key(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for draw in (fleet_icrs, fleet_errors):
-            save(draw(fleet), tmp_path / "fleet", ("png", "svg"))
+            save_figure(draw(fleet), tmp_path / "fleet", ("png", "svg"))
     shown = [text.get_text().strip() for text in fleet_icrs(fleet).legends[0].get_texts()]
     assert shown == [drawable(name, 24) for name in names]
 

@@ -16,7 +16,7 @@ import pytest
 import icrtool
 from icrtool.errors import IcrToolError
 from icrtool.output.files.formats import json_bytes, open_calibration
-from icrtool.output.files.run_columns import COLUMNS, INTEGER_COLUMNS
+from icrtool.output.files.run_columns import COLUMNS_OF_STATES, INTEGER_COLUMNS
 from icrtool.output.run_directory import events_csv, log_of
 from icrtool.output.tables.run import format_run
 from support.edits import edited
@@ -227,7 +227,7 @@ def test_states_of_no_row_or_far_too_many_are_refused(run_place: Path, tmp_path:
 
     place = Path(shutil.copytree(run_place, tmp_path / "run"))
     (place / "states.csv").unlink()
-    types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS}
+    types = {name: pa.int64() if name in INTEGER_COLUMNS else pa.float64() for name in COLUMNS_OF_STATES}
     part = pa.table({name: pa.repeat(pa.scalar(0, kind), rows // 5) for name, kind in types.items()})
     with pq.ParquetWriter(place / "states.parquet", part.schema) as writer:
         for _ in range(5 if rows else 0):

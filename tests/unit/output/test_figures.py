@@ -14,7 +14,7 @@ from icrtool.kernels.filter_records import GATED
 from icrtool.output.figure_catalogue import FIGURES
 from icrtool.output.figures.calibrations import transfer
 from icrtool.output.figures.filter_estimates import gnss_difference
-from icrtool.output.figures.style import new_figure, save, style
+from icrtool.output.figures.style import new_figure, save_figure, style
 from icrtool.output.page.render import drawn_pictures
 from icrtool.pipeline import fit
 from icrtool.records.acceptance import CHOICE_HORIZON_M
@@ -231,14 +231,14 @@ def test_gnss_difference_marks_rejected_fixes_and_breaks_at_the_outage(run: Run)
 
 
 def test_line_styles_differ_in_grey() -> None:
-    from icrtool.output.figures.style import FILTER, FIX_COLOR, ICR, NO_SLIP
+    from icrtool.output.figures.style import FILTER, FIX_COLOR, ICR, NO_SLIP_LINE
 
     grey = [
         float(np.dot(mpl.colors.to_rgb(color), (0.299, 0.587, 0.114)))
-        for color in (FILTER["color"], ICR["color"], NO_SLIP["color"], FIX_COLOR)
+        for color in (FILTER["color"], ICR["color"], NO_SLIP_LINE["color"], FIX_COLOR)
     ]
     assert min(np.diff(sorted(grey))) > 0.09
-    assert len({str(pen["linestyle"]) for pen in (FILTER, ICR, NO_SLIP)}) == 3
+    assert len({str(pen["linestyle"]) for pen in (FILTER, ICR, NO_SLIP_LINE)}) == 3
 
 
 def test_the_picture_of_a_comparison_answers_with_both_errors_and_its_words_stand_apart() -> None:
@@ -275,10 +275,10 @@ def test_a_drive_that_shows_no_icrs_says_so_in_the_title(make_run: Callable[...,
 
 
 def test_a_users_settings_change_nothing(tmp_path, run: Run) -> None:
-    save(gnss_difference(run), tmp_path / "plain", ("png",))
+    save_figure(gnss_difference(run), tmp_path / "plain", ("png",))
     in_page = drawn_pictures([("gnss_difference", gnss_difference(run))])
     with mpl.rc_context({"font.size": 30.0, "axes.facecolor": "red", "savefig.dpi": 20, "text.usetex": True}):
-        save(gnss_difference(run), tmp_path / "set", ("png",))
+        save_figure(gnss_difference(run), tmp_path / "set", ("png",))
         assert drawn_pictures([("gnss_difference", gnss_difference(run))]) == in_page
         assert mpl.rcParams["font.size"] == 30.0
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "set.png").read_bytes()
@@ -286,7 +286,7 @@ def test_a_users_settings_change_nothing(tmp_path, run: Run) -> None:
 
 def test_a_pdf_has_the_same_bytes_every_time(tmp_path, run: Run) -> None:
     for place in ("one", "two"):
-        save(gnss_difference(run), tmp_path / place, ("pdf",))
+        save_figure(gnss_difference(run), tmp_path / place, ("pdf",))
     assert (tmp_path / "one.pdf").read_bytes() == (tmp_path / "two.pdf").read_bytes()
 
 

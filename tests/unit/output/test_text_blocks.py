@@ -20,7 +20,7 @@ from icrtool.output.text_blocks import (
     Line,
     Section,
     Table,
-    fitted,
+    fitted_to,
     format_blocks,
     format_markdown,
     stated,
@@ -49,7 +49,7 @@ def test_a_table_that_is_too_wide_cuts_no_number_of_a_run(run: Run, width: int) 
     tables = list(tables_of(run_blocks(run.document)))
     assert len(tables) > 1
     for table in tables:
-        narrow, left_out = fitted(table, width, 3)
+        narrow, left_out = fitted_to(table, width, 3)
         shown = {cell for row in narrow.rows for cell in row if "…" in cell}
         assert [cell for cell in shown if "±" in cell or cell.startswith(("+", "-"))] == []
         assert len(narrow.head) + len(left_out) == len(table.head)
@@ -58,7 +58,7 @@ def test_a_table_that_is_too_wide_cuts_no_number_of_a_run(run: Run, width: int) 
 
 def test_a_table_without_rows_is_nothing() -> None:
     assert format_blocks([Table("lr", [])]) == ""
-    assert fitted(Table("lr", []), 60, 3) == (Table("", []), [])
+    assert fitted_to(Table("lr", []), 60, 3) == (Table("", []), [])
 
 
 def test_what_is_empty_in_a_document_is_left_out() -> None:

@@ -23,7 +23,7 @@ from icrtool.simulation.drives import (
     check_drive,
     drive_plan,
     plan_body,
-    record,
+    record_drive,
     sample_times,
     sense,
     simulate,
@@ -187,7 +187,7 @@ def test_fixes_stand_on_the_globe_about_the_datum() -> None:
 
     truth = drive_plan(DrivePlan(duration_s=50.0), 0.01)
     seen = sense(truth, QUIET, 50.0, rng())
-    told = record(seen, QUIET, rng())
+    told = record_drive(seen, QUIET, rng())
     north, east, _ = geodetic2ned(told.latitude_deg, told.longitude_deg, told.height_m, *DATUM)
     np.testing.assert_allclose(np.column_stack([north, east]), seen.gnss_m, atol=1e-6)
     assert told.wheel_stamp_ns[0] == START_NS

@@ -8,7 +8,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
-from icrtool.output.files.run_columns import CHUNK_ROWS, StatesFormat, read_states, write_states
+from icrtool.output.files.run_columns import FORMATTED_ROWS, StatesFormat, read_states, write_states
 from icrtool.records.run import Run
 from icrtool.records.tables import States
 
@@ -65,7 +65,7 @@ def test_numbers_that_are_none_keep_their_kind(tmp_path: Path) -> None:
 
 
 def test_rows_keep_their_order_over_many_chunks(tmp_path: Path) -> None:
-    values = np.random.default_rng(1).standard_normal(3 * CHUNK_ROWS + 17)
+    values = np.random.default_rng(1).standard_normal(3 * FORMATTED_ROWS + 17)
     write_states(table_of(values), tmp_path / "states.csv", "csv")
     assert_same_bits(table_of(values), read_states(tmp_path / "states.csv", "csv"))
 
