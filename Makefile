@@ -115,8 +115,9 @@ docs: $(DEV)  ## build the documentation site into build/docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/docs
 	@echo "Pages: build/docs/index.html"
 
-schemas: $(DEV)  ## write the JSON schemas of the documents into docs/reference/schemas
+schemas: $(DEV)  ## write the JSON schemas of the documents into docs/reference/schemas, and docs/warnings.md
 	$(BIN)/python scripts/schemas.py
+	$(BIN)/python scripts/warning_codes.py
 
 samples: $(DEV)  ## simulate the sample logs again
 	$(BIN)/python $(SAMPLES)

@@ -48,6 +48,10 @@ CONTRADICTION_SIGMAS, CONTRADICTION_SHARE = 3.0, 0.1
 UNUSABLE_SHARE = 0.3
 """With more than this share of the fixes, or of the headings, rejected, the filter did not follow them."""
 
+REJECTED = {"fixes": "fixes_rejected", "headings": "headings_rejected"}
+MOSTLY_REJECTED = {"fixes": "fixes_mostly_rejected", "headings": "headings_mostly_rejected"}
+"""Codes of rejected measurements, by what is rejected; the second where the run is not usable for them."""
+
 
 def unusable_reasons(
     excitation: ExcitationDocument,
@@ -82,7 +86,7 @@ def unusable_reasons(
         reasons.append(note("icrs_inverted", "the ICRs ended inverted: check sides and signs of the wheels"))
     for word, share in rejected.items():
         if share > UNUSABLE_SHARE:
-            reasons.append(note(f"{word}_mostly_rejected", f"{100 * share:.0f} % of the {word} rejected"))
+            reasons.append(note(MOSTLY_REJECTED[word], f"{100 * share:.0f} % of the {word} rejected"))
     if noise.position_mps * STEP > LARGEST_POSITION_MPS:
         reasons.append(note("motion_unexplained", "the wheels explain almost none of the motion"))
     elif noise.heading_degps > USELESS_HEADING_DEGPS:
@@ -187,7 +191,7 @@ def run_warnings(
     for word, share in rejected.items():
         if share > WORTH_WARNING_SHARE:
             cause = _cause_of_rejection(findings.get(delays[word]))
-            found.append(note(f"{word}_rejected", f"{100 * share:.0f} % of the {word} were rejected: {cause}"))
+            found.append(note(REJECTED[word], f"{100 * share:.0f} % of the {word} were rejected: {cause}"))
     return about(name, found)
 
 

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from icrtool.records.note_catalogue import CATALOGUE, GRADES, Grade
+from icrtool.records.explanations import GRADES, Grade
+from icrtool.records.note_catalogue import CATALOGUE
 from icrtool.records.plain_data import Record
 
 GRAVE: Grade = "grave"
