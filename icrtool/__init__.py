@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from icrtool.dropout_analysis.report import DropoutReport
     from icrtool.errors import IcrToolError
     from icrtool.logs.read_log import read_log
+    from icrtool.motion.adaptive import AdaptiveModel
+    from icrtool.motion.robot_prior import prior_of_robots
     from icrtool.output.files.formats import open_calibration
     from icrtool.output.page.pages import write_page
     from icrtool.output.run_directory import open_run
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "AdaptiveModel",
     "Calibration",
     "Config",
     "DropoutReport",
@@ -63,11 +66,13 @@ __all__ = [
     "load_config",
     "open_calibration",
     "open_run",
+    "prior_of_robots",
     "read_log",
     "write_page",
 ]
 
 _HOMES = {
+    "AdaptiveModel": "icrtool.motion.adaptive",
     "Calibration": "icrtool.calibration.record",
     "Config": "icrtool.config",
     "DropoutReport": "icrtool.dropout_analysis.report",
@@ -82,6 +87,7 @@ _HOMES = {
     "load_config": "icrtool.config",
     "open_calibration": "icrtool.output.files.formats",
     "open_run": "icrtool.output.run_directory",
+    "prior_of_robots": "icrtool.motion.robot_prior",
     "read_log": "icrtool.logs.read_log",
     "write_page": "icrtool.output.page.pages",
 }

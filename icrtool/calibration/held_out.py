@@ -177,17 +177,22 @@ class HeldOut:
 
     def path(self, name: str, i: int, start: int, end: int) -> OpenLoopPath | None:
         """Return the path of a row from one state of recording i to another, predicted without what it touches."""
-        recording, rows = self.recordings[i], np.arange(start, end + 1)
-        track, t = recording.track, recording.track.t
-        ends = (np.array([track.distance[row]]) for row in (start, end))
+        recording = self.recordings[i]
+        ends = (recording.track.distance[row : row + 1] for row in (start, end))
         ((fold, _),) = left_out(self.folds, i, *ends)
         if (found := self.without(name, fold)) is None:
             return None
-        steps = self.fits[RECOMMENDED].pool.windows[i].track.around(t[start], t[end])
-        turned, place = predicted_path(recording, *found, steps)(t[rows])
-        turn = track.heading[start] - turned[0]
-        moved = np.exp(1j * turn) * (place - place[0])
-        return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, turned + turn)
+        return path_between(recording, found, self.fits[RECOMMENDED].pool.windows[i].track, start, end)
+
+
+def path_between(recording: Recording, found: Prediction, steps: Track, start: int, end: int) -> OpenLoopPath:
+    """Return the path that a model predicts from one state of a recording to another; `steps`: its samples joined."""
+    track, rows = recording.track, np.arange(start, end + 1)
+    near = steps.around(track.t[start], track.t[end])
+    turned, place = predicted_path(recording, *found, near)(track.t[rows])
+    turn = track.heading[start] - turned[0]
+    moved = np.exp(1j * turn) * (place - place[0])
+    return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, turned + turn)
 
 
 def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:

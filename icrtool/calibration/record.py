@@ -18,6 +18,7 @@ from msgspec import UNSET, UnsetType
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config, RobotConfig
 from icrtool.kernels.arrays import Floats, Ints
+from icrtool.motion.adaptive import TermsPrior
 from icrtool.motion.models import (
     FIVE,
     NO_SLIP,
@@ -28,6 +29,7 @@ from icrtool.motion.models import (
     find_model,
     wheel_motion,
 )
+from icrtool.motion.robot_prior import prior_of_model
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.notes import Note, is_grave, note
@@ -175,6 +177,11 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         """Return the three ICRs [m] and their covariance [m^2] for a filter to begin with (`icrtool.fit`)."""
         geometry, covariance = self._geometry()
         return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m)
+
+    def prior(self) -> TermsPrior:
+        """Return what it shows of the robot's next drive, for `icrtool.AdaptiveModel` to begin with."""
+        source = "calibration" if self.name is UNSET else self.name
+        return prior_of_model(self.width_m, self.fitted, self.fitted_with_gyro, source)
 
     def fitted_to(self, sha256: str) -> bool:
         """Return whether a log was among those the calibration was fitted to."""

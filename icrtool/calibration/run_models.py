@@ -6,7 +6,7 @@ the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from icrtool.calibration import pooled
+from icrtool.calibration.adaptive_rows import adapt, prior_for
 from icrtool.calibration.held_out import GYRO_SUFFIX, HeldOut, fit_models, hold_out
 from icrtool.calibration.record import Calibration, controller_numbers, fitted_document
 from icrtool.errors import DataError
@@ -100,6 +101,17 @@ class ComparedRow(NamedTuple):
     knows: str = ""
 
 
+def adaptive_rows(recording: Recording, heading: str, calibrations: Sequence[Calibration] = ()) -> list[ComparedRow]:
+    """Return row ``adaptive`` of a recording, and the one with the measured heading of a kind where it has one."""
+    drive = adapt(recording, prior_for(recording, calibrations))
+    knows = f"{drive.prior.source}, and the drive before each start"
+    rows = [ComparedRow("adaptive", drive.errors, drive.path, knows)]
+    if heading:
+        turned = partial(drive.errors, turned=True), partial(drive.path, turned=True)
+        rows.append(ComparedRow(f"adaptive_{heading}", *turned, knows))
+    return rows
+
+
 class ComparedModels(NamedTuple):
     """How the rows of a report were tested that are not the filter's.
 
@@ -120,13 +132,16 @@ class ComparedModels(NamedTuple):
     calibration: Calibration | None
 
 
-def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> ComparedModels:
+def compare_models(
+    run: Run, headings: Iterable[MeasuredHeading] = (), calibrations: Sequence[Calibration] = ()
+) -> ComparedModels:
     """Test every model on distance it was not fitted to.
 
     Parameters
     ----------
     run : a finished run, or one read back
     headings : measured headings, best first, for the models that need not turn by wheels alone
+    calibrations : row ``adaptive`` begins with the first one that was not fitted to this log, else with other robots
 
     Raises
     ------
@@ -148,6 +163,7 @@ def compare_models(run: Run, headings: Iterable[MeasuredHeading] = ()) -> Compar
     found = hold_out([recording])
     give_back_freed()
     rows = [row for row in _rows(run, found, heading) if run.track_width_m is not None or NO_SLIP not in row.name]
+    rows += adaptive_rows(recording, heading, calibrations)
     calibration = None
     if run.track_width_m is not None:
         calibration = pooled.calibration_from(found, pooled.robot_of(run, recording.width_m), pooled.use_notes(run))

@@ -164,7 +164,8 @@ def report_on(
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
-        ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro
+        ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro. Row
+        ``adaptive`` begins with the first one that was not fitted to this log, without one with other robots
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
@@ -199,7 +200,7 @@ def report_on(
     found, why = None, unusable
     if request.ladder and not unusable:
         try:
-            found = compare_models(compared, measured_headings(run))
+            found = compare_models(compared, measured_headings(run), calibrations)
         except DataError as err:
             why = f"{err.why}, {err.advice}"
     give_back_freed()

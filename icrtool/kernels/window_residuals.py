@@ -8,12 +8,15 @@ d Theta / d theta does not depend on them; cumulative sums over the steps give b
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats, Ints
 from icrtool.kernels.track import Track
+
+Number = TypeVar("Number", np.float64, np.complex128)
 
 VX, VY, OMEGA = 0, 1, 2
 """Axes of the body twist."""
@@ -38,6 +41,15 @@ class PathKnots(NamedTuple):
     velocity: Complexes
     heading_by: Floats
     place_by: Complexes
+
+
+def sums_from(first: np.generic, parts: NDArray[Number]) -> NDArray[Number]:
+    """Return the sums (n + 1,) of parts (n,), each before the next part, from the first sum on."""
+    sums = np.empty(len(parts) + 1, parts.dtype)
+    sums[0] = first
+    sums[1:] = parts
+    np.cumsum(sums, out=sums)
+    return sums
 
 
 def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> PathKnots:
@@ -69,12 +81,12 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
         here = slice(*np.searchsorted(row, [lo, lo + len(lasting)]))
         step, share = row[here] - lo, part[here]
         turned = lasting * omega
-        heading = np.cumsum(np.append(heading[-1], turned))
+        heading = sums_from(heading[-1], turned)
         angle, forward = heading[:-1] + ahead * omega, np.empty(len(lasting), np.complex128)
         forward.real, forward.imag = np.cos(angle), np.sin(angle)
         velocity = (v_x + 1j * v_y) * forward
         moved = lasting * velocity
-        place = np.cumsum(np.append(place[-1], moved))
+        place = sums_from(place[-1], moved)
         moving = lasting[step] > 0.0
         found.heading[here] = heading[step] + share * turned[step]
         found.turn_rate[here] = np.where(moving, omega[step], 0.0)
@@ -83,13 +95,13 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
         for a in range(k):
             by = lasting * columns[a]
             if axis[a] == OMEGA:
-                turned_by = np.cumsum(np.append(heading_by[a], by))
+                turned_by = sums_from(heading_by[a, 0], by)
                 found.heading_by[a, here] = turned_by[step] + share * by[step]
                 heading_by[a] = turned_by[-1]
                 moved_by = (turned_by[:-1] + ahead * columns[a]) * moved
             else:
                 moved_by = by * forward
-            sums = np.cumsum(np.append(place_by[a], moved_by))
+            sums = sums_from(place_by[a, 0], moved_by)
             # a turn and a velocity to the right move it at right angles to what is summed here
             found.place_by[a, here] = (sums[step] + share * moved_by[step]) * (1.0 if axis[a] == VX else 1j)
             place_by[a] = sums[-1]

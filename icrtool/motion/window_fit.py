@@ -62,8 +62,8 @@ def constant_std(model: MotionModel) -> Floats:
     return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:CONSTANTS_OF_WHEELS]
 
 
-def shortening(turned: Floats, length_m: Floats) -> Floats:
-    """Return the share (w,) of its displacement that a window goes on average where slip makes its heading wander.
+def heading_wander(turned: Floats, length_m: Floats) -> float:
+    """Return the variance of a heading that slip makes wander, for each metre [rad^2/m]; 0 of windows of one length.
 
     Parameters
     ----------
@@ -71,21 +71,39 @@ def shortening(turned: Floats, length_m: Floats) -> Floats:
 
     Notes
     -----
+    What longer windows stray more than short ones: what both have is of the reference.
+    """
+    short, long = float(length_m.min()), float(length_m.max())
+    if short == long:
+        return 0.0
+    near, far = (mad_std(turned[length_m == one]) ** 2 for one in (short, long))
+    return max(far - near, 0.0) / (long - short)
+
+
+def shortening(wander: float, length_m: Floats) -> Floats:
+    """Return the share (w,) of its displacement that a window goes on average where slip makes its heading wander.
+
+    Parameters
+    ----------
+    wander : of `heading_wander` [rad^2/m]; length_m : (w,) of the windows
+
+    Notes
+    -----
     A heading that wanders with a variance of q for each metre leaves the mean of e^{j Theta} short by q s / 2 after s
     metres: a displacement over L by q L / 4, to first order. Without it, the scale of the wheels, and with it the
-    multiplier, is too small. q is what longer windows stray more than short ones: what both have is of the reference.
+    multiplier, is too small.
     """
-    short, long = length_m.min(), length_m.max()
-    if short == long:
-        return np.ones(len(turned))
-    grown = np.square([mad_std(turned[length_m == one]) for one in (short, long)])
-    shares: Floats = np.exp(-max(grown[1] - grown[0], 0.0) / (long - short) * length_m / 4.0)
-    return shares
+    return np.asarray(np.exp(-wander * length_m / 4.0))
+
+
+Residuals = Callable[[Floats, Floats], tuple[Floats, Floats]]
+"""Gives residuals (m,) and their derivatives (m, k + c), of parameters (k,) and constants (c,)."""
 
 
 def residuals_of(
-    windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None
-) -> Callable[[Floats, Floats], tuple[Floats, Floats]]:
+    windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None,
+    wander: float | None = None,
+) -> Residuals:  # fmt: skip
     """Return what gives the residuals of all windows of one recording for one model, by sqrt(length).
 
     Displacements alone do not separate a turn from side slip, and show little of a spin on the spot: turns are
@@ -96,6 +114,7 @@ def residuals_of(
     windows : of `icrtool.motion.recording.cut_windows`
     model, width_m : what predicts, and the track width b [m]
     wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
+    wander : of `heading_wander`, where it is known [rad^2/m]; default: that of these windows
 
     Returns
     -------
@@ -130,7 +149,8 @@ def residuals_of(
             columns[-1] = (1.0 + parameters @ gains) * gyro_change
         path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), values, knot_t + delay)
         turned, turned_by = turn_residuals(path, start, end, seen_turned, root)
-        share = shortening(turned * root, windows.length_m)
+        strayed = heading_wander(turned * root, windows.length_m) if wander is None else wander
+        share = shortening(strayed, windows.length_m)
         moved, moved_by = window_residuals(path, start, end, seen, offset, root, share)
         # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
         terms = len(axes)

@@ -224,7 +224,7 @@ def test_the_ladder_holds_the_rows_of_the_summary(fitted: Path) -> None:
     document = json.loads((fitted / RUN / "dropout" / "report.json").read_text(encoding="utf-8"))["ladder"]
     rows, summary = (pd.read_csv(fitted / RUN / "dropout" / f"{name}.csv") for name in ("ladder", "summary"))
     names = [model["name"] for model in document["models"]]
-    wheels = {"icr", "no_slip", "icr_final", "controller", "recommended"}
+    wheels = {"icr", "no_slip", "icr_final", "controller", "recommended", "adaptive"}
     assert set(names) == wheels | {f"{name}_gyro" for name in wheels}
     assert list(rows.model.unique()) == names
     for name in ("trials", "expected_error_m", "p95_m"):

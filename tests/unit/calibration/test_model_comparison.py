@@ -90,7 +90,7 @@ def test_all_rows_have_errors_in_the_same_trials(run: Run) -> None:
     found, errors = compared_errors(run, measured_headings(run))
     assert list(errors) == [
         "controller", "recommended", "no_slip_heading", "controller_heading", "recommended_heading", "icr_heading",
-        "icr_final_heading",
+        "icr_final_heading", "adaptive", "adaptive_heading",
     ]  # fmt: skip
     for one in errors.values():
         assert np.array_equal(np.isfinite(one), found.table.trials[0].ends >= 0)

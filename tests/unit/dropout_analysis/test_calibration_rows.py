@@ -126,7 +126,7 @@ def test_gates_and_budgets_know_every_row(report: DropoutReport) -> None:
 
 def test_files_and_figures_hold_every_row(report: DropoutReport, tmp_path: Path) -> None:
     report.write(tmp_path / "dropout")
-    rows = {"icr", "no_slip", "icr_final", "controller", "recommended"}
+    rows = {"icr", "no_slip", "icr_final", "controller", "recommended", "adaptive"}
     names = rows | {f"{row}_heading" for row in rows} | {"calibration:own", "calibration:last.season"}
     assert set(pd.read_csv(tmp_path / "dropout" / "summary.csv")["model"]) == names
     assert set(pd.read_csv(tmp_path / "dropout" / "histogram.csv")["model"]) == names

@@ -1,0 +1,332 @@
+"""A motion model that learns from the past of a drive, sample by sample: on board, and as row ``adaptive`` of a report.
+
+It begins with a prior, a calibration or what is known of robots, and adds the windows of driven distance that have
+ended, by the terms, residuals, weights and priors of `icrtool.motion.window_fit`. Solutions follow one another by
+Gauss-Newton steps; the normal equations are added to. Until a drive is `REBUILT_TO_M` long they are also made anew from
+time to time, since its first windows were linearised far from what later ones show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.kernels.arrays import Floats, Ints
+from icrtool.kernels.elimination import normal_equations
+from icrtool.kernels.robust import robust_weights, scale_by_kind
+from icrtool.kernels.track import Windows
+from icrtool.kernels.window_residuals import OMEGA
+from icrtool.motion.drive_buffer import LARGEST_ADVANCE_M, DriveBuffer
+from icrtool.motion.models import GYRO_TERMS, MODELS, RECOMMENDED, TERMS, FittedModel, MotionModel, wheel_motion
+from icrtool.motion.recording import NO_CONSTANTS, LogConstants, size_of
+from icrtool.motion.window_fit import KINDS, Residuals, constant_std, heading_wander, residuals_of
+
+OVERLAP = 40.0
+"""Number of windows that count as one independent one. A stretch of 20 m holds 80, and shows a term about twice."""
+
+GAUSS_NEWTON_STEPS = 3
+"""Steps from one solution to the next."""
+
+SHARE_OF_DISTANCE, SHORTEST_M, LONGEST_M = 0.02, 2.0, 6.0
+"""The parameters are solved for again after this share of the driven distance, within these bounds [m]."""
+
+REBUILT_SHARE, REBUILT_TO_M = 0.3, 150.0
+"""All windows are linearised anew each time the distance has grown by this share, up to this distance [m]."""
+
+SETTLE_S = 0.5
+"""Time from the end of a window to its use [s]: the wheels may be read later than the poses by `LARGEST_DELAY_S`."""
+
+LARGEST_DELAY_S = 0.4
+"""Largest delay between wheels and poses [s], four standard deviations of its prior."""
+
+FEWEST_FOR_WANDER = 60
+"""Number of windows from which on it is estimated how much a heading wanders. Fewer show how the prior is off."""
+
+USUAL_STD, USUAL_COUNTS_AS = (0.03, 0.03), 4.0
+"""Spread of residuals before there are any, of displacements [m^0.5] and turns [rad/m^0.5], and the number of
+independent windows that it counts as. The first few windows fit almost exactly, whatever they show."""
+
+MOST_PENDING = 1000
+"""Number of samples after which those of a robot that stands are taken."""
+
+MODEL, TURNED = MODELS[RECOMMENDED], MODELS[RECOMMENDED].with_gyro()
+"""The model by the wheels alone, and with a gyro."""
+
+SHARED = [name for name in MODEL.terms if name in TURNED.terms]
+OF_WHEELS, OF_TURNED = ([one.terms.index(name) for name in SHARED] for one in (MODEL, TURNED))
+"""Places of the terms that both have, in the one without and in the one with a gyro."""
+
+
+@dataclass(frozen=True)
+class TermsPrior:
+    """What is known of a robot before a drive: mean and covariance of the terms of model `RECOMMENDED`.
+
+    Attributes
+    ----------
+    width_m : track width b that the terms refer to [m]
+    mean, covariance : (8,), (8, 8)
+    turned_mean, turned_covariance : of the terms of the model with a gyro (6,), (6, 6)
+    source : what it was made from, in a few words
+    """
+
+    width_m: float
+    mean: Floats
+    covariance: Floats
+    turned_mean: Floats
+    turned_covariance: Floats
+    source: str = ""
+
+    @classmethod
+    def of_wheels(cls, width_m: float, mean: Floats, covariance: Floats, source: str = "") -> TermsPrior:
+        """Return a prior of the terms without a gyro; what a gyro adds is as gyros usually are."""
+        gyro_std = np.array([TERMS[name].std for name in GYRO_TERMS])
+        k = len(OF_WHEELS)
+        turned_mean, turned = np.zeros(k + len(gyro_std)), np.zeros((k + len(gyro_std), k + len(gyro_std)))
+        turned_mean[OF_TURNED] = mean[OF_WHEELS]
+        turned[np.ix_(OF_TURNED, OF_TURNED)] = covariance[np.ix_(OF_WHEELS, OF_WHEELS)]
+        turned[range(k, k + len(gyro_std)), range(k, k + len(gyro_std))] = gyro_std**2
+        return cls(width_m, mean, covariance, turned_mean, turned, source)
+
+
+class Learned(NamedTuple):
+    """What is known from one time of a drive on.
+
+    Attributes
+    ----------
+    t_s : the time [s]; distance_m : driven by then
+    fitted, constants : the model by the wheels alone, and the constants of the drive
+    turned, turned_constants : the model with a gyro; None without one
+    """
+
+    t_s: float
+    distance_m: float
+    fitted: FittedModel
+    constants: LogConstants
+    turned: FittedModel | None = None
+    turned_constants: LogConstants = NO_CONSTANTS
+
+
+class Estimate:
+    """Parameters of a model and constants of a drive, with the normal equations of the windows so far.
+
+    Attributes
+    ----------
+    x : (k + c,) parameters, then `LogConstants`; mean, prior : (k + c,), (k + c, k + c) mean and information before
+    matrix, vector : (k + c, k + c), (k + c,) of the data: x solves (prior + matrix) x = prior mean + vector
+    scale : (2,) robust standard deviation of the residuals of displacements and turns
+    wander : of the heading, for each metre [rad^2/m]
+    fitted, constants : x as what predicts
+    """
+
+    def __init__(self, model: MotionModel, width_m: float, mean: Floats, covariance: Floats) -> None:
+        self.model, self.width_m = model, width_m
+        own, k = constant_std(model), len(model.terms)
+        self.mean = np.concatenate([mean, np.zeros(len(own))])
+        self.prior = np.diag(np.concatenate([np.zeros(k), own**-2.0]))
+        self.prior[:k, :k] = np.linalg.inv(covariance)
+        self.matrix, self.vector = np.zeros_like(self.prior), np.zeros_like(self.mean)
+        self.x, self.scale, self.wander = self.mean, np.array(USUAL_STD), 0.0
+        self.fitted, self.constants = FittedModel(model, mean, covariance), NO_CONSTANTS
+
+    def solve_anew(self, windows: Windows, wheels: FittedModel | None = None) -> None:
+        """Solve with all windows so far, linearised at every step; `wheels` as in `residuals_of`."""
+        kind = np.repeat(KINDS, len(windows.begin))
+        few = len(windows.begin) < FEWEST_FOR_WANDER
+        evaluate = residuals_of(windows, self.model, self.width_m, wheels, 0.0 if few else None)
+        at, (residuals, jacobian) = self.x, self._evaluated(evaluate)
+        for step in range(GAUSS_NEWTON_STEPS):
+            if step:
+                at, (residuals, jacobian) = self.x, self._evaluated(evaluate)
+            self.scale = _scale_of(residuals, kind)
+            self._step(*self._equations(residuals, jacobian, kind, at))
+        self.matrix, self.vector = self._equations(residuals, jacobian, kind, at)
+        if not few:
+            turns = (residuals + jacobian @ (self.x - at))[kind == KINDS[-1]]
+            self.wander = heading_wander(turns * np.sqrt(windows.length_m), windows.length_m)
+        self._finish(wheels)
+
+    def solve_with(self, windows: Windows, wheels: FittedModel | None = None) -> None:
+        """Solve with some further windows, linearised at the last solution."""
+        kind = np.repeat(KINDS, len(windows.begin))
+        at = self.x
+        residuals, jacobian = self._evaluated(residuals_of(windows, self.model, self.width_m, wheels, self.wander))
+        for _ in range(GAUSS_NEWTON_STEPS):
+            matrix, vector = self._equations(residuals, jacobian, kind, at)
+            self._step(self.matrix + matrix, self.vector + vector)
+        matrix, vector = self._equations(residuals, jacobian, kind, at)
+        self.matrix, self.vector = self.matrix + matrix, self.vector + vector
+        self._finish(wheels)
+
+    def _evaluated(self, evaluate: Residuals) -> tuple[Floats, Floats]:
+        k = len(self.model.terms)
+        return evaluate(self.x[:k], self.x[k:])
+
+    def _equations(self, residuals: Floats, jacobian: Floats, kind: Ints, at: Floats) -> tuple[Floats, Floats]:
+        """Return matrix and vector of residuals (m,) that were linearised at some parameters, weighted at `x`."""
+        here = residuals + jacobian @ (self.x - at)
+        weights = robust_weights(here, self.scale[kind], OVERLAP)
+        return normal_equations(jacobian @ at - residuals, jacobian, weights)
+
+    def _step(self, matrix: Floats, vector: Floats) -> None:
+        x = np.linalg.solve(self.prior + matrix, self.prior @ self.mean + vector)
+        delay = len(self.model.terms) + LogConstants._fields.index("wheels_later_s")
+        x[delay] = np.clip(x[delay], -LARGEST_DELAY_S, LARGEST_DELAY_S)
+        if np.isfinite(x).all():
+            self.x = x
+
+    def _finish(self, wheels: FittedModel | None) -> None:
+        k = len(self.model.terms)
+        covariance = np.linalg.inv(self.prior + self.matrix)[:k, :k]
+        self.fitted = FittedModel(self.model, self.x[:k], covariance, wheels)
+        self.constants = LogConstants(*self.x[k:].tolist())
+
+
+def _scale_of(residuals: Floats, kind: Ints) -> Floats:
+    """Return the robust standard deviation (2,) of the residuals of each kind, with the usual one."""
+    count = len(kind) / len(KINDS) / OVERLAP
+    found = scale_by_kind(residuals, kind)[[0, -1]]
+    together = (count * found**2 + USUAL_COUNTS_AS * np.square(USUAL_STD)) / (count + USUAL_COUNTS_AS)
+    return np.asarray(np.sqrt(together))
+
+
+class AdaptiveModel:
+    """A motion model that starts from a prior and learns from the samples of a drive as they come.
+
+    Frames and signs are those of `icrtool`: x forward, y right, turns clockwise. It holds some kilobytes, opens no file
+    and knows no log.
+
+    Parameters
+    ----------
+    prior : of `icrtool.Calibration.prior`, or `icrtool.prior_of_robots`
+    with_gyro : turn by a gyro and the wheels; each sample then needs the gyro's turn rate
+
+    Attributes
+    ----------
+    distance_m : driven so far
+    """
+
+    def __init__(self, prior: TermsPrior, *, with_gyro: bool = False) -> None:
+        self.prior, self.with_gyro, self.distance_m = prior, with_gyro, 0.0
+        size = size_of(prior.width_m)
+        self._drive, self._longest_m = DriveBuffer(size), LARGEST_ADVANCE_M * size
+        self._wheels = Estimate(MODEL, prior.width_m, prior.mean, prior.covariance)
+        self._turned = None
+        if with_gyro:
+            turned = Estimate(TURNED, prior.width_m, prior.turned_mean, prior.turned_covariance)
+            turned.fitted = FittedModel(turned.model, prior.turned_mean, prior.turned_covariance, self._wheels.fitted)
+            self._turned = turned
+        self._used, self._next_m, self._next_anew_m = 0, SHORTEST_M * size, 0.0
+        self._pending: list[tuple[float, ...]] = []
+        self._last: tuple[float, float, float] | None = None
+        self._begin_s: float | None = None
+
+    @property
+    def now(self) -> Learned:
+        """What is known now."""
+        wheels, turned = self._wheels, self._turned
+        time_s = self._last[0] if self._last is not None else 0.0
+        if turned is None:
+            return Learned(time_s, self.distance_m, wheels.fitted, wheels.constants)
+        return Learned(time_s, self.distance_m, wheels.fitted, wheels.constants, turned.fitted, turned.constants)
+
+    def observe(
+        self, t_s: float, v_left: float, v_right: float, pose: Sequence[float] | None = None, gyro_radps: float = 0.0,
+        *, broken: bool = False, gap: bool = False,
+    ) -> bool:  # fmt: skip
+        """Take one sample; return whether the parameters changed.
+
+        Parameters
+        ----------
+        t_s : its time, of any clock, ascending
+        v_left, v_right : wheel speeds [m/s] at the configured radius, which hold until the next sample
+        pose : north, east [m] and heading [rad] of the reference at that time; None while there is none (no GNSS)
+        gyro_radps : turn rate of the gyro, clockwise
+        broken : the robot slips, or the reference jumps, before the next sample: no window crosses it
+        gap : the wheels are not known until the next sample
+        """
+        begin = self._begin_s = t_s if self._begin_s is None else self._begin_s
+        north, east, heading = (np.nan, np.nan, np.nan) if pose is None else pose
+        at = t_s - begin
+        before = self.distance_m
+        if self._last is not None:
+            since, speed, unknown = self._last
+            advance = abs(speed) * (at - since)
+            if not unknown and at >= since and advance <= self._longest_m:
+                self.distance_m += advance
+        self._last = at, (v_left + v_right) / 2.0, float(gap)
+        self._pending.append(
+            (at, v_left, v_right, north, east, heading, gyro_radps, pose is not None, float(broken), float(gap))
+        )
+        every = self._drive.every_m
+        if math.floor(self.distance_m / every) == math.floor(before / every) and len(self._pending) < MOST_PENDING:
+            return False
+        samples, self._pending = np.array(self._pending, np.float64).T, []
+        return bool(self._take(samples))
+
+    def observe_all(self, samples: Floats) -> list[Learned]:
+        """Take many samples (10, n) at once, `icrtool.motion.drive_buffer.COLUMNS`; return what was learned, in order.
+
+        Notes
+        -----
+        As `observe` of each, their times counted from the first one.
+        """
+        if self._begin_s is None:
+            self._begin_s = 0.0
+        found = self._take(samples)
+        self.distance_m = self._drive.distance_m
+        self._last = float(samples[0, -1]), float(samples[1, -1] + samples[2, -1]) / 2.0, float(samples[-1, -1])
+        return found
+
+    def twist(self, v_left: Floats | float, v_right: Floats | float, gyro_radps: Floats | float = 0.0) -> Floats:
+        """Return the body twist v_x, v_y [m/s], omega [rad/s] of wheel speeds [m/s], (3,) or (3, n), as known now.
+
+        Parameters
+        ----------
+        v_left, v_right : at the configured wheel radius; gyro_radps : of a model with a gyro
+
+        Notes
+        -----
+        x forward, y right, omega clockwise; for REP-103 (y left, counter-clockwise) negate v_y and omega.
+        """
+        left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
+        one = self._wheels if self._turned is None else self._turned
+        gyro = np.broadcast_to(np.asarray(gyro_radps, np.float64), left.shape)
+        found = one.fitted.twist(wheel_motion(left, right, self.prior.width_m, gyro))
+        found[OMEGA] += one.constants.gyro_bias_radps
+        return found[:, 0] if np.ndim(v_left) == 0 else found
+
+    def _take(self, samples: Floats) -> list[Learned]:
+        """Take samples, and solve at each knot where that is due."""
+        found = []
+        for knot in range(self._drive.take(samples), self._drive.count):
+            at_m, size = knot * self._drive.every_m, self._drive.size
+            if at_m < self._next_m:
+                continue
+            self._next_m = at_m + float(np.clip(SHARE_OF_DISTANCE * at_m, SHORTEST_M * size, LONGEST_M * size))
+            if self._solve(knot, at_m):
+                found.append(self.now._replace(t_s=self._drive.time_of(knot), distance_m=at_m))
+        if self._next_anew_m > REBUILT_TO_M * self._drive.size:
+            self._drive.forget_until(self._used)
+        return found
+
+    def _solve(self, knot: int, at_m: float) -> bool:
+        """Solve with the windows that have ended at a knot; return whether there were new ones."""
+        last = self._drive.last_by(self._drive.time_of(knot) - SETTLE_S)
+        windows = self._drive.windows(self._used, last, knot)
+        self._used = max(self._used, last + 1)
+        if windows is None:
+            return False
+        if anew := self._next_anew_m <= at_m <= REBUILT_TO_M * self._drive.size:
+            self._next_anew_m = (1.0 + REBUILT_SHARE) * at_m
+            windows = self._drive.windows(0, last, knot) or windows
+        wheels: FittedModel | None = None
+        for one in (self._wheels, self._turned):
+            if one is not None:
+                solve = one.solve_anew if anew else one.solve_with
+                solve(windows, wheels)
+                wheels = one.fitted
+        return True

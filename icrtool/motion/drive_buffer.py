@@ -1,0 +1,190 @@
+"""The past of a drive, sample by sample: wheel samples joined to steps, poses kept every half metre, windows of them.
+
+All of it depends on the samples alone, not on how many come at a time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrtool.kernels.arrays import Bools, Floats, Ints
+from icrtool.kernels.track import LONGEST_DELAY_S, Track, Windows
+from icrtool.motion.recording import EVERY_M, STEP_S, WINDOWS_M
+
+STANDING_STEP_S = 10.0
+"""Length of the steps to which the wheel samples of a robot that stands are joined [s]. It may stand for hours."""
+
+LARGEST_ADVANCE_M = 5.0
+"""Largest distance [m] that wheels roll between two samples. A longer one is a damaged speed or stamp: a gap."""
+
+ON_EDGE = 1e-6
+"""Share of a step by which a stamp may precede the step's begin: decimal fractions of a second are not exact."""
+
+COLUMNS = ("t_s", "v_left", "v_right", "north_m", "east_m", "heading_rad", "gyro_radps", "known", "broken", "gap")
+"""Rows of samples (10, n): time; wheel speeds [m/s] until the next sample; pose of the reference; turn rate of a gyro;
+whether the pose is known; whether windows end before the next sample; whether the wheels are unknown until then."""
+
+T, V_LEFT, V_RIGHT, NORTH, EAST, HEADING, GYRO, KNOWN, BROKEN, GAP = range(len(COLUMNS))
+
+KNOT_T, KNOT_SEGMENT, KNOT_KNOWN, KNOT_STEPS, KNOT_SAMPLES = 0, 4, 5, 6, 7
+"""Rows of the knots (8, m), north, east and heading between the first two: the segment of a knot changes where windows
+end; the steps, and the samples in them, are those that were complete."""
+
+
+class DriveBuffer:
+    """Steps and knots of a drive: a knot is the first sample after each half metre of driven distance.
+
+    Driven distance is the path of the mean of both sides: a spin on the spot adds none.
+
+    Attributes
+    ----------
+    size : part of the usual distances that is used (`icrtool.motion.recording.size_of`)
+    every_m : distance between knots
+    count : of the knots so far
+    """
+
+    def __init__(self, size: float) -> None:
+        self.size, self.every_m = size, EVERY_M * size
+        self._open = np.empty((len(COLUMNS), 0))
+        self._distance, self._segment, self._heading = 0.0, 0.0, 0.0
+        self._steps, self._steps_before, self._samples = np.empty((5, 0)), 0, 0
+        self._knots, self._knots_before = np.empty((8, 0)), 0
+
+    @property
+    def distance_m(self) -> float:
+        """Driven distance until the last sample [m]."""
+        return self._distance
+
+    @property
+    def count(self) -> int:
+        """Number of the knots so far, those that were forgotten too."""
+        return self._knots_before + self._knots.shape[1]
+
+    def take(self, samples: Floats) -> int:
+        """Take further samples (10, n), `COLUMNS`, in order of time; return the number of the first new knot."""
+        first_knot, old = self.count, self._open.shape[1]
+        if not samples.shape[1]:
+            return first_knot
+        rows = np.concatenate([self._open, samples], axis=1)
+        held, advance, gap = _intervals(rows, self.size)
+        # the interval before each new sample; the very first one has none
+        before = slice(max(old - 1, 0), None)
+        distance = np.cumsum(np.append(self._distance, advance[before]))
+        ends = gap[before] | (rows[BROKEN, :-1][before] > 0.0)
+        segment = np.cumsum(np.append(self._segment, ends))
+        self._distance, self._segment = float(distance[-1]), float(segment[-1])
+        cell = np.floor(distance / self.every_m)
+        if old:
+            laid = np.diff(cell)
+            segment = segment[1:]
+        else:
+            laid = np.diff(cell, prepend=-1.0)
+        known = (rows[KNOWN] > 0.0) & np.isfinite(rows[[NORTH, EAST, HEADING]]).all(axis=0)
+        heading = self._unwrapped(rows[HEADING, old:], known[old:])
+        number, first = _step_of(rows, gap)
+        # knots, before the steps that are complete now are added
+        at = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
+        row = old + at
+        pose = [np.where(known[row], one, 0.0) for one in (rows[NORTH, row], rows[EAST, row], heading[at])]
+        steps = self._steps_before + self._steps.shape[1] + number[row]
+        self._knots = np.column_stack(
+            [self._knots, [rows[T, row], *pose, segment[at], known[row], steps, self._samples + first[number[row]]]]
+        )
+        self._close(rows, held, first)
+        return first_knot
+
+    def _unwrapped(self, heading: Floats, known: Bools) -> Floats:
+        """Return headings (n,) that follow those before by no more than a half turn, where they are known."""
+        angles = np.append(self._heading, heading[known])
+        turns = np.cumsum(np.rint(np.diff(angles) / (2.0 * np.pi)))
+        found = np.zeros(len(heading))
+        found[known] = angles[1:] - 2.0 * np.pi * turns
+        if len(turns):
+            self._heading = float(found[known][-1])
+        return found
+
+    def _close(self, rows: Floats, held: Floats, first: Ints) -> None:
+        """Keep the steps that are complete: means over their time; keep the samples of the open one as they are."""
+        closed = int(first[-1])
+        if closed:
+            begin, lasting = first[:-1], held[:closed]
+            total = np.add.reduceat(lasting, begin)
+            joined = [rows[T, begin], total]
+            for column in (rows[V_LEFT], rows[V_RIGHT], rows[GYRO]):
+                mean = np.add.reduceat(lasting * column[:closed], begin)
+                joined.append(np.divide(mean, total, out=column[begin], where=total > 0.0))
+            self._steps = np.column_stack([self._steps, joined])
+            self._samples += closed
+        self._open = rows[:, closed:].copy()
+
+    def time_of(self, knot: int) -> float:
+        """Return the time of a knot [s]."""
+        return float(self._knots[KNOT_T, knot - self._knots_before])
+
+    def last_by(self, t_s: float) -> int:
+        """Return the number of the last knot by a time."""
+        return self._knots_before + int(np.searchsorted(self._knots[KNOT_T], t_s, side="right")) - 1
+
+    def windows(self, first: int, last: int, now: int) -> Windows | None:
+        """Return the windows that end at the knots from `first` to `last`; None where there is none.
+
+        Parameters
+        ----------
+        now : knot at which the wheels are known: steps that were complete there belong to the track
+
+        Notes
+        -----
+        As `icrtool.kernels.track.cut`: no window crosses a gap, a jump or a slip event, or has an end without a pose.
+        """
+        knots, before = self._knots, self._knots_before
+        segment, known = knots[KNOT_SEGMENT], knots[KNOT_KNOWN] > 0.0
+        found = []
+        for length_m in WINDOWS_M:
+            over = round(length_m / EVERY_M)
+            end = np.arange(max(first - before, over), last - before + 1)
+            end = end[(segment[end] == segment[end - over]) & known[end] & known[end - over]]
+            found.append(np.stack([end - over, end, np.full(len(end), length_m * self.size)]))
+        begin, end, length = np.concatenate(found, axis=1)
+        if not len(begin):
+            return None
+        lo, hi = int(begin.min()), last - before + 1
+        t, north, east, heading = knots[:4, lo:hi]
+        complete, samples = knots[KNOT_STEPS, now - before], knots[KNOT_SAMPLES, now - before]
+        steps = self._steps[:, : int(complete) - self._steps_before]
+        steps = steps[:, max(int(np.searchsorted(steps[0], t[0] - LONGEST_DELAY_S)) - 1, 0) :]
+        none = np.zeros(hi - lo, np.bool_)
+        track = Track(
+            t=steps[0], held=steps[1], v_left=steps[2], v_right=steps[3], place_t=t, north=north, east=east,
+            heading_t=t, heading=heading, distance=np.arange(lo, hi, dtype=np.float64) * self.every_m, in_outage=none, jump=none,
+            slipping=none, gyro=steps[4], into=(1.0 - complete / max(samples, 1.0)) / 2.0,
+        )  # fmt: skip
+        return Windows(track, begin.astype(np.int64) - lo, end.astype(np.int64) - lo, length)
+
+    def forget_until(self, end: int) -> None:
+        """Drop what no window needs that ends at the knot `end` or later."""
+        keep = end - round(max(WINDOWS_M) / EVERY_M)
+        drop = keep - self._knots_before
+        if drop <= 0:
+            return
+        self._knots, self._knots_before = self._knots[:, drop:].copy(), keep
+        since_s = self._knots[KNOT_T, 0] - LONGEST_DELAY_S
+        old = max(int(np.searchsorted(self._steps[0], since_s)) - 1, 0)
+        self._steps, self._steps_before = self._steps[:, old:].copy(), self._steps_before + old
+
+
+def _intervals(rows: Floats, size: float) -> tuple[Floats, Floats, Bools]:
+    """Return how long each sample but the last holds [s], how far the wheels roll then [m], and whether it is a gap."""
+    held = np.diff(rows[T])
+    advance = np.abs((rows[V_LEFT, :-1] + rows[V_RIGHT, :-1]) / 2.0) * held
+    gap = (rows[GAP, :-1] > 0.0) | ~(held >= 0.0) | ~(advance <= LARGEST_ADVANCE_M * size)
+    held[gap] = advance[gap] = 0.0
+    return held, advance, gap
+
+
+def _step_of(rows: Floats, gap: Bools) -> tuple[Ints, Ints]:
+    """Return the step of each sample (n,), counted from 0, and the first sample of each step."""
+    standing = (rows[V_LEFT] == 0.0) & (rows[V_RIGHT] == 0.0)
+    cell = np.floor(rows[T] / np.where(standing, STANDING_STEP_S, STEP_S) + ON_EDGE)
+    begins = np.ones(rows.shape[1], np.bool_)
+    begins[1:] = (np.diff(cell) != 0.0) | (standing[1:] != standing[:-1]) | gap
+    return np.cumsum(begins) - 1, np.flatnonzero(begins)

@@ -1,0 +1,99 @@
+"""What is known of a skid-steer robot before it drives: the spread of the robots that logs and publications show."""
+
+from __future__ import annotations
+
+import functools
+import tomllib
+from dataclasses import replace
+from importlib import resources
+
+import numpy as np
+
+from icrtool.kernels.arrays import Floats
+from icrtool.motion.adaptive import MODEL, TURNED, TermsPrior
+from icrtool.motion.models import TERMS, FittedModel
+
+BETWEEN_DRIVES = 0.15
+"""Standard deviation of a term between drives of one robot, as a share of that between robots (`TERMS`).
+
+Ten recorded drives of one robot differ by 0.006 in vx_v, 0.06 in vx_w, 0.008 in omega_w, 0.002 in omega_v and 0.06 in
+vy_w; from ground to ground omega_w differs by 0.03.
+"""
+
+SOURCE = "other robots"
+
+
+@functools.cache
+def known_robots() -> dict[str, dict[str, float | str]]:
+    """Return the terms of robots by name, and their ``source``."""
+    return tomllib.loads(resources.files("icrtool").joinpath("robot_terms.toml").read_text(encoding="utf-8"))
+
+
+def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
+    """Return what is known of a robot of which nothing is known but its track width b.
+
+    Parameters
+    ----------
+    track_width_m : b [m]
+    without : name of a robot to leave out, to test the prior on it
+
+    Notes
+    -----
+    Median and variance of each term over the robots of ``robot_terms.toml``. The prior of the term
+    (`icrtool.motion.models.TERMS`) counts as one more robot, whose term is not known; the median is of n robots, so a
+    further robot differs from it by 1 + 1 / n times the variance.
+    """
+    robots = [terms for name, terms in known_robots().items() if name != without]
+    mean, variance = [], []
+    for name in MODEL.terms:
+        term = TERMS[name]
+        shown = np.array([term.mean, *(float(terms[name]) for terms in robots if name in terms)])
+        middle, n = float(np.median(shown)), len(shown)
+        mean.append(middle)
+        variance.append((float(np.sum((shown - middle) ** 2)) + term.std**2) / n * (1.0 + 1.0 / n))
+    return TermsPrior.of_wheels(track_width_m, np.array(mean), np.diag(variance), SOURCE)
+
+
+def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedModel | None, source: str) -> TermsPrior:
+    """Return what fitted models of a robot show of its next drive.
+
+    Parameters
+    ----------
+    fitted, turned : by the wheels alone, and with a gyro; of terms that one lacks, `prior_of_robots` is taken
+
+    Notes
+    -----
+    The covariance of the parameters, and that between drives (`between_drives`).
+    """
+    of_robots = prior_of_robots(track_width_m)
+    mean, covariance = _placed(MODEL.terms, of_robots.mean, of_robots.covariance, fitted)
+    prior = TermsPrior.of_wheels(track_width_m, mean, covariance, source)
+    if turned is None:
+        return prior
+    mean, covariance = _placed(TURNED.terms, prior.turned_mean, prior.turned_covariance, turned)
+    return replace(prior, turned_mean=mean, turned_covariance=covariance)
+
+
+def _placed(
+    terms: tuple[str, ...], mean: Floats, covariance: Floats, fitted: FittedModel
+) -> tuple[Floats, Floats]:  # fmt: skip
+    """Return mean and covariance of terms, those of a fitted model for a further drive, the others as they were."""
+    names = fitted.model.terms
+    of_fit = [names.index(name) for name in terms if name in names]
+    at = [terms.index(name) for name in terms if name in names]
+    mean, covariance = mean.copy(), covariance.copy()
+    mean[at] = fitted.parameters[of_fit]
+    covariance[at, :] = covariance[:, at] = 0.0
+    covariance[np.ix_(at, at)] = (fitted.covariance + between_drives(names))[np.ix_(of_fit, of_fit)]
+    return mean, covariance
+
+
+def between_drives(names: tuple[str, ...]) -> Floats:
+    """Return the covariance (k, k) of terms between drives of one robot.
+
+    Notes
+    -----
+    Of terms that few drives show (`Term.wide`), it is the whole of their prior.
+    """
+    std = [TERMS[name].std * (1.0 if TERMS[name].wide else BETWEEN_DRIVES) for name in names]
+    return np.diag(np.square(std))
