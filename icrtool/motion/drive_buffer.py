@@ -155,8 +155,8 @@ class DriveBuffer:
         none = np.zeros(hi - lo, np.bool_)
         track = Track(
             t=steps[0], held=steps[1], v_left=steps[2], v_right=steps[3], place_t=t, north=north, east=east,
-            heading_t=t, heading=heading, distance=np.arange(lo, hi, dtype=np.float64) * self.every_m, in_outage=none, jump=none,
-            slipping=none, gyro=steps[4], into=(1.0 - complete / max(samples, 1.0)) / 2.0,
+            heading_t=t, heading=heading, distance=np.arange(lo, hi, dtype=np.float64) * self.every_m, in_outage=none,
+            jump=none, slipping=none, gyro=steps[4], into=(1.0 - complete / max(samples, 1.0)) / 2.0,
         )  # fmt: skip
         return Windows(track, begin.astype(np.int64) - lo, end.astype(np.int64) - lo, length)
 

@@ -273,7 +273,8 @@ def test_the_chart_of_errors_draws_the_main_models_and_folds_the_others(chrome: 
     page.open(file)
     names = "[...document.querySelectorAll('#{} input:checked')].map((one) => one.closest('li').textContent.trim())"
     drawn = page.evaluate(names.format("error-keys"))
-    assert {*DRAWN_AT_FIRST} <= {*drawn} <= {*DRAWN_AT_FIRST, "recommended_gyro", "recommended_heading"}
+    turned = {f"{name}_{kind}" for name in ("adaptive", "recommended") for kind in ("gyro", "heading")}
+    assert {*DRAWN_AT_FIRST, "adaptive"} <= {*drawn} <= {*DRAWN_AT_FIRST, "adaptive"} | turned
     assert page.evaluate(names.format("error-others")) == []
     assert drawn[0] == "controller"
     assert drawn[-1] == "no_slip"

@@ -1,4 +1,4 @@
-"""A model that learns while it drives: against a plain transcription, from the past alone, equal by samples and at once."""
+"""A model that learns while it drives: against a plain transcription, from the past alone, by samples or at once."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def made_drive(
 
 def observed(recording: Recording, model: AdaptiveModel) -> list[Learned]:
     """Return what a model learned that observes a recording sample by sample."""
-    found = []
-    for one in samples_of(recording).T.tolist():
-        if model.observe(*one[:3], one[3:6] if one[7] else None, one[6], broken=bool(one[8]), gap=bool(one[9])):
-            found.append(model.now)
-    return found
+    return [
+        model.now
+        for *sample, gyro, known, broken, gap in samples_of(recording).T.tolist()
+        if model.observe(*sample[:3], sample[3:] if known else None, gyro, broken=bool(broken), gap=bool(gap))
+    ]
 
 
 def same(one: Learned, other: Learned) -> bool:
