@@ -23,9 +23,9 @@ from icrtool.kernels.window_residuals import OMEGA
 from icrtool.motion.drive_buffer import LARGEST_ADVANCE_M, DriveBuffer
 from icrtool.motion.models import GYRO_TERMS, MODELS, RECOMMENDED, TERMS, FittedModel, MotionModel, wheel_motion
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, size_of
-from icrtool.motion.window_fit import KINDS, Residuals, constant_std, heading_wander, residuals_of
+from icrtool.motion.window_fit import RESIDUAL_KINDS, Residuals, constant_std, heading_wander, residuals_of
 
-OVERLAP = 40.0
+WINDOWS_AS_ONE = 40.0
 """Number of windows that count as one independent one. A stretch of 20 m holds 80, and shows a term about twice."""
 
 GAUSS_NEWTON_STEPS = 3
@@ -53,11 +53,13 @@ independent windows that it counts as. The first few windows fit almost exactly,
 MOST_PENDING = 1000
 """Number of samples after which those of a robot that stands are taken."""
 
-MODEL, TURNED = MODELS[RECOMMENDED], MODELS[RECOMMENDED].with_gyro()
+WHEELS_MODEL, TURNED_MODEL = MODELS[RECOMMENDED], MODELS[RECOMMENDED].with_gyro()
 """The model by the wheels alone, and with a gyro."""
 
-SHARED = [name for name in MODEL.terms if name in TURNED.terms]
-OF_WHEELS, OF_TURNED = ([one.terms.index(name) for name in SHARED] for one in (MODEL, TURNED))
+SHARED_TERMS = [name for name in WHEELS_MODEL.terms if name in TURNED_MODEL.terms]
+SHARED_OF_WHEELS, SHARED_OF_TURNED = (
+    [one.terms.index(name) for name in SHARED_TERMS] for one in (WHEELS_MODEL, TURNED_MODEL)
+)
 """Places of the terms that both have, in the one without and in the one with a gyro."""
 
 
@@ -84,10 +86,10 @@ class TermsPrior:
     def of_wheels(cls, width_m: float, mean: Floats, covariance: Floats, source: str = "") -> TermsPrior:
         """Return a prior of the terms without a gyro; what a gyro adds is as gyros usually are."""
         gyro_std = np.array([TERMS[name].std for name in GYRO_TERMS])
-        k = len(OF_WHEELS)
+        k = len(SHARED_OF_WHEELS)
         turned_mean, turned = np.zeros(k + len(gyro_std)), np.zeros((k + len(gyro_std), k + len(gyro_std)))
-        turned_mean[OF_TURNED] = mean[OF_WHEELS]
-        turned[np.ix_(OF_TURNED, OF_TURNED)] = covariance[np.ix_(OF_WHEELS, OF_WHEELS)]
+        turned_mean[SHARED_OF_TURNED] = mean[SHARED_OF_WHEELS]
+        turned[np.ix_(SHARED_OF_TURNED, SHARED_OF_TURNED)] = covariance[np.ix_(SHARED_OF_WHEELS, SHARED_OF_WHEELS)]
         turned[range(k, k + len(gyro_std)), range(k, k + len(gyro_std))] = gyro_std**2
         return cls(width_m, mean, covariance, turned_mean, turned, source)
 
@@ -134,7 +136,7 @@ class Estimate:
 
     def solve_anew(self, windows: Windows, wheels: FittedModel | None = None) -> None:
         """Solve with all windows so far, linearised at every step; `wheels` as in `residuals_of`."""
-        kind = np.repeat(KINDS, len(windows.begin))
+        kind = np.repeat(RESIDUAL_KINDS, len(windows.begin))
         few = len(windows.begin) < FEWEST_FOR_WANDER
         evaluate = residuals_of(windows, self.model, self.width_m, wheels, 0.0 if few else None)
         at, (residuals, jacobian) = self.x, self._evaluated(evaluate)
@@ -145,13 +147,13 @@ class Estimate:
             self._step(*self._equations(residuals, jacobian, kind, at))
         self.matrix, self.vector = self._equations(residuals, jacobian, kind, at)
         if not few:
-            turns = (residuals + jacobian @ (self.x - at))[kind == KINDS[-1]]
+            turns = (residuals + jacobian @ (self.x - at))[kind == RESIDUAL_KINDS[-1]]
             self.wander = heading_wander(turns * np.sqrt(windows.length_m), windows.length_m)
         self._finish(wheels)
 
     def solve_with(self, windows: Windows, wheels: FittedModel | None = None) -> None:
         """Solve with some further windows, linearised at the last solution."""
-        kind = np.repeat(KINDS, len(windows.begin))
+        kind = np.repeat(RESIDUAL_KINDS, len(windows.begin))
         at = self.x
         residuals, jacobian = self._evaluated(residuals_of(windows, self.model, self.width_m, wheels, self.wander))
         for _ in range(GAUSS_NEWTON_STEPS):
@@ -168,7 +170,7 @@ class Estimate:
     def _equations(self, residuals: Floats, jacobian: Floats, kind: Ints, at: Floats) -> tuple[Floats, Floats]:
         """Return matrix and vector of residuals (m,) that were linearised at some parameters, weighted at `x`."""
         here = residuals + jacobian @ (self.x - at)
-        weights = robust_weights(here, self.scale[kind], OVERLAP)
+        weights = robust_weights(here, self.scale[kind], WINDOWS_AS_ONE)
         return normal_equations(jacobian @ at - residuals, jacobian, weights)
 
     def _step(self, matrix: Floats, vector: Floats) -> None:
@@ -187,7 +189,7 @@ class Estimate:
 
 def _scale_of(residuals: Floats, kind: Ints) -> Floats:
     """Return the robust standard deviation (2,) of the residuals of each kind, with the usual one."""
-    count = len(kind) / len(KINDS) / OVERLAP
+    count = len(kind) / len(RESIDUAL_KINDS) / WINDOWS_AS_ONE
     found = scale_by_kind(residuals, kind)[[0, -1]]
     together = (count * found**2 + USUAL_COUNTS_AS * np.square(USUAL_STD)) / (count + USUAL_COUNTS_AS)
     return np.asarray(np.sqrt(together))
@@ -213,10 +215,10 @@ class AdaptiveModel:
         self.prior, self.with_gyro, self.distance_m = prior, with_gyro, 0.0
         size = size_of(prior.width_m)
         self._drive, self._longest_m = DriveBuffer(size), LARGEST_ADVANCE_M * size
-        self._wheels = Estimate(MODEL, prior.width_m, prior.mean, prior.covariance)
+        self._wheels = Estimate(WHEELS_MODEL, prior.width_m, prior.mean, prior.covariance)
         self._turned = None
         if with_gyro:
-            turned = Estimate(TURNED, prior.width_m, prior.turned_mean, prior.turned_covariance)
+            turned = Estimate(TURNED_MODEL, prior.width_m, prior.turned_mean, prior.turned_covariance)
             turned.fitted = FittedModel(turned.model, prior.turned_mean, prior.turned_covariance, self._wheels.fitted)
             self._turned = turned
         self._used, self._next_m, self._next_anew_m = 0, SHORTEST_M * size, 0.0
@@ -268,7 +270,7 @@ class AdaptiveModel:
         return bool(self._take(samples))
 
     def observe_all(self, samples: Floats) -> list[Learned]:
-        """Take many samples (10, n) at once, `icrtool.motion.drive_buffer.COLUMNS`; return what was learned, in order.
+        """Take many samples (10, n) at once, `icrtool.motion.drive_buffer.SAMPLE_ROWS`; return what was learned, in order.
 
         Notes
         -----

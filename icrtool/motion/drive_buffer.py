@@ -9,7 +9,7 @@ import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.track import LONGEST_DELAY_S, Track, Windows
-from icrtool.motion.recording import EVERY_M, STEP_S, WINDOWS_M
+from icrtool.motion.recording import EVERY_M, RECORDING_STEP_S, WINDOWS_M
 
 STANDING_STEP_S = 10.0
 """Length of the steps to which the wheel samples of a robot that stands are joined [s]. It may stand for hours."""
@@ -20,11 +20,22 @@ LARGEST_ADVANCE_M = 5.0
 ON_EDGE = 1e-6
 """Share of a step by which a stamp may precede the step's begin: decimal fractions of a second are not exact."""
 
-COLUMNS = ("t_s", "v_left", "v_right", "north_m", "east_m", "heading_rad", "gyro_radps", "known", "broken", "gap")
+SAMPLE_ROWS = ("t_s", "v_left", "v_right", "north_m", "east_m", "heading_rad", "gyro_radps", "known", "broken", "gap")
 """Rows of samples (10, n): time; wheel speeds [m/s] until the next sample; pose of the reference; turn rate of a gyro;
 whether the pose is known; whether windows end before the next sample; whether the wheels are unknown until then."""
 
-T, V_LEFT, V_RIGHT, NORTH, EAST, HEADING, GYRO, KNOWN, BROKEN, GAP = range(len(COLUMNS))
+(
+    SAMPLE_T,
+    SAMPLE_LEFT,
+    SAMPLE_RIGHT,
+    SAMPLE_NORTH,
+    SAMPLE_EAST,
+    SAMPLE_HEADING,
+    SAMPLE_GYRO,
+    SAMPLE_KNOWN,
+    SAMPLE_BROKEN,
+    SAMPLE_GAP,
+) = range(len(SAMPLE_ROWS))
 
 KNOT_T, KNOT_SEGMENT, KNOT_KNOWN, KNOT_STEPS, KNOT_SAMPLES = 0, 4, 5, 6, 7
 """Rows of the knots (8, m), north, east and heading between the first two: the segment of a knot changes where windows
@@ -45,7 +56,7 @@ class DriveBuffer:
 
     def __init__(self, size: float) -> None:
         self.size, self.every_m = size, EVERY_M * size
-        self._open = np.empty((len(COLUMNS), 0))
+        self._open = np.empty((len(SAMPLE_ROWS), 0))
         self._distance, self._segment, self._heading = 0.0, 0.0, 0.0
         self._steps, self._steps_before, self._samples = np.empty((5, 0)), 0, 0
         self._knots, self._knots_before = np.empty((8, 0)), 0
@@ -61,7 +72,7 @@ class DriveBuffer:
         return self._knots_before + self._knots.shape[1]
 
     def take(self, samples: Floats) -> int:
-        """Take further samples (10, n), `COLUMNS`, in order of time; return the number of the first new knot."""
+        """Take further samples (10, n), `SAMPLE_ROWS`, in order of time; return the number of the first new knot."""
         first_knot, old = self.count, self._open.shape[1]
         if not samples.shape[1]:
             return first_knot
@@ -70,7 +81,7 @@ class DriveBuffer:
         # the interval before each new sample; the very first one has none
         before = slice(max(old - 1, 0), None)
         distance = np.cumsum(np.append(self._distance, advance[before]))
-        ends = gap[before] | (rows[BROKEN, :-1][before] > 0.0)
+        ends = gap[before] | (rows[SAMPLE_BROKEN, :-1][before] > 0.0)
         segment = np.cumsum(np.append(self._segment, ends))
         self._distance, self._segment = float(distance[-1]), float(segment[-1])
         cell = np.floor(distance / self.every_m)
@@ -79,16 +90,21 @@ class DriveBuffer:
             segment = segment[1:]
         else:
             laid = np.diff(cell, prepend=-1.0)
-        known = (rows[KNOWN] > 0.0) & np.isfinite(rows[[NORTH, EAST, HEADING]]).all(axis=0)
-        heading = self._unwrapped(rows[HEADING, old:], known[old:])
+        known = (rows[SAMPLE_KNOWN] > 0.0) & np.isfinite(rows[[SAMPLE_NORTH, SAMPLE_EAST, SAMPLE_HEADING]]).all(axis=0)
+        heading = self._unwrapped(rows[SAMPLE_HEADING, old:], known[old:])
         number, first = _step_of(rows, gap)
         # knots, before the steps that are complete now are added
         at = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
         row = old + at
-        pose = [np.where(known[row], one, 0.0) for one in (rows[NORTH, row], rows[EAST, row], heading[at])]
+        pose = [
+            np.where(known[row], one, 0.0) for one in (rows[SAMPLE_NORTH, row], rows[SAMPLE_EAST, row], heading[at])
+        ]
         steps = self._steps_before + self._steps.shape[1] + number[row]
         self._knots = np.column_stack(
-            [self._knots, [rows[T, row], *pose, segment[at], known[row], steps, self._samples + first[number[row]]]]
+            [
+                self._knots,
+                [rows[SAMPLE_T, row], *pose, segment[at], known[row], steps, self._samples + first[number[row]]],
+            ]
         )
         self._close(rows, held, first)
         return first_knot
@@ -109,8 +125,8 @@ class DriveBuffer:
         if closed:
             begin, lasting = first[:-1], held[:closed]
             total = np.add.reduceat(lasting, begin)
-            joined = [rows[T, begin], total]
-            for column in (rows[V_LEFT], rows[V_RIGHT], rows[GYRO]):
+            joined = [rows[SAMPLE_T, begin], total]
+            for column in (rows[SAMPLE_LEFT], rows[SAMPLE_RIGHT], rows[SAMPLE_GYRO]):
                 mean = np.add.reduceat(lasting * column[:closed], begin)
                 joined.append(np.divide(mean, total, out=column[begin], where=total > 0.0))
             self._steps = np.column_stack([self._steps, joined])
@@ -174,17 +190,17 @@ class DriveBuffer:
 
 def _intervals(rows: Floats, size: float) -> tuple[Floats, Floats, Bools]:
     """Return how long each sample but the last holds [s], how far the wheels roll then [m], and whether it is a gap."""
-    held = np.diff(rows[T])
-    advance = np.abs((rows[V_LEFT, :-1] + rows[V_RIGHT, :-1]) / 2.0) * held
-    gap = (rows[GAP, :-1] > 0.0) | ~(held >= 0.0) | ~(advance <= LARGEST_ADVANCE_M * size)
+    held = np.diff(rows[SAMPLE_T])
+    advance = np.abs((rows[SAMPLE_LEFT, :-1] + rows[SAMPLE_RIGHT, :-1]) / 2.0) * held
+    gap = (rows[SAMPLE_GAP, :-1] > 0.0) | ~(held >= 0.0) | ~(advance <= LARGEST_ADVANCE_M * size)
     held[gap] = advance[gap] = 0.0
     return held, advance, gap
 
 
 def _step_of(rows: Floats, gap: Bools) -> tuple[Ints, Ints]:
     """Return the step of each sample (n,), counted from 0, and the first sample of each step."""
-    standing = (rows[V_LEFT] == 0.0) & (rows[V_RIGHT] == 0.0)
-    cell = np.floor(rows[T] / np.where(standing, STANDING_STEP_S, STEP_S) + ON_EDGE)
+    standing = (rows[SAMPLE_LEFT] == 0.0) & (rows[SAMPLE_RIGHT] == 0.0)
+    cell = np.floor(rows[SAMPLE_T] / np.where(standing, STANDING_STEP_S, RECORDING_STEP_S) + ON_EDGE)
     begins = np.ones(rows.shape[1], np.bool_)
     begins[1:] = (np.diff(cell) != 0.0) | (standing[1:] != standing[:-1]) | gap
     return np.cumsum(begins) - 1, np.flatnonzero(begins)

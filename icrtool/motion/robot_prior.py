@@ -10,7 +10,7 @@ from importlib import resources
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.motion.adaptive import MODEL, TURNED, TermsPrior
+from icrtool.motion.adaptive import TURNED_MODEL, WHEELS_MODEL, TermsPrior
 from icrtool.motion.models import TERMS, FittedModel
 
 BETWEEN_DRIVES = 0.15
@@ -20,7 +20,7 @@ Ten recorded drives of one robot differ by 0.006 in vx_v, 0.06 in vx_w, 0.008 in
 vy_w; from ground to ground omega_w differs by 0.03.
 """
 
-SOURCE = "other robots"
+OTHER_ROBOTS = "other robots"
 
 
 @functools.cache
@@ -45,13 +45,13 @@ def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
     """
     robots = [terms for name, terms in known_robots().items() if name != without]
     mean, variance = [], []
-    for name in MODEL.terms:
+    for name in WHEELS_MODEL.terms:
         term = TERMS[name]
         shown = np.array([term.mean, *(float(terms[name]) for terms in robots if name in terms)])
         middle, n = float(np.median(shown)), len(shown)
         mean.append(middle)
         variance.append((float(np.sum((shown - middle) ** 2)) + term.std**2) / n * (1.0 + 1.0 / n))
-    return TermsPrior.of_wheels(track_width_m, np.array(mean), np.diag(variance), SOURCE)
+    return TermsPrior.of_wheels(track_width_m, np.array(mean), np.diag(variance), OTHER_ROBOTS)
 
 
 def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedModel | None, source: str) -> TermsPrior:
@@ -66,11 +66,11 @@ def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedMode
     The covariance of the parameters, and that between drives (`between_drives`).
     """
     of_robots = prior_of_robots(track_width_m)
-    mean, covariance = _placed(MODEL.terms, of_robots.mean, of_robots.covariance, fitted)
+    mean, covariance = _placed(WHEELS_MODEL.terms, of_robots.mean, of_robots.covariance, fitted)
     prior = TermsPrior.of_wheels(track_width_m, mean, covariance, source)
     if turned is None:
         return prior
-    mean, covariance = _placed(TURNED.terms, prior.turned_mean, prior.turned_covariance, turned)
+    mean, covariance = _placed(TURNED_MODEL.terms, prior.turned_mean, prior.turned_covariance, turned)
     return replace(prior, turned_mean=mean, turned_covariance=covariance)
 
 

@@ -11,7 +11,7 @@ from icrtool.calibration.adaptive_rows import adapt, samples_of
 from icrtool.kernels.arrays import Complexes, Floats
 from icrtool.kernels.track import Track
 from icrtool.motion import adaptive
-from icrtool.motion.adaptive import MODEL, AdaptiveModel, Learned, TermsPrior
+from icrtool.motion.adaptive import WHEELS_MODEL, AdaptiveModel, Learned, TermsPrior
 from icrtool.motion.models import TERMS
 from icrtool.motion.recording import Recording, cut_trials
 from icrtool.motion.robot_prior import between_drives, known_robots, prior_of_robots
@@ -219,7 +219,7 @@ def test_the_true_terms_are_learned_within_their_deviations() -> None:
         model.observe_all(samples_of(made_drive(250.0, seed=seed)))
         fitted = model.now.fitted
         off.append((fitted.parameters - TRUE)[:5] / fitted.std[:5])
-        turn = MODEL.terms.index("omega_w")
+        turn = WHEELS_MODEL.terms.index("omega_w")
         assert abs(fitted.parameters[turn] - TRUE[turn]) < 0.02
     assert np.sqrt(np.mean(np.square(off))) < 1.5
 
@@ -298,19 +298,19 @@ def test_a_wrapped_heading_is_the_same_heading() -> None:
 def test_every_known_robot_states_terms_and_their_source() -> None:
     for name, terms in known_robots().items():
         assert len(str(terms["source"])) > 20, name
-        assert set(terms) - {"source"} <= set(MODEL.terms), name
+        assert set(terms) - {"source"} <= set(WHEELS_MODEL.terms), name
         assert 0.4 < float(terms["omega_w"]) < 1.0, name
 
 
 def test_a_robot_that_is_left_out_does_not_enter_its_prior() -> None:
     every, others = prior_of_robots(1.0), prior_of_robots(1.0, without="warthog")
-    scale = MODEL.terms.index("vx_v")
+    scale = WHEELS_MODEL.terms.index("vx_v")
     assert every.mean[scale] == pytest.approx(0.969)
     assert others.mean[scale] == pytest.approx((0.969 + 1.0) / 2)
-    turn = MODEL.terms.index("omega_w")
+    turn = WHEELS_MODEL.terms.index("omega_w")
     assert 0.1 < math.sqrt(others.covariance[turn, turn]) < TERMS["omega_w"].std
 
 
 def test_drives_of_one_robot_differ_less_than_robots() -> None:
-    std = np.sqrt(np.diag(between_drives(MODEL.terms)))
-    assert (std <= [TERMS[name].std for name in MODEL.terms]).all()
+    std = np.sqrt(np.diag(between_drives(WHEELS_MODEL.terms)))
+    assert (std <= [TERMS[name].std for name in WHEELS_MODEL.terms]).all()
