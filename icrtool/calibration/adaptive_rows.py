@@ -12,7 +12,7 @@ from icrtool.calibration.record import Calibration
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Ints
 from icrtool.kernels.track import OpenLoopPath, Track
 from icrtool.motion.adaptive import AdaptiveModel, Learned, TermsPrior
-from icrtool.motion.drive_buffer import SAMPLE_ROWS
+from icrtool.motion.drive_buffer import SampleRow
 from icrtool.motion.recording import Recording, TrialErrors, Trials, predicted_path, steps_of, trial_errors
 from icrtool.motion.robot_prior import prior_of_robots
 from icrtool.motion.window_fit import Prediction
@@ -27,7 +27,7 @@ def prior_for(recording: Recording, calibrations: Sequence[Calibration] = ()) ->
 def samples_of(recording: Recording, rows: slice = slice(None)) -> Floats:
     """Return the wheel samples and poses of a recording (10, n), as `AdaptiveModel` takes them."""
     wheels, track = recording.wheels(rows), recording.track
-    samples = np.zeros((len(SAMPLE_ROWS), len(wheels.t)))
+    samples = np.zeros((len(SampleRow), len(wheels.t)))
     samples[:3] = wheels.t, wheels.v_left, wheels.v_right
     samples[3:6] = track.north[rows], track.east[rows], track.heading[rows]
     if wheels.gyro is not None:

@@ -270,7 +270,7 @@ class AdaptiveModel:
         return bool(self._take(samples))
 
     def observe_all(self, samples: Floats) -> list[Learned]:
-        """Take many samples (10, n) at once, `icrtool.motion.drive_buffer.SAMPLE_ROWS`; return what was learned, in order.
+        """Take many samples (10, n) at once, in rows `icrtool.motion.drive_buffer.SampleRow`; return what was learned.
 
         Notes
         -----

@@ -5,6 +5,8 @@ All of it depends on the samples alone, not on how many come at a time.
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 import numpy as np
 
 from icrtool.kernels.arrays import Bools, Floats, Ints
@@ -20,22 +22,18 @@ LARGEST_ADVANCE_M = 5.0
 ON_EDGE = 1e-6
 """Share of a step by which a stamp may precede the step's begin: decimal fractions of a second are not exact."""
 
-SAMPLE_ROWS = ("t_s", "v_left", "v_right", "north_m", "east_m", "heading_rad", "gyro_radps", "known", "broken", "gap")
-"""Rows of samples (10, n): time; wheel speeds [m/s] until the next sample; pose of the reference; turn rate of a gyro;
-whether the pose is known; whether windows end before the next sample; whether the wheels are unknown until then."""
 
-(
-    SAMPLE_T,
-    SAMPLE_LEFT,
-    SAMPLE_RIGHT,
-    SAMPLE_NORTH,
-    SAMPLE_EAST,
-    SAMPLE_HEADING,
-    SAMPLE_GYRO,
-    SAMPLE_KNOWN,
-    SAMPLE_BROKEN,
-    SAMPLE_GAP,
-) = range(len(SAMPLE_ROWS))
+class SampleRow(IntEnum):
+    """Rows of samples (10, n).
+
+    Time [s]; wheel speeds until the next sample [m/s]; pose of the reference [m, m, rad]; turn rate of a gyro [rad/s];
+    whether the pose is known; whether windows end before the next sample; whether the wheels are unknown until then.
+    """
+
+    T, LEFT, RIGHT, NORTH, EAST, HEADING, GYRO, KNOWN, BROKEN, GAP = range(10)
+
+
+POSE = [SampleRow.NORTH, SampleRow.EAST, SampleRow.HEADING]
 
 KNOT_T, KNOT_SEGMENT, KNOT_KNOWN, KNOT_STEPS, KNOT_SAMPLES = 0, 4, 5, 6, 7
 """Rows of the knots (8, m), north, east and heading between the first two: the segment of a knot changes where windows
@@ -56,7 +54,7 @@ class DriveBuffer:
 
     def __init__(self, size: float) -> None:
         self.size, self.every_m = size, EVERY_M * size
-        self._open = np.empty((len(SAMPLE_ROWS), 0))
+        self._open = np.empty((len(SampleRow), 0))
         self._distance, self._segment, self._heading = 0.0, 0.0, 0.0
         self._steps, self._steps_before, self._samples = np.empty((5, 0)), 0, 0
         self._knots, self._knots_before = np.empty((8, 0)), 0
@@ -72,7 +70,7 @@ class DriveBuffer:
         return self._knots_before + self._knots.shape[1]
 
     def take(self, samples: Floats) -> int:
-        """Take further samples (10, n), `SAMPLE_ROWS`, in order of time; return the number of the first new knot."""
+        """Take further samples (10, n), `SampleRow`, in order of time; return the number of the first new knot."""
         first_knot, old = self.count, self._open.shape[1]
         if not samples.shape[1]:
             return first_knot
@@ -81,7 +79,7 @@ class DriveBuffer:
         # the interval before each new sample; the very first one has none
         before = slice(max(old - 1, 0), None)
         distance = np.cumsum(np.append(self._distance, advance[before]))
-        ends = gap[before] | (rows[SAMPLE_BROKEN, :-1][before] > 0.0)
+        ends = gap[before] | (rows[SampleRow.BROKEN, :-1][before] > 0.0)
         segment = np.cumsum(np.append(self._segment, ends))
         self._distance, self._segment = float(distance[-1]), float(segment[-1])
         cell = np.floor(distance / self.every_m)
@@ -90,20 +88,20 @@ class DriveBuffer:
             segment = segment[1:]
         else:
             laid = np.diff(cell, prepend=-1.0)
-        known = (rows[SAMPLE_KNOWN] > 0.0) & np.isfinite(rows[[SAMPLE_NORTH, SAMPLE_EAST, SAMPLE_HEADING]]).all(axis=0)
-        heading = self._unwrapped(rows[SAMPLE_HEADING, old:], known[old:])
+        known = (rows[SampleRow.KNOWN] > 0.0) & np.isfinite(
+            rows[[SampleRow.NORTH, SampleRow.EAST, SampleRow.HEADING]]
+        ).all(axis=0)
+        heading = self._unwrapped(rows[SampleRow.HEADING, old:], known[old:])
         number, first = _step_of(rows, gap)
         # knots, before the steps that are complete now are added
         at = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
         row = old + at
-        pose = [
-            np.where(known[row], one, 0.0) for one in (rows[SAMPLE_NORTH, row], rows[SAMPLE_EAST, row], heading[at])
-        ]
+        pose = [np.where(known[row], one, 0.0) for one in (*rows[POSE[:2]][:, row], heading[at])]
         steps = self._steps_before + self._steps.shape[1] + number[row]
         self._knots = np.column_stack(
             [
                 self._knots,
-                [rows[SAMPLE_T, row], *pose, segment[at], known[row], steps, self._samples + first[number[row]]],
+                [rows[SampleRow.T, row], *pose, segment[at], known[row], steps, self._samples + first[number[row]]],
             ]
         )
         self._close(rows, held, first)
@@ -125,8 +123,8 @@ class DriveBuffer:
         if closed:
             begin, lasting = first[:-1], held[:closed]
             total = np.add.reduceat(lasting, begin)
-            joined = [rows[SAMPLE_T, begin], total]
-            for column in (rows[SAMPLE_LEFT], rows[SAMPLE_RIGHT], rows[SAMPLE_GYRO]):
+            joined = [rows[SampleRow.T, begin], total]
+            for column in (rows[SampleRow.LEFT], rows[SampleRow.RIGHT], rows[SampleRow.GYRO]):
                 mean = np.add.reduceat(lasting * column[:closed], begin)
                 joined.append(np.divide(mean, total, out=column[begin], where=total > 0.0))
             self._steps = np.column_stack([self._steps, joined])
@@ -190,17 +188,17 @@ class DriveBuffer:
 
 def _intervals(rows: Floats, size: float) -> tuple[Floats, Floats, Bools]:
     """Return how long each sample but the last holds [s], how far the wheels roll then [m], and whether it is a gap."""
-    held = np.diff(rows[SAMPLE_T])
-    advance = np.abs((rows[SAMPLE_LEFT, :-1] + rows[SAMPLE_RIGHT, :-1]) / 2.0) * held
-    gap = (rows[SAMPLE_GAP, :-1] > 0.0) | ~(held >= 0.0) | ~(advance <= LARGEST_ADVANCE_M * size)
+    held = np.diff(rows[SampleRow.T])
+    advance = np.abs((rows[SampleRow.LEFT, :-1] + rows[SampleRow.RIGHT, :-1]) / 2.0) * held
+    gap = (rows[SampleRow.GAP, :-1] > 0.0) | ~(held >= 0.0) | ~(advance <= LARGEST_ADVANCE_M * size)
     held[gap] = advance[gap] = 0.0
     return held, advance, gap
 
 
 def _step_of(rows: Floats, gap: Bools) -> tuple[Ints, Ints]:
     """Return the step of each sample (n,), counted from 0, and the first sample of each step."""
-    standing = (rows[SAMPLE_LEFT] == 0.0) & (rows[SAMPLE_RIGHT] == 0.0)
-    cell = np.floor(rows[SAMPLE_T] / np.where(standing, STANDING_STEP_S, RECORDING_STEP_S) + ON_EDGE)
+    standing = (rows[SampleRow.LEFT] == 0.0) & (rows[SampleRow.RIGHT] == 0.0)
+    cell = np.floor(rows[SampleRow.T] / np.where(standing, STANDING_STEP_S, RECORDING_STEP_S) + ON_EDGE)
     begins = np.ones(rows.shape[1], np.bool_)
     begins[1:] = (np.diff(cell) != 0.0) | (standing[1:] != standing[:-1]) | gap
     return np.cumsum(begins) - 1, np.flatnonzero(begins)
