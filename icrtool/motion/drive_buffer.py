@@ -33,7 +33,7 @@ class SampleRow(IntEnum):
     T, LEFT, RIGHT, NORTH, EAST, HEADING, GYRO, KNOWN, BROKEN, GAP = range(10)
 
 
-POSE = [SampleRow.NORTH, SampleRow.EAST, SampleRow.HEADING]
+POSE_ROWS = [SampleRow.NORTH, SampleRow.EAST, SampleRow.HEADING]
 
 KNOT_T, KNOT_SEGMENT, KNOT_KNOWN, KNOT_STEPS, KNOT_SAMPLES = 0, 4, 5, 6, 7
 """Rows of the knots (8, m), north, east and heading between the first two: the segment of a knot changes where windows
@@ -96,7 +96,7 @@ class DriveBuffer:
         # knots, before the steps that are complete now are added
         at = np.repeat(np.arange(len(laid)), laid.astype(np.int64))
         row = old + at
-        pose = [np.where(known[row], one, 0.0) for one in (*rows[POSE[:2]][:, row], heading[at])]
+        pose = [np.where(known[row], one, 0.0) for one in (*rows[POSE_ROWS[:2]][:, row], heading[at])]
         steps = self._steps_before + self._steps.shape[1] + number[row]
         self._knots = np.column_stack(
             [
