@@ -102,6 +102,7 @@ class FramesConfig:
     heading_offset_deg: Literal["auto"] | Degrees = "auto"
     reference_delay_s: Literal["auto"] | Delay = "auto"
     heading_delay_s: Literal["auto"] | Delay = "auto"
+    gyro_delay_s: Literal["auto"] | Delay = "auto"
     antenna_forward_m: Literal["auto"] | Place = "auto"
     antenna_right_m: Literal["auto"] | Place = "auto"
     datum: tuple[Latitude, Longitude] | None = None

@@ -164,6 +164,7 @@ def _warm_start(source: Path | None, config: Config, note: Callable[[str], None]
     from icrtool.output.run_directory import open_run
 
     start = open_calibration(source).warm_start() if source.is_file() else open_run(source).ended_with
+    start = replace(start, source=source.name)
     theirs, ours = start.track_width_m, config.robot.track_width_m
     if note is not None and theirs is not None and ours is not None and not math.isclose(theirs, ours, rel_tol=0.01):
         note(f"{source}: made with a track width of {theirs:g} m, not {ours:g} m: are its ICRs this robot's?")

@@ -20,9 +20,9 @@ from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
-from icrtool.records.measurements import Finding, IcrStart, Measurements, SensorData
+from icrtool.records.measurements import Finding, Measurements, SensorData
 from icrtool.records.notes import about, note
-from icrtool.records.run import ICR_COLUMNS, width_or_usual_m
+from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
 
@@ -86,7 +86,6 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
         heading_correlation_s=max(config.filter.heading_correlation_s, found.correlation_s),
         antenna_m=antenna_m,
         losses_ns=quality.losses_ns,
-        icr_start=start_icrs(findings, config),
         heading_is_estimated=derived is not None,
         heading_is_measured=math.isfinite(heading_std_rad),
         turn_wander_rad=math.inf if found.fit is None else found.fit.turn_wander_rad,
@@ -137,16 +136,7 @@ def _antenna_m(log: RobotLog, config: Config) -> tuple[float, float]:
     )
 
 
-LEAST_START_STD, INFLATION = 0.15, 3.0
-"""The filter starts from the alignment's ICRs with three times their standard deviation, at least this part of b."""
-
-LARGEST_WIDTH_STD = 0.2
-"""The ICRs are shown where W is known to this share."""
-
-USUAL_WIDTH = 1.5
-"""Most skid-steer robots turn as if they were this much wider than they are."""
-
-START = "start of the filter"
+NOT_A_CORRECTION = "compared with the filter's ICRs"
 
 
 def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
@@ -177,12 +167,12 @@ def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) ->
     return findings | {
         "left_scale": _finding(left_scale, std[4], found.scales[0], nothing=1.0),
         "right_scale": _finding(right_scale, std[5], found.scales[1], nothing=1.0),
-        "icr_separation_m": Finding(width * multiplier, width * std[3], 0.0, START),
+        "icr_separation_m": Finding(width * multiplier, width * std[3], 0.0, NOT_A_CORRECTION),
         "antenna_forward_minus_x_icr_m": Finding(-x, std[2], forward_m, place),
         "antenna_right_minus_icr_middle_m": Finding(-(right + left) / 2, middle_std, right_m, place),
-        "y_icr_right_m": Finding(right + right_m, std[0], 0.0, START),
-        "y_icr_left_m": Finding(left + right_m, std[1], 0.0, START),
-        "x_icr_m": Finding(x + forward_m, std[2], 0.0, START),
+        "y_icr_right_m": Finding(right + right_m, std[0], 0.0, NOT_A_CORRECTION),
+        "y_icr_left_m": Finding(left + right_m, std[1], 0.0, NOT_A_CORRECTION),
+        "x_icr_m": Finding(x + forward_m, std[2], 0.0, NOT_A_CORRECTION),
     }
 
 
@@ -197,26 +187,6 @@ def _finding(value: float | None, std: float | None, applied: float, nothing: fl
     else:
         why = "not corrected: this drive does not show it"
     return Finding(value, std, applied, why)
-
-
-def start_icrs(findings: dict[str, Finding], config: Config) -> IcrStart | None:
-    """Return the ICRs to start the filter from; None where the preset states them.
-
-    They are those of the alignment with an inflated standard deviation, where the drive shows them; else those of
-    most skid-steer robots, as uncertain as those differ.
-    """
-    if config.filter.rules.initial_icrs_m is not None:
-        return None
-    b = width_or_usual_m(config.robot.track_width_m)
-    least = LEAST_START_STD * b
-    known = [findings[name] for name in ("icr_separation_m", *ICR_COLUMNS) if name in findings]
-    if known:
-        (width, right, left, x), std = [one.value or 0.0 for one in known], [one.std or 0.0 for one in known]
-        shown = std[0] < LARGEST_WIDTH_STD * width and max(std[1:]) < b
-        if shown and right > least > -least > left:
-            inflated = [max(INFLATION * one, least) for one in std[1:]]
-            return IcrStart((right, left, x), (inflated[0], inflated[1], inflated[2]))
-    return IcrStart((USUAL_WIDTH * b / 2, -USUAL_WIDTH * b / 2, 0.0), (b / 2, b / 2, b / 2))
 
 
 LENGTH_M, SHARE = 10.0, 0.9

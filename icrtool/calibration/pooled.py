@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from os import PathLike
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from msgspec import UNSET
@@ -20,7 +20,7 @@ from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, Lever
-from icrtool.motion.recording import ErrorsOf, GyroLine, Recording, cut_windows, fit_gyro_line
+from icrtool.motion.recording import ErrorsOf, GyroLine, PastLines, Recording, cut_windows, fit_gyro_line
 from icrtool.motion.window_fit import Fold, Prediction, own_constants
 from icrtool.records import calibration_document as documents
 from icrtool.records.measurements import MeasuredHeading
@@ -60,7 +60,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         x_clock_std_m=run.document.icr.x_clock_std_m,
         wheel_scales=run.wheel_scales,
     )
-    return plain if heading is None else with_turn_rate(plain, heading)
+    return plain if heading is None else with_turn_rate(plain, heading, run.config.frames.gyro_delay_s)
 
 
 def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
@@ -73,8 +73,13 @@ def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
     )
 
 
-def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
-    """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it."""
+def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | Literal["auto"] = "auto") -> Recording:
+    """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it.
+
+    Parameters
+    ----------
+    delay_s : by which it lags the wheels; ``auto``: as the turns of the reference show
+    """
     if not np.isfinite(heading.angle_rad).all():
         return plain
     t = plain.track.t
@@ -91,7 +96,7 @@ def with_turn_rate(plain: Recording, heading: MeasuredHeading) -> Recording:
     give_back_freed()
     if not line.is_yaw:
         return plain
-    track = plain.track._replace(gyro=np.sign(line.scale) * rate(line.lead_s))
+    track = plain.track._replace(gyro=np.sign(line.scale) * rate(line.lead_s if delay_s == "auto" else delay_s))
     return replace(plain, track=track, gyro_reversed=line.scale < 0.0)
 
 
@@ -100,14 +105,11 @@ def turning_recording_of(run: Run, kind: str = "gyro", *, width_m: float | None 
     return recording_of(run, next((one for one in measured_headings(run) if one.kind == kind), None), width_m=width_m)
 
 
-def scaled_gyro(recording: Recording) -> Floats:
-    """Return the turn rate of a recording's gyro (n,) [rad/s] with scale and bias that fit its reference."""
-    if recording.track.gyro is None:
-        return np.zeros(len(recording.track.t))
-    line = _gyro_line(recording, recording.track.gyro)
-    rate: Floats = line.scale * recording.track.gyro
-    rate += line.bias_radps
-    return rate
+def gyro_line(recording: Recording) -> PastLines:
+    """Return the one line of a recording's gyro that fits the reference of the whole drive."""
+    gyro = recording.track.gyro
+    line = GyroLine(1.0, 0.0, 0.0) if gyro is None else _gyro_line(recording, gyro)
+    return PastLines(np.zeros(1, np.int64), np.array([line.scale]), np.array([line.bias_radps]))
 
 
 def _gyro_line(recording: Recording, rate: Floats) -> GyroLine:

@@ -176,7 +176,8 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     def warm_start(self) -> WarmStart:
         """Return the three ICRs [m] and their covariance [m^2] for a filter to begin with (`icrtool.fit`)."""
         geometry, covariance = self._geometry()
-        return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m)
+        source = "" if self.name is UNSET else self.name
+        return WarmStart(np.array(geometry[:3]), covariance[:3, :3], self.width_m, source)
 
     def prior(self) -> TermsPrior:
         """Return what it shows of the robot's next drive, for `icrtool.AdaptiveModel` to begin with."""

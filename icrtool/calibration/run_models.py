@@ -18,15 +18,17 @@ from icrtool.calibration.adaptive_rows import adapt, prior_for
 from icrtool.calibration.held_out import GYRO_SUFFIX, HeldOut, fit_models, hold_out
 from icrtool.calibration.record import Calibration, controller_numbers, fitted_document
 from icrtool.errors import DataError
+from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.observability import WEAK_SHARE
+from icrtool.estimation.run_filter import noise_of
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
 from icrtool.motion.models import FIVE, ICR_VALUES, NO_SLIP, RECOMMENDED, TrackGeometry
-from icrtool.motion.recording import ErrorsOf, Recording, TrialErrors, Trials
+from icrtool.motion.recording import ErrorsOf, PastLines, Recording, TrialErrors, Trials, past_gyro_lines
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.notes import Note, note
 from icrtool.records.process_resources import give_back_freed
-from icrtool.records.rows import row_of
+from icrtool.records.rows import INSTALLATION, PAST, row_of
 from icrtool.records.run import ICR_COLUMNS, Run, no_slip_icrs, vendor_icrs, width_or_usual_m
 from icrtool.records.run_document import GeometryDocument, RunDocument
 
@@ -79,10 +81,11 @@ def with_motion(run: Run) -> RunDocument:
 
 
 class Model(NamedTuple):
-    """What predicts motion from wheel speeds: ICRs per start, or one triple."""
+    """What predicts motion from wheel speeds: ICRs per start, or one triple; `knows` as in `ComparedRow`."""
 
     name: str
     icrs: FrozenIcrs
+    knows: str = ""
 
 
 class ComparedRow(NamedTuple):
@@ -175,7 +178,7 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
     notes = list[Note]()
     plain = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     for one in headings:
-        found = pooled.with_turn_rate(plain, one)
+        found = pooled.with_turn_rate(plain, one, run.config.frames.gyro_delay_s)
         if found.track.gyro is not None:
             if found.gyro_reversed:
                 why = f"the {one.kind} counts turns in the other direction: its sign was changed"
@@ -201,15 +204,17 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
         for one in models_of(run):
             # Neither has an arm about which a measured turn moves the robot: with a gyro both would be no_slip_gyro.
             if not row_of(one.name).compared:
-                errors_of = partial(_errors_turned, run, recording, one.icrs)
-                yield ComparedRow(f"{one.name}_{kind}", errors_of)
+                of_past = one.name == "icr"
+                lines = partial(past_gyro_lines, recording.track) if of_past else partial(pooled.gyro_line, recording)
+                errors_of = partial(_errors_turned, run, recording, one.icrs, lines)
+                yield ComparedRow(f"{one.name}_{kind}", errors_of, knows=one.knows)
 
 
 def models_of(run: Run) -> tuple[Model, ...]:
     """Return the filter's ICRs at each start and its final ones; those of track width and published skid factor."""
     table = run.table
     momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
-    models = [Model("icr", momentary)]
+    models = [Model("icr", momentary, momentary_knows(run))]
     if (width := run.track_width_m) is not None:
         models.append(Model(NO_SLIP, FrozenIcrs.constant(*no_slip_icrs(width))))
     if (published := vendor_icrs(run.document)) is not None:
@@ -218,35 +223,70 @@ def models_of(run: Run) -> tuple[Model, ...]:
     return (*models, Model("icr_final", final))
 
 
-def turned_path(run: Run, recording: Recording) -> tuple[Floats, Complexes]:
-    """Return heading [rad] and place, ahead + j right [m], (n,) each, by mean track speed and measured turn rate."""
-    psi, last = recording.track.cumulate(pooled.scaled_gyro(recording)), len(recording.track.t) - 1
-    give_back_freed()
-    held, place = recording.track.held, np.zeros(last + 1, np.complex128)
-    for lo in range(0, last, ROWS_AT_ONCE):
-        hi = min(lo + ROWS_AT_ONCE, last)
-        moved = held[lo:hi] * (run.table.v_left_mps[lo:hi] + run.table.v_right_mps[lo:hi]) / 2.0
-        place[lo + 1 : hi + 1] = moved * np.exp(0.5j * (psi[lo:hi] + psi[lo + 1 : hi + 1]))
-    return psi, np.cumsum(place, out=place)
+def momentary_knows(run: Run) -> str:
+    """Return what the momentary ICRs of a run were learned from."""
+    start, parts = run.began_with, [PAST]
+    if start is not None:
+        parts = [f"started from {start.source or 'another run'}", PAST]
+    if run.config.filter.rules.corrects:
+        parts.append(INSTALLATION)
+    if noise_of(run) != configured_noise(run.config):
+        parts.append("process noise from all of the drive")
+    return ", ".join(parts)
 
 
-def _errors_turned(run: Run, recording: Recording, icrs: FrozenIcrs, trials: Trials) -> TrialErrors:
+def turned_path(run: Run, recording: Recording, turned: Floats, rows: slice) -> tuple[Floats, Complexes]:
+    """Return heading [rad] and place, ahead + j right [m], at some states (k,), by mean track speed and a heading.
+
+    Parameters
+    ----------
+    turned : (k,) the heading there [rad]
+    """
+    lo, hi = rows.start, rows.stop - 1
+    place = np.zeros(hi + 1 - lo, np.complex128)
+    for begin in range(lo, hi, ROWS_AT_ONCE):
+        some = slice(begin, min(begin + ROWS_AT_ONCE, hi))
+        of = slice(some.start - lo, some.stop - lo)
+        moved = recording.track.held[some] * (run.table.v_left_mps[some] + run.table.v_right_mps[some]) / 2.0
+        place[of.start + 1 : of.stop + 1] = moved * np.exp(0.5j * (turned[of] + turned[of.start + 1 : of.stop + 1]))
+    return turned, np.cumsum(place, out=place)
+
+
+def _errors_turned(
+    run: Run, recording: Recording, icrs: FrozenIcrs, lines: Callable[[], PastLines], trials: Trials
+) -> TrialErrors:
     """Return the errors (k, h) of ICRs (n,) or (1,) along the path of `turned_path`, which is kept for no longer.
+
+    Parameters
+    ----------
+    lines : gives scale and bias of the gyro, from the state of each on
 
     Notes
     -----
     With omega measured, displacement is the sum of V e^{j psi}, V the mean track speed, and
     ((y_r + y_l) / 2 - j x) (e^{j psi_e} - e^{j psi_s}) / j: W drops out.
     """
-    (psi, place), track = turned_path(run, recording), recording.track
+    track, (first_rows, scales, biases) = recording.track, lines()
+    gyro = track.gyro if track.gyro is not None else np.zeros(len(track.t))
+    turned, lasted = track.cumulate(gyro), track.cumulate(np.ones(len(track.t)))
+    give_back_freed()
     errors = TrialErrors.none(trials.ends.shape)
-    for h in range(trials.ends.shape[1]):
-        some = trials.ends[:, h] >= 0
-        s, e = trials.starts[some], trials.ends[some, h]
-        right, left, x = (column if len(column) == 1 else column[s] for column in icrs)
-        arm = (right + left) / 2.0 - 1j * x
-        moved = place[e] - place[s] - 1j * arm * (np.exp(1j * psi[e]) - np.exp(1j * psi[s]))
-        driven = track.north[e] - track.north[s] + 1j * (track.east[e] - track.east[s])
-        errors.position[some, h] = np.abs(np.exp(1j * (track.heading[s] - psi[s])) * moved - driven)
-        errors.heading[some, h] = np.abs(psi[e] - psi[s] - track.heading[e] + track.heading[s])
+    of_line = np.searchsorted(trials.starts, np.append(first_rows, len(track.t)))
+    for line, (scale, bias) in enumerate(zip(scales.tolist(), biases.tolist(), strict=True)):
+        mine = slice(of_line[line], of_line[line + 1])
+        if mine.start == mine.stop or (last := int(trials.ends[mine].max())) < 0:
+            continue
+        first = int(trials.starts[mine.start])
+        rows = slice(first, last + 1)
+        psi, place = turned_path(run, recording, scale * turned[rows] + bias * lasted[rows], rows)
+        for h in range(trials.ends.shape[1]):
+            some = mine.start + np.flatnonzero(trials.ends[mine, h] >= 0)
+            s, e = trials.starts[some], trials.ends[some, h]
+            right, left, x = (column if len(column) == 1 else column[s] for column in icrs)
+            arm = (right + left) / 2.0 - 1j * x
+            begin, end = psi[s - first], psi[e - first]
+            moved = place[e - first] - place[s - first] - 1j * arm * (np.exp(1j * end) - np.exp(1j * begin))
+            driven = track.north[e] - track.north[s] + 1j * (track.east[e] - track.east[s])
+            errors.position[some, h] = np.abs(np.exp(1j * (track.heading[s] - begin)) * moved - driven)
+            errors.heading[some, h] = np.abs(end - begin - track.heading[e] + track.heading[s])
     return errors

@@ -17,6 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from icrtool.calibration.run_models import models_of
 from icrtool.errors import RunError
+from icrtool.estimation.convergence import fallen_at
 from icrtool.estimation.observability import WEAK_SHARE
 from icrtool.kernels.arrays import Bools, Floats, Ints, Rows, rows_of_cells
 from icrtool.kernels.open_loop import open_loop_errors
@@ -28,12 +29,6 @@ from icrtool.records.run import ICR_COLUMNS, Run, track_of
 
 STANDING_MPS = 0.01
 """The robot stands while both tracks are slower than this."""
-
-LEARNED_SHARE = 0.9
-"""Part of the fall of its standard deviation after which an ICR is learned."""
-
-LEAST_FALL = 0.5
-"""A standard deviation that loses less than this part of itself shows that the drive added nothing to the start."""
 
 
 def standing_states(track: Track) -> Bools:
@@ -59,26 +54,23 @@ def first_learned(run: Run) -> int | None:
 
     Notes
     -----
-    The standard deviation of an ICR falls from s_0 at the first state to s_f, its median over the second half of the
-    states. The ICR is learned at the first state with s <= s_f + 0.1 (s_0 - s_f): 90 % of the change, as Pentzer 2014
-    (Section 5.2) counts it for the estimate itself. The standard deviation is taken because a trial that starts there
-    does not know the final value yet. An ICR whose standard deviation does not fall by half was known from the start
-    where it is at most `WEAK_SHARE` of y_right - y_left, the limit of "weakly shown", and is never learned otherwise. A
-    warm start has learned the ICRs before the first state.
+    An ICR is learned when its standard deviation has made 90 % of its fall (`icrtool.estimation.convergence`), as
+    Pentzer 2014 (Section 5.2) counts it for the estimate itself. The standard deviation is taken because a trial that
+    starts there does not know the final value yet. An ICR whose standard deviation does not fall by half was known
+    from the start where it is at most `WEAK_SHARE` of y_right - y_left, the limit of "weakly shown", and is never
+    learned otherwise. A warm start has learned the ICRs before the first state.
     """
     if run.began_with is not None:
         return 0
-    learned = np.ones(len(run.table), np.bool_)
+    last = 0
     separation = abs(float(run.table.y_icr_right_m[-1] - run.table.y_icr_left_m[-1]))
     for column in ICR_COLUMNS:
         std: Floats = getattr(run.table, f"std_{column}")
-        first, final = float(std[0]), float(np.median(std[len(std) // 2 :]))
-        if final > (1.0 - LEAST_FALL) * first:
-            if first > WEAK_SHARE * separation:
-                return None
-            continue
-        learned &= std <= final + (1.0 - LEARNED_SHARE) * (first - final)
-    return int(np.argmax(learned)) if learned.any() else None
+        if (learned := fallen_at(std)) is not None:
+            last = max(last, learned)
+        elif float(std[0]) > WEAK_SHARE * separation:
+            return None
+    return last
 
 
 DRAWS = 20_000

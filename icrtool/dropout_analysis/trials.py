@@ -281,6 +281,5 @@ def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> document
             errors_m = [float(f"{error:.6g}") for error in one.errors_m]
             blocks.append(documents.BlocksDocument(row.horizon_m, **plain(one._asdict() | {"errors_m": errors_m})))
     of_name = row_of(model.name)
-    knows = (isinstance(model, ComparedRow) and model.knows) or of_name.knows
-    document = documents.ModelDocument(model.name, of_name.words, knows, list(rows), blocks)
+    document = documents.ModelDocument(model.name, of_name.words, model.knows or of_name.knows, list(rows), blocks)
     return documents.ModelResult(document, bins, sums, tuple(row for row in free if row is not None))

@@ -20,6 +20,7 @@ from icrtool.estimation.filter_setup import (
     FilterSetup,
     check_start,
     configured_noise,
+    initial_icrs,
     set_up_filter,
     wheel_gap_s,
 )
@@ -27,7 +28,7 @@ from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, wrapped
 from icrtool.kernels.ekf import run_ekf, run_smoother
 from icrtool.kernels.filter_records import REFERENCE_STEP_S, UNSEEN, FilterOutput, FilterParameters
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
-from icrtool.records.measurements import SensorData
+from icrtool.records.measurements import IcrStart, SensorData
 from icrtool.records.presets import ProcessNoise
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.run import STATE_COLUMNS, MeasurementOutcome, Run, WarmStart
@@ -61,6 +62,7 @@ class Filtered(NamedTuple):
     noise : process noise of the pose that the run was made with
     least_icr_m : what the filter kept the y ICRs from the centre line; -inf: anywhere
     began_with : ICRs and covariance of the warm start, None without one
+    icr_start : ICRs that it started from where there is no warm start
     changes_s : terrain changes, seconds since the first recorded state, in order
     """
 
@@ -74,6 +76,7 @@ class Filtered(NamedTuple):
     noise: ProcessNoise
     least_icr_m: float
     began_with: WarmStart | None
+    icr_start: IcrStart
     changes_s: tuple[float, ...]
 
 
@@ -120,6 +123,7 @@ def run_filter(
         noise=noise,
         least_icr_m=parameters.least_icr,
         began_with=warm_start,
+        icr_start=initial_icrs(config),
         changes_s=changes_s,
     )
 
@@ -153,6 +157,7 @@ def set_up_again(run: Run, outages_ns: tuple[tuple[int, int], ...] = ()) -> Filt
         changes_s=run.changes_s,
         warm_start=run.began_with,
         outages_ns=outages_ns,
+        start=run.document.filter.icr_start,
     )
 
 

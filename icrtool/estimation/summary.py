@@ -11,6 +11,7 @@ from msgspec.structs import asdict
 from icrtool import __version__
 from icrtool.alignment.gnss_quality import CLASSES
 from icrtool.config import Config
+from icrtool.estimation.convergence import converge
 from icrtool.estimation.observability import (
     cut_states,
     final_covariance,
@@ -28,7 +29,7 @@ from icrtool.estimation.run_warnings import (
     run_warnings,
     unusable_reasons,
 )
-from icrtool.kernels.arrays import Bools, Floats, Ints, runs_of
+from icrtool.kernels.arrays import Bools, Floats, Ints
 from icrtool.kernels.filter_records import RECOVERED
 from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M
 from icrtool.records.measurements import Fixes, Measurements, ReferenceJump, SlipEvent
@@ -61,12 +62,6 @@ from icrtool.records.run_document import (
 )
 from icrtool.records.samples import Datum, InputFile, are_twist
 from icrtool.records.tables import States
-
-ARRIVED_S = 2.0
-"""An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""
-
-SMALLEST_CHANGE_M = 0.03
-"""An ICR whose estimate moved less than this from its start has no convergence to time."""
 
 
 def summarise(
@@ -205,8 +200,10 @@ def filter_summary(measurements: Measurements, filtered: Filtered, config: Confi
         antenna_m=sensors.antenna_m,
         antenna_is_known=measurements.antenna_is_known,
         states=len(filtered.table),
-        warm_start=None if start is None else WarmStartDocument(start.icrs_m.tolist(), start.covariance_m2.tolist()),
-        icr_start=sensors.icr_start,
+        warm_start=None
+        if start is None
+        else WarmStartDocument(start.icrs_m.tolist(), start.covariance_m2.tolist(), start.source),
+        icr_start=filtered.icr_start,
         nis_gnss_mean=_mean(filtered.gnss.nis[filtered.gnss.used]),
         gnss_rejected=_count(filtered.gnss.rejected),
         nis_heading_mean=_mean(filtered.heading.nis[filtered.heading.used]),
@@ -265,39 +262,6 @@ def _speed_while_turning(table: States) -> float:
 def _seconds(span: SlipEvent | ReferenceJump, start_ns: int) -> dict[str, float]:
     """Return begin and end of a span in seconds since the first recorded state, of stamp `start_ns`."""
     return {"begin_s": (span.begin_ns - start_ns) / 1e9, "end_s": (span.end_ns - start_ns) / 1e9}
-
-
-def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:
-    """Find when each ICR estimate converged, up to a time where one is given.
-
-    Returns
-    -------
-    dict
-        By column: time [s] at which the estimate has made 10 % of the change from its start to its settled value
-        (median over the second half of the run), and time from which on it stays within 10 % of that change for
-        `ARRIVED_S`; None where the change is below `SMALLEST_CHANGE_M` or the estimate never settles.
-
-    Notes
-    -----
-    Pentzer 2014, Section 5.2: the time from 10 % change to within 90 % of the final value.
-    """
-    spans: dict[IcrColumn, tuple[float, float] | None] = {}
-    rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
-    t_s = table.t_s[:rows]
-    for column in ICR_COLUMNS:
-        estimate: Floats = getattr(table, column)[:rows]
-        settled = float(np.median(estimate[len(estimate) // 2 :]))
-        change = settled - float(estimate[0])
-        if abs(change) < SMALLEST_CHANGE_M:
-            spans[column] = None
-            continue
-        gone = (estimate - estimate[0]) / change
-        first = int(np.argmax(np.abs(gone) >= 0.1))
-        begin, behind = runs_of(np.abs(gone - 1.0) <= 0.1)
-        settled_by = np.searchsorted(t_s, t_s[begin] + ARRIVED_S)
-        stays = begin[(settled_by <= behind) & (settled_by < rows)]
-        spans[column] = (float(t_s[first]), float(t_s[stays[0]])) if len(stays) else None
-    return spans
 
 
 def icr_summary(

@@ -43,7 +43,7 @@ class FilterParameters(NamedTuple):
     recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
     icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
     least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: anywhere
-    guard : sign guard of the kinematics, one of the above; other than GUARDED in studies only
+    guard : sign guard of the kinematics, one of the above: PRINTED in preset ``paper``, UNGUARDED in studies only
     """
 
     process_variance: tuple[float, float, float, float, float, float]

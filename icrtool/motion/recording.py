@@ -5,6 +5,7 @@ The gyro is compared with the heading by one line, which alignment uses too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 
 from icrtool.errors import DataError
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats, Ints, Rows, rows_at_steps
-from icrtool.kernels.robust import robust_least_squares
+from icrtool.kernels.robust import LOSS_SIGMAS, robust_least_squares
 from icrtool.kernels.track import Track, Windows, cut, ends_from
 from icrtool.kernels.window_residuals import OMEGA, path_at
 from icrtool.motion.models import NO_LEVER, FittedModel, Lever, wheel_motion
@@ -348,3 +349,70 @@ def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: 
 
     zero = np.zeros(3)
     return GyroLine(*robust_least_squares(evaluate, zero, zero, GYRO_PRIOR_STD, overlap=10.0).x.tolist())
+
+
+GYRO_START_STD = (0.02, 0.005)
+"""Standard deviations of scale and bias [rad/s] of a gyro before a drive: those of `TERMS` and `GYRO_PRIOR_STD`."""
+
+TURN_NOISE_RAD, GUESSED_TURNS = 0.01, 5
+"""Spread of the differences of turns over `TURN_S` before a drive, and how many differences the guess counts as."""
+
+MEAN_TO_STD = 1.2533
+"""Standard deviation over mean size, for normal values."""
+
+MOST_SIGMAS = 3.0
+"""A larger difference counts as this many standard deviations in the spread of the differences."""
+
+RENEWED_S = 10.0
+"""Scale and bias of a gyro are taken anew so often: they change slowly. In the first seconds more often."""
+
+
+class PastLines(NamedTuple):
+    """Lines of a gyro, each from the turns that had ended before the state from which it holds.
+
+    Attributes
+    ----------
+    row : (k,) first state of each, from 0 on; scale (k,); bias_radps (k,)
+    """
+
+    row: Ints
+    scale: Floats
+    bias_radps: Floats
+
+
+def past_gyro_lines(track: Track) -> PastLines:
+    """Return scale and bias of a track's gyro as known from the past of each state, without its lead.
+
+    Notes
+    -----
+    Recursive least squares over turns of `TURN_S` (Kalman 1960, constant state): normal equations are added to. Each
+    turn has the soft-L1 weight of what the line before missed it by.
+    """
+    t, lasted = track.t - track.t[0], track.cumulate(np.ones(len(track.t)))
+    turned = np.zeros(len(t)) if track.gyro is None else track.cumulate(track.gyro)
+    every = rows_at_steps(t, TURN_S)
+    begins = [0.0]
+    while begins[-1] < t[-1]:
+        begins.append(begins[-1] + min(max(begins[-1], TURN_S), RENEWED_S))
+    rows = np.searchsorted(t, begins[: max(len(begins) - 1, 1)])
+    made = [np.diff(column[every]).tolist() for column in (turned, lasted, track.heading)]
+    # of scale - 1 and bias: information and its vector
+    a, b, c = GYRO_START_STD[0] ** -2.0, 0.0, GYRO_START_STD[1] ** -2.0
+    p = q = scale = bias = 0.0
+    count, sizes, done = GUESSED_TURNS, GUESSED_TURNS * TURN_NOISE_RAD / MEAN_TO_STD, 0
+    lines = []
+    for row in rows.tolist():
+        known = int(np.searchsorted(every[1:], row, side="right"))
+        for turn, time, truth in zip(*(column[done:known] for column in made), strict=True):
+            spread = MEAN_TO_STD * sizes / count
+            missed = truth - turn - scale * turn - bias * time
+            weight = 1.0 / (spread**2 * math.sqrt(1.0 + (missed / (LOSS_SIGMAS * spread)) ** 2))
+            a, b, c = a + weight * turn * turn, b + weight * turn * time, c + weight * time * time
+            p, q = p + weight * turn * (truth - turn), q + weight * time * (truth - turn)
+            determinant = a * c - b * b
+            scale, bias = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+            count, sizes = count + 1, sizes + min(abs(missed), MOST_SIGMAS * spread)
+        done = known
+        lines.append((1.0 + scale, bias))
+    found = np.array(lines)
+    return PastLines(rows, found[:, 0], found[:, 1])

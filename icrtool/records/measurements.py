@@ -91,7 +91,6 @@ class SensorData:
     losses_ns : half-open spans in which RTK was lost, (k, 2)
     events : slip events, in order of time
     jumps : of the reference, likewise
-    icr_start : initial ICRs by the alignment, or typical ones of such robots; None: those of the preset
     """
 
     name: str
@@ -105,7 +104,6 @@ class SensorData:
     losses_ns: Ints
     events: tuple[SlipEvent, ...] = ()
     jumps: tuple[ReferenceJump, ...] = ()
-    icr_start: IcrStart | None = None
     heading_is_estimated: bool = False
     heading_is_measured: bool = False
     turn_wander_rad: float = math.inf

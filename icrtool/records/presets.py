@@ -33,8 +33,10 @@ class Preset:
     rate_invariant : process noise does not depend on the number of steps
     step_heading : part of the turn of a step after which the robot moves along its heading
     process_noise : of the pose, where none is configured
-    initial_icrs_m : right, left, x [m]; None: those that the drive shows, else those of the tracks
-    initial_icr_std_m : None: by the drive and the track width
+    printed_derivatives : the Jacobian is that of Eqs. 28-29 as printed, with the difference of Eqs. 32-34; else it has
+        the true derivatives. Both are the same where the right ICR is right of the left one
+    initial_icrs_m : right, left, x [m]; None: those of skid-steer robots of the track width
+    initial_icr_std_m : None: as those differ
     terrain_icr_std_m : of the ICRs after a change of terrain [m]; None: the track width
     """
 
@@ -47,6 +49,7 @@ class Preset:
     rate_invariant: bool
     step_heading: float
     process_noise: ProcessNoise
+    printed_derivatives: bool
     initial_icrs_m: tuple[float, float, float] | None
     initial_icr_std_m: float | None
     terrain_icr_std_m: float | None
@@ -64,6 +67,8 @@ PAPER = Preset(
     step_heading=0.0,
     # Eq. 30: 0.1 m/s in the text, 0.2 squared in the matrix. The matrix is used.
     process_noise=ProcessNoise(0.2, 5.0),
+    # With the true derivatives an inverted start stays inverted, and Fig. 7 is not reproduced.
+    printed_derivatives=True,
     # Section 6.1
     initial_icrs_m=(1.0, -1.0, 1.0),
     initial_icr_std_m=1.0,
@@ -86,6 +91,7 @@ FIELD = Preset(
     # With the paper's 0.2 and 5 the 2-sigma bands hold only 83 % (position) and 86 % (heading) of the truth on
     # rigid-body simulated robots, with these 90 % and more.
     process_noise=ProcessNoise(0.3, 7.0),
+    printed_derivatives=False,
     initial_icrs_m=None,
     initial_icr_std_m=None,
     # 10 m is far beyond what a linearised filter of ICRs a metre apart bears: some drives end with wrong ICRs.

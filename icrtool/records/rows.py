@@ -22,6 +22,12 @@ REST_OF_DRIVE = "the rest of the drive"
 
 WHOLE_DRIVE = "the whole drive, its trials too"
 
+PAST = "the drive before each start"
+"""What the numbers of a row were learned from that knows nothing of its trials."""
+
+INSTALLATION = "sensors corrected by all of the drive"
+"""What a row knows of all of the drive: conventions, heading offset, delays, scales, and the noise of the sensors."""
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
@@ -73,14 +79,14 @@ REPORT_ROWS: dict[str, Row] = {
             shown=True, pictured=True, in_csv=True, on_robot=True, turned_shown=True,
         ),
         Row(
-            "adaptive", "motion model, learning on while it drives", "other logs, and the drive before each start",
+            "adaptive", "motion model, learning on while it drives", f"other logs, and {PAST}",
             "pink", shown=True, pictured=True, in_csv=True, on_robot=True,
-            turned_shown=True, turned_knows="other logs, and the drive before each start",
+            turned_shown=True, turned_knows=f"other logs, and {PAST}",
         ),
         Row(
-            "icr", "ICRs as estimated at each start", "the drive before each start", "blue", "dashed",
+            "icr", "ICRs as estimated at each start", f"{PAST}, {INSTALLATION}", "blue", "dashed",
             pictured=True, in_csv=True,
-            turned_knows="the drive before each start, scale and bias of the gyro from the whole drive",
+            turned_knows=f"{PAST}, {INSTALLATION}",
         ),
         Row("icr_final", "ICRs at the end of the log", WHOLE_DRIVE, "grey", "dotted", turned_knows=WHOLE_DRIVE),
         Row(

@@ -91,12 +91,14 @@ class MeasurementOutcome:
 class WarmStart:
     """ICRs (3,) [m], right, left, x, and their covariance (3, 3) [m^2] to start from (Pentzer 2014, Fig. 18).
 
-    `track_width_m` is b of the robot they were learned on, None where it was not given.
+    `track_width_m` is b of the robot they were learned on, None where it was not given; `source` the name of the run or
+    file that they come from, empty where it has none.
     """
 
     icrs_m: Floats
     covariance_m2: Floats
     track_width_m: float | None = None
+    source: str = ""
 
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
@@ -192,13 +194,15 @@ class Run:
     def began_with(self) -> WarmStart | None:
         """What the run was warm-started with, None where it was not."""
         stored = self.document.filter.warm_start
-        return WarmStart(np.array(stored.icrs_m), np.array(stored.covariance_m2)) if stored else None
+        if stored is None:
+            return None
+        return WarmStart(np.array(stored.icrs_m), np.array(stored.covariance_m2), source=stored.source)
 
     @property
     def ended_with(self) -> WarmStart:
         """The filter's last ICRs and their covariance, to start another run from; large where not shown."""
         covariance = np.array(self.document.icr.final_covariance_m2, np.float64)
-        return WarmStart(np.array(self.table.icrs_at(-1)), covariance, self.track_width_m)
+        return WarmStart(np.array(self.table.icrs_at(-1)), covariance, self.track_width_m, self.name)
 
     @property
     def wheel_scales(self) -> tuple[float, float]:

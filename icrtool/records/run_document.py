@@ -225,10 +225,11 @@ class HeadingDocument(HeadingFacts, frozen=True, kw_only=True):
 
 
 class WarmStartDocument(Record, frozen=True):
-    """What a run began with."""
+    """What a run began with; `source`: the name of the run or file, empty where it is not known."""
 
     icrs_m: Annotated[list[float], Three]
     covariance_m2: Matrix
+    source: str = ""
 
 
 class FilterDocument(Record, frozen=True, kw_only=True):

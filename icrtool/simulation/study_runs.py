@@ -19,7 +19,6 @@ from icrtool.config import Config
 from icrtool.estimation.filter_setup import configured_noise, process_variance, set_up_filter
 from icrtool.kernels.arrays import Floats, Ints, wrapped
 from icrtool.kernels.ekf import run_ekf
-from icrtool.kernels.filter_records import GUARDED
 from icrtool.kernels.kinematics import drive, model_states
 from icrtool.records.samples import HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
@@ -68,7 +67,7 @@ class Scenario:
     ----------
     config : its filter section is used, and its robot for the start of preset ``field``
     inflate : inflate the ICR covariance at the drive's ICR changes (Section 5.2)
-    guard : sign guard, of `icrtool.kernels.kinematics`; other than GUARDED the filter takes the Euler steps of Eq. 14
+    guard : sign guard, of `icrtool.kernels.filter_records`, with the Euler steps of Eq. 14; None: those of the preset
     model_icr_std_m : the truth obeys the filter's model, Eq. 14 with process noise drawn from Q (Eq. 30), from ICRs
         drawn with this standard deviation on; None: constant ICRs and exact kinematics
     """
@@ -77,7 +76,7 @@ class Scenario:
     sensors: Sensors
     config: Config
     inflate: bool = False
-    guard: int = GUARDED
+    guard: int | None = None
     model_icr_std_m: float | None = None
 
 
@@ -154,7 +153,7 @@ def _filtered(scenario: Scenario, run: int, seed: int) -> StudyRun:
     changes = tuple(time for time, _ in scenario.plan.changes) if scenario.inflate else ()
     sensors = sensors_as_sent(readings_log(readings, scenario.sensors), scenario.config)
     setup = set_up_filter(sensors, scenario.config, changes_s=changes)
-    if scenario.guard != GUARDED:
+    if scenario.guard is not None:
         euler = setup.parameters._replace(guard=scenario.guard, step_heading=0.0)
         setup = setup._replace(parameters=euler)
     first = int(np.searchsorted(setup.data.wheel_t, setup.t0))

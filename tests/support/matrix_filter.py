@@ -13,6 +13,7 @@ import numpy as np
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.filter_records import (
     GATED,
+    PRINTED,
     RECOVERED,
     REFERENCE_STEP_S,
     USED,
@@ -41,11 +42,13 @@ def step_state(x: Floats, v_left: float, v_right: float, dt: float, step_heading
     return np.array([N + dt * (v_x * c - v_y * s), E + dt * (v_x * s + v_y * c), psi + dt * omega, y_r, y_l, x_v])
 
 
-def state_jacobian(x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0) -> Floats:
-    """Return F (6, 6), the derivative of `step_state` (Eq. 17)."""
+def state_jacobian(
+    x: Floats, v_left: float, v_right: float, dt: float, step_heading: float = 0.0, *, printed: bool = False
+) -> Floats:
+    """Return F (6, 6), the derivative of `step_state` (Eq. 17); `printed`: as Eqs. 28-29 have it."""
     _, _, psi, y_r, y_l, x_v = x
     W = max(abs(y_l - y_r), MIN_ICR_SEPARATION_M)
-    sign = 1.0 if y_r >= y_l else -1.0
+    sign = 1.0 if y_r >= y_l or printed else -1.0
     difference = v_left - v_right
     v_x, v_y, omega = (v_left * y_r - v_right * y_l) / W, -difference * x_v / W, difference / W
     c, s = math.cos(psi + step_heading * dt * omega), math.sin(psi + step_heading * dt * omega)
@@ -97,7 +100,7 @@ def run_ekf_plain(data: FilterInputs, t0: float, x0: Floats, P0: Floats, paramet
                 P = P + dt * np.diag([speed, speed, turn, 0.0, 0.0, 0.0]) + Q
             else:
                 speeds = (data.v_left[held], data.v_right[held])
-                F = state_jacobian(x, *speeds, dt, parameters.step_heading)
+                F = state_jacobian(x, *speeds, dt, parameters.step_heading, printed=parameters.guard == PRINTED)
                 stepped = step_state(x, *speeds, dt, parameters.step_heading)
                 travelled += math.hypot(*(stepped[:2] - x[:2]))
                 x, P = stepped, F @ P @ F.T + Q

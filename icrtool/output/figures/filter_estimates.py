@@ -54,7 +54,7 @@ def _time_axis(span_s: float) -> tuple[str, float]:
 
 @style.styled
 def icr_estimates(run: Run) -> Figure:
-    """Return the three ICR estimates over time with ±2σ, their 10-90 % convergence, b/2 where known, and GNSS outages.
+    """Return the three ICR estimates over time with ±1σ, start and convergence, b/2 where known, and GNSS outages.
 
     A long run has two columns, each with its own scale: the learning, and what follows.
     """
@@ -82,7 +82,8 @@ def icr_estimates(run: Run) -> Figure:
             _draw_estimate(axes, run, column, span, first=axes is row[0])
         row[0].set_ylabel(f"ICR {ICR_WORDS[column]} [m]")
         settling, final = run.convergence_s[column], finals[column]
-        found = f"10–90 % in {settling[1] - settling[0]:.1f} s" if settling else "starts near its final value"
+        without = "known from the start" if run.began_with is not None else "does not converge"
+        found = f"10–90 % in {settling[1] - settling[0]:.1f} s" if settling else without
         row[0].set_title(found, loc="left", pad=4.0)
         found = f"final {signed(final)} ± {stds[column]:.3f} m" if final is not None else "not shown by this drive"
         row[-1].set_title(found, loc="right", pad=4.0)
@@ -122,13 +123,14 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     t, value, std = table.t_s[rows], getattr(table, column)[rows], getattr(table, f"std_{column}")[rows]
     shown = extremes(value)
     axes.plot(t[shown] / unit, value[shown], color="black", linewidth=1.0, label="estimate")
-    low, high = value - 2 * std, value + 2 * std
+    low, high = value - std, value + std
     shown = extremes(low, high)
-    axes.fill_between(t[shown] / unit, low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="±2σ")
+    axes.fill_between(t[shown] / unit, low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="±1σ")
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
-        # Here the band is as wide as the prior: it is shown as far as the estimates go.
-        marks = ("white", "10 %"), ("black", "90 % of the change")
+        # The band of the start is as wide as robots differ: it is shown to one standard deviation.
+        spread += [low[0], high[0]]
+        marks = ("white", "10 %"), ("black", "90 %: converged")
         for second, (fill, label) in zip(run.convergence_s[column] or (), marks, strict=False):
             spread.append(float(getattr(table, column)[np.searchsorted(table.t_s, second)]))
             axes.plot([second / unit], spread[-1:], zorder=4, clip_on=False, label=label, **style.spot(fill))

@@ -335,7 +335,6 @@ def read_measurements(
             losses_ns=spans_of(document.rtk_losses_ns),
             events=tuple(SlipEvent(*(getattr(one, name) for name in SlipEvent._fields)) for one in document.events),
             jumps=tuple(ReferenceJump(*msgspec.structs.astuple(one)[:-2]) for one in document.reference_jumps),
-            icr_start=facts.icr_start,
             heading_is_estimated=facts.heading_is_estimated,
             heading_is_measured=facts.heading_is_measured,
             turn_wander_rad=math.inf if facts.turn_wander_rad is None else facts.turn_wander_rad,

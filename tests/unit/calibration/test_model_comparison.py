@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 import icrtool
-from icrtool.calibration.pooled import recording_of
+from icrtool.calibration.pooled import gyro_line, recording_of
 from icrtool.calibration.run_models import ComparedModels, _errors_turned, compare_models
 from icrtool.config import parse_config
 from icrtool.errors import DataError
@@ -49,7 +50,7 @@ def test_along_a_true_heading_the_path_is_the_models_own(run: Run) -> None:
     recording = recording_of(run, MeasuredHeading("gyro", turned))
     trials = cut_trials(recording, (5.0,))
     icrs = FrozenIcrs.constant(0.5, -0.6, 0.1)
-    found = _errors_turned(run, recording, icrs, trials).position
+    found = _errors_turned(run, recording, icrs, partial(gyro_line, recording), trials).position
     ahead = (0.5 * table.v_left_mps + 0.6 * table.v_right_mps) / width
     aside = -0.1 * (table.v_left_mps - table.v_right_mps) / width
     step = (dt * (ahead + 1j * aside))[:-1] * np.exp(0.5j * (turned[1:] + turned[:-1]))

@@ -145,7 +145,7 @@ def test_a_limit_is_missed_only_beyond_the_interval(report: DropoutReport, writt
     assert verdict.margin_m < 0 < verdict.margin_high_m
     assert verdict.passed
     assert not check_gate(gate, report, baseline, strict=True).passed
-    far = check_gate(parse_gate("icr_final.p95@2m <= 0.1 * baseline"), report, baseline)
+    far = check_gate(parse_gate("no_slip.p95@2m <= 0.1 * baseline"), report, baseline)
     assert not far.passed
     assert far.margin_high_m < 0
     for part in (

@@ -57,7 +57,7 @@ def test_no_spaced_outage_begins_where_the_robot_stands(clean: Run) -> None:
     assert len(spans) > 3
     for begin, end in spans:
         assert not 20 < begin < 39.9
-        assert float(np.diff(np.interp([begin, end], t, stood))[0]) > 0.1
+        assert float(np.diff(np.interp([begin, end], t, stood))[0]) > 0.05
 
 
 def test_no_outage_reaches_into_one_of_the_logs_own(run: Run) -> None:

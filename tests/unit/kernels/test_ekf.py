@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icrtool.kernels.ekf import run_ekf, wrap
-from icrtool.kernels.filter_records import GATED, RECOVERED, UNSEEN, USED, FilterInputs, FilterParameters
+from icrtool.kernels.filter_records import GATED, PRINTED, RECOVERED, UNSEEN, USED, FilterInputs, FilterParameters
 from support.matrix_filter import run_ekf_plain, state_jacobian, step_state
 
 PAPER_Q = (0.2**2, 0.2**2, math.radians(5.0) ** 2, 1e-4, 1e-4, 1e-4)
@@ -16,6 +16,8 @@ TWIN_TOLERANCE = 1e-9
 """Joint and one-by-one updates round differently; states are of order 1 to 100 [m, rad]."""
 TRANSCRIPTION_TOLERANCE = 1e-6
 """What the method asks of preset `paper`, in every column."""
+INVERTED_S, INVERTED_STD_M = 1.5, 0.02
+"""An inverted start is compared for this time [s], with this standard deviation [m]: W halves, and is not yet 0."""
 COMPLEX_STEP = 1e-30
 DERIVATIVE_TOLERANCE = 1e-12
 
@@ -110,6 +112,8 @@ def test_twins_agree_through_gaps_changes_and_inverted_starts() -> None:
     )
     assert_twins(data, parameters())
     assert_twins(data, parameters(), icrs=(-0.5, 0.5, 0.1))
+    short, _ = drive(3, seconds=INVERTED_S)
+    assert_twins(short, parameters(guard=PRINTED), icrs=(-0.7, 0.9, 1.0), icr_std=INVERTED_STD_M)
     assert_twins(data, parameters(least_icr=0.2), icrs=(-0.5, 0.5, 0.1))
 
 
@@ -152,6 +156,26 @@ def test_the_jacobian_equals_complex_step_differences(icrs: tuple[float, float, 
         np.testing.assert_allclose(F[:, column], derivative, atol=DERIVATIVE_TOLERANCE)
 
 
+def printed_jacobian(x: np.ndarray, v_left: float, v_right: float, dt: float) -> np.ndarray:
+    """Eqs. 17 and 27-29 as they are printed, with D, the difference of Eqs. 32-34, in place of y_l - y_r."""
+    _, _, psi, y_r, y_l, x_v = x
+    D = -abs(y_l - y_r)
+    along, turning = v_right * y_l - v_left * y_r, (v_left - v_right) * x_v
+    c, s = math.cos(psi), math.sin(psi)
+    F = np.eye(6)
+    F[0, 2] = dt * (-along / D * s - turning / D * c)
+    F[1, 2] = dt * (along / D * c - turning / D * s)
+    F[0, 3] = dt * (along * c / D**2 - v_left * c / D - turning * s / D**2)
+    F[0, 4] = dt * (-along * c / D**2 + v_right * c / D + turning * s / D**2)
+    F[0, 5] = -dt * (v_left - v_right) * s / D
+    F[1, 3] = dt * (along * s / D**2 - v_left * s / D + turning * c / D**2)
+    F[1, 4] = dt * (-along * s / D**2 + v_right * s / D - turning * c / D**2)
+    F[1, 5] = dt * (v_left - v_right) * c / D
+    F[2, 3] = -dt * (v_left - v_right) / D**2
+    F[2, 4] = dt * (v_left - v_right) / D**2
+    return F
+
+
 def transcription(data: FilterInputs, x: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Eqs. 14-25 as they stand in the paper, for a log with all three streams at the same stamps."""
     Q = np.diag(PAPER_Q)
@@ -161,9 +185,7 @@ def transcription(data: FilterInputs, x: np.ndarray, P: np.ndarray) -> np.ndarra
     for k in range(1, len(data.wheel_t)):
         dt = data.wheel_t[k] - data.wheel_t[k - 1]
         u = data.v_left[k - 1], data.v_right[k - 1]
-        F = np.column_stack(
-            [np.imag(step_state(x + 1j * COMPLEX_STEP * np.eye(6)[i], *u, dt)) / COMPLEX_STEP for i in range(6)]
-        )
+        F = printed_jacobian(x, *u, dt)
         x, P = step_state(x, *u, dt), F @ P @ F.T + dt**2 * Q
         y = np.array([*data.gnss_z[k], data.heading_z[k]])
         nu = y - H @ x
@@ -174,11 +196,22 @@ def transcription(data: FilterInputs, x: np.ndarray, P: np.ndarray) -> np.ndarra
     return np.array(states)
 
 
-def test_the_papers_filter_equals_a_transcription_of_its_equations() -> None:
-    data, _ = drive(6, seconds=60.0, rate=100.0, coincident=True)
-    t0, x0, _ = start(data, icrs=(1.0, -1.0, 1.0))
-    P0 = np.diag([1e-4, 1e-4, math.radians(1) ** 2, 1.0, 1.0, 1.0])
-    out = run_ekf(data, t0, x0, P0, parameters(rate_invariant=False, step_heading=0.0, wheel_gap_s=math.inf))
+def test_derivatives_as_printed_are_the_true_ones_of_a_proper_state_only() -> None:
+    for icrs, proper in (((0.5, -0.75, -0.25), True), ((-0.3, 0.4, 0.1), False)):
+        x = np.array([3.0, -2.0, 0.7, *icrs])
+        difference = np.abs(printed_jacobian(x, 0.31, 0.52, 0.01) - state_jacobian(x, 0.31, 0.52, 0.01)).max()
+        assert (difference < DERIVATIVE_TOLERANCE) == proper
+
+
+@pytest.mark.parametrize(
+    ("icrs", "std", "seconds"), [((1.0, -1.0, 1.0), 1.0, 60.0), ((-0.7, 0.9, 1.0), INVERTED_STD_M, INVERTED_S)]
+)
+def test_the_papers_filter_equals_a_transcription(icrs: tuple[float, ...], std: float, seconds: float) -> None:
+    """Its own start, and an inverted one."""
+    data, _ = drive(6, seconds=seconds, rate=100.0, coincident=True)
+    t0, x0, P0 = start(data, icrs=icrs, icr_std=std)
+    settings = parameters(rate_invariant=False, step_heading=0.0, wheel_gap_s=math.inf, guard=PRINTED)
+    out = run_ekf(data, t0, x0, P0, settings)
     np.testing.assert_allclose(out.x, transcription(data, x0, P0), atol=TRANSCRIPTION_TOLERANCE)
 
 

@@ -176,10 +176,12 @@ def test_odometry_that_leads_away_leaves_the_picture(make_run: Callable[..., Run
 
 def test_icr_estimates_show_bands_and_outage(run: Run) -> None:
     figure = drawn("icr_estimates", run)
-    assert legend_texts(figure) == ["estimate", "±2σ", "no slip (±b/2, 0)", "no usable GNSS"]
-    # the alignment starts the filter where this drive has its ICRs
+    assert legend_texts(figure) == [
+        "estimate", "±1σ", "10 %", "90 %: converged", "no slip (±b/2, 0)", "no usable GNSS"
+    ]  # fmt: skip
     rises = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
-    assert rises == ["starts near its final value"] * 3
+    assert len(rises) == 3
+    assert all(rise.startswith("10–90 % in ") for rise in rises)
     finals = [axes.get_title(loc="right") for axes in figure.axes if axes.get_title(loc="right")]
     assert finals[1].startswith("final −0.6")
     assert [axes.get_ylabel() for axes in figure.axes if axes.get_ylabel()] == [
@@ -195,7 +197,7 @@ def test_icr_estimates_from_a_given_start_show_their_rises() -> None:
     run = fit(simulate(), replace(config, filter=far))
     figure = drawn("icr_estimates", run)
     texts = legend_texts(figure)
-    assert texts == ["estimate", "±2σ", "10 %", "90 % of the change", "no slip (±b/2, 0)", "no usable GNSS"]
+    assert texts == ["estimate", "±1σ", "10 %", "90 %: converged", "no slip (±b/2, 0)", "no usable GNSS"]
     rises = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
     convergence = run.summary["icr"]["convergence_s"]
     assert rises == [

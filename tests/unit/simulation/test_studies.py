@@ -131,7 +131,7 @@ def test_a_proper_start_converges_and_an_unguarded_inverted_one_never() -> None:
     def share(guard: str, right: float, left: float) -> dict[str, Any]:
         return level(result, series=guard, start_y_icr_right_m=right, start_y_icr_left_m=left)
 
-    for guard in ("no guard", "guard, printed derivatives", "guard"):
+    for guard in ("no guard", "guard, printed derivatives", "guard, true derivatives"):
         assert share(guard, 1.0, -1.0)["converged"] >= 0.75
     assert share("no guard", -1.0, 1.0)["inverted"] == 1.0
     assert share("guard, printed derivatives", -1.0, 1.0)["inverted"] == 0.0

@@ -1,0 +1,76 @@
+"""When a filter had learned its ICRs: by the estimates (Pentzer 2014, Section 5.2), or by their standard deviations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from icrtool.kernels.arrays import Floats, runs_of
+from icrtool.records.run import ICR_COLUMNS
+from icrtool.records.run_document import IcrColumn
+from icrtool.records.tables import States
+
+ARRIVED_S = 2.0
+"""An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""
+
+SMALLEST_CHANGE_M = 0.03
+"""The time of an estimate that moved less than this from its start is that of its standard deviation."""
+
+LEARNED_SHARE = 0.9
+"""Part of its fall after which a standard deviation has fallen, and the ICR is learned."""
+
+LEAST_FALL = 0.5
+"""A standard deviation that loses less than this part of itself shows that the drive added nothing to the start."""
+
+
+def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:
+    """Find when each ICR estimate converged, up to a time where one is given.
+
+    Returns
+    -------
+    dict
+        By column: time [s] at which the estimate has made 10 % of the change from its start to its settled value
+        (median over the second half of the run), and time from which on it stays within 10 % of that change for
+        `ARRIVED_S`; None where it never settles. Of an estimate that starts near its settled value, so that 10 % of
+        the change are less than the standard deviation it has there, the times at which its standard deviation has
+        made 10 and 90 % of its fall; None where that is less than half.
+
+    Notes
+    -----
+    Pentzer 2014, Section 5.2: the time from 10 % change to within 90 % of the final value. An estimate that happens to
+    start at its final value has no such time, though the filter did not know that it was right.
+    """
+    rows = max(int(np.searchsorted(table.t_s, until_s)), 1) if until_s is not None else len(table)
+    t_s = table.t_s[:rows]
+    return {
+        column: _span(t_s, getattr(table, column)[:rows], getattr(table, f"std_{column}")[:rows])
+        for column in ICR_COLUMNS
+    }
+
+
+def _span(t_s: Floats, estimate: Floats, std: Floats) -> tuple[float, float] | None:
+    """Return begin and end [s] of the convergence of one estimate (n,) with its standard deviation (n,)."""
+    settled, noise = (float(np.median(one[len(one) // 2 :])) for one in (estimate, std))
+    change = settled - float(estimate[0])
+    if abs(change) < max(SMALLEST_CHANGE_M, noise / (1.0 - LEARNED_SHARE)):
+        begin, end = (fallen_at(std, share) for share in (1.0 - LEARNED_SHARE, LEARNED_SHARE))
+        return None if begin is None or end is None else (float(t_s[begin]), float(t_s[end]))
+    gone = (estimate - estimate[0]) / change
+    first = int(np.argmax(np.abs(gone) >= 0.1))
+    begins, behind = runs_of(np.abs(gone - 1.0) <= 0.1)
+    settled_by = np.searchsorted(t_s, t_s[begins] + ARRIVED_S)
+    stays = begins[(settled_by <= behind) & (settled_by < len(t_s))]
+    return (float(t_s[first]), float(t_s[stays[0]])) if len(stays) else None
+
+
+def fallen_at(std: Floats, share: float = LEARNED_SHARE) -> int | None:
+    """Return the first state at which a standard deviation (n,) has made a share of its fall; None where it has none.
+
+    Notes
+    -----
+    It falls from s_0 at the first state to s_f, its median over the second half of the states, and has made the share
+    at the first state with s <= s_f + (1 - share) (s_0 - s_f). None where s_f exceeds half of s_0 (`LEAST_FALL`).
+    """
+    first, final = float(std[0]), float(np.median(std[len(std) // 2 :]))
+    if final > (1.0 - LEAST_FALL) * first:
+        return None
+    return int(np.argmax(std <= final + (1.0 - share) * (first - final)))
