@@ -1,18 +1,16 @@
-"""The ICR EKF, compiled: event-driven propagation and updates (Pentzer 2014, Section 3, Eqs. 13-25).
+"""The ICR EKF and its smoother, compiled (Pentzer 2014, Section 3, Eqs. 13-25; Rauch, Tung, Striebel 1965).
 
 The state is x = (N, E, psi, y_icr_right, y_icr_left, x_icr). The letters are the paper's: x P F Q H R nu S K.
-The tests compare this filter with one in matrix form (tests/support/matrix_filter.py), the one to read first.
-`filter_events` is the one event loop: the filter and the smoother's forward pass call it.
+`filter_events` is the one event loop: the filter and the smoother's forward pass call it. The tests compare the filter
+with a filter in matrix form (tests/support/matrix_filter.py), which is the one to read first.
 
-Rauch-Tung-Striebel smoother of the ICR EKF: the same events once more, then backwards.
-
-The filter's own steps are run again and every event is kept as a node: what was
-predicted there, what was left after its updates. Backwards, with F of Eqs. 17, 27-29 between node i and the next,
+The smoother runs the filter again and keeps a node for every event: the predicted state, and the state after the
+updates. Backwards, with F of Eqs. 17, 27-29 between node i and the next,
 
     C = P_i F^T (P-_{i+1})^-1,   xs_i = x_i + C (xs_{i+1} - x-_{i+1}),   Ps_i = P_i + C (Ps_{i+1} - P-_{i+1}) C^T
 
-(Rauch, Tung, Striebel 1965). A long log is taken in chunks from checkpoints of the forward pass: memory does not grow
-with it; the filter runs twice.
+A long log is smoothed in chunks from checkpoints of the forward pass: the filter runs twice, and memory does not grow
+with the log.
 """
 
 from __future__ import annotations
@@ -106,7 +104,7 @@ def keep_sides(x: Floats, P: Floats, least: float) -> None:
     """
     for turn in range(4):
         place = 3 + turn % 2
-        sign = 7.0 - 2.0 * place
+        sign = 1.0 if place == 3 else -1.0
         beyond = least - sign * x[place]
         if beyond > 0.0:
             for i in range(6):
@@ -358,7 +356,7 @@ class Smoothed(NamedTuple):
 def run_smoother(
     data: FilterInputs, t0: float, x0: Floats, P0: Floats, parameters: FilterParameters, chunk_rows: int = CHUNK_SAMPLES
 ) -> Smoothed:
-    """Smooth the run that `icrtool.kernels.ekf.run_ekf` makes of the same arguments.
+    """Smooth the run that `run_ekf` makes of the same arguments.
 
     Returns
     -------

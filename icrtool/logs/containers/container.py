@@ -172,7 +172,7 @@ def unpack_messages(
     report : called once, after the last block, with how many messages could not be decompressed, and why
     """
     left_out, reason = 0, ""
-    inflation = Inflation()
+    inflation, decompressor = Inflation(), zstandard.ZstdDecompressor()
     for block in blocks:
         kept: list[int] = []
         messages: list[bytes] = []
@@ -190,7 +190,7 @@ def unpack_messages(
                 size = zstandard.frame_content_size(packed)
                 if size >= 0:
                     inflation.count(len(packed), size)
-                message = zstandard.ZstdDecompressor().decompress(packed, max_output_size=PIECE_BYTES)
+                message = decompressor.decompress(packed, max_output_size=PIECE_BYTES)
                 if size < 0:
                     inflation.count(len(packed), len(message))
             except (DecompressionError, zstandard.ZstdError, MemoryError) as err:

@@ -54,7 +54,7 @@ from icrtool.records.run import ICR_WORDS, Run, check_type
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text
 
-VENDOR = ("vendor/uPlot.iife.min.js", "vendor/d3.min.js")
+VENDOR = ("vendor/uPlot.iife.min.js", "vendor/d3-subset.min.js")
 SCRIPTS = (*VENDOR, "columns.js", "open_loop.js", "charts.js", "map.js", "run.js")
 
 

@@ -316,3 +316,14 @@ def test_the_bundled_libraries_are_those_that_are_listed() -> None:
     for file in VENDOR.glob("*.min.*"):
         assert f"`{file.name}`" in listed
         assert hashlib.sha256(file.read_bytes()).hexdigest() in listed
+
+
+def test_the_subset_of_d3_holds_the_functions_that_the_scripts_call_and_no_others() -> None:
+    root = VENDOR.parents[4]
+    called = {
+        name for file in VENDOR.parent.glob("*.js") for name in re.findall(r"\bd3\.(\w+)", file.read_text("utf-8"))
+    }
+    entry = re.findall(r"^export \{ (.*) \} from", (root / "scripts" / "d3_subset.sh").read_text("utf-8"), re.MULTILINE)
+    assert called == {name for names in entry for name in names.split(", ")}
+    bundle = (VENDOR / "d3-subset.min.js").read_text("utf-8")
+    assert all(re.search(rf"\b{name}:\(\)=>", bundle) for name in called)
