@@ -34,7 +34,7 @@ from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.notes import Note, is_grave, note
 from icrtool.records.plain_data import plain
-from icrtool.records.run import WarmStart, call_output
+from icrtool.records.run import WarmStart
 from icrtool.records.run_document import ControllerNumbers, ParameterDocument, RecommendedDocument
 from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
@@ -201,9 +201,10 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         OutputError
             Something that is not a calibration is there, or it cannot be written.
         """
+        from icrtool.output.files.formats import write_calibration
+
         document = msgspec.structs.replace(self, name=UNSET)
-        file: Path = call_output("files.formats", "write_calibration", document, Path(path))
-        return file
+        return write_calibration(document, Path(path))
 
     def __repr__(self) -> str:
         p95, _ = self.held_out_m("recommended", 10.0)

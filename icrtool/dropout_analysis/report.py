@@ -27,7 +27,6 @@ from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.choices import FigureSet
 from icrtool.records.plain_data import plain
-from icrtool.records.run import call_output
 from icrtool.records.run_document import RunDocument, known_content
 from icrtool.records.text import escaped, listed
 
@@ -140,11 +139,13 @@ class DropoutReport(OpenLoopErrors):
         OutputError
             Something that is not a dropout report is there, or the disk does not take it.
         """
+        from icrtool.output.dropout_directory import write_report
+
         if path is None:
             if self.run_directory is None:
                 raise ValueError("path: this run was not read from a directory; name one for its report")
             path = self.run_directory / "dropout"
-        call_output("dropout_directory", "write_report", lambda _: self, Path(path), plots=plots, figures=figures)
+        write_report(lambda _: self, Path(path), plots=plots, figures=figures)
 
     def __repr__(self) -> str:
         icr, h = self.result("icr"), self.horizons_m
@@ -154,7 +155,9 @@ class DropoutReport(OpenLoopErrors):
         return f"<DropoutReport {self.name!r}: {len(self.results)} models from {states:,} states{error}{limits}>"
 
     def _repr_html_(self) -> str:
-        return f"<pre>{escape(call_output('tables.dropout', 'format_dropout', self))}</pre>"
+        from icrtool.output.tables.dropout import format_dropout
+
+        return f"<pre>{escape(format_dropout(self))}</pre>"
 
 
 @dataclass(frozen=True, slots=True)

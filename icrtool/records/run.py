@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -239,7 +238,9 @@ class Run:
         OutputError
             A file or a directory of another program exists at `path`, or the disk cannot be written.
         """
-        call_output("run_directory", "write_run", self, Path(path), states=states, plots=plots, figures=figures)
+        from icrtool.output.run_directory import write_run
+
+        write_run(self, Path(path), states=states, plots=plots, figures=figures)
 
     def __repr__(self) -> str:
         drive, icr = self.document.drive, self.document.icr
@@ -250,8 +251,10 @@ class Run:
         )
 
     def _repr_html_(self) -> str:
+        from icrtool.output.tables.run import format_run
+
         warnings = "".join(f"<li>{escape(warning)}</li>" for warning in self.warnings)
-        text = escape(call_output("tables.run", "format_run", self))
+        text = escape(format_run(self))
         return f"<pre>{text}</pre>" + (
             f"<details><summary>Warnings</summary><ul>{warnings}</ul></details>" if warnings else ""
         )
@@ -320,12 +323,3 @@ def track_of_states(
         table.t_s, held, table.v_left_mps, table.v_right_mps, table.north_m, table.east_m, table.heading_rad,
         table.distance_m, in_outage=in_outage, jump=jumping, slipping=slipping,
     )  # fmt: skip
-
-
-def call_output(module: str, function: str, *arguments: object, **options: object) -> Any:  # noqa: ANN401 - the type is that of the function called
-    """Return ``icrtool.output.MODULE.FUNCTION(*arguments, **options)``.
-
-    A record holds data and knows no code that uses it, yet a notebook expects ``run.write(path)``. Such methods look
-    their function up here by name, so that importing a record imports nothing of the layer above it.
-    """
-    return getattr(importlib.import_module(f"icrtool.output.{module}"), function)(*arguments, **options)
