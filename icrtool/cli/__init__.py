@@ -25,6 +25,9 @@ from icrtool.records.process_resources import keep_freed, may_end, remove_unfini
 
 __all__ = ["main", "when_used"]
 
+ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Signals that end a command; Windows has no SIGHUP."""
+
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status of a program that Ctrl-C ended."""
 
@@ -89,6 +92,11 @@ def _run() -> int:
             # A path that is too long, or on a disk that fails, where no command knows more about it.
             error(f"{LogText(str(err.filename))}: {err.strerror}" if isinstance(err, OSError) else str(err))
             return 1
+        except MemoryError:
+            from icrtool.cli.printing import error
+
+            error("memory: there is not enough; give it more (ulimit -v), or read a part of the log (--from, --to)")
+            return 1
         except click.ClickException as err:
             err.show()
             return err.exit_code
@@ -131,12 +139,15 @@ def when_used() -> Iterator[None]:
 
 @contextmanager
 def end_at_once() -> Iterator[None]:
-    """Have SIGINT and SIGTERM end the process with the status 128 and their number; on Windows nothing changes."""
+    """Have the signals of `ENDING` end the process with the status 128 and their number; on Windows nothing changes.
+
+    SIGHUP comes where a terminal is closed.
+    """
     if threading.current_thread() is not threading.main_thread() or sys.platform == "win32":
         yield
         return
     # A signal that the parent process set to be ignored, as a shell does for background jobs, stays ignored.
-    handled = [one for one in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(one) is not signal.SIG_IGN]
+    handled = [one for one in ENDING if signal.getsignal(one) is not signal.SIG_IGN]
     arrived, signalled = os.pipe()
     os.set_blocking(signalled, False)
     over = threading.Event()
@@ -158,9 +169,9 @@ def end_at_once() -> Iterator[None]:
 
 
 def _watch(arrived: int, over: threading.Event) -> None:
-    """Wait for SIGINT or SIGTERM, and end the process where the main thread does not."""
+    """Wait for one of these signals, and end the process where the main thread does not."""
     while (number := os.read(arrived, 1)[0]) != OVER:
-        if number in (signal.SIGINT, signal.SIGTERM) and not over.wait(SIGNAL_GRACE_S):
+        if number in ENDING and not over.wait(SIGNAL_GRACE_S):
             _end(number)
     os.close(arrived)
 

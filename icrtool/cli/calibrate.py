@@ -67,6 +67,9 @@ def calibrate_command(
         raise click.UsageError("--plot and --x-icr are for one log")
     if output is not None:
         formats.calibration_file(output)
+    if plot is not None and run_directory.is_run_directory(sources[0]):
+        # A run may come from a stranger: no file or address is read because it says so.
+        raise errors.RunError(sources[0], "--plot draws the residuals of a log, not of a run", "name its log")
     if all(run_directory.is_run_directory(source) for source in sources):
         check_run_config(config)
     runs = runs_named(sources, config, printer)
@@ -99,7 +102,7 @@ def calibrate_command(
 
 def _draw_residuals(source: Path, run: Run, plot: Path) -> None:
     """Draw the residuals of one log's alignment."""
-    log = read_log.read_log(source if run.directory is None else run_directory.log_of(run), run.config)
+    log = read_log.read_log(source, run.config)
     measured = wheel_units.with_wheel_speeds(align.choose_reference(log, run.config), run.config)
     fit = corrections.align_streams(measured, run.config).fit
     if fit is not None:

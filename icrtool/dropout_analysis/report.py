@@ -291,6 +291,8 @@ def parse_gate(text: str) -> Gate:
         raise ConfigError(f"gate {text!r}", "0 m is no length", "name one above zero, for example @10m")
     factor = float(match["factor"] or 1.0) if match["baseline"] else 0.0
     bound_m = float((match["bound"] or match["offset"] or "0").replace(" ", ""))
+    if not all(map(math.isfinite, (at_m, factor, bound_m))):
+        raise ConfigError(f"gate {text!r}", "a number is too large", "give metres, for example 1.2")
     return Gate(
         " ".join(text.split()), match["model"], match["metric"], None if within else at_m, match["relation"], bound_m,
         factor, at_m if within else None,

@@ -214,4 +214,5 @@ def _is_unchanged(before: FleetFile, path: UrlPath) -> bool:
     except LogError:
         return False
     version = next(iter(now.version.values()), "")
-    return bool(version) and (now.size, version) == (before.bytes, before.version)
+    stated = now.size, version, before.address and path.digest
+    return bool(version) and stated == (before.bytes, before.version, before.address)

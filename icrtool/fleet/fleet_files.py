@@ -384,4 +384,4 @@ def _pooled(
 
 def _content(inputs: Sequence[FleetFile]) -> tuple[str, ...]:
     """Return what copies of a log have in common, whatever their names; of content that is not known, the place."""
-    return tuple(sorted(file.sha256 or f"at {file.path}" for file in inputs))
+    return tuple(sorted(file.sha256 or f"at {file.path} {file.bytes} {file.version} {file.address}" for file in inputs))

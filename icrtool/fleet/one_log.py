@@ -83,7 +83,10 @@ def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, .
     Of an address, `inputs` is all that is known.
     """
     if isinstance(path, UrlPath):
-        return tuple(FleetFile(one.path, one.bytes, 0, one.sha256, one.version or one.etag or "") for one in inputs)
+        return tuple(
+            FleetFile(one.path, one.bytes, 0, one.sha256, one.version or one.etag or "", one.address or "")
+            for one in inputs
+        )
     hashes = {file.path: file.sha256 for file in inputs}
     found = []
     for file in files_of_log(path):

@@ -12,6 +12,7 @@ import hashlib
 import importlib
 import os
 import pkgutil
+import stat
 import sys
 import tempfile
 import threading
@@ -98,6 +99,18 @@ class _Arguments:
             self.forms.append(_SCALARS[name])
 
 
+_OBJECT_MAGICS = (b"\x7fELF", b"\xcf\xfa\xed\xfe", b"\x64\x86", b"\x64\xaa")
+"""First bytes of an object file: of Linux, macOS and Windows (two processors)."""
+
+
+def _is_own(place: Path) -> bool:
+    """Return whether nobody else may write a file or a folder: what is kept there is run."""
+    if not hasattr(os, "geteuid"):
+        return True
+    status = place.stat()
+    return status.st_uid in (0, os.geteuid()) and not status.st_mode & stat.S_IWOTH
+
+
 class MachineCode(NamedTuple):
     """A compiled kernel: the name of its function, what that returns (a key of `_RESULTS`), and the object file."""
 
@@ -113,11 +126,12 @@ class MachineCode(NamedTuple):
     @classmethod
     def read(cls, file: Path) -> MachineCode | None:
         """Return what a file holds; None where it is not there, or damaged."""
-        with suppress(OSError):
-            data = file.read_bytes()
+        with suppress(OSError, ValueError):
+            data = file.read_bytes() if _is_own(file) and _is_own(file.parent) else b""
             if hashlib.sha256(data[32:]).digest() == data[:32]:
                 name, result, content = data[32:].split(b"\n", 2)
-                return cls(name.decode(), result.decode(), content)
+                if result.decode() in _RESULTS and content.startswith(_OBJECT_MAGICS):
+                    return cls(name.decode(), result.decode(), content)
         return None
 
     def function(self, forms: Sequence[Any]) -> Callable[[Sequence[object]], Result]:

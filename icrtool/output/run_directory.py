@@ -166,7 +166,7 @@ def new_run(
 def replaced_log(directory: Path, run: Run) -> str | None:
     """Return the path of the log whose run a new run replaces; None where it has the same content, or none is there."""
     before, now = _inputs_of(directory), run.document.inputs
-    same = [one.sha256 or one.path for one in before] == [one.sha256 or one.path for one in now]
+    same = [one.identity for one in before] == [one.identity for one in now]
     return str(before[0].path) if before and not same else None
 
 

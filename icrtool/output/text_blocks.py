@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from icrtool.records.text import shortened
+from icrtool.records.text import escaped, shortened
 
 TEXT_WIDTH = 100
 """Characters in a line of plain text."""
@@ -357,4 +357,6 @@ def _markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
 
 def _escaped_markdown(text: str) -> str:
     """Return text with what Markdown would take for markup escaped."""
-    return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text)
+    plain = re.sub(r"([\\`*_{}\[\]<>|#~&$])", r"\\\1", escaped(" ".join(text.split())))
+    # GitHub and GitLab notify whom an @ names, also behind an escape: a word joiner parts it from the name
+    return plain.replace("@", "@\u2060")

@@ -66,6 +66,7 @@ class FleetFile(Record, frozen=True):
     mtime_ns : with `bytes` spares hashing it again; 0 of one that is not on a disk
     sha256 : None where not all of it was read
     version : what its store states about the content, of one that is not on a disk
+    address : SHA-256 of the whole address of one that is not on a disk
     """
 
     path: str
@@ -73,6 +74,7 @@ class FleetFile(Record, frozen=True):
     mtime_ns: int
     sha256: str | None
     version: str = ""
+    address: str = ""
 
 
 class FleetLog(Record, frozen=True):

@@ -15,6 +15,7 @@ import sys
 from io import BufferedReader
 from pathlib import Path, PurePosixPath
 from typing import Self
+from urllib.parse import quote, unquote, unquote_plus, urlsplit
 
 if sys.platform == "win32":
     from pathlib import WindowsPath as _LocalPath
@@ -24,6 +25,8 @@ else:
 LARGEST_DOCUMENT_BYTES = 1 << 28
 """Of a file that is read into memory whole: the run.json of a long drive has some MB."""
 
+_READ_ON_BYTES = 1 << 20
+
 # Windows has neither; there pipes are no files.
 _FILE = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
@@ -32,7 +35,12 @@ NOT_REGULAR = "not a regular file"
 SAVE_IT = "save what it gives to a file, and name that"
 
 _URL = re.compile(r"^([a-z][a-z0-9+.-]+)://", re.IGNORECASE)
-_SECRETS = re.compile(r"(?<=://)[^/\s'\"@]*@|(?<=[\w/.~%+*-])\?[^\s'\"]*")
+SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "http", "https")
+"""The kinds of addresses that are read: object stores and web servers. Others reach files and devices of this machine,
+its memory, or programs (``file``, ``memory``, ``github``, chains with ``::``)."""
+
+_LEAST_SECRET = 4
+"""Characters of the shortest part of an address that is looked for in the texts of libraries."""
 
 
 class NotRegularFileError(OSError):
@@ -81,7 +89,11 @@ def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGE
         As `open_regular`; the file is larger than `most_bytes`.
     """
     with open_regular(path, inside) as file:
-        content = file.read(most_bytes + 1)
+        # as large as the file, not as the limit: so much memory is asked for
+        size = min(os.fstat(file.fileno()).st_size, most_bytes)
+        content = file.read(size + 1)
+        while len(content) <= most_bytes and (more := file.read(min(_READ_ON_BYTES, most_bytes + 1 - len(content)))):
+            content += more
     if len(content) > most_bytes:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
     return content
@@ -174,6 +186,34 @@ class UrlPath(_LocalPath):
     def __fspath__(self) -> str:
         return self._url
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of the whole address: two that differ in their query alone have the same text."""
+        import hashlib  # here, since the help of a command needs none
+
+        return hashlib.sha256(self._url.encode("utf-8", "surrogateescape")).hexdigest()
+
+    def problem(self) -> str:
+        """Return in words why it is no address that can be read, empty where it is one."""
+        if "::" in self._url.partition("?")[0]:
+            return "chains with :: are not read"
+        if self.scheme not in SCHEMES:
+            return f"{self.scheme}:// is no kind of address that is read"
+        if not self._url.isprintable() or chr(92) in self._url:
+            return "it has characters that no address has"
+        try:
+            parts = urlsplit(without_secrets(self._url))
+            is_whole = bool(parts.netloc.strip(".:…")) and (parts.port is None or parts.port > 0)
+        except ValueError as err:
+            return str(err)
+        return "" if is_whole else "it names no host or bucket"
+
+    def without_own_secrets(self, text: str) -> str:
+        """Return a text of a library with the secrets of this address left out."""
+        for secret in _secrets_of(self._url):
+            text = text.replace(secret, "…")
+        return text
+
     def __reduce__(self) -> tuple[type[UrlPath], tuple[str]]:
         return UrlPath, (self._url,)
 
@@ -189,6 +229,33 @@ def place_of(text: str) -> Path:
     return UrlPath(text) if _URL.match(text) else Path(text)
 
 
-def without_secrets(text: str) -> str:
-    """Return a text with the passwords, tokens and signatures of the addresses in it left out."""
-    return _SECRETS.sub("", text)
+def _parts(url: str) -> tuple[str, str, str, str]:
+    """Return an address as scheme, user and password, what is shown of it, and what stands behind that."""
+    scheme, _, rest = url.partition("://")
+    is_web, first = scheme.lower().startswith("http"), rest.partition("/")[0]
+    known, mark, host = first.rpartition("@")
+    shown = host + rest[len(first) :]
+    port = first.partition(":")[2]
+    if not mark and ":" in first and "@" in rest and not (is_web and (port.isdecimal() or first.startswith("["))):
+        known, mark, shown = rest.rpartition("@")  # a password with a slash
+    if "?" in known or "#" in known:
+        return scheme, "", "…", rest  # where its parts begin cannot be known
+    end = min((at for sign in ("?#" if is_web else "?") if (at := shown.find(sign)) >= 0), default=len(shown))
+    return scheme, known, shown[:end], shown[end:]
+
+
+def without_secrets(url: str) -> str:
+    """Return an address without user, password and query, where tokens and signatures stand; other texts unchanged."""
+    if "://" not in url:
+        return url
+    scheme, _, shown, _ = _parts(url)
+    return f"{scheme}://{shown}"
+
+
+def _secrets_of(url: str) -> list[str]:
+    """Return the parts of an address that no output shows, as they stand in it and without escapes, longest first."""
+    _, known, _, behind = _parts(url)
+    whole = {one for text in (known, behind) for one in (text, unquote(text), unquote_plus(text), quote(text))}
+    # a library may cut them elsewhere
+    pieces = whole | {piece for text in whole for piece in re.split(r"[^\w.~-]+", text)}
+    return sorted((one for one in pieces if len(one) >= _LEAST_SECRET), key=len, reverse=True)

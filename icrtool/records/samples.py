@@ -247,6 +247,7 @@ class InputFile:
     path : as given, without a password or token
     sha256 : hex; None where not all of it was read
     etag, version : what an object store, or a web server, states about the content
+    address : SHA-256 of the whole address, with what `path` leaves out
     """
 
     path: str
@@ -254,6 +255,18 @@ class InputFile:
     sha256: str | None
     etag: str | msgspec.UnsetType = msgspec.UNSET
     version: str | msgspec.UnsetType = msgspec.UNSET
+    address: str | msgspec.UnsetType = msgspec.UNSET
+
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """What two files have in common that hold the same: SHA-256, else size and version, else size and address."""
+        if self.sha256 is not None:
+            return (self.sha256,)
+        stated = self.version if self.version is not msgspec.UNSET else self.etag
+        # a time of modification is no version: many files may have it
+        is_version = isinstance(stated, str) and bool(stated) and not stated.endswith(" GMT")
+        where = self.path if self.address is msgspec.UNSET else self.address
+        return (self.bytes, stated) if is_version else (self.bytes, where)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,7 +32,7 @@ from icrtool.logs.containers.recording_files import (
     unpacked_name,
 )
 from icrtool.logs.containers.ros1_bag import Ros1Bag
-from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, read_by_ranges
+from icrtool.logs.containers.source import RemoteFile, changed_since, fetch_folder, most_bytes, read_by_ranges
 from icrtool.logs.containers.sqlite_bag import SqliteBag
 from icrtool.logs.containers.unpack import ScratchFolder, is_packed, save_unpacked, unpack
 from icrtool.records.notes import Note
@@ -166,6 +166,9 @@ def _by_ranges(path: Path, remote: RemoteFile) -> Container | str:
     if remote.is_folder:
         return "SQLite files, or packed"
     if not remote.has_ranges:
+        start = remote.start()
+        if start and container_of(BytesIO(start)) is None and not is_packed(start):
+            raise LogError(path, *_NOT_A_LOG)
         return "its server gives no parts of a file"
     start = remote.read_at(0, 512)
     kind = container_of(BytesIO(start))
@@ -217,10 +220,17 @@ def _brought(
         return log, Origin(inputs, transfer), distant
     if path != STANDARD_INPUT:
         return path, Origin(), distant
+    if sys.stdin is None or sys.stdin.closed:
+        raise LogError(path, "standard input is closed", "pipe a log into it, or name one")
     if sys.stdin.isatty():
         raise LogError(path, "standard input is a terminal", "pipe a log into it, or name one")
     log = folder / "stdin"
-    digest = save_unpacked(sys.stdin.buffer, log)
+
+    def check(start: bytes) -> None:
+        if start and not is_packed(start) and container_of(BytesIO(start)) is None:
+            raise LogError(path, *_NOT_A_LOG)
+
+    digest = save_unpacked(sys.stdin.buffer, log, check, most_bytes(folder))
     return log, Origin((InputFile(str(path), log.stat().st_size, digest),)), distant
 
 

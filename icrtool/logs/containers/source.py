@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -24,10 +25,14 @@ from icrtool.errors import LogError
 from icrtool.kernels.arrays import Bytes, Ints
 from icrtool.logs.containers.container import ahead
 from icrtool.logs.containers.recording_files import LOG_SUFFIXES, natural_order, unpacked_name
-from icrtool.records.places import UrlPath, place_of, without_secrets
+from icrtool.records.places import SCHEMES, UrlPath, place_of, without_secrets
 from icrtool.records.samples import InputFile
+from icrtool.records.text import LONGEST_NAME
 
 Result = TypeVar("Result")
+
+QUIET_S, SLOWEST_BPS = 15.0, 10_000
+"""A server may send nothing for this long [s]; and how slowly it may send a range [bytes/s]."""
 
 _NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
           "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
@@ -56,7 +61,10 @@ _FETCHED_BYTES, PIECES_AHEAD = 1 << 24, 4
 
 def filesystem(path: UrlPath) -> tuple[Any, str]:
     """Return the fsspec file system of an address, and the name of the file in it."""
-    needed = _NEEDS.get(path.scheme)
+    if problem := path.problem():
+        advice = f"an address begins with {', '.join(f'{scheme}://' for scheme in SCHEMES)}; name a file by its path"
+        raise LogError(path, f"is not read: {problem}", advice)
+    needed = _NEEDS[path.scheme]
     extra = "http" if needed == "aiohttp" else "cloud"
     try:
         import fsspec
@@ -65,16 +73,26 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
         fsspec.get_filesystem_class(path.scheme)
     except ImportError as err:
         raise LogError(path, f"needs {needed or err}", f"pip install 'icrtool[{extra}]'") from err
-    except ValueError as err:
-        raise LogError(
-            path, f"{path.scheme}:// is no kind of address that can be read", "try s3, gs, az or https"
-        ) from err
     for name in _LOGGERS:
         # They log tracebacks of requests, and addresses with their queries; one line reports where they fail.
         if (logger := logging.getLogger(name)).level == logging.NOTSET:
             logger.setLevel(logging.CRITICAL + 1)
-    found: tuple[Any, str] = asked(path, lambda: url_to_fs(path.url))
+    try:
+        found: tuple[Any, str] = asked(path, lambda: url_to_fs(path.url, **_patience(path.scheme)))
+    except (KeyError, IndexError, TypeError, AttributeError, NotImplementedError) as err:
+        raise LogError(path, "is no address that can be read", type(err).__name__) from None
     return found
+
+
+def _patience(scheme: str) -> dict[str, Any]:
+    """Return the settings of a file system by which a silent server is given up."""
+    if scheme.startswith("http"):
+        from aiohttp import ClientTimeout
+
+        return {"client_kwargs": {"timeout": ClientTimeout(total=None, sock_connect=QUIET_S, sock_read=QUIET_S)}}
+    if scheme.startswith("s3"):
+        return {"config_kwargs": {"connect_timeout": QUIET_S, "read_timeout": QUIET_S, "retries": {"max_attempts": 1}}}
+    return {}
 
 
 def asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done: str = "read") -> Result:
@@ -100,16 +118,43 @@ def asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done:
             if isinstance(cause, FileNotFoundError) or status == 404:
                 raise LogError(path, "no such file") from None
             refused = isinstance(cause, PermissionError | ValueError) or status in {401, 403}
-            if refused or not pauses:
+            is_late = isinstance(cause, TimeoutError)
+            if refused or is_late or not pauses:
                 why = f"may not be {done}" if refused else f"cannot be {done}"
-                raise LogError(path, why, without_secrets(str(cause) or type(cause).__name__)) from None
+                raise LogError(path, why, _words_of(cause, path)) from None
             time.sleep(pauses.pop(0))
+
+
+def _words_of(cause: BaseException, path: UrlPath) -> str:
+    """Return what an error of a library says, without the secrets of the address."""
+    if isinstance(cause, TimeoutError):
+        return f"its server sent nothing for {QUIET_S:g} s, or too slowly"
+    status = getattr(cause, "status", None)
+    if isinstance(status, int):
+        # the rest of such a text is the address, perhaps another one to which the server led
+        return f"its server answered {status} {getattr(cause, 'message', '')}".strip()
+    return path.without_own_secrets(str(cause)) or type(cause).__name__
 
 
 def _failures() -> tuple[type[Exception], ...]:
     """Return what a broken connection or a refused request is raised as."""
     loaded = [getattr(sys.modules.get(module), name, None) for module, name in _FAILURES]
     return (OSError, ValueError, *(one for one in loaded if one is not None))
+
+
+class _NoRangeError(ValueError):
+    """A server does not give the range that it was asked for."""
+
+
+def _check_range(answer: Any, begin: int, end: int, size: int) -> None:  # noqa: ANN401 - of a library
+    """Refuse an answer that is not the range [begin, end) of a file, before anything of its body is read."""
+    stated, encoding = answer.headers.get("Content-Range", ""), answer.headers.get("Content-Encoding", "identity")
+    if answer.status != 206:
+        raise _NoRangeError(f"its server answers a range with {answer.status}, not 206")
+    if encoding.lower() not in ("identity", ""):
+        raise _NoRangeError(f"its server sends a range with the encoding {encoding[:LONGEST_NAME]!r}")
+    if stated.replace(" ", "") not in (f"bytes{begin}-{end - 1}/{size}", f"bytes{begin}-{end - 1}/*"):
+        raise _NoRangeError(f"its server sends {stated[:LONGEST_NAME]!r} for bytes {begin}-{end - 1}/{size}")
 
 
 class Held(NamedTuple):
@@ -173,9 +218,9 @@ class RemoteFile:
         self.has_ranges = not self.is_folder and self.size > 0 and about.get("partial") is not False
         if self.has_ranges and path.scheme.startswith("http"):
             self.has_ranges = asked(path, self._gives_last_byte)
-        self.version = _version_of(about)
+        self.version = version_of(about)
         """What the store states about the content: ``version``, or else ``etag``; none where it states neither."""
-        self.input = InputFile(str(path), self.size, None, **self.version)
+        self.input = InputFile(str(path), self.size, None, **self.version, address=path.digest)
         """What run.json states about the file where not all of it is read: no SHA-256."""
         self.bytes_read = 0
         self._ends: tuple[Held, ...] = ()
@@ -183,11 +228,43 @@ class RemoteFile:
 
     def _gives_last_byte(self) -> bool:
         try:
-            with self._files.open(self._name, block_size=_LEAST_BYTES, cache_type="none") as file:
-                file.seek(self.size - 1)
-                return len(file.read(1)) == 1
-        except ValueError:
+            return len(self._web_ranges([self.size - 1], [self.size])[0]) == 1
+        except _NoRangeError:
             return False
+
+    def _web_ranges(self, begins: list[int], ends: list[int]) -> list[bytes]:
+        """Return ranges of a file on a web server, each read up to its length and no further.
+
+        Raises
+        ------
+        _NoRangeError
+            The server answers with anything else than the range that was asked for.
+        """
+        import asyncio
+
+        from fsspec.asyn import sync
+
+        async def one(begin: int, end: int) -> bytes:
+            session = await self._files.set_session()
+            headers = {"Range": f"bytes={begin}-{end - 1}", "Accept-Encoding": "identity"}
+            async with (
+                asyncio.timeout(QUIET_S + (end - begin) / SLOWEST_BPS),
+                session.get(self._files.encode_url(self._name), headers=headers) as answer,
+            ):
+                if answer.status >= 400:
+                    answer.raise_for_status()
+                _check_range(answer, begin, end, self.size)
+                pieces, left = [], end - begin
+                while left and (piece := await answer.content.read(left)):
+                    pieces.append(piece)
+                    left -= len(piece)
+                return b"".join(pieces)
+
+        async def all_of_them() -> list[bytes]:
+            return list(await asyncio.gather(*map(one, begins, ends)))
+
+        found: list[bytes] = sync(self._files.loop, all_of_them)
+        return found
 
     def read_at(self, at: int, count: int) -> bytes:
         """Return bytes of the file, as many as there are."""
@@ -226,6 +303,8 @@ class RemoteFile:
         ends = [min(end, self.size) for end in ends]
 
         def ask() -> list[bytes]:
+            if self.path.scheme.startswith("http"):
+                return self._web_ranges(begins, ends)
             pieces = self._files.cat_ranges([self._name] * len(begins), begins, ends)
             if (broken := next((one for one in pieces if isinstance(one, BaseException)), None)) is not None:
                 raise broken
@@ -238,6 +317,12 @@ class RemoteFile:
         self.bytes_read += sum(map(len, pieces))
         return pieces
 
+    def start(self) -> bytes:
+        """Return the first 512 bytes, without any range; fewer of a shorter file."""
+        for piece in self._pieces():
+            return piece[:512]
+        return b""
+
     def fetch(self, place: Path, share: Callable[[float], None] | None) -> InputFile:
         """Write the file to a place on disk, and return what run.json states about it.
 
@@ -248,9 +333,12 @@ class RemoteFile:
         OSError
             The disk is full.
         """
-        digest, written = hashlib.sha256(), 0
+        digest, written, most = hashlib.sha256(), 0, most_bytes(place.parent)
         with place.open("wb") as sink:
             for piece in self._pieces():
+                if written + len(piece) > (min(self.size, most) if self.size else most):
+                    why = f"sends more than {min(self.size, most) if self.size else most:,} bytes"
+                    raise LogError(self.path, why, "its size as stated, or half of the free space")
                 sink.write(piece)
                 digest.update(piece)
                 written += len(piece)
@@ -261,7 +349,8 @@ class RemoteFile:
     def _pieces(self) -> Iterator[bytes]:
         """Yield the content from start to end; the next pieces are read meanwhile."""
         if not self.has_ranges:
-            with asked(self.path, lambda: self._files.open(self._name, block_size=0)) as stream:
+            options = {"headers": {"Accept-Encoding": "identity"}} if self.path.scheme.startswith("http") else {}
+            with asked(self.path, lambda: self._files.open(self._name, block_size=0, **options)) as stream:
                 while piece := asked(self.path, lambda: stream.read(_FETCHED_BYTES), again=False):
                     yield piece
             return
@@ -274,6 +363,11 @@ class RemoteFile:
         self._last = _OfThread()
 
 
+def most_bytes(folder: Path) -> int:
+    """Return how much of an input without a known end is saved in a folder: half of the free space [bytes]."""
+    return shutil.disk_usage(folder).free // 2
+
+
 def read_by_ranges(files: Collection[RemoteFile]) -> str:
     """Return how much was read of some files."""
     # Ranges overlap a little: of a small file more comes than it has.
@@ -281,7 +375,8 @@ def read_by_ranges(files: Collection[RemoteFile]) -> str:
     return f"{read / 1e6:.3g} of {size / 1e6:.3g} MB read by ranges"
 
 
-def _version_of(about: dict[str, Any]) -> dict[str, str]:
+def version_of(about: dict[str, Any]) -> dict[str, str]:
+    """Return what a store states of the content of a file: its version, else its etag, else nothing."""
     for key, names in (("version", ("VersionId", "generation")), ("etag", ("ETag", "etag", "Last-Modified"))):
         stated = next((str(about[name]) for name in names if about.get(name)), "null")
         if stated != "null":
@@ -328,7 +423,7 @@ def changed_since(path: UrlPath, inputs: Iterable[InputFile]) -> bool:
     for one in inputs:
         stated = now.get(one.path, {})
         version = {key: value for key in ("version", "etag") if (value := getattr(one, key)) is not UNSET}
-        if stated.get("size") not in {one.bytes, None} or _version_of(stated) != version:
+        if stated.get("size") not in {one.bytes, None} or version_of(stated) != version:
             return True
     return False
 

@@ -7,10 +7,12 @@ directory in an archive; what stands in an archive may be compressed again.
 from __future__ import annotations
 
 import bz2
+import errno
 import hashlib
 import lzma
 import math
 import os
+import platform
 import re
 import secrets
 import shutil
@@ -19,6 +21,7 @@ import weakref
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from gzip import GzipFile
@@ -37,21 +40,24 @@ from icrtool.logs.containers.recording_files import LOG_SUFFIXES, PACKED_SUFFIX,
 from icrtool.records import process_resources
 from icrtool.records.notes import Note, note
 from icrtool.records.places import open_regular
-from icrtool.records.text import listed
+from icrtool.records.text import LogText, listed
 
 _PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED_SUFFIX})?$|\.db3-wal$|^metadata\.yaml$")
 
 _PIECE_BYTES, _DECODER_BYTES = 1 << 20, LARGEST_CHUNK_BYTES
 """That are unpacked at a time, and that a decoder may hold."""
 
-_MOST_ENTRIES = 100_000
-"""Of an archive that are looked at."""
+_MOST_ENTRIES, _MOST_FOLDERS = 100_000, 100
+"""Of an archive that are looked at, and folders with logs among them: one recording has one."""
 
 _LARGEST_EXTRA_BYTES, _LARGEST_READ_BYTES = 1 << 16, 1 << 22
 """Of a long name in a tar archive; of what zipfile reads at once, such as the directory of an archive."""
 
 _BEHIND = b"icrtool: behind the last frame"
 _TAR_BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
+_SPARSE_MORE = 482
+"""Place in the header of a sparse file in a tar archive that states whether a block of places follows it."""
+
 _TAR, _TAR_MARK = b"ustar", slice(257, 262)
 """What a tar archive has in its first block, and where."""
 
@@ -127,13 +133,45 @@ _DECODING_ERRORS = (
 """What decoders raise of data that is damaged or cut off."""
 
 
+def _scratch_of_host() -> str:
+    """Return what the names of the temporary folders on this host begin with."""
+    return f"icrtool-{re.sub(r'[^A-Za-z0-9.]', '_', platform.node())[:64]}-"
+
+
+def _clear_dead(folder: Path) -> None:
+    """Remove the temporary folders of this user and host whose process is gone: a killed one clears nothing."""
+    own = _scratch_of_host()
+    with suppress(OSError):
+        for entry in list(os.scandir(folder)):
+            number = entry.name.removeprefix(own).partition("-")[0] if entry.name.startswith(own) else ""
+            if not number.isdecimal() or not entry.is_dir(follow_symlinks=False):
+                continue
+            is_ours = not hasattr(os, "geteuid") or entry.stat(follow_symlinks=False).st_uid == os.geteuid()
+            if is_ours and not _is_running(int(number)):
+                shutil.rmtree(entry.path, ignore_errors=True)
+
+
+def _is_running(number: int) -> bool:
+    """Return whether there is a process of this number; True where that cannot be known."""
+    if os.name == "nt":
+        return True
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
+
+
 class ScratchFolder:
     """A temporary folder, removed when it is closed, or when the process is ended by force."""
 
     def __init__(self) -> None:
         with process_resources.undisturbed():  # Python tries out which folder can be written
             folder = Path(tempfile.gettempdir())
-        self.path = folder / f"icrtool-{secrets.token_hex(8)}"
+        _clear_dead(folder)
+        self.path = folder / f"{_scratch_of_host()}{os.getpid()}-{secrets.token_hex(8)}"
         # before it is there: a signal may come at any time
         process_resources.begin(self.path)
         self.path.mkdir(mode=0o700)
@@ -150,19 +188,30 @@ def is_packed(start: bytes) -> bool:
     return start.startswith((_ZIP, *DECODERS)) or start[_TAR_MARK] == _TAR
 
 
-def save_unpacked(source: Readable, place: Path) -> str:
+def save_unpacked(source: Readable, place: Path, check: Callable[[bytes], None], most_bytes: int) -> str:
     """Write a stream to a file, and return the SHA-256 of it (hex).
+
+    Parameters
+    ----------
+    check : called with the first 512 bytes, before any more is read; refuses a stream by an error of its own
 
     Raises
     ------
     OSError
-        The disk is full.
+        The disk is full, or the stream is longer than `most_bytes`.
     """
-    digest = hashlib.sha256()
+    digest, left, start = hashlib.sha256(), most_bytes, b""
+    while len(start) < _TAR_BLOCK_BYTES and (piece := source.read(_TAR_BLOCK_BYTES - len(start))):
+        start += piece
+    check(start)
     with place.open("wb") as sink:
-        while piece := source.read(_PIECE_BYTES):
+        piece = start
+        while piece or (piece := source.read(_PIECE_BYTES)):
+            if (left := left - len(piece)) < 0:
+                raise OSError(errno.EFBIG, f"more than {most_bytes:,} bytes, half of the free space")
             sink.write(piece)
             digest.update(piece)
+            piece = b""
     return digest.hexdigest()
 
 
@@ -301,6 +350,8 @@ def _unpacked(
     found: list[Path] = []
     for name, entry in entries:
         place = PurePosixPath(name)
+        if len(groups) > _MOST_FOLDERS:
+            raise LogError(path, f"has logs in more than {_MOST_FOLDERS} folders", "unpack it, and name one of them")
         if not _PARTS_OF_LOGS.search(place.name):
             others.append(name)
             continue
@@ -347,12 +398,25 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
             name = fields.get(b"path", name.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
             stated = int(fields[b"size"]) if fields.get(b"size", b"").isdigit() else stated
             continue
+        if info.type == b"K":
+            # the target of a link, of any length; the name of the next entry stays
+            stream.skip(info.size + -info.size % _TAR_BLOCK_BYTES)
+            continue
         size = info.size if stated is None else stated
         if info.type in {REGTYPE, AREGTYPE, CONTTYPE}:
             entry = _Stream(stream, budget, size)
             yield name or info.name, entry
             entry.skip()
             stream.skip(-size % _TAR_BLOCK_BYTES)
+        elif info.type == b"S":
+            if _PARTS_OF_LOGS.search(PurePosixPath(name or info.name).name):
+                return budget.stop(
+                    "log_damaged", f"{LogText(name or info.name)} is a sparse file; pack it without --sparse"
+                )
+            more = head[_SPARSE_MORE]
+            while more and (block := stream.exactly(_TAR_BLOCK_BYTES)):
+                more = block[504] if len(block) == _TAR_BLOCK_BYTES else 0
+            stream.skip(size + -size % _TAR_BLOCK_BYTES)
         elif info.type not in SUPPORTED_TYPES or info.type == b"g":
             stream.skip(size + -size % _TAR_BLOCK_BYTES)
         name, stated = "", None

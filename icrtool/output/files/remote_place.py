@@ -5,14 +5,15 @@ The one place that writes over a connection. All others write to a folder on dis
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from icrtool.errors import IcrToolError, LogError, OutputError
-from icrtool.logs.containers.source import asked, filesystem
+from icrtool.logs.containers.source import asked, filesystem, version_of
 from icrtool.logs.containers.unpack import ScratchFolder
 from icrtool.output.files.atomic import make_folders, place_errors, write_file
 from icrtool.output.files.formats import CHECKSUM_FILE, SOURCES_FILE
@@ -27,8 +28,8 @@ COUNTS = (CHECKSUM_FILE, FLEET_FILE)
 MOST_REQUESTS = 8
 """That are made at the same time."""
 
-_PROBE = ".icrtool-upload"
-"""Written and removed before any work is done for the place."""
+_PROBE, _CLAIM = ".icrtool-upload", ".icrtool-writer"
+"""Written and removed before any work is done for the place; there while results are uploaded: by whom."""
 
 Needed = Callable[[str], bool]
 """Whether the content of a file is needed, by its name below the place; of others the name alone is."""
@@ -126,6 +127,7 @@ class _Store:
         with _as_output(place):
             self._files, self._name = filesystem(place)
         self._name = self._name.rstrip("/")
+        self._found: list[object] = []
 
     def put(self, content: bytes, name: str = "") -> None:
         """Write a file."""
@@ -140,11 +142,12 @@ class _Store:
             What identifies the content of the files, by their names.
         """
         names = []
+        self._found = self._what_counts()
         for name in self._names(parts):
             # A stranger may have written it: it must be the name of a file below the folder.
             path = PurePosixPath(name)
             below = name and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
-            if below and name != _PROBE:
+            if below and name not in {_PROBE, _CLAIM}:
                 names.append(name)
         with place_errors(self._place):
             for name in names:
@@ -161,13 +164,57 @@ class _Store:
         changed = [name for name, identity in now.items() if identity != before.get(name)]
         if not changed and not gone:
             return
+        claim = self._claim()
         last = [name for name in COUNTS if name in now]
         self.remove([name for name in COUNTS if name in before])
         self.remove([name for name in gone if name not in COUNTS])
         # What a broken upload leaves is known as icrtool's by the first of these, run.json among them.
         first = [name for name in changed if name.endswith(".json") and name not in last]
         for names in (first, [name for name in changed if name not in {*first, *last}], last):
+            if names is last:
+                self._check_claim(claim)
             self._each(lambda name: self._files.put_file(str(folder / name), self._of(name)), names)
+        self.remove([_CLAIM])
+
+    def _claim(self) -> bytes:
+        """Return what states that this command writes there, once it is there; the last one that begins goes on.
+
+        Raises
+        ------
+        OutputError
+            Another command wrote there since this one began.
+        """
+        advice = "its results stay; name another place, or run the command again"
+        if self._what_counts() != self._found:
+            raise OutputError(self._place, "another command wrote there meanwhile", advice)
+        claim = secrets.token_hex(16).encode()
+        self.put(claim, _CLAIM)
+        self._check_claim(claim)
+        return claim
+
+    def _check_claim(self, claim: bytes) -> None:
+        """Refuse to write on where another command claimed the place at the same time."""
+        self._files.invalidate_cache()
+        if self._done(lambda: self._files.cat_file(self._of(_CLAIM))) != claim:
+            why = "another command began to write there at the same time"
+            raise OutputError(self._place, why, "its results stay; run this command again")
+
+    def _what_counts(self) -> list[object]:
+        """Return what the store states of the files without which results do not count."""
+        return [(about.get("size"), version_of(about)) if (about := self._about(name)) else None for name in COUNTS]
+
+    def _about(self, name: str) -> dict[str, Any]:
+        """Return what the store states of a file now; nothing where there is none."""
+
+        def ask() -> dict[str, Any]:
+            self._files.invalidate_cache()
+            try:
+                stated: dict[str, Any] = self._files.info(self._of(name))
+            except FileNotFoundError:
+                return {}
+            return stated
+
+        return self._done(ask)
 
     def _names(self, parts: Collection[str] | None) -> list[str]:
         """Return the files below the address."""

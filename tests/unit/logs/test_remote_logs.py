@@ -444,7 +444,7 @@ def test_an_address_keeps_its_slashes_and_hides_its_secrets():
     assert "pass" not in repr(path) + str(path) + f"{path}"
     assert log_name(place_of("s3://bucket/mon/a.mcap.zst")) == "a"
     assert not isinstance(place_of("C:/logs/a.mcap"), UrlPath)
-    assert without_secrets("404, url='https://h/a?token=x'; s3://k:s@b/c") == "404, url='https://h/a'; s3://b/c"
+    assert [without_secrets(one) for one in ("https://h/a?token=x", "s3://k:s@b/c")] == ["https://h/a", "s3://b/c"]
 
 
 def test_compare_names_an_address_by_its_file_and_without_its_query():

@@ -1,0 +1,176 @@
+"""Addresses: their secrets stand in no output, two that differ in their query are two, odd ones are refused."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from icrtool.errors import LogError
+from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.containers.source import filesystem
+from icrtool.records.places import UrlPath, place_of
+from icrtool.records.samples import InputFile
+
+SECRET = "d0ntPr1ntTh1s"
+FORMS = {
+    "https://user:{s}@host/a.mcap": "https://host/a.mcap",
+    "https://{s}@host/a.mcap": "https://host/a.mcap",
+    "https://user:p@{s}@host/a.mcap": "https://host/a.mcap",
+    "https://user:p/{s}@host/a.mcap": "https://host/a.mcap",
+    "https://user:p?{s}@host/a.mcap": "https://…",
+    "https://user:p#{s}@host/a.mcap": "https://…",
+    "https://host/a.mcap?token={s}": "https://host/a.mcap",
+    "https://host/a[1].mcap?token={s}": "https://host/a[1].mcap",
+    "https://host/a(1).mcap?token={s}": "https://host/a(1).mcap",
+    "https://host?token=a@{s}": "https://…",
+    "https://host/?token=a@{s}": "https://host/",
+    "https://host/a.mcap#access_token={s}": "https://host/a.mcap",
+    "https://host/a.mcap?x=1?token={s}": "https://host/a.mcap",
+    "https://host:8080/a@b.mcap?t={s}": "https://host:8080/a@b.mcap",
+    "http://[::1]:80/a.mcap?t={s}": "http://[::1]:80/a.mcap",
+    "s3://KEY:{s}@bucket/a.mcap": "s3://bucket/a.mcap",
+    "s3://KEY:{s}/+x@bucket/a.mcap": "s3://bucket/a.mcap",
+    "s3://KEY:12/{s}@bucket/a.mcap": "s3://bucket/a.mcap",
+    "s3://KEY:{s}@bucket": "s3://bucket",
+    "s3://bucket/a.mcap?X-Amz-Signature={s}": "s3://bucket/a.mcap",
+    "s3://bucket/mon day/a [1].mcap?sig={s}": "s3://bucket/mon day/a [1].mcap",
+    "az://box/a.mcap?sv=1&sig={s}%3D": "az://box/a.mcap",
+    "S3://KEY:{s}@bucket/a.mcap": "S3://bucket/a.mcap",
+}
+REFUSED = (
+    "file:///dev/zero", "memory://x", "github://a:b@c/d", "ftp://host/a.mcap", "zip://a::s3://b/c.zip", "local://a",
+    "simplecache::s3://b/a.mcap", "s3://b/a::file:///etc/passwd", "https://", "https:///a.mcap", "https://host:99999/a",
+    "https://host:x/a", "http://[::1/a.mcap", "s3://", "s3://@/a", "https://ho st/\x1b[2J", "https://host\\a", "data://x",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_secret_of_an_address_is_in_its_text_its_name_or_an_error(form: str) -> None:
+    url = form.format(s=SECRET)
+    place = place_of(url)
+    assert isinstance(place, UrlPath)
+    assert str(place) == FORMS[form]
+    assert SECRET not in f"{place} {place.name} {place!r} {place.parts} {place / 'run'} {LogError(place, 'x')}"
+    assert place.url == url
+    assert SECRET not in place.without_own_secrets(f"GET {url} failed: {SECRET}")
+
+
+def test_escaped_forms_of_a_secret_are_left_out_of_a_library_s_text() -> None:
+    place = UrlPath("https://host/a.mcap?token=a%2Fb%2Bsecret")
+    assert "secret" not in place.without_own_secrets("url a/b+secret; a%2Fb%2Bsecret")
+
+
+@pytest.mark.parametrize("url", REFUSED)
+def test_an_address_that_is_not_documented_is_refused_in_one_line(url: str) -> None:
+    path = place_of(url)
+    with pytest.raises(LogError) as error:
+        filesystem(path if isinstance(path, UrlPath) else UrlPath(url))
+    assert len(str(error.value).splitlines()) == 1
+    assert str(error.value).isprintable()
+
+
+def test_what_identifies_a_file_is_its_content_or_its_whole_address() -> None:
+    def stated(url: str, **more: str) -> InputFile:
+        return InputFile(str(UrlPath(url)), 9, None, address=UrlPath(url).digest, **more)
+
+    one, two = "https://h/download?id=1", "https://h/download?id=2"
+    assert stated(one).path == stated(two).path
+    assert stated(one).identity != stated(two).identity
+    assert stated(one, etag="a").identity == stated(two, etag="a").identity  # a new signature of the same content
+    assert stated(one, etag="a").identity != stated(one, etag="b").identity
+    assert stated(one, etag="Sat, 01 Jan 2026 00:00:00 GMT").identity[1] == UrlPath(one).digest
+    assert InputFile("a", 9, "ab").identity == InputFile("b", 9, "ab").identity
+
+
+@contextmanager
+def lying_server(answer: bytes, forever: bytes = b"") -> Iterator[tuple[str, list[int]]]:
+    """Answer HEAD with a size of 1 MB, and GET with what is given; count what is sent."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    sent = [0]
+
+    def serve(client: socket.socket) -> None:
+        with client:
+            try:
+                while request := client.recv(65536):
+                    if request.startswith(b"HEAD"):
+                        client.sendall(b'HTTP/1.1 200 OK\r\nContent-Length: 1000000\r\nETag: "a"\r\n\r\n')
+                        continue
+                    client.sendall(answer)
+                    while forever and sent[0] < 200_000_000:
+                        client.sendall(forever)
+                        sent[0] += len(forever)
+                    return
+            except OSError:
+                return
+
+    def accept() -> None:
+        while True:
+            try:
+                client, _ = listening.accept()
+            except OSError:
+                return
+            threading.Thread(target=serve, args=(client,), daemon=True).start()
+
+    threading.Thread(target=accept, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{listening.getsockname()[1]}/a.mcap", sent
+    finally:
+        listening.close()
+
+
+CHUNK = b"10000\r\n" + bytes(65536) + b"\r\n"
+CHUNKED = b"Transfer-Encoding: chunked\r\n"
+LIES = {
+    "200 without an end": b"HTTP/1.1 200 OK\r\n" + CHUNKED + b"\r\n",
+    "another range": b"HTTP/1.1 206 P\r\nContent-Range: bytes 0-9/1000000\r\n" + CHUNKED + b"\r\n",
+    "another size": b"HTTP/1.1 206 P\r\nContent-Range: bytes 999999-999999/5\r\n" + CHUNKED + b"\r\n",
+    "no range stated": b"HTTP/1.1 206 P\r\n" + CHUNKED + b"\r\n",
+    "an encoding": b"HTTP/1.1 206 P\r\nContent-Range: bytes 999999-999999/1000000\r\nContent-Encoding: gzip\r\n"
+    + CHUNKED + b"\r\n",
+    "a range without an end": b"HTTP/1.1 206 P\r\nContent-Range: bytes 999999-999999/1000000\r\n" + CHUNKED + b"\r\n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_server_that_lies_about_a_range_is_refused_and_little_is_read(lie: str) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    with lying_server(LIES[lie], CHUNK) as (url, sent), pytest.raises(LogError) as error:
+        open_log(UrlPath(url))
+    assert len(str(error.value).splitlines()) == 1
+    assert sent[0] < 50_000_000  # what the sockets hold
+
+
+def test_a_silent_server_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("aiohttp", reason="needs the extra icrtool[http]")
+    from icrtool.logs.containers import source
+
+    monkeypatch.setattr(source, "QUIET_S", 0.3)
+    start = b"HTTP/1.1 206 P\r\nContent-Range: bytes 999999-999999/1000000\r\nContent-Length: 1\r\n\r\n"
+    with lying_server(start) as (url, _), pytest.raises(LogError):
+        open_log(UrlPath(url))
+
+
+def test_standard_input_that_is_no_log_is_refused_by_its_first_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    import io
+    import sys
+
+    class Endless(io.RawIOBase):
+        given = 0
+
+        def readable(self) -> bool:
+            return True
+
+        def readinto(self, space: memoryview) -> int:  # type: ignore[override]
+            self.given += len(space)
+            return len(space)
+
+    stream = Endless()
+    monkeypatch.setattr(sys, "stdin", type("In", (), {"buffer": stream, "isatty": lambda _: False, "closed": False})())
+    with pytest.raises(LogError, match="not a log"):
+        open_log(Path("-"))
+    assert stream.given <= 4096
