@@ -270,12 +270,13 @@ def _number(text: str) -> float:
 
 
 _MINUTES = 60.0
+"""Of a degree; a receiver that rounds writes all of them."""
 
 
 def _degrees(text: str, side: str, sides: str) -> float:
     """Return degrees of ``ddmm.mmmm``, negative on the second of two sides; NaN without one of them."""
     whole, minutes = divmod(_number(text), 100.0)
-    if not (whole >= 0.0 and minutes < _MINUTES):
+    if not (whole >= 0.0 and minutes <= _MINUTES):
         return float("nan")  # the side is a letter, not a sign
     return (whole + minutes / 60.0) * {sides[0]: 1.0, sides[1]: -1.0}.get(side, float("nan"))
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from icrtool.config import Config
-from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC, parse_sentence
+from icrtool.logs.messages.decoded_values import GGA, GST, HDT, NMEA_SENTENCE, RMC, _degrees, parse_sentence
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.records.samples import FIXED_FIX, FLOAT_FIX, OTHER_FIX
 from support.tables import channel_of, collected, read_source
@@ -153,3 +153,9 @@ def test_sentences_of_megabytes_cost_no_time() -> None:
     table = table_of([b"$" + b"," * 1_000_000 + b"*00"] * 20)
     assert table.unreadable == 20
     assert time.process_time() - begin < 2.0
+
+
+@pytest.mark.parametrize("north", ["4760.0001", "4799.0", "-4712.0"])
+def test_more_than_sixty_minutes_or_a_minus_is_no_latitude(north: str) -> None:
+    assert math.isnan(_degrees(north, "N", "NS"))
+    assert _degrees("4730.0", "S", "NS") == -47.5
