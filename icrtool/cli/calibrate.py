@@ -68,7 +68,7 @@ def calibrate_command(
     if output is not None:
         formats.calibration_file(output)
     if plot is not None and run_directory.is_run_directory(sources[0]):
-        # A run may come from a stranger: no file or address is read because it says so.
+        # A run may come from a stranger: no file or address is read because it names one.
         raise errors.RunError(sources[0], "--plot draws the residuals of a log, not of a run", "name its log")
     if all(run_directory.is_run_directory(source) for source in sources):
         check_run_config(config)

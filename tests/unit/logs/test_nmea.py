@@ -53,6 +53,8 @@ def table_of(texts: list[bytes]) -> TopicTable:
 @given(FIXES)
 def test_a_fix_is_where_another_library_reads_it(fix: tuple[float, str, float, str, int, float, float]) -> None:
     north, side, east, hemisphere, quality, height, undulation = fix
+    # ddmm.mmmm: of the last two digits before the point no more than a degree has minutes
+    north, east = (angle // 100 * 100 + 0.6 * (angle % 100) for angle in (north, east))
     fields = (
         "101500.25", f"{north:012.6f}", side, f"{east:013.6f}", hemisphere, str(quality), "12", "0.8",
         f"{height:.3f}", "M", f"{undulation:.3f}", "M", "", "",
