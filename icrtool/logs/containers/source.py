@@ -118,15 +118,15 @@ def asked(path: UrlPath, ask: Callable[[], Result], *, again: bool = True, done:
             if isinstance(cause, FileNotFoundError) or status == 404:
                 raise LogError(path, "no such file") from None
             refused = isinstance(cause, PermissionError | ValueError) or status in {401, 403}
-            is_late = isinstance(cause, TimeoutError)
-            if refused or is_late or not pauses:
+            timed_out = isinstance(cause, TimeoutError)
+            if refused or timed_out or not pauses:
                 why = f"may not be {done}" if refused else f"cannot be {done}"
                 raise LogError(path, why, _words_of(cause, path)) from None
             time.sleep(pauses.pop(0))
 
 
 def _words_of(cause: BaseException, path: UrlPath) -> str:
-    """Return what an error of a library says, without the secrets of the address."""
+    """Return what an error of a library states, without the secrets of the address."""
     if isinstance(cause, TimeoutError):
         return f"its server sent nothing for {QUIET_S:g} s, or too slowly"
     status = getattr(cause, "status", None)
