@@ -24,7 +24,7 @@ def test_a_run_that_lacks_later_keys_has_their_defaults_and_unknown_keys_are_ign
     run = icrtool.open_run(DATA / "run")
     stored = json.loads((DATA / "run" / "run.json").read_bytes())
     for key in ("heading_is_measured", "turn_wander_rad", "antenna_is_known"):
-        del stored["filter"][key]
+        del stored["facts"][key]
     del stored["reference_jumps"], stored["icr"]["x_clock_std_m"]
     stored["gnss"]["later"] = stored["later"] = [1]
     run.write(tmp_path / "run", plots=())

@@ -20,8 +20,9 @@ from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds
 from icrtool.config import Config
 from icrtool.errors import ConfigError, DataError
-from icrtool.records.measurements import Finding, Measurements, SensorData
+from icrtool.records.measurements import Finding, LogFacts, Measurements, SensorData
 from icrtool.records.notes import about, note
+from icrtool.records.plain_data import known
 from icrtool.records.run import width_or_usual_m
 from icrtool.records.tables import RobotLog
 
@@ -82,13 +83,17 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
         fixes=quality.fixes,
         headings=headings,
         gyro=found.log.gyro,
-        heading_from_position=found.log.heading_is_of_position,
-        heading_correlation_s=max(config.filter.heading_correlation_s, found.correlation_s),
-        antenna_m=antenna_m,
+        facts=LogFacts(
+            heading_from_position=found.log.heading_is_of_position,
+            heading_correlation_s=max(config.filter.heading_correlation_s, found.correlation_s),
+            heading_is_estimated=derived is not None,
+            heading_is_measured=math.isfinite(heading_std_rad),
+            turn_wander_rad=None if found.fit is None else known(found.fit.turn_wander_rad),
+            antenna_m=antenna_m,
+            antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
+            clock_std_s=found.delays.clock_std_s,
+        ),
         losses_ns=quality.losses_ns,
-        heading_is_estimated=derived is not None,
-        heading_is_measured=math.isfinite(heading_std_rad),
-        turn_wander_rad=math.inf if found.fit is None else found.fit.turn_wander_rad,
         attitude=None if derived is None else derived.attitude,
     )
     return Measurements(
@@ -98,8 +103,6 @@ def _align_once(log: RobotLog, config: Config) -> Measurements:
         heading=heading,
         streams=found.log.streams,
         fix_statistics=quality.statistics,
-        clock_std_s=found.delays.clock_std_s,
-        antenna_is_known=log.antenna_m is not None or config.frames.antenna_right_m != "auto",
         notes=(*found.log.notes, *found.notes, *quality.notes),
     )
 
@@ -119,9 +122,11 @@ def sensors_as_sent(log: RobotLog, config: Config) -> SensorData:
         fixes=fixes_of(log.gnss, config.filter),
         headings=replace(log.heading, var_rad2=heading_variance(log.heading, config.filter)),
         gyro=log.gyro,
-        heading_from_position=log.heading_is_of_position,
-        heading_correlation_s=config.filter.heading_correlation_s,
-        antenna_m=_antenna_m(log, config),
+        facts=LogFacts(
+            heading_from_position=log.heading_is_of_position,
+            heading_correlation_s=config.filter.heading_correlation_s,
+            antenna_m=_antenna_m(log, config),
+        ),
         losses_ns=np.empty((0, 2), np.int64),
     )
 

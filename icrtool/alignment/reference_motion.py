@@ -164,7 +164,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     wheels, fixes, headings = sensors.wheels, sensors.fixes, sensors.headings
     if min(len(wheels.stamp_ns), len(fixes.stamp_ns), len(headings.stamp_ns)) < FEWEST_FIXES:
         return None
-    track = track_of_streams(wheels, fixes, headings, same_clock=sensors.heading_from_position)
+    track = track_of_streams(wheels, fixes, headings, same_clock=sensors.facts.heading_from_position)
     left, right = track.v_left, track.v_right
     begin, end = (pick(track.t[at], track.heading_t[at]) for pick, at in ((max, 0), (min, -1)))
     rows = np.flatnonzero((track.place_t >= begin) & (track.place_t <= end))
@@ -198,7 +198,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
         holes=np.append(0, np.cumsum(np.logical_or.reduce([of_wheels, *of_others]))),
         wheel_holes=np.append(0, np.cumsum(of_wheels)), fix_class=fixes.fix_class[rows],
-        turn_follows_place=sensors.heading_is_estimated, gyro=by_gyro,
+        turn_follows_place=sensors.facts.heading_is_estimated, gyro=by_gyro,
     )  # fmt: skip
 
 

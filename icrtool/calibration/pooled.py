@@ -65,8 +65,8 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
 
 def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
     """Return the antenna's position where it is configured, or in the log's transforms, forward and right [m]."""
-    used, given = run.sensors.antenna_m, run.config.frames
-    in_log = run.document.filter.antenna_is_known and given.antenna_right_m == "auto"
+    used, given = run.sensors.facts.antenna_m, run.config.frames
+    in_log = run.sensors.facts.antenna_is_known and given.antenna_right_m == "auto"
     return (
         used[0] if in_log or given.antenna_forward_m != "auto" else None,
         used[1] if in_log or given.antenna_right_m != "auto" else None,

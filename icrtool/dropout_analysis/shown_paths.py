@@ -246,7 +246,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
     end error and is left out; so is one that the drive begins with: neither position nor ICRs were known before it.
     """
     track, table, fixes = track_of(run), run.table, run.sensors.fixes
-    (forward, right), origin = run.sensors.antenna_m, int(table.stamp_ns[0])
+    (forward, right), origin = run.sensors.facts.antenna_m, int(table.stamp_ns[0])
     outages = []
     for begin, end in run.outages_ns:
         first, last = (int(row) for row in np.searchsorted(table.stamp_ns, [begin, end]))

@@ -165,7 +165,7 @@ def set_up_filter(
     )
     start = initial_icrs(config) if start is None else start
     icrs, icr_std = np.array(start.icrs_m), np.array(start.std_m)
-    if sensors.headings_are_precise:
+    if sensors.facts.headings_are_precise:
         data = data._replace(turn_variance=_response_variance(data, float(icrs[0] - icrs[1])) + TURN_WANDER_RAD**2)
     if not (len(gnss_t) and len(heading_t)):
         raise DataError(sensors.name, "the outages leave no fix or no heading", "shorten them")
@@ -288,8 +288,8 @@ def _samples_that_err_alike(sensors: SensorData, noise: ProcessNoise) -> float:
     then sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise. All headings count: what an outage takes away
     must not change how the rest is weighed.
     """
-    tau_s, stamps = sensors.heading_correlation_s, sensors.headings.stamp_ns
-    if sensors.headings_are_precise:
+    tau_s, stamps = sensors.facts.heading_correlation_s, sensors.headings.stamp_ns
+    if sensors.facts.headings_are_precise:
         density, usual = (
             math.radians(one.heading_degps) ** 2 * REFERENCE_STEP_S + TURN_WANDER_RAD**2
             for one in (noise, FIELD.process_noise)
@@ -325,8 +325,8 @@ def _parameters(config: Config, data: FilterInputs, sensors: SensorData, noise: 
         gnss_gate=gates[0],
         heading_gate=gates[1],
         heading_correlation=_samples_that_err_alike(sensors, noise) if rules.measures_noise else 1.0,
-        antenna_forward=sensors.antenna_m[0] if rules.corrects else 0.0,
-        antenna_right=sensors.antenna_m[1] if rules.corrects else 0.0,
+        antenna_forward=sensors.facts.antenna_m[0] if rules.corrects else 0.0,
+        antenna_right=sensors.facts.antenna_m[1] if rules.corrects else 0.0,
         wheel_gap_s=wheel_gap_s(config, data.wheel_t) if rules.corrects else math.inf,
         gap_speed_variance=GAP_SPEED_STD_MPS**2,
         gap_turn_variance=GAP_TURN_STD_RADPS**2,

@@ -152,7 +152,7 @@ def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
         yield MeasuredHeading(
             "gyro", _integrate(_since(sensors.gyro.stamp_ns, stamps), sensors.gyro.rate_radps, run.table.t_s)
         )
-    needs_positions = sensors.heading_from_position or sensors.heading_is_estimated
+    needs_positions = sensors.facts.heading_from_position or sensors.facts.heading_is_estimated
     attitude = None if needs_positions else sensors.headings
     attitude = sensors.attitude if sensors.attitude is not None else attitude
     if attitude is not None and _covers(attitude.stamp_ns, stamps):

@@ -219,7 +219,9 @@ def run_adaptively(
     if all(not len(one) or one.mean() <= TOLERATED_NIS for one in nis):
         return parameters, output, noise
     del output, nis  # of a long log, as large as all that the next run makes
-    largest = min(LARGEST_HEADING_DEGPS, STEP * math.degrees(sensors.turn_wander_rad) / math.sqrt(REFERENCE_STEP_S))
+    wander_rad, largest = sensors.facts.turn_wander_rad, LARGEST_HEADING_DEGPS
+    if wander_rad is not None:
+        largest = min(largest, STEP * math.degrees(wander_rad) / math.sqrt(REFERENCE_STEP_S))
     part = _busiest_part(sensors)
     moving = part.moving()
     best = find_noise(
@@ -330,7 +332,7 @@ def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
 
     The filter averages them to learn the ICRs; each of them is nearer to the body's heading than their average.
     """
-    if not (sensors.headings_are_precise and used.any()):
+    if not (sensors.facts.headings_are_precise and used.any()):
         return
     headings, psi, rows = sensors.headings, table.heading_rad, np.flatnonzero(used)
     stamps = headings.stamp_ns[rows]

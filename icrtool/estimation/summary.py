@@ -87,7 +87,7 @@ def summarise(
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
     changes_s = tuple(t for t in filtered.changes_s if 0.0 < t < table.t_s[-1])
     convergence = converge(table, min(changes_s, default=None))
-    covariance, excitation, x_clock_std_m = learned(filtered, config, measurements.clock_std_s)
+    covariance, excitation, x_clock_std_m = learned(filtered, config, sensors.facts.clock_std_s)
     give_back_freed()
     multiplier = None if width is None else (separation_multiplier(table, width), multiplier_std(covariance, width))
     inverted = bool(table.y_icr_right_m[-1] <= table.y_icr_left_m[-1])
@@ -143,13 +143,14 @@ def summarise(
             applied_delay_s=lag.applied, used=_count(filtered.heading.used), rejected=_count(filtered.heading.rejected),
         ),
         wheels=measurements.wheels,
-        events=tuple(EventDocument(**(one._asdict() | _seconds(one, start_ns))) for one in sensors.events),
+        events=tuple(EventDocument(**(asdict(one) | _seconds(one, start_ns))) for one in sensors.events),
         reference_jumps=tuple(
             ReferenceJumpDocument(**(asdict(one) | _seconds(one, start_ns))) for one in sensors.jumps
         ),
         outages_ns=_spans(filtered.outages_ns),
         rtk_losses_ns=_spans(sensors.losses_ns),
         wheel_gaps_ns=_spans(table.stamp_ns[np.flatnonzero(filtered.in_gap)[:, None] + [0, 1]]),
+        facts=sensors.facts,
         filter=filter_summary(measurements, filtered, config),
         excitation=excitation,
     )  # fmt: skip
@@ -168,7 +169,7 @@ def _notes(
         *run_warnings(name, rejected, multiplier, excitation, measurements.findings, inverted=inverted),
         *(
             []
-            if measurements.antenna_is_known or not excitation.verdict.shows_sides
+            if filtered.sensors.facts.antenna_is_known or not excitation.verdict.shows_sides
             else antenna_warning(name, table, covariance)
         ),
         *(
@@ -186,19 +187,12 @@ def filter_summary(measurements: Measurements, filtered: Filtered, config: Confi
 
     The mean NIS is 2 of fixes and 1 of headings where the noise is right.
     """
-    sensors, start = filtered.sensors, filtered.began_with
+    start = filtered.began_with
     return FilterDocument(
         preset=config.filter.preset,
         process_position_mps=filtered.noise.position_mps,
         process_heading_degps=filtered.noise.heading_degps,
         reference_delay_s=measurements.findings["position_delay_s"].applied,
-        heading_correlation_s=sensors.heading_correlation_s,
-        heading_from_position=sensors.heading_from_position,
-        heading_is_estimated=sensors.heading_is_estimated,
-        heading_is_measured=sensors.heading_is_measured,
-        turn_wander_rad=known(sensors.turn_wander_rad),
-        antenna_m=sensors.antenna_m,
-        antenna_is_known=measurements.antenna_is_known,
         states=len(filtered.table),
         warm_start=None
         if start is None

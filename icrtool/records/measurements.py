@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -71,6 +70,37 @@ class IcrStart(Record, frozen=True):
     std_m: Triple
 
 
+class LogFacts(Record, frozen=True, kw_only=True):
+    """What is known of a log beside its streams; ``facts`` of run.json.
+
+    Attributes
+    ----------
+    heading_from_position : heading and position are fields of the same messages: they have the same delay
+    heading_correlation_s : the errors of headings closer together than this are correlated
+    heading_is_estimated : the headings are estimated, with the positions; they do not exist without them
+    heading_is_measured : the variance of the headings is that of a reference's poses, as measured
+    turn_wander_rad : how far the heading wanders from the turn of the wheels in a second (rms), noise included; None:
+        not known
+    antenna_m : the antenna from the body origin, forward and right
+    antenna_is_known : its place was configured, or in the log
+    clock_std_s : standard deviation of the time between position and heading, after the correction of delays
+    """
+
+    heading_from_position: bool
+    heading_correlation_s: float
+    heading_is_estimated: bool = False
+    heading_is_measured: bool = False
+    turn_wander_rad: float | None = None
+    antenna_m: tuple[float, float]
+    antenna_is_known: bool = False
+    clock_std_s: float = 0.0
+
+    @property
+    def headings_are_precise(self) -> bool:
+        """Whether the variance of a heading is its own, and not that of an error which lasts."""
+        return self.heading_is_estimated or self.heading_is_measured
+
+
 @dataclass(frozen=True, slots=True)
 class SensorData:
     """The streams of one log as the filter uses them: all it needs of the log.
@@ -80,17 +110,11 @@ class SensorData:
     name : of the log
     headings : clockwise from north, offset corrected; every variance finite
     gyro : not used by the filter; None without one
-    heading_from_position : heading and position are fields of the same messages: they have the same delay
-    heading_correlation_s : the errors of headings closer together than this are correlated
-    heading_is_estimated : `headings` are estimated, with the positions; they do not exist without them
-    heading_is_measured : the variance of `headings` is that of a reference's poses, as measured
-    turn_wander_rad : how far the heading wanders from the turn of the wheels in a second (rms), noise included; inf:
-        not known
-    attitude : an attitude sensor's heading, its offset corrected, where `headings` are estimated with it; else None
-    antenna_m : the antenna from the body origin, forward and right
+    facts : all that is no column and no span of time
     losses_ns : half-open spans in which RTK was lost, (k, 2)
     events : slip events, in order of time
     jumps : of the reference, likewise
+    attitude : an attitude sensor's heading, its offset corrected, where `headings` are estimated with it; else None
     """
 
     name: str
@@ -98,21 +122,11 @@ class SensorData:
     fixes: Fixes
     headings: HeadingSamples
     gyro: GyroSamples | None
-    heading_from_position: bool
-    heading_correlation_s: float
-    antenna_m: tuple[float, float]
+    facts: LogFacts
     losses_ns: Ints
     events: tuple[SlipEvent, ...] = ()
     jumps: tuple[ReferenceJump, ...] = ()
-    heading_is_estimated: bool = False
-    heading_is_measured: bool = False
-    turn_wander_rad: float = math.inf
     attitude: HeadingSamples | None = None
-
-    @property
-    def headings_are_precise(self) -> bool:
-        """Whether the variance of a heading is its own, and not that of an error which lasts."""
-        return self.heading_is_estimated or self.heading_is_measured
 
     def moving(self) -> tuple[Bools, Bools]:
         """Return at which fixes (m,) and headings (h,) the wheels turn, or do within `MOVING_S`; all where at none.
@@ -229,8 +243,6 @@ class Measurements:
     findings : by name with unit; run.json has them as ``alignment``
     streams : the log's chosen topics; ``why`` also names the unit of the wheels
     wheels, heading : what is known of them, for run.json
-    clock_std_s : standard deviation of the time between position and heading after that
-    antenna_is_known : its place was configured, or in the log
     notes : findings, in the order they were made
     """
 
@@ -240,8 +252,6 @@ class Measurements:
     heading: HeadingFacts
     streams: tuple[StreamChoice, ...]
     fix_statistics: FixStatistics
-    clock_std_s: float
-    antenna_is_known: bool
     notes: tuple[Note, ...]
 
 
@@ -264,7 +274,7 @@ SlipKind = Literal["immobilised", "slip", "skid", "spin"]
 """Wheels turn and the robot stands; it moves less than its wheels; it moves sideways; it turns less than expected."""
 
 
-class SlipEvent(NamedTuple):
+class SlipEvent(Record, frozen=True):
     """One span in which the robot did not do what its wheels did.
 
     Attributes

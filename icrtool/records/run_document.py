@@ -11,7 +11,16 @@ from typing import Annotated, Generic, Literal, TypeVar
 import msgspec
 
 from icrtool.config import Config
-from icrtool.records.measurements import Finding, HeadingFacts, IcrStart, ReferenceJump, SlipKind, Triple, WheelFacts
+from icrtool.records.measurements import (
+    Finding,
+    HeadingFacts,
+    IcrStart,
+    LogFacts,
+    ReferenceJump,
+    SlipKind,
+    Triple,
+    WheelFacts,
+)
 from icrtool.records.notes import Note
 from icrtool.records.plain_data import Record
 from icrtool.records.requests import FitRequest
@@ -239,13 +248,6 @@ class FilterDocument(Record, frozen=True, kw_only=True):
     process_position_mps: float
     process_heading_degps: float
     reference_delay_s: float
-    heading_correlation_s: float
-    heading_from_position: bool
-    heading_is_estimated: bool
-    heading_is_measured: bool = False
-    turn_wander_rad: float | None = None
-    antenna_m: tuple[float, float]
-    antenna_is_known: bool = False
     states: int
     warm_start: WarmStartDocument | None
     icr_start: IcrStart | None
@@ -359,6 +361,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
     outages_ns: Spans
     rtk_losses_ns: Spans
     wheel_gaps_ns: Spans
+    facts: LogFacts
     filter: FilterDocument
     excitation: ExcitationDocument
     recommended: RecommendedDocument | None = None

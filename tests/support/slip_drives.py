@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from icrtool.kernels.arrays import Floats
-from icrtool.records.measurements import Fixes, SensorData
+from icrtool.records.measurements import Fixes, LogFacts, SensorData
 from icrtool.records.samples import GyroSamples, HeadingSamples, WheelSamples
 
 START_NS = 1_760_000_000_000_000_000
@@ -62,8 +62,6 @@ def drive(
             stamps, np.angle(np.exp(1j * (psi + rng.normal(0, 0.009, n)))), np.full(n, np.radians(1) ** 2)
         ),
         gyro=GyroSamples("/imu", stamps, omega + rng.normal(0, 0.003, n)) if gyro else None,
-        heading_from_position=False,
-        heading_correlation_s=0.0,
-        antenna_m=(0.0, 0.0),
+        facts=LogFacts(heading_from_position=False, heading_correlation_s=0.0, antenna_m=(0.0, 0.0)),
         losses_ns=np.empty((0, 2), np.int64),
     )  # fmt: skip

@@ -7,7 +7,6 @@ others are columns of the states.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
@@ -301,7 +300,6 @@ def read_measurements(
     OSError
         The file cannot be read.
     """
-    facts = document.filter
     try:
         with open_regular(directory / MEASUREMENTS_FILE, directory) as file, ZipFile(file) as stored:
             if any(member.compress_type != ZIP_STORED for member in stored.infolist()):
@@ -329,15 +327,11 @@ def read_measurements(
             fixes=fixes,
             headings=headings,
             gyro=gyro,
-            heading_from_position=facts.heading_from_position,
-            heading_correlation_s=facts.heading_correlation_s,
-            antenna_m=facts.antenna_m,
+            facts=document.facts,
             losses_ns=spans_of(document.rtk_losses_ns),
-            events=tuple(SlipEvent(*(getattr(one, name) for name in SlipEvent._fields)) for one in document.events),
-            jumps=tuple(ReferenceJump(*msgspec.structs.astuple(one)[:-2]) for one in document.reference_jumps),
-            heading_is_estimated=facts.heading_is_estimated,
-            heading_is_measured=facts.heading_is_measured,
-            turn_wander_rad=math.inf if facts.turn_wander_rad is None else facts.turn_wander_rad,
+            # They hold seconds too, which the records of the log do not have.
+            events=msgspec.convert(document.events, tuple[SlipEvent, ...], from_attributes=True),
+            jumps=msgspec.convert(document.reference_jumps, tuple[ReferenceJump, ...], from_attributes=True),
             attitude=attitude,
         )
         outcomes = []

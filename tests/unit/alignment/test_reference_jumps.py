@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -97,6 +98,7 @@ def test_a_heading_that_turns_at_once_is_a_jump() -> None:
     sensors = drive()
     late = sensors.headings.stamp_ns >= START_NS + round(AT_S * 1e9)
     turned = replace(sensors.headings, heading_rad=sensors.headings.heading_rad + np.radians(60.0) * late)
-    (jump,) = jumps_of(replace(sensors, headings=turned, heading_from_position=True))
+    facts = msgspec.structs.replace(sensors.facts, heading_from_position=True)
+    (jump,) = jumps_of(replace(sensors, headings=turned, facts=facts))
     assert (jump.kind, jump.undecided) == ("heading", False)
     assert jump.turn_deg == pytest.approx(60.0, abs=6.0)
