@@ -27,6 +27,7 @@ from icrtool.motion.recording import Recording, cut_trials
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.plain_data import known
+from icrtool.records.rows import FITTED_SPREAD
 from icrtool.records.run import Run
 from icrtool.records.text import with_interval, with_std
 
@@ -162,8 +163,9 @@ def _sum_up(
     _, expected, p50, p95, _ = ranked.summary()
     blocks = statistics.cut_blocks(np.isfinite(errors_m), path_m, horizon_m)
     sums = statistics.block_sums(errors_m, blocks, ranked, p50, p95)
-    low, high, p95_low, p95_high = statistics.error_intervals(errors_m, blocks, sums, p95)
-    return documents.ErrorsAt(horizon_m, *map(known, (p95, p95_low, p95_high, expected, low, high))), sums
+    found = statistics.error_intervals(errors_m, blocks, sums, p50, p95, FITTED_SPREAD)
+    numbers = (p95, found.p95_low, found.p95_high, expected, found.expected_low, found.expected_high)
+    return documents.ErrorsAt(horizon_m, *map(known, numbers)), sums
 
 
 def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[documents.ErrorsAt]:

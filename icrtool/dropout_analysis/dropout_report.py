@@ -297,6 +297,7 @@ def _report(
         # Without when it was made: the same run, the same file.
         recommended=None if made is None else msgspec.structs.replace(made, created=UNSET),
         budgets=budgets,
+        best=report.best_row(errors, calibrations) if usable else None,
         by_turning=by_turning,
         ladder=_ladder(errors, calibrations, found, left_out),
         gates=gates,

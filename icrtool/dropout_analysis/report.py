@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -24,9 +24,10 @@ from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import BlockSums, difference_half_width, within_budget
 from icrtool.kernels.track import TrialCounts
 from icrtool.records import dropout_document as documents
-from icrtool.records.acceptance import METRICS, BudgetDistance, Gate, Verdict
+from icrtool.records.acceptance import CHOICE_HORIZON_M, DISTANCES, METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.choices import FigureSet
 from icrtool.records.plain_data import plain
+from icrtool.records.rows import row_of, turned_by
 from icrtool.records.run_document import RunDocument, known_content
 from icrtool.records.text import escaped, listed
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 
 _NUMBER_FORM = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _FORM = re.compile(
-    r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max|within)@(?P<at>\d+(?:\.\d+)?)\s*m?\s*"
+    r"^\s*(?P<model>\w+(?::\S(?:.*\S)?)?)\.(?P<metric>p50|p95|expected|max|p95_next|within|within_next)@(?P<at>\d+(?:\.\d+)?)\s*m?\s*"
     rf"(?P<relation><=|>=|<|>)\s*(?:(?P<bound>[+-]?{_NUMBER_FORM})\s*m?|"
     rf"(?:(?P<factor>{_NUMBER_FORM})\s*\*\s*)?(?P<baseline>baseline)(?:\s*(?P<offset>[+-]\s*{_NUMBER_FORM})\s*m?)?)\s*$"
 )
@@ -217,7 +218,7 @@ class BaselineReport:
             raise ConfigError(f"gate {gate.text!r}", f"no {gate.model} in the baseline {self.path}", "make it again")
         rows.sort(key=lambda row: row.horizon_m)
         reached = within_budget(
-            documents.column_of(rows, "horizon_m"), documents.column_of(rows, "p95_m"), gate.budget_m
+            documents.column_of(rows, "horizon_m"), documents.column_of(rows, DISTANCES[gate.metric]), gate.budget_m
         )
         return (math.nan if reached is None else reached[0]), None
 
@@ -262,15 +263,52 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
         reached = within_budget(report.horizons_m, result.column("p95_m"), budget_m)
         if reached is not None:
             ends = (
-                within_budget(report.horizons_m, result.column(name), budget_m) for name in ("p95_high_m", "p95_low_m")
+                within_budget(report.horizons_m, result.column(name), budget_m)
+                for name in ("p95_high_m", "p95_low_m", "p95_next_high_m", "p95_next_low_m")
             )
             # An end that stays within the budget as far as there are intervals has no such distance.
-            low, high = (None if end is None or end[1] else end[0] for end in ends)
+            low, high, next_low, next_high = (None if end is None or end[1] else end[0] for end in ends)
             quiet = documents.column_of(result.without_events, "p95_m")
             free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
             without = (None, False) if free is None else free[:2]
-            found.append(BudgetDistance(result.name, budget_m, *reached, low, high, *without))
+            ends_m = low, high, next_low, next_high
+            found.append(BudgetDistance(result.name, budget_m, *reached, *ends_m, *without))
     return tuple(found)
+
+
+def best_row(
+    errors: OpenLoopErrors, calibrations: Sequence[documents.UsedCalibration] = ()
+) -> documents.BestRow | None:
+    """Return the row to drive with by wheels alone; None where no row that a robot can drive with has trials.
+
+    Parameters
+    ----------
+    calibrations : those of the report; one that was fitted to this log is not compared
+
+    Notes
+    -----
+    The smallest expected error near 10 m: a mean differs less by chance than a percentile. A row for comparison is as
+    good where its expected error is smaller, or larger by less than the interval of the difference.
+    """
+    own = {one.name for one in calibrations if one.fitted_to_this}
+    rows = {one.name: row_of(one.name) for one in errors.results if not turned_by(one.name) and one.name not in own}
+    results = {one.name: one for one in errors.results if one.name in rows and rows[one.name].on_robot}
+    means = {name: one.column("expected_error_m") for name, one in results.items()}
+    driven = {name: mean for name, mean in means.items() if not rows[name].compared and np.isfinite(mean).any()}
+    if not driven:
+        return None
+    tested = np.all([np.isfinite(mean) for mean in driven.values()], axis=0)
+    if not tested.any():
+        return None
+    h = int(np.argmin(np.where(tested, np.abs(errors.horizons_m - CHOICE_HORIZON_M), np.inf)))
+    best = min(driven, key=lambda name: float(driven[name][h]))
+    least, as_good = float(driven[best][h]), []
+    for name in (name for name in means if rows[name].compared and math.isfinite(means[name][h])):
+        sums = results[best].block_sums[h], results[name].block_sums[h]
+        half = difference_half_width(*sums, "expected", 1.0, paired=True)
+        if (worse := float(means[name][h]) - least) <= 0.0 or worse <= half:
+            as_good.append(name)
+    return documents.BestRow(best, float(errors.horizons_m[h]), least, tuple(as_good))
 
 
 def parse_gate(text: str) -> Gate:
@@ -283,10 +321,13 @@ def parse_gate(text: str) -> Gate:
     """
     match = _FORM.match(text)
     if match is None:
-        form = "model.p50|p95|expected|max@HORIZONm <= metres, model.within@ERRORm >= metres, or [FACTOR *] baseline"
+        form = (
+            "model.p50|p95|expected|max|p95_next@HORIZONm <= metres, model.within|within_next@ERRORm >= metres, "
+            "or [FACTOR *] baseline"
+        )
         example = 'for example "recommended.p95@10m <= 1.2" or "recommended.within@0.5m >= 10"'
         raise ConfigError(f"gate {text!r}", f"not of the form {form}", example)
-    at_m, within = float(match["at"]), match["metric"] == "within"
+    at_m, within = float(match["at"]), match["metric"] in DISTANCES
     if not at_m > 0:
         raise ConfigError(f"gate {text!r}", "0 m is no length", "name one above zero, for example @10m")
     factor = float(match["factor"] or 1.0) if match["baseline"] else 0.0
@@ -320,7 +361,7 @@ def check_gate(
         raise ConfigError(f"gate {gate.text!r}", f"no model {gate.model}", advice)
     sums = None
     if gate.budget_m is not None:
-        reached = within_budget(report.horizons_m, result.column("p95_m"), gate.budget_m)
+        reached = within_budget(report.horizons_m, result.column(DISTANCES[gate.metric]), gate.budget_m)
         value = math.nan if reached is None else reached[0]
     else:
         places = np.flatnonzero(np.isclose(report.horizons_m, gate.horizon_m or math.nan))

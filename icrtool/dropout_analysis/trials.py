@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -119,7 +120,8 @@ def measure_errors(
                     errors, tested, touching = _errors(track, model, ends, pool), blocks, slipping
                 # Beside each other, columns of a long log would fill the memory.
                 each = pool.map if together > TRIAL_THREADS else map
-                rows.extend(each(_at_horizon, group.tolist(), errors.T, of_few.heading.T[columns], tested, touching))
+                at_each = partial(_at_horizon, row_of(model.name).spread)
+                rows.extend(each(at_each, group.tolist(), errors.T, of_few.heading.T[columns], tested, touching))
                 if model.name == "icr":
                     first = len(errors) if learned is None else learned
                     before += each(_row, group.tolist(), errors[:first].T)
@@ -250,11 +252,12 @@ def _errors(track: Track, model: Model, ends: Rows, pool: Executor) -> Floats:
 
 
 def _at_horizon(
-    metres: float, errors: Floats, turned: Floats, blocks: statistics.Blocks | None, slipping: Bools | None
-) -> _AtHorizon:
+    spread: statistics.Spread, metres: float, errors: Floats, turned: Floats, blocks: statistics.Blocks | None,
+    slipping: Bools | None,
+) -> _AtHorizon:  # fmt: skip
     """Return the errors (n,) of one model at one horizon in numbers; `turned` (k,) are those of its turns [rad].
 
-    `slipping` (n,) marks the trials that touch a slip event.
+    `slipping` (n,) marks the trials that touch a slip event; `spread` is what is known of other drives.
     """
     ranked = statistics.RankedTrials.of(errors)
     trials, expected, p50, p95, largest = ranked.summary()
@@ -263,7 +266,7 @@ def _at_horizon(
     bins = ranked.histogram(statistics.round_bin_width(shown_m))
     sums = statistics.block_sums(errors, blocks, ranked, p50, p95)
     del ranked  # as long as a column of the log, like what the intervals need
-    intervals = statistics.error_intervals(errors, blocks, sums, p95)
+    intervals = statistics.error_intervals(errors, blocks, sums, p50, p95, spread)
     _, turn_mean, _, turn_p95, _ = statistics.RankedTrials.of(np.degrees(turned)).summary()
     shares = 100.0 * expected / metres, 100.0 * p95 / metres
     numbers = (expected, p50, p95, largest, *shares, *intervals, turn_mean, turn_p95)

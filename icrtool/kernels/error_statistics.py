@@ -47,12 +47,45 @@ FEWEST_PATH_BLOCKS, MOST_PATH_BLOCKS, HORIZONS_A_BLOCK = 3, 8, 4
 twelve horizons is too short for an interval. More than eight blocks would be narrower by a sixth at most (Student's
 factor is 2.36, without limit 1.96), and less independent."""
 
-LARGEST_GROWTH = 10.0
-"""Logarithm of the widest interval: one block with all of the error shows nothing."""
+PRIOR_FREEDOM = 6.0
+"""Degrees of freedom of the spread that is known of other drives: it counts as much as seven blocks of path."""
 
 LEVEL, NORMAL_FACTOR = 0.95, 1.959964
-"""An interval holds the truth with this probability, as far as blocks are independent: so many standard deviations of a
-normal value."""
+"""Probability that the interval of a number of this drive holds the truth, and the standard deviations of a normal
+value that reach it."""
+
+NEXT_LEVEL, NEXT_NORMAL_FACTOR = 0.90, 1.644854
+"""The same of the interval of the next drive's number."""
+
+
+class Spread(NamedTuple):
+    """How the logarithm of p95 differs between drives of one robot on one kind of ground.
+
+    Attributes
+    ----------
+    shift : mean of the next drive's logarithm over this one's: numbers that were fitted to a drive fit it best
+    between : standard deviation between long drives
+    horizon_std : standard deviation of a drive as long as one horizon; the variance falls with the length of the drive
+
+    Notes
+    -----
+    Measured by ``benchmarks/next_drive.py``, and stated by row in `icrtool.records.rows`.
+    """
+
+    shift: float
+    between: float
+    horizon_std: float
+
+
+class Intervals(NamedTuple):
+    """Intervals of one horizon [m]: of this drive's numbers with `LEVEL`, of the next drive's with `NEXT_LEVEL`."""
+
+    expected_low: float
+    expected_high: float
+    p95_low: float
+    p95_high: float
+    p95_next_low: float
+    p95_next_high: float
 
 
 class Blocks(NamedTuple):
@@ -61,11 +94,13 @@ class Blocks(NamedTuple):
     Attributes
     ----------
     rows : where the trials stand among all starts
-    first : (k,) first trial of each block
+    first : (k,) first trial of each block; empty where the path is too short for `FEWEST_PATH_BLOCKS`
+    horizons : length of the path, in horizons
     """
 
     rows: slice | Bools
     first: Ints
+    horizons: float
 
 
 class BlockSums(NamedTuple):
@@ -115,15 +150,20 @@ def variance_of_sum(influence: Floats) -> float:
     return max(squares, squares + float(influence[1:] @ influence[:-1])) * k / (k - 1)
 
 
-def student_factor(freedom: float) -> float:
-    """Return how many standard deviations half an interval is, estimated with so many degrees of freedom.
+def student_factor(freedom: float, z: float = NORMAL_FACTOR) -> float:
+    """Return the standard deviations that half an interval is long, for a deviation estimated from data.
+
+    Parameters
+    ----------
+    freedom : degrees of freedom of the estimate
+    z : the standard deviations of a normal value
 
     Notes
     -----
     Student's t expanded about the normal quantile z (Abramowitz and Stegun 1964, 26.7.5): within 1 % from two degrees
     on, 0.1 % from four.
     """
-    z, inverse = NORMAL_FACTOR, 1.0 / freedom
+    inverse = 1.0 / freedom
     terms = (
         z,
         (z**3 + z) / 4.0,
@@ -134,42 +174,71 @@ def student_factor(freedom: float) -> float:
     return sum(term * inverse**power for power, term in enumerate(terms))
 
 
+def pooled_variance(measured: float, freedom: float, known: float) -> tuple[float, float]:
+    """Return a variance and its degrees of freedom, of a measured one and of one that is known of other drives.
+
+    Notes
+    -----
+    The mean of both, each with its degrees of freedom (those of the known one: `PRIOR_FREEDOM`): the posterior scale of
+    a normal variance under its conjugate prior.
+    """
+    together = PRIOR_FREEDOM + freedom
+    return (PRIOR_FREEDOM * known + freedom * measured) / together, together
+
+
 def error_intervals(
-    errors_m: Floats, blocks: Blocks | None, sums: BlockSums | None, p95_m: float
-) -> tuple[float, float, float, float]:
-    """Return confidence intervals of one horizon's expected error and p95.
+    errors_m: Floats, blocks: Blocks | None, sums: BlockSums | None, p50_m: float, p95_m: float, spread: Spread
+) -> Intervals:
+    """Return intervals of one horizon's expected error and p95, on this drive and on the next one.
 
     Parameters
     ----------
     errors_m, blocks : as of `block_sums`, which gave `sums`
-    p95_m : of all trials
+    p50_m, p95_m : of all trials
+    spread : what is known of other drives
 
     Returns
     -------
-    expected_low, expected_high, p95_low, p95_high [m]; NaN without blocks
+    NaN without trials.
 
     Notes
     -----
-    Student's t (1908) of what each block moves the logarithm of the number. p95 moves as the root mean square does,
-    which blocks show better than the few trials above p95; the variance is the larger of both. 600 simulated paths of
-    12 to 200 horizons: intervals hold the truth in 0.93-0.96 (p95 0.94-0.96) where what drives the errors changes
-    within a horizon, and in 0.88-0.95 (p95 0.82-0.95) where it wanders over four. What changes over tens of horizons no
-    short path shows.
+    Normal logarithms, Student's t (1908). The variance of a drive is the one that its blocks show, pooled with the one
+    that drives of its length have (`pooled_variance`): few blocks alone would give intervals of any width. p95 moves
+    as the root mean square does, which blocks show better than the few trials above p95; their variance is the larger
+    of both. Of short paths p95 is smaller than of long ones, in its logarithm by about its variance: the upper end is
+    further away by it. The interval of this drive's p95 does not go below its median, nor above the interval of the
+    next drive.
+
+    The next drive, of the same length, has its own variance of a finite path, and the variance between drives.
     """
-    if blocks is None or sums is None:
-        return (math.nan,) * 4
+    if blocks is None or not math.isfinite(p95_m):
+        return Intervals(*(math.nan,) * 6)
+    expected_m = float(errors_m[blocks.rows].mean()) if sums is None else float(sums.errors_m.sum() / sums.trials.sum())
+    if not (expected_m > 0.0 and p95_m > 0.0):
+        return Intervals(expected_m, expected_m, p95_m, p95_m, p95_m, p95_m)
+    of_length = spread.horizon_std**2 / blocks.horizons
+    measured = (of_length, of_length) if sums is None else _block_variances(errors_m, blocks, sums, expected_m, p95_m)
+    freedom = 0.0 if sums is None else len(sums.trials) - 1.0
+    (of_mean, _), (of_p95, together) = (pooled_variance(one, freedom, of_length) for one in measured)
+    of_next = 2.0 * of_p95 + spread.between**2
+    factor, of_next_factor = student_factor(together), student_factor(together, NEXT_NORMAL_FACTOR)
+    grown = math.exp(factor * math.sqrt(of_mean)), math.exp(factor * math.sqrt(of_p95))
+    longer = math.exp(of_p95)
+    middle, next_grown = p95_m * math.exp(spread.shift), math.exp(of_next_factor * math.sqrt(of_next))
+    next_low, next_high = middle / next_grown, middle * next_grown
+    p95_low, p95_high = max(p95_m / grown[1], min(p50_m, p95_m)), min(p95_m * grown[1] * longer, max(next_high, p95_m))
+    return Intervals(expected_m / grown[0], expected_m * grown[0], p95_low, p95_high, next_low, next_high)
+
+
+def _block_variances(
+    errors_m: Floats, blocks: Blocks, sums: BlockSums, expected_m: float, p95_m: float
+) -> tuple[float, float]:
+    """Return the variances of the logarithms of mean and p95 that the blocks show."""
     squares, trials = np.add.reduceat(errors_m[blocks.rows] ** 2, blocks.first), sums.trials
-    total, count = float(squares.sum()), int(trials.sum())
-    expected_m = float(sums.errors_m.sum()) / count
-    if not (total > 0.0 and expected_m > 0.0 and p95_m > 0.0):
-        return expected_m, expected_m, p95_m, p95_m
-    of_rms = variance_of_sum(np.asarray(squares / total - trials / count) / 2.0)
-    variances = variance_of_sum(sums.influence("expected") / expected_m), max(
-        of_rms, variance_of_sum(sums.influence("p95") / p95_m)
-    )  # fmt: skip
-    factor = student_factor(len(trials) - 1.0)
-    grown = [math.exp(min(factor * math.sqrt(variance), LARGEST_GROWTH)) for variance in variances]
-    return expected_m / grown[0], expected_m * grown[0], p95_m / grown[1], p95_m * grown[1]
+    of_rms = variance_of_sum(np.asarray(squares / squares.sum() - trials / trials.sum()) / 2.0)
+    of_share = variance_of_sum(sums.influence("p95") / p95_m)
+    return variance_of_sum(sums.influence("expected") / expected_m), max(of_rms, of_share)
 
 
 def difference_half_width(
@@ -186,7 +255,7 @@ def difference_half_width(
     Student's distribution. Paired: of the differences of the blocks' influences. Otherwise both variances
     add up, degrees of freedom of Welch (1947).
     """
-    if now is None or before is None or metric in {"max", "within"}:
+    if now is None or before is None or metric not in {"expected", *SHARES}:
         return math.nan
     new, old = now.influence(metric), factor * before.influence(metric)
     if paired and len(new) == len(old):
@@ -215,7 +284,7 @@ def block_sums(
     -------
     None without blocks.
     """
-    if blocks is None:
+    if blocks is None or not len(blocks.first):
         return None
     errors, first = errors_m[blocks.rows], blocks.first
     trials = np.diff(first, append=len(errors))
@@ -322,7 +391,7 @@ def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
 
     Returns
     -------
-    None where there are fewer than `FEWEST_PATH_BLOCKS`. Path without trials is left out.
+    None where there is no trial. Path without trials is left out.
     """
     if not (count := int(np.count_nonzero(tried))):
         return None
@@ -331,10 +400,12 @@ def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
     rows = slice(begin, end) if end - begin == count else tried
     path = path_m[rows]
     first = rows_of_cells(path, lambda part: np.floor((part - path[0]) * (BLOCK_PARTS / horizon_m)))
+    # The last trials end a horizon after they start.
+    horizons = len(first) / BLOCK_PARTS + 1.0
     if len(first) < FEWEST_PATH_BLOCKS * HORIZONS_A_BLOCK * BLOCK_PARTS:
-        return None
+        return Blocks(rows, first[:0], horizons)
     count = min(MOST_PATH_BLOCKS, len(first) // (BLOCK_PARTS * HORIZONS_A_BLOCK))
-    return Blocks(rows, first[-(-np.arange(count) * len(first) // count)])
+    return Blocks(rows, first[-(-np.arange(count) * len(first) // count)], horizons)
 
 
 def round_bin_width(largest_m: float) -> float:

@@ -13,8 +13,14 @@ CHOICE_HORIZON_M = 10.0
 """The distance that headlines, tables of calibrations and the worst trials are about."""
 
 
-METRICS = {"expected": "expected_error_m", "p50": "p50_m", "p95": "p95_m", "max": "max_m"}
-"""By its name in an acceptance limit: an error's name in files."""
+METRICS = {
+    "expected": "expected_error_m", "p50": "p50_m", "p95": "p95_m", "max": "max_m", "p95_next": "p95_next_high_m",
+}  # fmt: skip
+"""By its name in an acceptance limit: an error's name in files. ``p95_next`` is the upper end of what is expected of
+the next drive."""
+
+DISTANCES = {"within": "p95_m", "within_next": "p95_next_high_m"}
+"""By the name of a distance in an acceptance limit: the error in files that stays within a budget over it."""
 
 
 NEAR_HORIZONS_M = 1.5
@@ -32,6 +38,7 @@ class BudgetDistance(Record, frozen=True):
     without_events_m, beyond_without_events : the same of the trials that touch no slip event; None without an event
     low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; None where
         they stay within it, and where there is no interval
+    next_low_m, next_high_m : the same of the next drive of this robot on this kind of ground, 9 of 10
     """
 
     model: str
@@ -41,6 +48,8 @@ class BudgetDistance(Record, frozen=True):
     between_m: tuple[float, float]
     low_m: float | None = None
     high_m: float | None = None
+    next_low_m: float | None = None
+    next_high_m: float | None = None
     without_events_m: float | None = None
     beyond_without_events: bool = False
 
@@ -65,11 +74,13 @@ class BudgetDistance(Record, frozen=True):
         )
 
     @property
-    def interval_text(self) -> str:
-        """``13.2-15.0 m`` or ``at least 13.2 m``; empty where the interval leaves the budget nowhere."""
-        if self.low_m is None:
-            return ""
-        return f"{self.low_m:.1f}-{self.high_m:.1f} m" if self.high_m is not None else f"at least {self.low_m:.1f} m"
+    def next_text(self) -> str:
+        """``5.1-18 m``, ``5.1 m or more``, or empty where nothing is expected of the next drive."""
+        if self.next_low_m is None:
+            # Even the upper end stays within the budget at the last horizon.
+            return f"more than {self.distance_m:g} m" if self.beyond else ""
+        low = f"{self.next_low_m:.1f}"
+        return f"{low} m or more" if self.next_high_m is None else f"{low}-{self.next_high_m:.1f} m"
 
 
 class Gate(Record, frozen=True):

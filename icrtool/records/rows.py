@@ -9,6 +9,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from icrtool.kernels.error_statistics import Spread
+
 Color = Literal["green", "purple", "blue", "orange", "grey", "brown", "pink", "teal", "olive", "slate"]
 """Name of a colour; `icrtool.output.figures.style` and page.css state which it is on paper and on a screen."""
 
@@ -29,6 +31,16 @@ INSTALLATION = "sensors corrected by all of the drive"
 """What a row knows of all of the drive: conventions, heading offset, delays, scales, and the noise of the sensors."""
 
 
+FITTED_SPREAD = Spread(shift=0.3, between=0.45, horizon_std=1.0)
+"""Spread of p95 between drives, of rows whose numbers were fitted to the drive and turn by the wheels."""
+
+GIVEN_SPREAD = Spread(shift=0.0, between=0.45, horizon_std=0.95)
+"""The same, of rows whose numbers do not depend on the rest of the drive."""
+
+TURNED_SPREAD = Spread(shift=0.0, between=0.15, horizon_std=0.75)
+"""The same, of rows that turn by a gyro or a measured heading."""
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """One row of a report.
@@ -46,6 +58,7 @@ class Row:
     compared : stands for comparison: a thin line without interval, beside every other row in pictures of paths
     turned_shown : `shown` of the row with a gyro or heading
     turned_knows : `knows` of the row with a gyro or heading
+    spread : how its p95 differs between drives of one robot on one kind of ground
     """
 
     name: str
@@ -61,6 +74,7 @@ class Row:
     compared: bool = False
     turned_shown: bool = False
     turned_knows: str = REST_OF_DRIVE
+    spread: Spread = GIVEN_SPREAD
 
 
 REPORT_ROWS: dict[str, Row] = {
@@ -72,11 +86,11 @@ REPORT_ROWS: dict[str, Row] = {
         ),
         Row(
             "controller", "multiplier and radius factors alone", REST_OF_DRIVE, "purple", "dashed",
-            shown=True, pictured=True, in_csv=True, on_robot=True,
+            shown=True, pictured=True, in_csv=True, on_robot=True, spread=FITTED_SPREAD,
         ),
         Row(
             "recommended", "motion model of eight terms", REST_OF_DRIVE, "green", width=1.3,
-            shown=True, pictured=True, in_csv=True, on_robot=True, turned_shown=True,
+            shown=True, pictured=True, in_csv=True, on_robot=True, turned_shown=True, spread=FITTED_SPREAD,
         ),
         Row(
             "adaptive", "motion model, learning on while it drives", f"other logs, and {PAST}",
@@ -88,7 +102,8 @@ REPORT_ROWS: dict[str, Row] = {
             pictured=True, in_csv=True,
             turned_knows=f"{PAST}, {INSTALLATION}",
         ),
-        Row("icr_final", "ICRs at the end of the log", WHOLE_DRIVE, "grey", "dotted", turned_knows=WHOLE_DRIVE),
+        Row("icr_final", "ICRs at the end of the log", WHOLE_DRIVE, "grey", "dotted", turned_knows=WHOLE_DRIVE,
+            spread=FITTED_SPREAD),
         Row(
             "vendor", "published skid factor, not fitted", "the published factor", "brown", "dotted", 0.6,
             shown=True, pictured=True, in_csv=True, on_robot=True, compared=True,
@@ -142,7 +157,7 @@ def row_of(name: str) -> Row:
         return row
     return replace(
         row, words=f"{row.words}, with the {by}", knows=row.turned_knows, width=min(row.width, 0.6),
-        shown=row.turned_shown, pictured=False, in_csv=False, compared=False,
+        shown=row.turned_shown, pictured=False, in_csv=False, compared=False, spread=TURNED_SPREAD,
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 
 from msgspec import UNSET
@@ -39,11 +40,14 @@ from icrtool.output.text_format import (
 from icrtool.records.acceptance import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
 from icrtool.records.notes import is_grave
-from icrtool.records.rows import LONGEST_ROW_NAME, MOST_USEFUL, WITHOUT_IT, base_of, in_order, row_of, shown_rows
+from icrtool.records.rows import LONGEST_ROW_NAME, MOST_USEFUL, WITHOUT_IT, in_order, row_of, shown_rows
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
-ReachRow = tuple[str, str, str]
+ReachRow = tuple[str, str, str, str]
+
+NEXT_DRIVE = "next drive, 9 of 10"
+NEXT_DRIVE_MEANS = "next drive: of this robot on this kind of ground; another ground is not shown by this log"
 
 
 def format_dropout(report: DropoutReport) -> str:
@@ -98,52 +102,67 @@ def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Secti
 
 
 def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[list[ReachRow], list[ReachRow]]:
-    """Return name, distance and note of each row within a budget: those that are shown first, others.
+    """Return name, distance on this drive, on the next one, and note of each row: those that are shown first, others.
 
     Parameters
     ----------
     events : slip events of the run; the last row is the distance without them, where that is known
     """
     by_model = {one.model: one for one in report.budgets if one.budget_m == budget_m}
-    best = by_model.get(MOST_USEFUL) or by_model.get(WITHOUT_IT)
+    best = report.best.model if report.best is not None else MOST_USEFUL
     order = in_order(by_model)
-    first = shown_rows(order)
-    fitted = {one.name: one.fitted for one in report.calibrations}
-    rows = [reach_row(by_model[name], fitted.get(name, "")) for name in first]
+    first = sorted(shown_rows(order), key=lambda name: name != best)
+    notes = {one.name: one.fitted for one in report.calibrations}
+    if report.best is not None:
+        notes[best] = "best by wheels"
+        notes |= dict.fromkeys(report.best.as_good, "as good here")
+    rows = [reach_row(by_model[name], notes.get(name, "")) for name in first]
     if report.run.config.robot.track_width_m is None:
-        rows.append(("no_slip", "not known", "needs robot.track_width_m (--robot, --set)"))
-    if events and best is not None and (quiet := best.without_events_text):
-        rows.append((f"without its {counted(events, 'slip event')}", quiet, best.model))
-    return rows, [reach_row(by_model[name], by_model[name].interval_text) for name in order if name not in first]
+        rows.append(("no_slip", "not known", "", "needs robot.track_width_m (--robot, --set)"))
+    leading = by_model.get(best) or by_model.get(WITHOUT_IT)
+    if events and leading is not None and (quiet := leading.without_events_text):
+        rows.append((f"without its {counted(events, 'slip event')}", quiet, "", leading.model))
+    return rows, [reach_row(by_model[name]) for name in order if name not in first]
 
 
 def reach_row(one: BudgetDistance, note: str = "") -> ReachRow:
-    """Return name, distance and note of a row of a report; without a `note` what it is."""
-    (low, high), row = one.between_m, row_of(one.model)
-    if not note and base_of(one.model) == MOST_USEFUL:
-        note = one.interval_text
+    """Return name, distance on this drive, on the next one, and note of a row of a report."""
+    low, high = one.between_m
     if not note and high - low > NEAR_HORIZONS_M and not one.beyond:
         note = f"between {low:g} and {high:g} m"
-    return one.model, one.short_text, note or row.words
+    return one.model, one.short_text, one.next_text, note
 
 
 def reach_section(summary: RunDocument, report: DropoutDocument) -> Section:
-    """Return how far the robot stays within each budget."""
+    """Return how far the robot stays within each budget, on this drive and on the next one."""
     blocks: list[Block] = []
     lead, text = "", ""
     for budget_m in dict.fromkeys(one.budget_m for one in report.budgets):
         rows, others = reach_rows(report, budget_m, len(summary.events))
         if rows and not lead:
-            name, lead, note = rows[0]
-            text = f"within {budget_m:g} m (95 %), by wheel speeds alone with {name} ({note})"
-        shown = [(shortened(name, LONGEST_ROW_NAME), distance, note) for name, distance, note in rows]
-        blocks.append(Table("lrl", shown, caption=f"How far within {budget_m:g} m (95 %)?"))
-        blocks.append(Section("Other models", [Table("lrl", others)], VERBOSE))
-    if not blocks:
+            name, lead, next_drive, _ = rows[0]
+            then = f"; on the next drive on this ground {next_drive} (9 of 10)" if next_drive else ""
+            text = f"within {budget_m:g} m (95 %) on this drive, by wheel speeds alone with {name}{then}"
+        shown = [(shortened(name, LONGEST_ROW_NAME), *rest) for name, *rest in rows]
+        head = (f"within {budget_m:g} m (95 %)", "this drive", NEXT_DRIVE, "")
+        blocks.append(Table("lrrl", shown, head, "How far without GNSS?"))
+        blocks.append(Section("Other models", [Table("lrrl", others, head)], VERBOSE))
+    if blocks:
+        blocks += [*best_lines(report), NEXT_DRIVE_MEANS]
+    else:
         blocks.append("How far?  No trial is as long as the shortest horizon: no budget can be evaluated.")
     if report.ladder.left_out is not UNSET and report.ladder.left_out:
         blocks.append(Facts([("left out", f"recommended, controller: {report.ladder.left_out}")]))
     return Section("How far without GNSS?", blocks, lead=lead, text=text)
+
+
+def best_lines(report: DropoutDocument) -> Iterator[str]:
+    """Yield which row has the smallest error by wheels alone, and which rows for comparison are as good."""
+    if (best := report.best) is not None:
+        error = error_text(best.expected_error_m)
+        yield f"{best.model}: {error} expected after {best.horizon_m:g} m, the smallest error by wheels alone"
+        for name in best.as_good:
+            yield f"{name} ({row_of(name).words}) is not shown to be worse: it needs no calibration"
 
 
 def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:

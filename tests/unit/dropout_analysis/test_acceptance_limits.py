@@ -145,7 +145,7 @@ def test_a_budget_without_trials_is_left_out_and_no_length_is_refused(report: Dr
     ("high", "low", "text"),
     [
         ((0.2, 0.5, 2.5), (0.05, 0.2, 1.0), "1.5-3.4 m"),
-        ((0.2, 0.5, math.nan), (0.05, 0.2, math.nan), "at least 1.5 m"),
+        ((0.2, 0.5, math.nan), (0.05, 0.2, math.nan), "1.5 m or more"),
         ((0.2, math.nan, math.nan), (0.05, math.nan, math.nan), ""),
     ],
 )
@@ -153,10 +153,10 @@ def test_an_interval_of_a_budget_ends_where_its_knowledge_ends(
     report: DropoutReport, high: tuple[float, ...], low: tuple[float, ...], text: str
 ) -> None:
     one = with_p95(report, 0.1, 0.4, 2.0)
-    between = with_numbers(one.results[0], p95_low_m=low, p95_high_m=high)
+    between = with_numbers(one.results[0], p95_next_low_m=low, p95_next_high_m=high)
     (found,) = budget_distances(with_models(one, between), 0.3)
     assert found.distance_m == pytest.approx(1.0 + 1.5 * 0.2 / 0.3)
-    assert found.interval_text == text
+    assert found.next_text == text
 
 
 def test_errors_that_never_fall_are_those_of_isotonic_regression() -> None:
@@ -196,3 +196,19 @@ def test_every_limit_fails_on_a_run_that_is_not_usable(run: Run) -> None:
     allowed = dropout_report(bad, horizons_m=[5.0], gates=gates, allow_unusable=True)
     assert allowed.result("recommended") is not None
     assert allowed.document.gates[0].passed
+
+
+def test_a_limit_on_the_next_drive_is_about_the_end_that_9_of_10_drives_reach(report: DropoutReport) -> None:
+    one = with_p95(report, 0.1, 0.4, 2.0)
+    ahead = with_numbers(one.results[0], p95_next_low_m=(0.05, 0.2, 1.0), p95_next_high_m=(0.2, 0.5, 2.5))
+    found = with_models(one, ahead)
+    (reached,) = budget_distances(found, 0.3)
+    distance, error = (
+        check_gate(parse_gate(f"{one.results[0].name}.{text}"), found)
+        for text in ("within_next@0.3m >= 1.2", "p95_next@1m <= 0.25")
+    )
+    assert distance.value_m == pytest.approx(reached.next_low_m)
+    assert error.value_m == pytest.approx(0.2)
+    assert distance.passed
+    assert error.passed
+    assert not check_gate(parse_gate(f"{one.results[0].name}.within_next@0.3m >= 2"), found).passed

@@ -82,7 +82,7 @@ def test_the_distance_within_a_budget_is_given_with_and_without_events_from_the_
 
 def test_the_cost_is_printed_and_a_log_without_events_says_so(run: Run) -> None:
     text = format_dropout(dropout_report(run, horizons_m=HORIZONS_M, ladder=False, without_events=True))
-    assert "1 slip event left out: ICR after 10 m" in text
+    assert "1 slip event left out: icr after" in text
     assert "across a slip event" in text
     quiet = replace(run, sensors=replace(run.sensors, events=()))
     report = dropout_report(quiet, horizons_m=HORIZONS_M, ladder=False, without_events=True)

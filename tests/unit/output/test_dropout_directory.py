@@ -117,6 +117,8 @@ def test_report_json_says_the_same_and_why(written: Path, content: DropoutReport
         "between_m",
         "low_m",
         "high_m",
+        "next_low_m",
+        "next_high_m",
         "without_events_m",
         "beyond_without_events",
     }

@@ -117,8 +117,8 @@ def test_a_budget_is_a_table_a_field_engineer_can_act_on(content: DropoutReport)
     )
     report = msgspec.structs.replace(content.document, budgets=budgets)
     assert reach_rows(report, 0.5, 0) == (
-        [("icr", "7.3 m", "ICRs as estimated at each start"), ("no_slip", "about 2 m", "between 1 and 20 m")],
-        [("icr_final", "more than 20 m", "ICRs at the end of the log")],
+        [("icr", "7.3 m", "", ""), ("no_slip", "about 2 m", "", "between 1 and 20 m")],
+        [("icr_final", "more than 20 m", "more than 20 m", "")],
     )
     assert reach_rows(report, 9.0, 0) == ([], [])
 
@@ -168,7 +168,7 @@ def test_markdown_says_verdicts_sentences_and_numbers(content: DropoutReport) ->
     text = format_outcomes([("barn", content), ("runs/x", RunError("runs/x", "was edited"))])
     assert text.startswith("## barn")
     assert "Acceptance limits not met: 1" in text
-    assert "How far within 50 m (95 %)?" in text
+    assert "within 50 m (95 %)" in text
     assert "Could not be used: runs/x: was edited" in text
     tables = [part for part in text.split("\n\n") if part.startswith("|")]
     assert len(tables) > 1

@@ -105,11 +105,12 @@ def test_page_and_terminal_state_the_same_distances(run: Run, report: DropoutRep
     text = "".join("".join(Elements(run_page(replace(run, document=document), stated, {})).text).split())
     rows, _ = reach_rows(stated, report.document.budgets[0].budget_m, 2)
     assert rows[-1][:2] == ("without its 2 slip events", "more than 20 m")
-    lines = brief[brief.index("How far") :].splitlines()[1 : 1 + len(rows)]
+    lines = brief[brief.index("How far") :].splitlines()[2 : 2 + len(rows)]
     assert [[word for word in row if word] for row in rows] == [
         [word for word in re.split("  +", line.strip()) if word] for line in lines
     ]
-    assert all("".join(f"{label}:{distance}".split()) in text for label, distance, _ in rows)
+    text = text.replace("\N{NON-BREAKING HYPHEN}", "-")
+    assert all("".join(f"{label}{distance}{following}".split()) in text for label, distance, following, _ in rows)
     assert "without its" not in format_blocks(report_blocks(run.document, report.document), verbose=False)
 
 

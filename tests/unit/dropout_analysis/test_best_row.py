@@ -1,0 +1,41 @@
+"""Which row to drive with: the smallest expected error of rows that a robot can drive with, by wheels alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from icrtool.dropout_analysis.dropout_report import dropout_report
+from icrtool.dropout_analysis.report import best_row
+from icrtool.records.run import Run
+
+
+@pytest.fixture(scope="module")
+def run(make_run: Callable[..., Run]) -> Run:
+    return make_run(duration_s=60.0)
+
+
+def test_it_has_the_smallest_expected_error_at_10_m_and_no_gyro(run: Run) -> None:
+    report = dropout_report(run, horizons_m=[5.0, 10.0])
+    best = best_row(report)
+    assert best is not None
+    assert best.horizon_m == 10.0
+    errors = {
+        name: found.column("expected_error_m")[1]
+        for name in ("controller", "recommended")
+        if (found := report.result(name)) is not None
+    }
+    assert best.model == min(errors, key=lambda name: errors[name])
+    assert best.expected_error_m == pytest.approx(min(errors.values()))
+    assert report.document.best == best
+
+
+def test_no_slip_is_not_as_good_for_a_robot_that_slips(run: Run) -> None:
+    best = best_row(dropout_report(run, horizons_m=[5.0, 10.0]))
+    assert best is not None
+    assert best.as_good == ()
+
+
+def test_without_rows_that_a_robot_can_drive_with_there_is_none(run: Run) -> None:
+    assert best_row(dropout_report(run, horizons_m=[5.0], ladder=False)) is None
