@@ -107,7 +107,7 @@ class ComparedRow(NamedTuple):
 def adaptive_rows(recording: Recording, heading: str, calibrations: Sequence[Calibration] = ()) -> list[ComparedRow]:
     """Return row ``adaptive`` of a recording, and the one with the measured heading of a kind where it has one."""
     drive = adapt(recording, prior_for(recording, calibrations))
-    knows = f"{drive.prior.source}, and the drive before each start"
+    knows = f"{drive.prior.source}, and {PAST}, {INSTALLATION}"
     rows = [ComparedRow("adaptive", drive.errors, drive.path, knows)]
     if heading:
         turned = partial(drive.errors, turned=True), partial(drive.path, turned=True)

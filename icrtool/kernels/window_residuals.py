@@ -43,12 +43,12 @@ class PathKnots(NamedTuple):
     place_by: Complexes
 
 
-def sums_from(first: np.generic, parts: NDArray[Number]) -> NDArray[Number]:
-    """Return the sums (n + 1,) of parts (n,), each before the next part, from the first sum on."""
-    sums = np.empty(len(parts) + 1, parts.dtype)
-    sums[0] = first
-    sums[1:] = parts
-    np.cumsum(sums, out=sums)
+def sums_from(first: NDArray[Number], parts: NDArray[Number]) -> NDArray[Number]:
+    """Return the sums (..., n + 1) of parts (..., n), each of those before it, from the first ones (...) on."""
+    sums = np.empty((*parts.shape[:-1], parts.shape[-1] + 1), parts.dtype)
+    sums[..., 0] = first
+    sums[..., 1:] = parts
+    np.cumsum(sums, axis=-1, out=sums)
     return sums
 
 
@@ -71,10 +71,14 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
         np.zeros((k, m)), np.empty((k, m), np.complex128),
     )  # fmt: skip
     heading, place = np.zeros(1), np.zeros(1, np.complex128)
-    heading_by, place_by = np.zeros((k, 1)), np.zeros((k, 1), np.complex128)
+    turning, direction = np.empty(0, np.int64), np.empty((0, 1))
+    heading_by, place_by = np.empty(0), np.zeros(k, np.complex128)
     for lo in range(0, len(track.t), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE)
         fixed, axis, columns = twists(some)
+        if not lo:
+            turning, direction = np.flatnonzero(axis == OMEGA), np.where(axis == VX, 1.0, 1j)[:, None]
+            heading_by = np.zeros(len(turning))
         lasting = track.held[some]
         ahead = track.into * lasting
         v_x, v_y, omega = (fixed[one] + parameters[axis == one] @ columns[axis == one] for one in (VX, VY, OMEGA))
@@ -92,19 +96,15 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
         found.turn_rate[here] = np.where(moving, omega[step], 0.0)
         found.place[here] = place[step] + share * moved[step]
         found.velocity[here] = np.where(moving, velocity[step], 0.0)
-        for a in range(k):
-            by = lasting * columns[a]
-            if axis[a] == OMEGA:
-                turned_by = sums_from(heading_by[a, 0], by)
-                found.heading_by[a, here] = turned_by[step] + share * by[step]
-                heading_by[a] = turned_by[-1]
-                moved_by = (turned_by[:-1] + ahead * columns[a]) * moved
-            else:
-                moved_by = by * forward
-            sums = sums_from(place_by[a, 0], moved_by)
-            # a turn and a velocity to the right move it at right angles to what is summed here
-            found.place_by[a, here] = (sums[step] + share * moved_by[step]) * (1.0 if axis[a] == VX else 1j)
-            place_by[a] = sums[-1]
+        by = lasting * columns
+        turned_by = sums_from(heading_by, by[turning])
+        found.heading_by[turning, here] = turned_by[:, step] + share * by[turning][:, step]
+        moved_by = by * forward
+        moved_by[turning] = (turned_by[:, :-1] + ahead * columns[turning]) * moved
+        sums = sums_from(place_by, moved_by)
+        # a turn and a velocity to the right move it at right angles to what is summed here
+        found.place_by[:, here] = (sums[:, step] + share * moved_by[:, step]) * direction
+        heading_by, place_by = turned_by[:, -1], sums[:, -1]
     return found
 
 

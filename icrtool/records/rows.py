@@ -93,9 +93,9 @@ REPORT_ROWS: dict[str, Row] = {
             shown=True, pictured=True, in_csv=True, on_robot=True, turned_shown=True, spread=FITTED_SPREAD,
         ),
         Row(
-            "adaptive", "motion model, learning on while it drives", f"other logs, and {PAST}",
+            "adaptive", "motion model that adapts", f"other logs, and {PAST}, {INSTALLATION}",
             "pink", shown=True, pictured=True, in_csv=True, on_robot=True,
-            turned_shown=True, turned_knows=f"other logs, and {PAST}",
+            turned_shown=True, turned_knows=f"other logs, and {PAST}, {INSTALLATION}",
         ),
         Row(
             "icr", "ICRs as estimated at each start", f"{PAST}, {INSTALLATION}", "blue", "dashed",

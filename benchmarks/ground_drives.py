@@ -1,0 +1,246 @@
+"""Pairs of drives of skid-steer robots whose slip is made by friction, not by the motion models of icrtool.
+
+Each robot drives three times: A and B on one ground, whose friction is drawn again within what grounds of one kind
+differ by, and C on another one. Robots, grounds, paths and slip are drawn with fixed seeds. All drives are simulated
+together, a row of the arrays each: 84 drives of 200 s take about 15 s.
+
+Planar rigid body, clockwise angles, x forward, y right. Each contact of a wheel or of a part of a track slides with a
+velocity s, and the ground pulls back with mu N s / sqrt(s^2 + s_0^2), less sideways than along the wheel. s_0 grows
+with the wheel's speed (shear of the ground). Load moves with the lateral acceleration; rolling resistance, side slopes
+and friction that varies along the path act too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from unseen_drives import TrueDrive
+
+from icrtool.kernels.arrays import Floats
+from icrtool.records.samples import GyroSamples, HeadingSamples, PositionFixes, StreamChoice, WheelSamples
+from icrtool.records.tables import RobotLog
+from icrtool.records.text import LogText
+
+SECONDS, STEP_S, KEPT_EVERY = 200.0, 0.002, 5
+GRAVITY = 9.81
+DRIVES = ("A", "B", "C")
+START_NS = 1_760_000_000_000_000_000
+
+
+@dataclass(frozen=True)
+class Ground:
+    """How a ground holds a wheel.
+
+    Attributes
+    ----------
+    friction : largest force over load
+    slide_mps, slide_share : sliding at which half of it acts, and its growth with the wheel's speed
+    sideways : share of it that acts across the wheel
+    resistance : rolling resistance over load
+    uneven : relative variation of the friction of each side along the path
+    slope : variation of the slope across and along
+    """
+
+    friction: float
+    slide_mps: float
+    slide_share: float
+    sideways: float
+    resistance: float
+    uneven: float
+    slope: float
+
+
+@dataclass(frozen=True)
+class GroundRobot:
+    """A robot: size [m], contacts a side, place of the centre of mass, radius error of each side."""
+
+    width_m: float
+    base_m: float
+    contacts: int
+    mass_forward_m: float
+    mass_right_m: float
+    height_m: float
+    speed_mps: float
+    left_scale: float
+    right_scale: float
+
+
+def draw_robot(rng: np.random.Generator) -> GroundRobot:
+    """Draw a robot."""
+    width = float(np.exp(rng.uniform(math.log(0.4), math.log(1.1))))
+    return GroundRobot(
+        width, width * float(rng.uniform(0.6, 1.1)), int(rng.choice([2, 2, 5])), width * float(rng.normal(0.0, 0.08)),
+        width * float(rng.normal(0.0, 0.03)), width * float(rng.uniform(0.3, 0.6)),
+        float(rng.uniform(0.5, 1.0)) * min(1.0, width / 0.5), *np.exp(rng.normal(0.0, 0.004, 2)).tolist(),
+    )  # fmt: skip
+
+
+def draw_ground(rng: np.random.Generator) -> Ground:
+    """Draw a ground."""
+    friction, slide_mps = rng.uniform(0.4, 0.9), rng.uniform(0.02, 0.05)
+    slide_share = np.exp(rng.uniform(math.log(0.02), math.log(0.25)))
+    others = [rng.uniform(low, high) for low, high in ((0.6, 1.0), (0.02, 0.08), (0.01, 0.05), (0.0, 0.012))]
+    return Ground(*map(float, (friction, slide_mps, slide_share, *others)))
+
+
+def of_one_kind(ground: Ground, rng: np.random.Generator) -> Ground:
+    """Return a ground of the same kind on another day: each number differs by 5 %."""
+    factors = np.exp(rng.normal(0.0, 0.05, 7)).tolist()
+    numbers = [
+        getattr(ground, name) * factor for name, factor in zip(Ground.__dataclass_fields__, factors, strict=True)
+    ]
+    return Ground(*numbers)
+
+
+def _wander(rng: np.random.Generator, length_s: float, n: int) -> Floats:
+    """Return a random function of time (n,), of variance one, that changes within a length."""
+    knots = rng.normal(size=int(n * STEP_S / length_s) + 3)
+    at = np.arange(n) * STEP_S / length_s
+    row = at.astype(np.int64)
+    part = (1.0 - np.cos(np.pi * (at - row))) / 2.0
+    return (1.0 - part) * knots[row] + part * knots[row + 1]
+
+
+def _commands(robot: GroundRobot, rng: np.random.Generator, n: int) -> tuple[Floats, Floats]:
+    """Return wheel speeds that a driver asks of left and right (n,): straight, curves, spins and stops in turn."""
+    left, right = np.zeros(n), np.zeros(n)
+    row = int(2.0 / STEP_S)
+    while row < n:
+        lasting = int(rng.uniform(2.0, 9.0) / STEP_S)
+        kind, speed = rng.random(), robot.speed_mps * float(rng.uniform(0.6, 1.2))
+        turn = 0.0
+        if kind < 0.04:
+            speed = 0.0
+        elif kind < 0.12:
+            speed, turn = 0.0, float(rng.choice([-1.0, 1.0])) * robot.speed_mps * 0.6
+            lasting = min(lasting, int(3.0 / STEP_S))
+        elif kind < 0.7:
+            turn = float(rng.normal(0.0, 0.35)) * speed
+        left[row : row + lasting], right[row : row + lasting] = speed + turn, speed - turn
+        row += lasting
+    return left, right
+
+
+def simulate(count: int, seed: int = 40) -> list[dict[str, TrueDrive]]:
+    """Return the drives of some robots, by name."""
+    n = int(SECONDS / STEP_S)
+    robots, grounds, commands, uneven, slopes = [], [], [], [], []
+    for number in range(count):
+        rng = np.random.default_rng([seed, number])
+        robot, ground = draw_robot(rng), draw_ground(rng)
+        for each in (of_one_kind(ground, rng), of_one_kind(ground, rng), draw_ground(rng)):
+            # a robot's load differs a little from drive to drive
+            robots.append(
+                replace(robot, mass_forward_m=robot.mass_forward_m + robot.width_m * float(rng.normal(0.0, 0.01)))
+            )
+            grounds.append(each)
+            commands.append(_commands(robot, rng, n))
+            length_s = 8.0 / robot.speed_mps
+            uneven.append([1.0 + each.uneven * np.clip(_wander(rng, length_s, n), -2.5, 2.5) for _ in range(2)])
+            slopes.append([each.slope * _wander(rng, 2.0 * length_s, n) for _ in range(2)])
+    states = _integrate(robots, grounds, np.array(commands), np.array(uneven), np.array(slopes))
+    t = np.arange(states.shape[2]) * STEP_S * KEPT_EVERY
+    made = []
+    for number in range(count):
+        drives = {}
+        for i, name in enumerate(DRIVES):
+            row = len(DRIVES) * number + i
+            robot = robots[row]
+            north, east, heading, left, right = states[:, row]
+            sides = (left / robot.left_scale, right / robot.right_scale)
+            drives[name] = TrueDrive(f"robot{number:02d}{name}", robot.width_m, 0.15, t, north, east, heading, *sides)
+        made.append(drives)
+    return made
+
+
+def _integrate(
+    robots: list[GroundRobot], grounds: list[Ground], commands: Floats, uneven: Floats, slopes: Floats
+) -> Floats:
+    """Return north, east, heading, rolled left and right (5, drives, n) of all drives."""
+    of_robot = {name: np.array([getattr(one, name) for one in robots]) for name in GroundRobot.__dataclass_fields__}
+    of_ground = {
+        name: np.array([getattr(one, name) for one in grounds])[:, None, None] for name in Ground.__dataclass_fields__
+    }
+    width, base = of_robot["width_m"][:, None, None], of_robot["base_m"]
+    most = int(of_robot["contacts"].max())
+    # contacts (drives, side, contact); of robots with fewer the others bear no load
+    x, share = np.zeros((len(robots), 2, most)), np.zeros((len(robots), 2, most))
+    for row, one in enumerate(robots):
+        places = np.linspace(-0.5, 0.5, one.contacts) * base[row]
+        lever = places * one.mass_forward_m / np.mean(places**2)
+        for side in range(2):
+            x[row, side, : one.contacts] = places
+            share[row, side, : one.contacts] = np.maximum(1.0 + lever, 0.05) / one.contacts / 2.0
+        share[row] /= share[row].sum()
+    y = np.array([-0.5, 0.5])[None, :, None] * width
+    x = x - of_robot["mass_forward_m"][:, None, None]
+    y = y - of_robot["mass_right_m"][:, None, None]
+    aside, height = of_robot["mass_right_m"] / of_robot["width_m"], of_robot["height_m"] / of_robot["width_m"]
+    inertia = (of_robot["width_m"] ** 2 + (1.4 * base) ** 2) / 12.0
+    drives, _, n = commands.shape
+    v_x, v_y, omega, wheels = np.zeros(drives), np.zeros(drives), np.zeros(drives), np.zeros((drives, 2))
+    pose = np.zeros((5, drives))
+    kept = np.empty((5, drives, n // KEPT_EVERY))
+    sign = np.array([-1.0, 1.0])
+    lag = STEP_S / 0.15
+    forward, right_of = of_robot["mass_forward_m"], of_robot["mass_right_m"]
+    for i in range(n):
+        if i % KEPT_EVERY == 0:
+            row = i // KEPT_EVERY
+            kept[:, :, row] = pose
+            # the body's origin, from the centre of mass
+            cos, sin = np.cos(pose[2]), np.sin(pose[2])
+            kept[0, :, row] -= forward * cos - right_of * sin
+            kept[1, :, row] -= forward * sin + right_of * cos
+        wheels += lag * (commands[:, :, i] - wheels)
+        # load goes to the outer side of a turn
+        load = 1.0 + 2.0 * sign * (aside - height * v_x * omega / GRAVITY)[:, None]
+        load = np.clip(load, 0.1, 1.9)[:, :, None] * share * GRAVITY
+        rolled = wheels[:, :, None]
+        along = v_x[:, None, None] - omega[:, None, None] * y
+        across = v_y[:, None, None] + omega[:, None, None] * x
+        slide, sideways = along - rolled, of_ground["sideways"] * across
+        width_mps = of_ground["slide_mps"] + of_ground["slide_share"] * np.abs(rolled)
+        pull = of_ground["friction"] * uneven[:, :, i, None] * load / np.sqrt(slide**2 + across**2 + width_mps**2)
+        drag = of_ground["resistance"] * load * np.tanh(along / 0.02)
+        f_x, f_y = -pull * slide - drag, -pull * sideways
+        torque = (x * f_y - y * f_x).sum(axis=(1, 2)) / inertia
+        a_x = f_x.sum(axis=(1, 2)) + GRAVITY * slopes[:, 0, i] + omega * v_y
+        a_y = f_y.sum(axis=(1, 2)) + GRAVITY * slopes[:, 1, i] - omega * v_x
+        v_x, v_y, omega = v_x + STEP_S * a_x, v_y + STEP_S * a_y, omega + STEP_S * torque
+        pose[2] += STEP_S * omega
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        pose[0] += STEP_S * (v_x * cos - v_y * sin)
+        pose[1] += STEP_S * (v_x * sin + v_y * cos)
+        pose[3:] += STEP_S * wheels.T
+    return kept
+
+
+def measure(drive: TrueDrive, seed: int, *, gyro: bool = True) -> RobotLog:
+    """Return what sensors measure of a drive: wheels and gyro at 50 Hz, fixes of 1 cm at 10 Hz, heading of 1 degree."""
+    rng = np.random.default_rng([seed, 1])
+    t, stamps = drive.t_s, START_NS + np.rint(drive.t_s * 1e9).astype(np.int64)
+    fast, slow = slice(None, None, 2), slice(None, None, 10)
+    speeds = [np.diff(side[fast], append=side[-1]) / (t[2] - t[0]) for side in (drive.left_m, drive.right_m)]
+    speeds[0][-1], speeds[1][-1] = speeds[0][-2], speeds[1][-2]
+    fixes, headings = stamps[slow], stamps[fast]
+    m, k = len(fixes), len(headings)
+    smooth = np.convolve(rng.normal(0.0, 1.0, k + 200), np.ones(100) / 10.0, "same")[100 : 100 + k]
+    psi = drive.heading_rad[fast] + math.radians(0.4) * smooth + math.radians(0.5) * rng.normal(size=k)
+    variance = np.full(m, 1e-4)
+    rate = np.gradient(drive.heading_rad[fast], t[fast]) * 1.005 + 0.002 + rng.normal(0.0, 0.003, k)
+    streams = [
+        StreamChoice(role, LogText(topic), LogText("made/Made"), len(at), hz, "header", 0.0, "made")
+        for role, topic, at, hz in (
+            ("wheels", "/w", headings, 50.0), ("gnss", "/p", fixes, 10.0), ("heading", "/h", headings, 50.0)
+        )
+    ]  # fmt: skip
+    north, east = drive.north_m[slow] + rng.normal(0.0, 0.01, m), drive.east_m[slow] + rng.normal(0.0, 0.01, m)
+    return RobotLog(
+        LogText(drive.name), WheelSamples(headings, *speeds),
+        PositionFixes(fixes, north, east, variance, variance.copy(), np.zeros(m)),
+        HeadingSamples(headings, np.angle(np.exp(1j * psi)), np.full(k, math.radians(1.0) ** 2)),
+        None, tuple(streams), (), {}, (), None, GyroSamples(LogText("/imu"), headings, rate) if gyro else None,
+    )  # fmt: skip

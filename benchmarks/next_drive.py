@@ -1,0 +1,114 @@
+"""What a drive teaches for the next one: ``benchmarks/next_drive.py [--robots 28] [--seed 40] [--csv FILE]``.
+
+Each simulated robot of `benchmarks/ground_drives.py` is calibrated from drive A. Drive B on the same ground, and C on
+another one, are reported with this calibration; the reports of B and C without it show what robots in general teach.
+Tables: error after 10 m, geometric mean over the robots whose drive A is usable, and its ratio to rows ``icr`` and
+``calibration``. A CSV holds every row of every report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from ground_drives import DRIVES, TrueDrive, measure, simulate
+
+import icrtool
+from icrtool.config import parse_config
+from icrtool.errors import IcrToolError
+
+AT_M = 10.0
+ROWS = (
+    "no_slip", "icr", "calibration", "recommended", "adaptive", "adaptive alone",
+    "icr_gyro", "calibration_gyro", "recommended_gyro", "adaptive_gyro",
+)  # fmt: skip
+
+
+class Found(NamedTuple):
+    """One row of the report of a drive at one horizon."""
+
+    robot: int
+    drive: str
+    usable: bool
+    model: str
+    horizon_m: float
+    trials: int
+    expected_m: float
+    p95_m: float
+    p95_low_m: float
+    p95_high_m: float
+
+
+def report_robot(number: int, drives: dict[str, TrueDrive]) -> Iterator[Found]:
+    """Yield the rows of the reports of a robot's drives, B and C with the calibration of A."""
+    calibration = None
+    for name in DRIVES:
+        drive = drives[name]
+        config = parse_config({"robot": {"track_width_m": drive.width_m, "wheel_radius_m": drive.radius_m}})
+        run = icrtool.fit(measure(drive, 10 * number + ord(name)), config)
+        used = [] if calibration is None else [calibration]
+        summary = icrtool.dropout_report(run, calibrations=used, allow_unusable=True).summary
+        yield from found(number, name, usable=run.usable, rows=summary.to_dict("records"))
+        if calibration is None:
+            calibration = icrtool.calibrate(run, allow_unusable=True)
+        else:
+            alone = icrtool.dropout_report(run, allow_unusable=True).summary
+            rows = alone[alone.model.str.startswith("adaptive")].to_dict("records")
+            for row in rows:
+                row["model"] += " alone"
+            yield from found(number, name, usable=run.usable, rows=rows)
+
+
+def found(number: int, name: str, *, usable: bool, rows: list[dict[str, object]]) -> Iterator[Found]:
+    """Yield rows of a summary."""
+    columns = ("model", "horizon_m", "trials", "expected_error_m", "p95_m", "p95_low_m", "p95_high_m")
+    for row in rows:
+        yield Found(number, name, usable, *(row[column] for column in columns))  # type: ignore[arg-type]
+
+
+def geometric_means(rows: list[Found], drive: str) -> dict[str, tuple[float, float]]:
+    """Return expected error and p95 at 10 m by model, over the robots whose drive A is usable."""
+    usable = {row.robot for row in rows if row.drive == "A" and row.usable}
+    means = {}
+    for model in ROWS:
+        errors = [
+            (row.expected_m, row.p95_m)
+            for row in rows
+            if row.model == model and row.drive == drive and row.horizon_m == AT_M and row.robot in usable
+        ]
+        if errors:
+            expected, p95 = np.exp(np.nanmean(np.log(errors), axis=0)).tolist()
+            means[model] = expected, p95
+    return means
+
+
+def main() -> None:
+    """Simulate, report and print."""
+    ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    ask.add_argument("--robots", type=int, default=28)
+    ask.add_argument("--seed", type=int, default=40)
+    ask.add_argument("--csv", type=Path)
+    given = ask.parse_args()
+    rows: list[Found] = []
+    for number, drives in enumerate(simulate(given.robots, given.seed)):
+        try:
+            rows += report_robot(number, drives)
+        except IcrToolError as err:
+            print(f"robot {number}: left out: {err}", flush=True)
+    if given.csv is not None:
+        with given.csv.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([Found._fields, *rows])
+    for drive, words in (("A", "its own drive"), ("B", "the same ground"), ("C", "another ground")):
+        means = geometric_means(rows, drive)
+        print(f"\ndrive {drive}, {words}: expected / 95 % after {AT_M:g} m; expected over icr, over calibration")
+        for model, (expected, p95) in means.items():
+            over = [expected / means[one][0] if one in means else float("nan") for one in ("icr", "calibration")]
+            print(f"{model:18} {expected:.3f} / {p95:.3f} m   {over[0]:.2f}  {over[1]:.2f}")
+
+
+if __name__ == "__main__":
+    main()
