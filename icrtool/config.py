@@ -62,13 +62,15 @@ class RobotConfig:
 
 @dataclass(frozen=True, slots=True)
 class TopicsConfig:
-    """Topics by role."""
+    """Topics by role, the clock of their stamps, and whether the status of fixes counts."""
 
     wheels: str | None = None
     wheel_left: str | None = None
     wheel_right: str | None = None
     gnss: str | None = None
     heading: str | None = None
+    clock: Literal["auto", "header", "log"] = "auto"
+    gnss_status: Literal["stated", "ignored"] = "stated"
 
     def __post_init__(self) -> None:
         if (self.wheel_left is None) != (self.wheel_right is None):
@@ -84,6 +86,7 @@ class WheelsConfig:
     left_joints: tuple[str, ...] = ()
     right_joints: tuple[str, ...] = ()
     quantity: Literal["auto", "position", "velocity", "counts"] = "auto"
+    unit: Literal["auto", "rad/s", "m/s", "rpm", "deg/s", "counts"] = "auto"
     twist_width_m: Width | None = None
     left_scale: Literal["auto"] | SideScale = "auto"
     right_scale: Literal["auto"] | SideScale = "auto"

@@ -339,7 +339,7 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
         if not 0 <= row < len(usable) or not usable[row]:
             return 0.0
         one = steps.rows(slice(row, row + 1))
-        deviation = np.sqrt(one.sensor + (error * one.path_m) ** 2)[0]
+        deviation = np.sqrt(np.maximum(one.sensor + (error * one.path_m) ** 2, NO_VARIANCE))[0]
         expected, seen = _expected(one, shares)[0] / deviation, one.residual[0] / deviation
         size2 = float(expected @ expected)
         part = float(np.clip(expected @ seen / size2, 0.0, 1.0)) if size2 > CLEAR_STEP**2 else default
@@ -355,6 +355,10 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
     return _measured(steps.rows(span), span, shares, begin_s, end_s)
 
 
+NO_VARIANCE = float(np.finfo(np.float64).tiny)
+"""Least variance [m^2]: while the robot parks, sensors without noise leave none, and nothing is expected."""
+
+
 def _missed_shares(steps: ComparedWindows) -> Floats:
     """Return the shares that the left and the right side miss of their motion, and that the robot moves aside (3,).
 
@@ -363,7 +367,7 @@ def _missed_shares(steps: ComparedWindows) -> Floats:
     moved = np.concatenate([steps.model_sides, [steps.path_m]])
     missed = -np.concatenate([steps.of_sides, [steps.aside]])
     size, noise = np.abs(moved).sum(axis=1), steps.sensor.sum(axis=1).mean()
-    shares: Floats = (np.sign(moved) * missed).sum(axis=1) * size / (size**2 + noise)
+    shares: Floats = (np.sign(moved) * missed).sum(axis=1) * size / np.maximum(size**2 + noise, NO_VARIANCE)
     return shares
 
 
@@ -398,8 +402,7 @@ def _expected(steps: ComparedWindows, shares: Floats) -> Floats:
 def _evidence(steps: ComparedWindows, error: Floats, shares: Floats) -> Floats:
     """Return the log likelihood ratio of steps (k,): missing these shares over missing none; bounded."""
     seen = steps.residual
-    # while the robot parks, sensors without noise leave no variance, and nothing is expected
-    variance = np.maximum(steps.sensor + (error * steps.path_m[:, None]) ** 2, np.finfo(np.float64).tiny)
+    variance = np.maximum(steps.sensor + (error * steps.path_m[:, None]) ** 2, NO_VARIANCE)
     ratio = ((seen**2 - (seen - _expected(steps, shares)) ** 2) / (2 * variance)).sum(axis=1)
     return np.asarray(np.clip(ratio, -MOST_EVIDENCE, MOST_EVIDENCE))
 

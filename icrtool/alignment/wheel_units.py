@@ -6,6 +6,7 @@ A robot that stands, or is on a stand, shows none: it is refused here.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -207,7 +208,7 @@ def _metres_per_unit(
         if counts is not None:
             known["counts"] = 2 * math.pi * radius / counts
     unit, per = wheels.unit, "" if wheels.from_position else "/s"
-    if unit == "rad" and radius is not None and not wheels.from_position:
+    if unit == "rad" and radius is not None and not wheels.from_position and config.wheels.unit == "auto":
         scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
         far = scale is not None and scale.value > 0.0 and abs(math.log(scale.value / radius)) >= 2 * UNIT_TOLERANCE
         # the units in which drivers fill speeds of joints
@@ -219,14 +220,15 @@ def _metres_per_unit(
         return known[unit], "" if unit == "m" else f" in {unit}{per}", []
     scale = reference_scale(wheels.stamp_ns, wheels.left, wheels.right, gnss)
     if unit == "unknown" and scale is not None:
-        name, value = min(known.items(), key=lambda item: abs(math.log(scale.value / item[1])))
-        if abs(math.log(scale.value / value)) < UNIT_TOLERANCE:
-            return value, f" in {name}{per} (by the position reference)", []
+        found = _recognised(scale, known, None if wheels.from_position else radius)
+        if found is not None:
+            name, value = found
+            return value, f" in {name}{per if name in known else ''} (by the position reference)", []
     if scale is None and unit == "unknown":
         raise ConfigError(
-            "wheels.quantity",
+            "wheels.unit",
             f"{topic} names no unit, and the log has too little driving to find it",
-            "drive for half a minute; where they are ticks, give --set wheels.quantity=counts",
+            "give rad/s, m/s, rpm, deg/s or counts (ticks: wheels.quantity=counts), or drive for half a minute",
         )
     lacking = "robot.wheel_radius_m" if radius is None else "robot.encoder_counts_per_rev"
     if scale is None:
@@ -237,8 +239,29 @@ def _metres_per_unit(
         )
     what = {"rad": "wheel radius", "counts": "travel of a count"}.get(unit, "travel of a unit of the wheels")
     how = f"{what} {_with_std(scale)} m (estimated from the position reference)"
-    why = f"{topic} names no unit, and none that is known fits" if unit == "unknown" else f"{lacking} is not given"
+    why = (
+        f"{topic} names no unit, and none that is known fits (wheels.unit sets it)"
+        if unit == "unknown"
+        else f"{lacking} is not given"
+    )
     return scale.value, f", {how}", [note("wheel_unit_estimated", f"{why}: {how}")]
+
+
+def _recognised(scale: Scale, known: Mapping[WheelUnit, float], radius: float | None) -> tuple[str, float] | None:
+    """Return the unit, and its metres, that the position reference confirms; None for none.
+
+    Parameters
+    ----------
+    radius : of the wheels, where their speeds may be in rpm or deg/s
+    """
+    name, value = min(known.items(), key=lambda item: abs(math.log(scale.value / item[1])))
+    if abs(math.log(scale.value / value)) < UNIT_TOLERANCE:
+        return name, value
+    turning = {} if radius is None else {"rpm": 2 * math.pi * radius / 60, "deg/s": math.radians(radius)}
+    near = (
+        (name, value) for name, value in turning.items() if abs(math.log(scale.value / value)) < OTHER_UNIT_TOLERANCE
+    )
+    return next(near, None)
 
 
 def _with_std(scale: Scale) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import msgspec
 import numpy as np
@@ -47,6 +47,10 @@ class Odometry(NamedTuple):
     forward_m: Floats
     right_m: Floats
     heading_rad: Floats
+
+
+Frame = Literal["ned", "enu"]
+"""Body frames: x forward, y right, z down; or (REP-103) x forward, y left, z up."""
 
 
 class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
@@ -127,19 +131,25 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
                 return one.p95_m, one.expected_m
         return math.nan, math.nan
 
-    def twist(self, v_left: Floats | float, v_right: Floats | float) -> Floats:
+    def twist(self, v_left: Floats | float, v_right: Floats | float, *, frame: Frame = "ned") -> Floats:
         """Return the body twist v_x, v_y [m/s], omega [rad/s] of wheel speeds [m/s], (3,) or (3, n).
 
         Parameters
         ----------
         v_left, v_right : speeds of the sides at the configured wheel radius, forward positive
+        frame : ``ned``: x forward, y right, omega clockwise; ``enu`` (REP-103): y left, omega counter-clockwise
 
-        Notes
-        -----
-        x forward, y right, omega clockwise; for REP-103 (y left, counter-clockwise) negate v_y and omega.
+        Raises
+        ------
+        ValueError
+            Another frame.
         """
+        if frame not in get_args(Frame):
+            raise ValueError(f"frame {frame!r} is not known: ned or enu")
         left, right = np.atleast_1d(np.asarray(v_left, np.float64)), np.atleast_1d(np.asarray(v_right, np.float64))
         found = self.fitted.twist(wheel_motion(left, right, self.width_m))
+        if frame == "enu":
+            found = found * np.array([[1.0], [-1.0], [-1.0]])
         return found[:, 0] if np.ndim(v_left) == 0 else found
 
     def odometry(self, log: RobotLog) -> Odometry:

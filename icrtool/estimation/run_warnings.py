@@ -33,9 +33,9 @@ LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
 USUAL_X_M = 0.15
 """Skid-steer robots have their x_icr within about this of the body origin (Pentzer 2014: 0.06 and 0.14 m)."""
 
-LEAST_SEPARATION = 1.1
-"""Skid-steer robots turn as if they were at least so many times as wide: a body twist that shows less has a controller
-that knows the slip, or is fused with a gyro."""
+TWIST_SIGMAS = 2.0
+"""A body twist turns as the robot does where the separation of its ICRs is not larger than the track width by so many
+standard deviations: its controller knows the slip, or it is fused with a gyro."""
 
 WORTH_WARNING_SHARE = 0.1
 DELAY_SIGMAS = 3.0
@@ -58,7 +58,7 @@ def unusable_reasons(
     rejected: Mapping[str, float],
     noise: ProcessNoise,
     wheel_scale: Finding | None = None,
-    twist_separation: float | None = None,
+    twist_separation: tuple[float, float] | None = None,
     contradiction: str = "",
     filtered: str = "",
     *,
@@ -71,7 +71,8 @@ def unusable_reasons(
     rejected : `rejected_share` of the fixes, and of the headings
     contradiction : of `contradicts_windows`
     filtered : how the wheels show that a filter made them; nothing else is then worth a reason
-    twist_separation : (y_r - y_l) / b by a body twist that was converted with b, None for other wheels
+    twist_separation : (y_r - y_l) / b by a body twist that was converted with b, and its standard deviation; None for
+        other wheels
     inverted : the right ICR ended left of the left one
     """
     if filtered:
@@ -99,13 +100,26 @@ def unusable_reasons(
         if wheel_scale.std < LARGEST_SCALE_STD and abs(left - 1.0) > LARGEST_SCALE_CORRECTION:
             far = f"the robot goes {100 * left:.0f} % of the distance that the wheels report"
             reasons.append(note("wheel_scale_wrong", far))
-    if twist_separation is not None and twist_separation < LEAST_SEPARATION and not hidden:
-        why = (
-            f"the ICRs are {twist_separation:.2f} of the track width apart: the body twist turns as the robot does; "
-            "its controller multiplies the width (set wheels.twist_width_m), or it is fused with a gyro"
-        )
-        reasons.append(note("twist_holds_multiplier", why))
+    if twist_separation is not None and not hidden:
+        reasons += _twist_reasons(*twist_separation)
     return reasons
+
+
+def _twist_reasons(separation: float, std: float) -> list[Note]:
+    """Return why a body twist shows no ICRs, by their separation in track widths; none where the separation is larger.
+
+    Notes
+    -----
+    A twist that turns as the robot does shows ICRs as far apart as the width that it was converted with. Differential
+    drives turn by a few percent less than their wheels: their ICRs are further apart by more than their deviation.
+    """
+    if separation >= 1.0 + TWIST_SIGMAS * std:
+        return []
+    why = (
+        f"the ICRs are {separation:.2f} ± {std:.2f} of the track width apart: the body twist turns as the robot does; "
+        "its controller multiplies the width (set wheels.twist_width_m), or it is fused with a gyro"
+    )
+    return [note("twist_holds_multiplier", why)]
 
 
 def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str, Finding]) -> str:

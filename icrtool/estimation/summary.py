@@ -101,7 +101,7 @@ def summarise(
         "headings": rejected_share(filtered.heading.code[of_headings]),
     }
     unusable = unusable_reasons(
-        excitation, rejected, filtered.noise, scale, multiplier[0] if of_twist and multiplier is not None else None,
+        excitation, rejected, filtered.noise, scale, multiplier if of_twist else None,
         contradicts_windows(table, covariance, measurements.findings) if rules.corrects and not changes_s else "",
         measurements.wheels.filtered or "" if rules.corrects else "",
         inverted=inverted,

@@ -30,6 +30,7 @@ from icrtool.logs.messages.topic_table import TopicCollector, TopicTable, collec
 from icrtool.logs.streams.assembly import Survey, assemble, longest_part
 from icrtool.logs.streams.positions import TRANSFORM_TYPES, is_static, transform_pose
 from icrtool.logs.streams.select import fields_to_take, find_candidates
+from icrtool.records.notes import note
 from icrtool.records.places import UrlPath, place_of
 from icrtool.records.plain_data import Record
 from icrtool.records.samples import InputFile, Role, rate_and_jitter
@@ -254,6 +255,16 @@ def is_table(path: Path) -> bool:
     return _CSV_NAME.search(path.name) is not None and (path.is_file() or isinstance(path, UrlPath))
 
 
+def table_form(head: bytes, row: bytes) -> tuple[str, str]:
+    """Return the character between the columns of a table, and its decimal sign, by its first line and first row.
+
+    Where semicolons or tabs part the columns, as in countries that write a decimal comma, a comma in the row is one.
+    """
+    counts = {sign: head.count(sign.encode()) for sign in (",", ";", "\t")}
+    separator = max(counts, key=lambda sign: counts[sign])
+    return separator, "," if separator != "," and b"," in row else "."
+
+
 def csv_frame(path: Path) -> pd.DataFrame:
     """Return the columns of a CSV file whose first line names them.
 
@@ -269,7 +280,12 @@ def csv_frame(path: Path) -> pd.DataFrame:
     with path.open("rb") as stream:
         if len(head := stream.readline(LONGEST_HEAD_BYTES)) == LONGEST_HEAD_BYTES:
             raise ValueError(f"its first line has more than {head.count(b',')} columns")
-    table = pd.read_csv(path, skipinitialspace=True)
+        first = stream.readline(LONGEST_HEAD_BYTES)
+    separator, decimal = table_form(head, first)
+    table = pd.read_csv(path, skipinitialspace=separator != "\t", sep=separator, decimal=decimal, encoding="utf-8-sig")
+    signs = {";": "semicolons", "\t": "tabs"}
+    if separator != ",":
+        table.attrs["form"] = f"{signs[separator]} between columns" + (", decimal comma" if decimal == "," else "")
     if not isinstance(table.index, pd.RangeIndex):
         raise ValueError("its rows have more values than its first line has names")  # noqa: TRY004 - of the file
     return table
@@ -297,6 +313,7 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
         raise LogError(path, "cannot be read", err.strerror or str(err)) from err
     except ValueError as err:
         raise LogError(path, "not a CSV table", str(err)) from err
+    form = table.attrs.get("form", "")
     table = table.rename(columns=str)
     if begin is not None or stop is not None:
         clock, unit = ("stamp_ns", 1) if "stamp_ns" in table else ("t_s", 1e9)
@@ -308,7 +325,8 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
             inside &= stamps < nanoseconds(stop, first) if stop is not None else True
             table = table[inside]
     log = RobotLog.from_frames(table, table, table, table, log_name(path))
-    return longest_part(replace(log, inputs=(read,)))
+    notes = (note("table_form", f"read with {form}", log.name),) if form else ()
+    return longest_part(replace(log, inputs=(read,), notes=(*log.notes, *notes)))
 
 
 TOPIC_GAP_IN_INTERVALS, SHORTEST_GAP_S = 5.0, 0.1

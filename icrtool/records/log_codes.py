@@ -17,6 +17,12 @@ OF_FILES: dict[str, Explanation] = {
         "The damaged part is left out; there may be gaps in the drive.",
         "Copy the log again, and compare its size and checksum with those of the original.",
     ),
+    "table_form": Explanation(
+        "info",
+        "The columns of a table are parted by semicolons or tabs, perhaps with decimal commas.",
+        "It is read in that form.",
+        "None is needed. Check that the named form is that of the table.",
+    ),
     "log_part_unreadable": Explanation(
         "warning",
         "A file of a recording, its message definitions, its write-ahead log or its metadata cannot be read.",
@@ -150,6 +156,18 @@ OF_WHEELS: dict[str, Explanation] = {
         "The numbers of a wheel begin again at a limit, as counters of few bits and angles do.",
         "They are counted on.",
         "None is needed. Check the named limit.",
+    ),
+    "header_clock": Explanation(
+        "info",
+        "The header stamps of all streams are of one clock that is far from log time, as simulated time is.",
+        "The header stamps are used.",
+        "None is needed. `topics.clock` sets which stamps are used.",
+    ),
+    "gyro_in_degrees": Explanation(
+        "info",
+        "The turn rates of an inertial unit agree with those of headings or fixes in deg/s, not in rad/s.",
+        "They are converted.",
+        "None is needed. Send rad/s (REP-103).",
     ),
     "joints_not_used": Explanation(
         "warning",

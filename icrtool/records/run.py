@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -130,6 +131,29 @@ class Run:
     def states(self) -> pd.DataFrame:
         """The recorded states, equal to states.csv."""
         return self.table.frame()
+
+    def states_enu(self) -> pd.DataFrame:
+        """Return the recorded states in the frames of REP-103, with the same rows as `states`.
+
+        Returns
+        -------
+        ``stamp_ns``, ``t_s``; ``x_m`` east and ``y_m`` north of the datum; ``yaw_rad`` counter-clockwise from east,
+        unwrapped; ICRs in the body frame with y to the left (the right one is negative); ``std_`` of each; wheel speeds
+        and distance as in `states`.
+        """
+        table, turned = self.table.frame(), {"y_icr_right_m", "y_icr_left_m"}
+        names = {"north_m": "y_m", "east_m": "x_m", "heading_rad": "yaw_rad"}
+        columns = {}
+        for name in table:
+            plain_name = str(name).removeprefix("std_")
+            values = table[name]
+            if name == "heading_rad":
+                values = math.pi / 2 - values
+            elif name in turned:
+                values = -values
+            columns[str(name).replace(plain_name, names.get(plain_name, plain_name))] = values
+        first = ("stamp_ns", "t_s", "x_m", "y_m")
+        return type(table)({name: columns[name] for name in (*first, *(one for one in columns if one not in first))})
 
     @property
     def name(self) -> str:

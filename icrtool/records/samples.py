@@ -184,6 +184,7 @@ TWIST_TYPES = frozenset(
         "geometry_msgs/TwistWithCovarianceStamped",
         "nav_msgs/Odometry",
         "scout_msgs/ScoutStatus",
+        "bunker_msgs/BunkerStatus",
     }
 )
 """Message types whose wheels are a body twist, measured or commanded: wheel speeds are made of it with a width.

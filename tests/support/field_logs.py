@@ -50,10 +50,11 @@ class Message(NamedTuple):
     content: Any
 
 
-def make_drive(seconds: float = 60.0, rate: float = 20.0) -> Drive:
-    """Drive with the ICRs `support.drives.ICRS`."""
+def make_drive(seconds: float = 60.0, rate: float = 20.0, *, slower: float = 1.0) -> Drive:
+    """Drive with the ICRs `support.drives.ICRS`, at 0.5 m/s times `slower`."""
     t = np.arange(0.0, seconds, 1.0 / rate)
-    v_left, v_right = 0.5 + 0.4 * np.sin(0.5 * t), 0.5 + 0.4 * np.sin(0.31 * t + 1.0)
+    v_left = slower * (0.5 + 0.4 * np.sin(0.5 * slower * t))
+    v_right = slower * (0.5 + 0.4 * np.sin(0.31 * slower * t + 1.0))
     x = np.zeros((len(t), 6))
     x[0] = [0.0, 0.0, 0.3, *ICRS]
     for k in range(len(t) - 1):
@@ -111,15 +112,21 @@ def fixes(drive: Drive, topic: str = "/gps/fix", every: int = 4, *, status: int 
         yield Message(stamp_ns, topic, kind, message)
 
 
-def imus(drive: Drive, topic: str = "/imu/data", *, unit: float = 1.0, noise: float = 0.0) -> Iterator[Message]:
+def imus(
+    drive: Drive, topic: str = "/imu/data", *, unit: float = 1.0, noise: float = 0.0, oriented: bool = True
+) -> Iterator[Message]:
     """Yield orientations, and turn rates times `unit` with some noise [rad/s] (standard deviation)."""
+    absent = np.zeros(9) if oriented else np.array([-1.0, *[0.0] * 8])
     kind, rng = "sensor_msgs/msg/Imu", np.random.default_rng(3)
     rates = -drive.turn + rng.normal(0.0, noise, len(drive.turn)) if noise else -drive.turn
     for i, stamp_ns in enumerate(drive.stamp_ns.tolist()):
         half = (np.pi / 2 - drive.heading[i]) / 2
         turned = made("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=float(np.sin(half)), w=float(np.cos(half)))
         rate = made("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=float(rates[i] * unit))
-        message = made(kind, header=header(stamp_ns, "imu"), orientation=turned, angular_velocity=rate)
+        message = made(
+            kind, header=header(stamp_ns, "imu"), orientation=turned, angular_velocity=rate,
+            orientation_covariance=absent,
+        )  # fmt: skip
         yield Message(stamp_ns, topic, kind, message)
 
 

@@ -30,6 +30,9 @@ from icrtool.logs.containers.container import (
 from icrtool.records.text import LogText
 
 SQLITE_MAGIC = b"SQLite format 3\0"
+_WAL_AT, _IN_WAL_MODE = 18, b"\2"
+"""Place in the header of a database, and value there, that states that it is written by a write-ahead log."""
+
 _TABLES = frozenset({"topics", "messages", "message_definitions"})
 _FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "count"})
 """The tables, columns and functions that our queries use; SQLite refuses everything else."""
@@ -82,6 +85,8 @@ class SqliteBag(Container):
                 self._rows = _UNKNOWN_ROWS if last is None else last[0] or 0
                 if not isinstance(self._rows, int):
                     raise sqlite3.DatabaseError("its rows are not numbered")
+                if not self._rows and (lacking := self._lacking_log()):
+                    self.report("log_damaged", f"it holds no message: {lacking}")
             except BaseException:
                 self.close()
                 raise
@@ -89,10 +94,18 @@ class SqliteBag(Container):
             if self._interruption is not None:
                 raise self._interruption from None
             is_damaged = getattr(err, "sqlite_errorcode", None) == sqlite3.SQLITE_CORRUPT
-            found = "; ".join(
-                [str(err), *(one.sentence for one in self.problems), *([self._advice] if is_damaged else [])]
-            )
+            advice = self._lacking_log() or (self._advice if is_damaged else "")
+            found = "; ".join(filter(None, [str(err), *(one.sentence for one in self.problems), advice]))
             raise LogError(path, "not a readable rosbag2 database", found) from err
+
+    def _lacking_log(self) -> str:
+        """Return in words that the write-ahead log of a database is missing; empty where it has none, or has it."""
+        log = self._file.with_name(f"{self._file.name}-wal")
+        with self._file.open("rb") as file:
+            is_ahead = file.read(_WAL_AT + 1)[_WAL_AT:] == _IN_WAL_MODE
+        if not is_ahead or log.exists():
+            return ""
+        return f"its write-ahead log {log.name} is missing, in which a recorder keeps messages: copy it beside the file"
 
     def share_read(self) -> float:
         """Return the last row read as a share of all rows."""

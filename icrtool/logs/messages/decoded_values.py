@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, reduce
@@ -184,17 +185,25 @@ def _padded(rows: Sequence[Sequence[Any]], lacking: float, result: type[np.float
 
 NMEA_SENTENCE = "nmea_msgs/Sentence"
 
-GGA, RMC, GST, HDT = 1, 2, 3, 4
-"""Kinds of sentences that are read: fix with quality, fix with validity, deviations of the fix, true heading."""
+GGA, RMC, GST, HDT = 1, 2, 4, 8
+"""Kinds of sentences that are read: fix with quality, fix with validity, deviations of the fix, true heading (HDT, THS,
+UNIHEADINGA). A message with several sentences has the sum."""
 
 QUALITY_OF_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8, "N": 0}
 """The mode indicator of RMC as the quality of GGA: autonomous, differential, PPS, RTK fixed and float, and so on."""
 
-NMEA_FIELDS = ("latitude", "longitude", "altitude", "heading", "north_std", "east_std")
-"""What the sentences hold, NaN where one does not: degrees, m above the ellipsoid, degrees clockwise from north, m."""
+NMEA_FIELDS = ("latitude", "longitude", "altitude", "heading", "north_std", "east_std", "heading_std")
+"""What the sentences hold, NaN where one does not: degrees, m above the ellipsoid, degrees clockwise from north, m, m,
+degrees."""
 
 _KINDS_OF_NMEA = {"sentence_kind": "int32", "quality": "int32", **dict.fromkeys(NMEA_FIELDS, "float64")}
 _SENTENCE = re.compile(rb"\s*[$!]([ -)+-~]{5,})\*([0-9A-Fa-f]{2})\s*")
+_WITHOUT_CHECKSUM = re.compile(rb"\s*[$!]([ -)+-~]{5,})\s*")
+"""A sentence without a checksum."""
+
+_LONG = re.compile(rb"\s*#([ -)+-~]{5,})\*([0-9A-Fa-f]{8})\s*")
+"""A log of NovAtel and Unicore in ASCII: header, semicolon, fields, CRC of 32 bits."""
+
 _PLAIN_NUMBER = re.compile(r"-?\d{1,12}(?:\.\d{0,12})?")
 
 
@@ -209,14 +218,20 @@ class SentenceDecoder:
 
     inner: Decoder
     kinds: dict[str, str] = field(init=False)
+    _has_checksums: bool = False
 
     def __post_init__(self) -> None:
         self.kinds = {path: kind for path, kind in self.inner.kinds.items() if path != "sentence"} | _KINDS_OF_NMEA
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> DecodedValues:
-        """Decode the first of messages [start, end) (n,) of `data`; one with a wrong checksum is unreadable."""
+        """Decode the first of messages [start, end) (n,) of `data`.
+
+        One with a wrong checksum is unreadable, and one without, unless no sentence of the topic has one.
+        """
         decoded = self.inner.decode(data, start, end)
-        sentences = [parse_sentence(text) for text in decoded.texts("sentence")]
+        texts = decoded.texts("sentence")
+        self._has_checksums = self._has_checksums or any(_SENTENCE.search(text) for text in texts)
+        sentences = [parse_sentences(text, bare=not self._has_checksums) for text in texts]
         is_one = np.array([one is not None for one in sentences], np.bool_)
         read = [one for one in sentences if one is not None]
         values: dict[str, Sequence[Any]] = {
@@ -232,12 +247,50 @@ class SentenceDecoder:
         return DecodedValues(self.kinds, values, readable)
 
 
-def parse_sentence(text: bytes) -> dict[str, Any] | None:
-    """Return what a sentence holds; None without the checksum of NMEA 0183, or with a wrong one."""
+def parse_sentences(text: bytes, *, bare: bool = False) -> dict[str, Any] | None:
+    """Return what the sentences of a message hold together, the first of each kind; None where none can be read.
+
+    Parameters
+    ----------
+    bare : sentences without a checksum are read, too
+    """
+    whole: dict[str, Any] | None = None
+    lines = text.splitlines()
+    # the last of a message that is longer than what is read of it is incomplete
+    for line in lines if len(text) < LONGEST_TEXT else lines[:-1]:
+        if (found := parse_sentence(line, bare=bare)) is not None:
+            whole = whole or {}
+            kinds = whole.get("sentence_kind", 0) | found.get("sentence_kind", 0)
+            # The place of a GGA, with its height, counts more than that of an RMC.
+            is_better = found.get("sentence_kind") == GGA
+            whole = ({**whole, **found} if is_better else {**found, **whole}) | (
+                {"sentence_kind": kinds} if kinds else {}
+            )
+    return whole
+
+
+def parse_sentence(text: bytes, *, bare: bool = False) -> dict[str, Any] | None:
+    """Return what a sentence holds; None without the checksum of NMEA 0183, or with a wrong one.
+
+    Parameters
+    ----------
+    bare : one without a checksum is read, too
+    """
+    if (long := _LONG.fullmatch(text)) is not None:
+        return _parse_long(long[1].decode("ascii")) if _crc_of(long[1]) == int(long[2], 16) else None
     found = _SENTENCE.fullmatch(text)
-    if found is None or reduce(xor, found[1]) != int(found[2], 16):
-        return None
-    name, *fields = found[1].decode("ascii").split(",")
+    is_right = found is not None and reduce(xor, found[1]) == int(found[2], 16)
+    found = found or (_WITHOUT_CHECKSUM.fullmatch(text) if bare else None)
+    return (
+        _fields_of(found[1].decode("ascii"))
+        if found is not None and (is_right or found.re is _WITHOUT_CHECKSUM)
+        else None
+    )
+
+
+def _fields_of(text: str) -> dict[str, Any]:
+    """Return what the text of a sentence between sign and checksum holds."""
+    name, *fields = text.split(",")
     fields += [""] * 16
     match name[2:]:
         case "GGA":
@@ -261,8 +314,27 @@ def parse_sentence(text: bytes) -> dict[str, Any] | None:
             return {"sentence_kind": GST, "north_std": _number(fields[5]), "east_std": _number(fields[6])}
         case "HDT":
             return {"sentence_kind": HDT, "heading": _number(fields[0])}
+        case "THS":
+            return {"sentence_kind": HDT, "heading": _number(fields[0]) if fields[1] in ("A", "") else math.nan}
         case _:
             return {}
+
+
+def _parse_long(text: str) -> dict[str, Any]:
+    """Return the heading of UNIHEADINGA and HEADINGA, NaN where it is not solved; nothing of other logs."""
+    head, _, body = text.partition(";")
+    if head.partition(",")[0] not in ("UNIHEADINGA", "HEADINGA", "HEADING2A"):
+        return {}
+    solution, kind, _, heading, _, _, std, *_ = [*body.split(","), *[""] * 8]
+    is_solved = solution == "SOL_COMPUTED" and kind != "NONE"
+    return {
+        "sentence_kind": HDT, "heading": _number(heading) if is_solved else math.nan, "heading_std": _number(std),
+    }  # fmt: skip
+
+
+def _crc_of(text: bytes) -> int:
+    """Return the CRC of a log of NovAtel and Unicore: CRC-32 that begins with 0 and is not inverted."""
+    return zlib.crc32(text, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 def _number(text: str) -> float:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ from icrtool.errors import ConfigError, DataError, LogError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import DISORDER_NS, TopicTable
+from icrtool.logs.streams.gyro_units import DEGREE, is_in_degrees, is_too_fast
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE, find_gyro, inertial_units
 from icrtool.logs.streams.positions import antenna_place
 from icrtool.logs.streams.select import Candidates, Choice, choose_streams, ignored_joints, other_references
 from icrtool.logs.streams.sources import (
+    BY_LOG,
     Clock,
     Convention,
     HeadingSource,
@@ -26,7 +29,11 @@ from icrtool.logs.streams.sources import (
     Source,
     StampedRows,
     WheelSource,
+    by_header,
+    by_log,
     increasing,
+    share_clock,
+    stamp_rows,
 )
 from icrtool.logs.streams.wheel_pairs import topic_of_side
 from icrtool.records.notes import Note, about, note
@@ -107,8 +114,11 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
     chosen: dict[Role, Source] = {"wheels": motion, "gnss": position}
     if source is not None:
         chosen["heading"] = source
+    retime, notes = _clock_of(chosen, config)
+    chosen = {role: replace(one, stamps=retime(one.stamps)) for role, one in chosen.items()}
+    motion, position = replace(motion, stamps=retime(motion.stamps)), replace(position, stamps=retime(position.stamps))
+    source = None if source is None else replace(source, stamps=retime(source.stamps))
     clock = common_clock([one.stamps for one in chosen.values()])
-    notes = list[Note]()
     if clock == "log":
         far = "one stream has no header stamps, and the header stamps of another are far from log time"
         notes.append(note("log_time_used", f"{far}; log time is used for all streams"))
@@ -142,16 +152,60 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
         streams.append(StreamChoice(role, one.topic, one.message_type, count, rate, used, jitter, one.why + detail))
     # The fixes of the other GNSS receivers lie in the local plane of the chosen one.
     others = [one for one in found.gnss if one.geodetic is not None and not one.problem and one.topic != position.topic]
+    others = [replace(one, stamps=retime(one.stamps)) for one in others]
     receivers = [OtherReceiver(one.topic, _fixes(one, config, clock, datum)[0]) for one in others if datum is not None]
-    known: dict[str, StampedRows] = {one.topic: one.stamps for one in found.heading if one.message_type == GYRO_TYPE}
-    units = inertial_units(survey.tables, GYRO_AXES, clock, known)
+    known: dict[str, StampedRows] = {
+        table.topic: retime(stamp_rows(table)) for table in survey.tables if table.message_type == GYRO_TYPE
+    }
+    gyro = find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, known)
+    gyros, degrees = _gyros(inertial_units(survey.tables, GYRO_AXES, clock, known), heading, gnss)
+    if gyro is not None and gyro.topic in degrees:
+        gyro = replace(gyro, rate_radps=gyro.rate_radps * DEGREE)
+    gyro = None if gyro is not None and is_too_fast(gyro.rate_radps[:, None]) else gyro
+    notes += [note("gyro_in_degrees", f"{one}: its turn rates are in deg/s, not rad/s: converted") for one in degrees]
     log = RobotLog(
         name, wheels, gnss, heading, datum, tuple(streams), survey.inputs, dict(position.rejected),
-        (*survey.problems, *about(name, notes)), antenna,
-        find_gyro(survey.tables, motion.topic, "" if source is None else source.topic, clock, known),
-        tuple(GyroAxes(table.topic, stamps, np.array(rates).T) for table, stamps, rates in units), tuple(receivers),
+        (*survey.problems, *about(name, notes)), antenna, gyro, gyros, tuple(receivers),
     )  # fmt: skip
     return longest_part(log)
+
+
+def _clock_of(chosen: Mapping[Role, Source], config: Config) -> tuple[Callable[[StampedRows], StampedRows], list[Note]]:
+    """Return what gives stamps the clock that is configured, or that all headers share; and a note.
+
+    Raises
+    ------
+    ConfigError
+        Header stamps are configured and a stream has none that can be used.
+    """
+    if config.topics.clock == "log":
+        return by_log, []
+    if config.topics.clock == "header":
+        for one in chosen.values():
+            if one.stamps.header_ns is None and one.stamps.far_ns is None:
+                why = f"{one.topic} has no header stamps that can be used ({one.stamps.note})"
+                raise ConfigError("topics.clock", why, "set it to auto or log")
+        return by_header, []
+    if share_clock([one.stamps for one in chosen.values()]):
+        far = next(iter(chosen.values())).stamps.note
+        why = f"{far} and are of one clock in all streams, as simulated time: they are used"
+        return by_header, [note("header_clock", why)]
+    return lambda rows: rows, []
+
+
+def _gyros(
+    units: Iterable[tuple[TopicTable, Ints, Sequence[Floats]]], heading: HeadingSamples, gnss: PositionFixes
+) -> tuple[tuple[GyroAxes, ...], list[str]]:
+    """Return the inertial units with their rates in rad/s, and the topics that sent deg/s."""
+    gyros, degrees = list[GyroAxes](), list[str]()
+    for table, stamps, axes in units:
+        rates = np.array(axes).T
+        if is_in_degrees(stamps, rates, heading, gnss):
+            degrees.append(table.topic)
+            rates *= DEGREE
+        if not is_too_fast(rates):
+            gyros.append(GyroAxes(table.topic, stamps, rates))
+    return tuple(gyros), degrees
 
 
 def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[Note]:
@@ -189,7 +243,7 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         moved = "the later ones are moved by as much, which log time shows"
         yield note("clock_set", f"{why}: their clock was set {setting} while recording; {moved}")
     for role, rows in streams:
-        if rows.note and rows.note != "no header":
+        if rows.note and rows.note not in ("no header", BY_LOG):
             yield note("log_time_used", f"{role}: {rows.note}; log time is used")
         if rows.replaced > 1:
             counted = f"{rows.replaced} of {len(rows.log_ns)} header stamps are of another clock"
@@ -313,12 +367,25 @@ def _pick(motion: WheelSource, config: Config) -> tuple[Floats, Floats, WheelUni
             np.ptp(travelled[finite]) == 0.0 and np.nanmax(np.abs(speed)) > 0.0
             for travelled, speed in zip(positions, speeds, strict=True)
         )
+    factor, unit = WHEEL_UNITS.get(config.wheels.unit, (1.0, motion.unit))
     if positions is not None and wanted != "velocity" and not stuck:
-        return *positions, "counts" if wanted == "counts" else motion.unit, True
+        if config.wheels.unit == "rpm":
+            raise ConfigError(
+                "wheels.unit", f"{motion.topic} holds positions, which have no rpm", "give rad/s or deg/s"
+            )
+        left, right = positions
+        return left * factor, right * factor, "counts" if wanted == "counts" else unit, True
     if speeds is None:
         raise ConfigError("wheels.quantity", f"{motion.topic} has no velocity of both sides", "leave it on auto")
-    return *speeds, motion.unit, False
+    left, right = speeds
+    return left * factor, right * factor, unit, False
 
+
+WHEEL_UNITS: dict[str, tuple[float, WheelUnit]] = {
+    "rad/s": (1.0, "rad"), "deg/s": (math.radians(1.0), "rad"), "rpm": (2 * math.pi / 60, "rad"),
+    "m/s": (1.0, "m"), "counts": (1.0, "counts"),
+}  # fmt: skip
+"""Configured units of wheels: the factor of the numbers, and the unit of the products, per second for speeds."""
 
 PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0
 """A longer interval between samples is reported; a log whose samples are a day apart is of two recordings."""

@@ -13,6 +13,7 @@ import numpy as np
 from icrtool.config import Config
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, turned_axis, unwrapped
 from icrtool.logs.messages.topic_table import FRAME_FIELD, TopicTable
+from icrtool.logs.streams.gyro_units import DEGREE, FASTEST_RADPS, MOST_BAD
 from icrtool.logs.streams.positions import GOAL, GOAL_WORDS, is_fused
 from icrtool.logs.streams.sources import (
     Clock,
@@ -314,12 +315,6 @@ def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:
 GYRO_TYPE = "sensor_msgs/Imu"
 GYRO_AXES = ("angular_velocity.x", "angular_velocity.y", "angular_velocity.z")
 
-FASTEST_RADPS = math.radians(1000.0)
-"""No robot turns faster than this [rad/s]."""
-
-MOST_BAD = 0.01
-"""A topic is not used where a larger share of its rates is not finite."""
-
 
 def find_gyro(
     tables: Sequence[TopicTable],
@@ -354,7 +349,10 @@ def inertial_units(
         if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in axes):
             continue
         rates = [table.floats(axis) for axis in axes]
+        # in rad/s or in deg/s: which, turns show later
         sound: Bools = np.logical_and.reduce([np.abs(one) <= FASTEST_RADPS for one in rates])
+        if np.count_nonzero(~sound) > MOST_BAD * len(sound):
+            sound = np.logical_and.reduce([np.abs(one) * DEGREE <= FASTEST_RADPS for one in rates])
         if np.count_nonzero(~sound) <= MOST_BAD * len(sound) and any(np.ptp(one[sound]) for one in rates):
             stamps = (known.get(table.topic) or stamp_rows(table)).on(clock)
             rows, _, _ = increasing(stamps, sound)

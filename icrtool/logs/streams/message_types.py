@@ -58,6 +58,9 @@ _SEGWAY_STAMPED = replace(
 _BOTH = ("data[0]", "data[1]")
 _RPM = FixedWheels("wheel speeds [rpm] of the autopilot: 0 left, 1 right", 80.0, speed=_BOTH, factor=2 * np.pi / 60)
 _TRAVEL = FixedWheels("wheel distances [m] of the autopilot: 0 left, 1 right", 90.0, _BOTH, unit="m")
+_AGILEX = Twist(
+    "the base's own speed and turn rate", 70.0, "", "linear_velocity", "lateral_velocity", "angular_velocity"
+)
 _TWIST = Twist("body twist", 50.0, fused=45.0)
 
 # Positions
@@ -143,9 +146,9 @@ _SENTENCE_FIX = Fix(
 
 def _read_fixes(table: TopicTable, config: Config) -> Source:
     """Return the fixes of GGA, with the deviations of the nearest GST; of RMC where there is no GGA."""
-    kinds = table.column("sentence_kind")
-    kind, name = (GGA, "GGA") if (kinds == GGA).any() else (RMC, "RMC")
-    fixes, deviations = table.rows(kinds == kind), table.rows(kinds == GST)
+    kinds = table.column("sentence_kind").astype(np.int64)
+    kind, name = (GGA, "GGA") if (kinds & GGA).any() else (RMC, "RMC")
+    fixes, deviations = table.rows((kinds & kind) > 0), table.rows((kinds & GST) > 0)
     if not len(fixes):
         raise DefinitionError(table.topic, "none of its sentences is GGA or RMC")
     if len(deviations):
@@ -159,14 +162,16 @@ def _read_fixes(table: TopicTable, config: Config) -> Source:
 
 # Headings
 _OF_POSE = Orientation("orientation of the pose", 50.0, "pose.orientation")
-_TRUE_HEADING = Bearing("heading of the GNSS receiver (HDT)", 88.0, known_by="NMEA: clockwise from true north")
+_TRUE_HEADING = Bearing(
+    "heading of the GNSS receiver (NMEA)", 88.0, std="heading_std * deg", known_by="NMEA: clockwise from true north"
+)
 
 
 def _read_true_headings(table: TopicTable, config: Config) -> Source:
-    """Return the true headings of HDT."""
-    true = table.rows(table.column("sentence_kind") == HDT)
+    """Return the true headings of HDT, THS and UNIHEADINGA."""
+    true = table.rows((table.column("sentence_kind").astype(np.int64) & HDT) > 0)
     if not len(true):
-        raise DefinitionError(table.topic, "none of its sentences is HDT")
+        raise DefinitionError(table.topic, "none of its sentences is HDT, THS or UNIHEADINGA")
     return _TRUE_HEADING.read(true, config)
 
 
@@ -208,9 +213,8 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
         "segway_rmp_ros2/SegwayStatus": _SEGWAY,
         "segway_interfaces/Segwaystatus": _SEGWAY,
         # its motor rpm is integer, and before the gearbox
-        "scout_msgs/ScoutStatus": Twist(
-            "the base's own speed and turn rate", 70.0, "", "linear_velocity", "lateral_velocity", "angular_velocity"
-        ),
+        "scout_msgs/ScoutStatus": _AGILEX,
+        "bunker_msgs/BunkerStatus": _AGILEX,
         "nav_msgs/Odometry": Twist("twist of the wheel odometry", 60.0, "twist.twist.", fused=50.0),
         "geometry_msgs/TwistStamped": replace(_TWIST, path="twist."),
         "geometry_msgs/TwistWithCovarianceStamped": replace(_TWIST, path="twist.twist."),

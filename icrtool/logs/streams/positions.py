@@ -128,14 +128,15 @@ class Fix:
         numbers = (*self.place, *self.std, *self.covariance, self.solution.name)
         return fields_in(numbers, (*self.valid, *self.stated, *self.independent))
 
-    def read(self, table: TopicTable, _: Config) -> PositionSource:
+    def read(self, table: TopicTable, config: Config) -> PositionSource:
         """Return its positions; usable: finite, with a fix, and if geodetic on earth, not at 0, 0, near the others.
 
         Metric positions of goals, of dead reckoning and of frames whose z is not up are refused.
         """
         first, second = (number(table, one, needed=True) for one in self.place[:2])
         third = number(table, self.place[2])
-        no_fix, finite = ~all_valid(table, self.valid), np.isfinite(first) & np.isfinite(second)
+        status_counts = config.topics.gnss_status == "stated"
+        no_fix, finite = ~all_valid(table, self.valid) & status_counts, np.isfinite(first) & np.isfinite(second)
         if self.metric:
             reasons = {"not finite": ~finite, "no fix": no_fix}
         else:
@@ -154,6 +155,7 @@ class Fix:
                 rejected[reason] = count
             usable &= ~bad
         places, variance = np.column_stack([first, second, third]), self._variance(table)
+        silenced = rejected.get("no fix", 0) == len(table) and bool(np.isfinite(variance[:, :2]).any())
         geodetic = metric = None
         if self.metric:
             metric = np.column_stack([second, first])
@@ -166,6 +168,7 @@ class Fix:
             score, why = self._worth(places[usable, :2], variance[usable, :2])
             counts = ", ".join(f"{reason} {count}" for reason, count in rejected.items())
             problem = "" if usable.any() else f"no usable fix ({counts})"
+            problem += "; they state an accuracy: topics.gnss_status=ignored uses them" if silenced else ""
         return PositionSource(
             **of_topic(table), geodetic=geodetic, metric=metric, variance=variance, usable=usable, rejected=rejected,
             score=score, why=why, problem=problem, stated_class=self.solution.of(table),

@@ -47,6 +47,9 @@ WORTHY = 40.0
 SAME_MESSAGE = 100.0
 """Position and heading of one metric pose share a frame; a heading from elsewhere does not fit a local map."""
 
+NO_SCHEMA = "no schema"
+"""Stands for the message type of a channel that states none."""
+
 MOST_LISTED_TOPICS = 40
 MOST_REFERENCES = 3
 
@@ -326,7 +329,7 @@ def _listing(channels: Sequence[Channel], reasons: Mapping[str, str]) -> list[st
         reason = f": {reasons[channel.topic]}" if channel.topic in reasons else ""
         if not reason and channel.encoding not in READ_ENCODINGS:
             reason = f": serialization {str(channel.encoding)!r} is not read"
-        entries[channel.topic] = f"{channel.topic} ({channel.message_type}{reason})"
+        entries[channel.topic] = f"{channel.topic} ({channel.message_type or NO_SCHEMA}{reason})"
     ordered = [entries[topic] for topic in sorted(entries, key=lambda topic: topic not in reasons)]
     more = len(ordered) - MOST_LISTED_TOPICS
     return ([*ordered[:MOST_LISTED_TOPICS], f"{more} more"] if more > 0 else ordered) or ["no topic at all"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple
 
@@ -23,6 +23,9 @@ LARGEST_SHARE_BACKWARDS = 0.01
 LARGEST_SHARE_ZERO = 0.01
 
 Clock = Literal["header", "log"]
+
+FEWEST_STAMPS = 2
+"""A stream with fewer shows no clock."""
 
 AROUND = 25
 """Messages before and after a step of a clock whose median delay to log time shows its size."""
@@ -52,6 +55,7 @@ class StampedRows:
     replaced : header stamps of another clock that log times stand for
     set_back : as `TopicTable.set_back`
     clock_set : of the headers; their stamps are those of a clock that was not set
+    far_ns : (n,) header stamps of a clock far from log time, as simulated time is; None where there are none
     """
 
     header_ns: Ints | None
@@ -61,6 +65,7 @@ class StampedRows:
     replaced: int = 0
     set_back: SetBack = NOT_SET_BACK
     clock_set: ClockSet = NEVER_SET
+    far_ns: Ints | None = None
 
     def on(self, clock: Clock) -> Ints:
         """Return the stamps on a clock; the log's where the header's cannot be used."""
@@ -71,8 +76,8 @@ def stamp_rows(table: TopicTable) -> StampedRows:
     """Return the stamps of a topic; header stamps only where they are non-zero, near log time and increasing."""
     log_ns = table.log_time_ns
 
-    def unusable(note: str, clock_set: ClockSet = NEVER_SET) -> StampedRows:
-        return StampedRows(None, log_ns, note, 0, set_back=table.set_back, clock_set=clock_set)
+    def unusable(note: str, clock_set: ClockSet = NEVER_SET, far_ns: Ints | None = None) -> StampedRows:
+        return StampedRows(None, log_ns, note, 0, set_back=table.set_back, clock_set=clock_set, far_ns=far_ns)
 
     seconds, nanoseconds = (table.integers(*paths) for paths in zip(*STAMPS, strict=True))
     if seconds is None or nanoseconds is None or not len(log_ns):
@@ -84,7 +89,15 @@ def stamp_rows(table: TopicTable) -> StampedRows:
     header, clock_set = _without_clock_steps(header, log_ns)
     delay = int(np.median(log_ns - header, overwrite_input=True))
     if abs(delay) > DISORDER_NS:
-        return unusable(f"header stamps are {delay / 1e9:+z.1f} s from log time", clock_set)
+        is_set, why = header != 0, f"header stamps are {delay / 1e9:+z.1f} s from log time"
+        header = (
+            header
+            if is_set.all()
+            else np.interp(log_ns, log_ns[is_set], header[is_set] - header[is_set][0]).astype(np.int64)
+            + header[is_set][0]
+        )
+        back = np.count_nonzero(np.diff(header) < 0) > LARGEST_SHARE_BACKWARDS * len(header)
+        return unusable(why, clock_set, None if back else header)
     # A few stamps of another clock (a first message at 0) are replaced by their log times.
     off = log_ns - header
     off -= delay
@@ -94,6 +107,33 @@ def stamp_rows(table: TopicTable) -> StampedRows:
     if backwards > LARGEST_SHARE_BACKWARDS:
         return unusable(f"{100 * backwards:.0f} % of the header stamps go back", clock_set)
     return StampedRows(header, log_ns, "", delay, int(np.count_nonzero(other)), table.set_back, clock_set)
+
+
+BY_LOG = "topics.clock is log"
+"""Why header stamps are not used where that is configured."""
+
+
+def share_clock(streams: Sequence[StampedRows]) -> bool:
+    """Return whether all streams have header stamps far from log time, of one clock, however fast it goes."""
+    if not streams or any(rows.far_ns is None or len(rows.log_ns) < FEWEST_STAMPS for rows in streams):
+        return False
+    first, *others = ((rows.log_ns, np.asarray(rows.far_ns) - rows.log_ns) for rows in streams)
+    for log_ns, ahead in others:
+        inside = (log_ns >= first[0][0]) & (log_ns <= first[0][-1])
+        apart = ahead[inside] - np.interp(log_ns[inside], first[0], first[1])
+        if not len(apart) or abs(float(np.median(apart))) > DISORDER_NS:
+            return False
+    return True
+
+
+def by_header(rows: StampedRows) -> StampedRows:
+    """Return stamps that go by the header, however far from log time; the same where there are none."""
+    return rows if rows.far_ns is None else replace(rows, header_ns=rows.far_ns, note="", far_ns=None)
+
+
+def by_log(rows: StampedRows) -> StampedRows:
+    """Return stamps that go by log time."""
+    return replace(rows, header_ns=None, note=BY_LOG, delay_ns=0, replaced=0, far_ns=None)
 
 
 def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:

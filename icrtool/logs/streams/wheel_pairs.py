@@ -21,7 +21,7 @@ from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.logs.messages.topic_table import TopicTable
 from icrtool.logs.streams.counters import TURN_MODULI, Modulus, continued, find_modulus, register_size
 from icrtool.logs.streams.message_types import KNOWN_TYPES
-from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, stamp_rows
+from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, share_clock, stamp_rows
 from icrtool.logs.streams.wheels import COMMAND_NOTES, COMMANDED, COMMANDED_PENALTY, MOST_WHEELS, WHEEL_WORDS, elements
 from icrtool.records.notes import note
 from icrtool.records.samples import WheelUnit
@@ -335,7 +335,8 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
         place = np.clip(np.searchsorted(held, moments + _half_interval(times), side="right") - 1, 0, None)
         what, speed = "speeds", (first, rights[place].astype(np.float64))
     header = None if stamps.header_ns is None else stamps.header_ns[both]
-    stamps = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both])
+    far = None if stamps.far_ns is None else stamps.far_ns[both]
+    stamps = replace(stamps, header_ns=header, log_ns=stamps.log_ns[both], far_ns=far)
     why = f"{why}: {what}"
     return motion_of(
         topic=topic, message_type=kind, stamps=stamps, position=position, speed=speed, unit=unit, score=score, why=why,
@@ -352,7 +353,9 @@ def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, In
     if len(headers) == 2:
         return stamps, headers[0], headers[1]
     note = rows[0].note or rows[1].note or "the header stamps of a side go back"
-    return replace(stamps, header_ns=None, note=note, delay_ns=0, replaced=0), rows[0].log_ns, rows[1].log_ns
+    far = rows[0].far_ns if share_clock(rows) else None
+    stamps = replace(stamps, header_ns=None, note=note, delay_ns=0, replaced=0, far_ns=far)
+    return stamps, rows[0].log_ns, rows[1].log_ns
 
 
 def _half_interval(times: Ints) -> int:

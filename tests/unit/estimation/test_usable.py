@@ -21,6 +21,7 @@ from icrtool.records.notes import unusable_because
 from icrtool.records.presets import FIELD, ProcessNoise
 from icrtool.records.run import Run
 from icrtool.records.run_document import ExcitationDocument, VerdictByIcr
+from icrtool.records.tables import RobotLog
 from support.drives import make_log
 
 WIDTH = "robot.track_width_m=0.6"
@@ -81,15 +82,29 @@ def test_wheels_that_explain_nothing_make_a_run_unusable(noise: ProcessNoise, wo
 
 
 def test_a_body_twist_that_turns_as_the_robot_does_makes_a_run_unusable() -> None:
-    """Its controller multiplies the width, or it is fused: the ICRs are those of the assumed width."""
+    """Its controller multiplies the width, or it is fused: the ICRs are those of the assumed width.
+
+    ICRs that are further apart than the width by more than their deviation are those of a robot that slips a little.
+    """
     log = make_log(seed=1)
     of_twist = tuple(replace(one, message_type="nav_msgs/Odometry") for one in log.streams)
     v, turn = (log.wheels.left + log.wheels.right) / 2, (log.wheels.left - log.wheels.right) / 2
-    known = replace(log, streams=of_twist, wheels=replace(log.wheels, left=v + turn / 1.75, right=v - turn / 1.75))
+
+    def turning(share: float) -> RobotLog:
+        """The twist of a robot whose ICRs are as far apart as its width, over a share."""
+        factor = 0.6 / 1.1 / share
+        return replace(
+            log, streams=of_twist, wheels=replace(log.wheels, left=v + turn * factor, right=v - turn * factor)
+        )
+
+    known = turning(1.0)
     run = fit(known, load_config(sets=[WIDTH]))
     assert not run.usable
     assert "wheels.twist_width_m" in run.summary["unusable_because"]
     assert fit(known, load_config(sets=[WIDTH, "wheels.twist_width_m=1.05"])).usable
+    for share in (1 / 1.05, 1 / 1.09):
+        assert fit(turning(share), load_config(sets=[WIDTH])).usable
+    assert not fit(turning(1 / 0.95), load_config(sets=[WIDTH])).usable
     assert fit(replace(log, streams=of_twist), load_config(sets=[WIDTH])).usable
 
 

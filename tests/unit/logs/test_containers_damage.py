@@ -882,3 +882,26 @@ def test_checksum_of_the_summary_is_the_one_the_specification_means(tmp_path):
     whole = write_mcap(tmp_path / "log.mcap", make_messages(5)).read_bytes()
     start = int.from_bytes(whole[-28:-20], "little")
     assert zlib.crc32(whole[start:-12]) == int.from_bytes(whole[-12:-8], "little")
+
+
+def test_a_database_whose_write_ahead_log_was_not_copied_names_it(tmp_path):
+    """A recorder that runs keeps its tables, or its messages, in the log beside the file."""
+    for name, tables_too in (("tables.db3", True), ("messages.db3", False)):
+        recorded = tmp_path / f"recorded_{name}"
+        database = sqlite3.connect(recorded)
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("PRAGMA wal_autocheckpoint = 0")
+        database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+        database.execute(
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)"
+        )
+        database.commit()
+        if not tables_too:
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        database.execute("INSERT INTO messages VALUES (1, 1, 1, x'00')")
+        database.commit()
+        alone = tmp_path / name
+        alone.write_bytes(recorded.read_bytes())
+        database.close()
+        with pytest.raises(LogError, match=rf"{name}-wal is missing"):
+            open_log(alone)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from icrtool.config import load_config
 from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.read_log import read_log
 from icrtool.logs.streams.headings import find_gyro
+from support.field_logs import ROBOT, fixes, imus, joint_states, make_drive, write_messages
 
 COUNT = 60
 TIMES = 1_760_000_000_000_000_000 + 10_000_000 * np.arange(COUNT)
@@ -50,3 +54,21 @@ def test_a_unit_that_measures_nothing_is_no_gyro_and_bad_samples_are_left_out() 
     assert found is not None
     assert len(found.rate_radps) == 2 * COUNT - 1
     assert np.abs(found.rate_radps).max() < 1.0
+
+
+@pytest.mark.parametrize("unit", [1.0, 180 / np.pi])
+@pytest.mark.parametrize("slower", [1.0, 0.1])
+@pytest.mark.parametrize("has_heading", [True, False])
+@pytest.mark.parametrize("noise_radps", [0.0, 0.02])
+def test_turn_rates_in_degrees_are_converted_and_named(
+    tmp_path: Path, unit: float, slower: float, has_heading: bool, noise_radps: float
+) -> None:
+    """Of a robot that turns up to 40 deg/s, or ten times slower, with and without an orientation beside the rates."""
+    drive = make_drive(60.0 / slower, 20.0, slower=slower)
+    sent = imus(drive, unit=unit, noise=noise_radps * slower, oriented=has_heading)
+    log = read_log(
+        write_messages(tmp_path / "log.mcap", joint_states(drive), fixes(drive), sent), load_config(sets=ROBOT)
+    )
+    assert log.gyro is not None
+    np.testing.assert_allclose(log.gyro.rate_radps, drive.turn, atol=5 * noise_radps * slower + 1e-9)
+    assert any("in deg/s" in one for one in log.warnings) == (unit > 1)

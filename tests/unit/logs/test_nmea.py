@@ -161,3 +161,65 @@ def test_sentences_of_megabytes_cost_no_time() -> None:
 def test_more_than_sixty_minutes_or_a_minus_is_no_latitude(north: str) -> None:
     assert math.isnan(_degrees(north, "N", "NS"))
     assert _degrees("4730.0", "S", "NS") == -47.5
+
+
+def novatel_crc(text: bytes) -> int:
+    """CRC of 32 bits as the manual of NovAtel's OEM7 gives it, bit by bit."""
+    crc = 0
+    for byte in text:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
+    return crc
+
+
+def uniheading(heading: float, solution: str = "SOL_COMPUTED", kind: str = "NARROW_INT") -> bytes:
+    body = f"UNIHEADINGA,97,GPS,FINE,2190,375201200,0,0,18,12;{solution},{kind},0.9931,{heading:.4f},0.5,0.0,0.31,0.62"
+    return f"#{body}*{novatel_crc(body.encode()):08x}\r\n".encode()
+
+
+def test_several_sentences_in_a_message_are_read_together() -> None:
+    """A receiver whose epochs are logged whole: fix, deviations and heading have one stamp."""
+    rest = "010,08.0,03.0,,A"
+    texts = [
+        sentence(f"GNRMC,101500.00,A,4806.000,N,01136.000,E,0.5,{rest}") + gga(4)
+        + sentence("GNGST,101500.00,0.01,0.02,0.01,30,0.012,0.015,0.03") + sentence(f"GNHDT,{30 + i:.2f},T")
+        for i in range(5)
+    ]  # fmt: skip
+    fixes = read_source("gnss", table_of(texts), Config())
+    np.testing.assert_allclose(fixes.variance[:, 0], 0.012**2)
+    assert set(fixes.stated_class) == {FIXED_FIX}
+    assert np.isfinite(fixes.geodetic[:, 2]).all()
+    heading = read_source("heading", table_of(texts), Config())
+    np.testing.assert_allclose(np.degrees(heading.yaw_rad), 30.0 + np.arange(5))
+
+
+def test_sentences_without_checksums_are_read_where_no_sentence_has_one() -> None:
+    bare = [gga(4).partition(b"*")[0] for _ in range(5)]
+    assert read_source("gnss", table_of(bare), Config()).usable.sum() == 5
+    assert len(table_of([*bare, gga(4)])) == 1
+
+
+@pytest.mark.parametrize("text", ["GNTHS,{:.2f},A", "GPHDT,{:.2f},T"])
+def test_true_headings_are_read_of_either_sentence(text: str) -> None:
+    found = read_source("heading", table_of([sentence(text.format(30 + i)) for i in range(5)]), Config())
+    np.testing.assert_allclose(np.degrees(found.yaw_rad), 30.0 + np.arange(5))
+
+
+def test_a_heading_that_is_not_valid_is_left_out() -> None:
+    texts = [
+        sentence("GNTHS,30.00,A"),
+        sentence("GNTHS,31.00,V"),
+        uniheading(32.0),
+        uniheading(33.0, "INSUFFICIENT_OBS"),
+    ]
+    found = read_source("heading", table_of(texts), Config())
+    np.testing.assert_array_equal(found.usable, [True, False, True, False])
+
+
+def test_headings_of_unicore_are_read_with_their_deviation_and_checked() -> None:
+    texts = [uniheading(30.0 + i) for i in range(5)]
+    texts[3] = texts[3].replace(b"0.9931", b"0.9932")
+    found = read_source("heading", table_of(texts), Config())
+    np.testing.assert_allclose(np.degrees(found.yaw_rad), [30.0, 31.0, 32.0, 34.0])
+    np.testing.assert_allclose(np.degrees(np.sqrt(found.variance)), 0.31)

@@ -1,0 +1,98 @@
+"""The unit of turn rates: REP-103 asks for rad/s, and some drivers send deg/s."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from icrtool.kernels.arrays import Floats, Ints, trapezoids
+from icrtool.records.samples import HeadingSamples, PositionFixes
+
+DEGREE = math.radians(1.0)
+
+FASTEST_RADPS = math.radians(1000.0)
+"""No robot turns faster than this [rad/s]."""
+
+MOST_BAD = 0.01
+"""A topic is not used where a larger share of its rates is not finite, or faster than a robot turns."""
+
+SPAN_S, SHORTEST_CHORD_M = 1.0, 0.3
+"""Turns are compared over this time [s], by positions between displacements of at least this length [m]."""
+
+MOST_SPANS = 20.0
+"""Of a slow robot the displacements take up to so many times as long."""
+
+FEWEST_TURNS_OF_GYRO = 10
+"""With fewer turns to compare, the unit that the message type states is taken."""
+
+AGREE, LEAST_SCATTER, CLEARER = 0.6, 0.05, 0.25
+"""Turns agree with deg/s where the mean direction of their differences has this length, and their scatter, 1 less that
+length, is smaller than this part of the scatter with rad/s, which is at least the second: a turn of a few degrees fits
+both."""
+
+
+def is_in_degrees(t_ns: Ints, rates: Floats, heading: HeadingSamples, fixes: PositionFixes) -> bool:
+    """Return whether turn rates (n, 3) are in deg/s: by their size, else by the turns of headings or of fixes.
+
+    A turn by the integrated rate agrees with that of the reference in one of both units, in one
+    sense.
+    """
+    fast = is_too_fast(rates)
+    for begin, end, turn, half_turns in (_turns_of_heading(heading), _turns_of_course(fixes)):
+        inside = (begin >= t_ns[0]) & (end <= t_ns[-1])
+        if np.count_nonzero(inside) >= FEWEST_TURNS_OF_GYRO:
+            found = [
+                _agreement(t_ns, rates * unit, begin[inside], end[inside], turn[inside], half_turns)
+                for unit in (DEGREE, 1.0)
+            ]
+            in_degrees, in_radians = (1.0 - one for one in found)
+            clearer = in_radians > LEAST_SCATTER and in_degrees < CLEARER * in_radians
+            return in_degrees < 1.0 - AGREE and (fast or clearer)
+    return fast
+
+
+def is_too_fast(rates: Floats) -> bool:
+    """Return whether turn rates (n, 3) are too often those of no robot [rad/s]."""
+    return bool(np.count_nonzero(np.abs(rates).max(axis=1) > FASTEST_RADPS) > MOST_BAD * len(rates))
+
+
+def _agreement(t_ns: Ints, rates: Floats, begin: Ints, end: Ints, turn: Floats, half_turns: bool) -> float:
+    """Return how well turns (m,) agree with the rate about the axis that turns most, in one sense: 0 not, 1 exactly."""
+    t = (t_ns - t_ns[0]) / 1e9
+    first, last = (begin - t_ns[0]) / 1e9, (end - t_ns[0]) / 1e9
+    factor = 2.0 if half_turns else 1.0
+    rate = rates[:, int(np.argmax(rates.std(axis=0)))]
+    angle = trapezoids(t, rate - float(np.median(rate)))
+    by_gyro = np.interp(last, t, angle) - np.interp(first, t, angle)
+    differences = (turn - sense * by_gyro for sense in (1.0, -1.0))
+    return max(abs(complex(np.mean(np.exp(1j * factor * one)))) for one in differences)
+
+
+def _turns_of_heading(heading: HeadingSamples) -> tuple[Ints, Ints, Floats, bool]:
+    stamps = heading.stamp_ns
+    rows = _spaced(stamps)
+    turn = np.diff(heading.heading_rad[rows])
+    return stamps[rows][:-1], stamps[rows][1:], turn, False
+
+
+def _turns_of_course(fixes: PositionFixes) -> tuple[Ints, Ints, Floats, bool]:
+    """Return middles of displacements one after the other, and how far their direction turns, half turns aside."""
+    stamps, place = fixes.stamp_ns, fixes.north_m + 1j * fixes.east_m
+    moved = np.abs(np.diff(place[_spaced(stamps)]))
+    usual = float(np.median(moved)) if len(moved) else 0.0
+    rows = _spaced(stamps, SPAN_S * min(max(2.0 * SHORTEST_CHORD_M / max(usual, 1e-9), 1.0), MOST_SPANS))
+    step = np.diff(place[rows])
+    middle = stamps[rows][:-1] + np.diff(stamps[rows]) // 2
+    clear = np.abs(step) > SHORTEST_CHORD_M
+    both = clear[:-1] & clear[1:] if len(clear) else clear
+    turn = np.angle(step[1:][both] * np.conj(step[:-1][both])) if len(step) > 1 else np.empty(0)
+    return middle[:-1][both], middle[1:][both], turn, True
+
+
+def _spaced(stamps: Ints, span_s: float = SPAN_S) -> Ints:
+    """Return rows of samples that are about a span [s] apart."""
+    if not len(stamps):
+        return np.empty(0, np.int64)
+    _, rows = np.unique((stamps - stamps[0]) // int(span_s * 1e9), return_index=True)
+    return rows
