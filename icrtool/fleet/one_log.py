@@ -136,7 +136,10 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
         events=len(summary.events),
         outages=len(report.outages),
         warnings=len(summary.warnings),
-        notes=summary.notes,
+        # A row is sent between processes as plain text: msgspec encodes no `LogText`.
+        notes=tuple(
+            replace(one, subject=str.__str__(one.subject), text=str.__str__(one.text)) for one in summary.notes
+        ),
         verdicts=tuple(fleet_verdict(one, request.known.log) for one in report.document.gates),
         baseline=_errors(one for one in earlier if report.result(one.name) is not None),
         changes=report.baseline.changes(summary) if report.baseline is not None else (),

@@ -396,6 +396,7 @@ NAMES = ("grass", HOSTILE)
 LOGGED = {"path": "", "sha256": "", "distance_m": 90.0, "heading_offset_deg": 0.0, "wheels_delay_s": 0.0}
 COMPARISON = {
     "schema": "icrtool/compare/1",
+    "tool_version": "0",
     "groups": {name: {"model": "icr", "logs": [LOGGED | {"name": name}], "geometry": {}} for name in NAMES},
     "pairs": [
         {"first": "grass", "second": HOSTILE, "verdict": f"They differ: {HOSTILE}",

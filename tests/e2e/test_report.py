@@ -116,7 +116,14 @@ def test_a_fleet_and_a_comparison_have_pages(icrtool: Command, run_place: Path) 
             "parameters": [parameter | {"significant": True}],
             "errors": [{"horizon_m": 10.0, "paired": False, **numbers}]}  # fmt: skip
     transfer = [{"calibrated_on": "old", "tested_on": "<i>new</i>", "horizon_m": 10.0, "trials": 3, **numbers}]
-    compared = {"schema": "icrtool/compare/1", "groups": groups, "pairs": [pair], "transfer": transfer}
+    compared = {
+        "schema": "icrtool/compare/1",
+        "tool_version": "0",
+        "groups": groups,
+        "pairs": [pair],
+        "transfer": transfer,
+        "costs": [],
+    }
     (run_place / "compared.json").write_text(json.dumps(compared), encoding="utf-8")
     status, _, errors = icrtool("report", "results", "compared.json")
     assert (status, errors) == (0, "")
