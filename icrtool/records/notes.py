@@ -48,12 +48,14 @@ def note(code: str, text: str, subject: str = "") -> Note:
     KeyError
         The code is not in the catalogue.
     """
-    return Note(code, CATALOGUE[code].grade, subject, text)
+    # a name of a log is a `LogText`, which msgspec does not encode
+    return Note(code, CATALOGUE[code].grade, str.__str__(subject), str.__str__(text))
 
 
 def about(subject: str, notes: Iterable[Note]) -> tuple[Note, ...]:
     """Return findings as those of a log or file of this name."""
-    return tuple(msgspec.structs.replace(one, subject=subject) for one in notes)
+    plain = str.__str__(subject)
+    return tuple(msgspec.structs.replace(one, subject=plain) for one in notes)
 
 
 def is_grave(one: Note) -> bool:

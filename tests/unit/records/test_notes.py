@@ -17,6 +17,7 @@ from icrtool.records.fleet_document import FleetLog
 from icrtool.records.note_catalogue import CATALOGUE
 from icrtool.records.notes import Note, about, first_to_read, note, unusable_because, warnings_of
 from icrtool.records.run import Run
+from icrtool.records.text import LogText
 from support.barn import configured, simulate
 
 CUT = note("log_cut_off", "a text that says nothing", "drive.bag")
@@ -91,3 +92,9 @@ def test_other_words_change_nothing_that_a_program_decides(run: Run) -> None:
     unusable = msgspec.structs.replace(row, usable=False, notes=(REJECTED,))
     assert line_of(unusable).endswith("do not use: 40 % of the fixes rejected")
     assert fleet_rows([row])[0]["notes"] == "log_cut_off"
+
+
+def test_a_finding_about_a_name_of_a_log_can_be_encoded() -> None:
+    named = LogText("drive")
+    for one in (note(MOVED.code, "moved", named), *about(named, [MOVED])):
+        assert msgspec.json.decode(msgspec.json.encode(one), type=Note).subject == "drive"
