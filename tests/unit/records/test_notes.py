@@ -42,6 +42,13 @@ def test_a_code_without_explanation_is_refused() -> None:
         note("unheard_of", "something")
 
 
+def test_a_finding_about_a_log_of_any_name_is_encoded() -> None:
+    name = LogText("drive\n\u202e.bag")
+    for one in (note("log_cut_off", "cut off", name), *about(name, [MOVED])):
+        assert msgspec.json.decode(msgspec.json.encode(one), type=Note) == one
+        assert one.subject == "drive\\n\\u202e.bag"
+
+
 def test_warnings_are_the_sentences_and_grave_findings_the_reasons() -> None:
     found = (*about("drive", [MOVED]), CUT, *REASONS)
     assert warnings_of(found) == (
