@@ -178,6 +178,7 @@ def report_into(
     files: ResultFiles,
     begin: Stage,
     *,
+    log: Path | None = None,
     calibrations: Sequence[Calibration] = (),
     baseline: BaselineReport | None = None,
 ) -> DropoutReport:
@@ -185,6 +186,7 @@ def report_into(
 
     Parameters
     ----------
+    log : that scored topics are read from
     calibrations : each becomes a row of the report
     baseline : of the same log
     """
@@ -196,7 +198,7 @@ def report_into(
 
     def analysed(sink: ErrorSink | None) -> DropoutReport:
         stage("dropout analysis")
-        report = report_on(run, request, calibrations=calibrations, baseline=baseline, sink=sink)
+        report = report_on(run, request, log=log, calibrations=calibrations, baseline=baseline, sink=sink)
         stage("dropout report, pictures" if files.plots else "dropout report")
         return report
 

@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from icrtool.cli.commands import icrtool as command_line
+from support.pose_topics import dead_reckoned, measured, pose_plan, true_poses, write_pose_log
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -86,6 +87,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         for log, seed in {"field.mcap": "1", "other.bag": "2", "season/a.mcap": "3"}.items():
             Path(log).parent.mkdir(exist_ok=True)
             assert run("simulate", "-o", log, "--seed", seed, *options).exit_code == 0
+        true, odometry = true_poses(), "nav_msgs/msg/Odometry"
+        poses = {"/odometry/filtered": measured(true, 0.01, 0.002), "/visual/odom": dead_reckoned(true, 1.0, 0.01)}
+        plans = [pose_plan(topic, odometry, of_topic) for topic, of_topic in poses.items()]
+        write_pose_log(Path("localised.mcap"), plans, radius_m=0.1651)
         fits = {"field.mcap": "icrtool-runs/field", "season/a.mcap": "season1/a"}
         for log, directory in fits.items():
             assert run("fit", log, *robot, "--plots", "none", "-o", directory, "-q").exit_code == 0

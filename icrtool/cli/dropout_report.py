@@ -19,6 +19,7 @@ from icrtool.records.text import LogText, escaped
 with when_used():
     from icrtool import errors, pipeline
     from icrtool.dropout_analysis import dropout_report
+    from icrtool.logs.containers import recording_files
     from icrtool.output import run_directory, text_blocks
     from icrtool.output.exports import acceptance
     from icrtool.output.files import formats, remote_place
@@ -51,6 +52,8 @@ REPORT_OPTIONS = options.reporting(
            "ones."),
     option("--calibration calibration_files", "CAL.json", FILE, "Also predict with a calibration that icrtool "
            "calibrate wrote; repeatable.", multiple=True),
+    option("--score", "TOPIC", None, "Also compare the poses of a topic with the reference, for example "
+           "/odometry/filtered; needs the LOG, which is read again; repeatable.", multiple=True),
     option("--outage outage_s", "SECONDS", POSITIVE, "Force GNSS outages of this length, and report the error at their "
            "end; repeatable.", multiple=True),
     option("--outage-at outage_at_s", "SECONDS", float, "Begin of a forced outage, since the first state; default: "
@@ -92,6 +95,11 @@ def dropout_report_command(
     report = report.configured(config)
     given = Given(tuple(map(formats.open_calibration, calibration_files)), compared)
     sources, places = plan_sources(sources, place, config, printer)
+    if report.score and (runs := [source for source in sources if source not in places]):
+        why = f"{escaped(str(runs[0]))} is a run, which holds no poses of other topics"
+        raise errors.ConfigError("--score", why, "name its LOG in place of the run")
+    if report.score and recording_files.STANDARD_INPUT in sources:
+        raise errors.ConfigError("--score", "the log is read twice, and standard input is there once", "name a file")
     inputs = Inputs("source")
     reports: dict[str, DropoutReport] = {}
     for number, source in enumerate(sources):
@@ -161,8 +169,9 @@ def _report_one(
         baseline = given.baseline.find(run.name, run.document.content) if given.baseline is not None else None
         with printer.stages(LogText(run.name)) as stages:
             report = pipeline.report_into(
-                folder, run, request, files, stages.begin, calibrations=given.calibrations, baseline=baseline
-            )
+                folder, run, request, files, stages.begin, log=None if place is None else source,
+                calibrations=given.calibrations, baseline=baseline,
+            )  # fmt: skip
     if report.baseline is not None:
         printer.warn(f"{run.name}: {change}" for change in report.baseline.changes(run.document))
     directory = source if place is None else place.directory

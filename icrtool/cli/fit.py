@@ -21,7 +21,7 @@ from icrtool.records.text import LogText, escaped
 with when_used():
     from icrtool import errors, pipeline
     from icrtool.alignment import wheel_units
-    from icrtool.logs import read_log
+    from icrtool.logs import read_log, topic_poses
     from icrtool.logs.streams import assembly
     from icrtool.output import text_format
     from icrtool.output.tables import overview
@@ -165,6 +165,8 @@ def _examine(
     # What errors and warnings of the log begin with: its name, or its path.
     names = (survey.name if survey is not None else LogText(log.stem), escaped(str(log)))
     command = overview.next_command(escaped(str(log)), given, run)
+    used = [stream.topic for stream in measured.streams if stream.role == "gnss"] if measured is not None else []
+    scorable = topic_poses.scorable_topics(holds, used) if holds is not None else ()
     found = survey.problems if survey is not None else ()
     if measured is not None:
         found = measured.notes if run is None else run.notes
@@ -179,11 +181,12 @@ def _examine(
                 "warnings": list(warnings),
                 "verdict": overview.verdict(run, problem, names),
                 "next": command,
+                "scorable": list(scorable),
                 "run": run.summary if run is not None else None,
             }
         )
     elif printer.shows:
-        printer.show(overview.info_blocks(holds, measured, run, problem, names, config, command))
+        printer.show(overview.info_blocks(holds, measured, run, problem, names, config, command, scorable))
     # On a terminal the answer names the gravest one.
     if printer.verbose or printer.as_json or not sys.stderr.isatty():
         printer.warn(warnings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -17,22 +18,26 @@ from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, compare_models
 from icrtool.dropout_analysis import report, shown_paths
 from icrtool.dropout_analysis.starts import split_by_turning, with_smoothed_reference
+from icrtool.dropout_analysis.topic_rows import topic_rows
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.error_statistics import FEWEST_PATH_BLOCKS, HORIZONS_A_BLOCK, LEVEL, MOST_PATH_BLOCKS
 from icrtool.kernels.open_loop import TOLERANCE_M
+from icrtool.logs.topic_poses import read_topic_poses
 from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import DEFAULT_SEED, BudgetDistance, Gate, Verdict
 from icrtool.records.calibration_document import CalibrationFile
 from icrtool.records.choices import Reference, Starts
 from icrtool.records.dropout_document import TurningSplit, UsedCalibration
-from icrtool.records.notes import warnings_of
+from icrtool.records.notes import Note, warnings_of
 from icrtool.records.plain_data import plain
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.requests import ReportRequest
-from icrtool.records.run import MAKE_RUN, Run, check_type
+from icrtool.records.rows import TOPIC_ROW, kind_of
+from icrtool.records.run import MAKE_RUN, Run, check_type, track_of
 from icrtool.records.text import distance_text
+from icrtool.records.topic_poses import TopicPoses
 
 ERROR_FIELDS = len(documents.ErrorRow.__struct_fields__)
 
@@ -105,7 +110,9 @@ def dropout_report(
     without_events: bool = False,
     with_jumps: bool = False,
     ladder: bool = True,
+    score: Sequence[str] = (),
     seed: int = DEFAULT_SEED,
+    log: str | Path | None = None,
     calibrations: Sequence[Calibration] = (),
     baseline: report.BaselineReport | None = None,
     sink: ErrorSink | None = None,
@@ -121,11 +128,12 @@ def dropout_report(
     starts, reference : the states that trials start from, and what trials are compared with
     without_events, with_jumps : the trials that count
     ladder, seed : whether models are tested on held-out distance; seed of the random draws
-    calibrations, baseline, sink : as in `report_on`
+    score : topics of poses in the log; each becomes a row ``topic:NAME``
+    log, calibrations, baseline, sink : as in `report_on`
 
     Raises
     ------
-    ConfigError, DataError, RunError
+    ConfigError, DataError, LogError, RunError
         As of `report_on`.
 
     Notes
@@ -145,15 +153,17 @@ def dropout_report(
         without_events=without_events,
         with_jumps=with_jumps,
         ladder=ladder,
+        score=tuple(score),
         seed=seed,
     )
-    return report_on(run, request, calibrations=calibrations, baseline=baseline, sink=sink)
+    return report_on(run, request, log=log, calibrations=calibrations, baseline=baseline, sink=sink)
 
 
 def report_on(
     run: Run,
     request: ReportRequest,
     *,
+    log: str | Path | None = None,
     calibrations: Sequence[Calibration] = (),
     baseline: report.BaselineReport | None = None,
     sink: ErrorSink | None = None,
@@ -163,6 +173,7 @@ def report_on(
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
+    log : that the run was made of, as `icrtool.read_log` takes it: scored topics are read from it
     calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
         ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro. Row
         ``adaptive`` begins with the first one that was not fitted to this log, without one with other robots
@@ -172,9 +183,11 @@ def report_on(
     Raises
     ------
     ConfigError
-        A limit, horizon, budget or outage that cannot be used, or a calibration of another robot.
+        A limit, horizon, budget, outage or scored topic that cannot be used, or a calibration of another robot.
     DataError
         The run has fewer than two states.
+    LogError
+        The log of scored topics cannot be read.
     RunError
         The reference is ``smoothed`` and the run has no smoothed states.
     """
@@ -190,6 +203,7 @@ def report_on(
     if request.outage_at_s and not lengths_s:
         raise ConfigError("outage_at_s", "gives the begin of an outage without a length", "give outage_s too")
     plans = [shown_paths.plan_outages(run, length, request.outage_at_s) for length in lengths_s]
+    scored = _scored_topics(request, log)
     forced = [outage for plan in plans for outage in shown_paths.force_outages(run, plan)]
     compared = with_smoothed_reference(run) if request.reference == "smoothed" else run
     unusable = "" if run.usable or request.allow_unusable else str(run.document.unusable_because)
@@ -197,6 +211,7 @@ def report_on(
     examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, request.starts)
     give_back_freed()
     used, further = _calibration_rows(compared, () if unusable else calibrations)
+    of_topics, topic_notes = topic_rows(compared, track_of(compared), scored) if scored and not unusable else ([], [])
     found, why = None, unusable
     if request.ladder and not unusable:
         try:
@@ -211,7 +226,7 @@ def report_on(
     rows = () if found is None else found.rows
     track, sparse = (None, None) if found is None else (found.track, found.table.trials[0].starts)
     errors = measure_errors(
-        compared, horizons, further=[*rows, *further], starts=request.starts, seed=request.seed, sink=sink,
+        compared, horizons, further=[*rows, *further, *of_topics], starts=request.starts, seed=request.seed, sink=sink,
         starts_of_further=sparse, track=track,
     )  # fmt: skip
     give_back_freed()
@@ -227,7 +242,7 @@ def report_on(
         left_out=why,
         calibrations=used,
         examples=examples,
-        worst=shown_paths.worst_trials(compared, found, starts=request.starts),
+        worst=shown_paths.worst_trials(compared, found, starts=request.starts, further=of_topics),
         outages=(*forced, *shown_paths.real_outages(compared)),
         budgets=tuple(one for budget_m in budgets_m for one in report.budget_distances(errors, budget_m)),
         gates=tuple(
@@ -239,7 +254,26 @@ def report_on(
         usable=not unusable,
         baseline=baseline,
         by_turning=by_turning,
+        notes=tuple(topic_notes),
     )  # fmt: skip
+
+
+def _scored_topics(request: ReportRequest, log: str | Path | None) -> Sequence[TopicPoses]:
+    """Return the poses of the topics that are asked for.
+
+    Raises
+    ------
+    ConfigError
+        There is no log to read them from, or a topic that cannot be used.
+    LogError
+        The log cannot be read.
+    """
+    if not request.score:
+        return ()
+    if log is None:
+        why = "a run holds no poses of other topics, and opens no log by itself"
+        raise ConfigError("score", why, "give the log that it was made of")
+    return read_topic_poses(log, list(dict.fromkeys(request.score)))
 
 
 def _report(
@@ -249,6 +283,7 @@ def _report(
     by_turning: tuple[TurningSplit, ...] = (), found: ComparedModels | None = None, left_out: str = "",
     worst: tuple[documents.ExampleTrial, ...] = (), examples: tuple[documents.ExampleTrial, ...] = (),
     outages: tuple[documents.Outage, ...] = (), baseline: report.BaselineReport | None = None, usable: bool = True,
+    notes: tuple[Note, ...] = (),
 ) -> report.DropoutReport:  # fmt: skip
     """Return the report of a run.
 
@@ -256,9 +291,10 @@ def _report(
     ----------
     errors : of its models
     with_events : errors of all trials, where those of `errors` cross no slip event
+    notes : of the rows, in addition to those of the run
     """
     made = None if found is None else found.calibration
-    notes = (*run.notes, *(() if found is None else found.notes))
+    notes = (*run.notes, *(() if found is None else found.notes), *notes)
     cost = None
     if with_events is not None:
         all_rows = {one.name: one.document.by_horizon for one in with_events.results}
@@ -347,7 +383,7 @@ def _ladder(
     given, turned = {one.name for one in calibrations}, f"_{found.heading}"
     models = []
     for one in errors.results:
-        if one.name not in given:
+        if one.name not in given and kind_of(one.name) != TOPIC_ROW:
             with_heading = bool(found.heading) and one.name.endswith(turned)
             rows = [astuple(row)[1:ERROR_FIELDS] for row in one.document.by_horizon]
             heading = found.heading if with_heading else "wheels"

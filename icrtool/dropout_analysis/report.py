@@ -27,7 +27,7 @@ from icrtool.records import dropout_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M, DISTANCES, METRICS, BudgetDistance, Gate, Verdict
 from icrtool.records.choices import FigureSet
 from icrtool.records.plain_data import plain
-from icrtool.records.rows import row_of, turned_by
+from icrtool.records.rows import TOPIC_ROW, kind_of, row_of, turned_by
 from icrtool.records.run_document import RunDocument, known_content
 from icrtool.records.text import escaped, listed
 
@@ -291,6 +291,8 @@ def best_row(
     good where its expected error is smaller, or larger by less than the interval of the difference.
     """
     own = {one.name for one in calibrations if one.fitted_to_this}
+    # A localisation in the log has other sensors than the wheels.
+    own |= {one.name for one in errors.results if kind_of(one.name) == TOPIC_ROW}
     rows = {one.name: row_of(one.name) for one in errors.results if not turned_by(one.name) and one.name not in own}
     results = {one.name: one for one in errors.results if one.name in rows and rows[one.name].on_robot}
     means = {name: one.column("expected_error_m") for name, one in results.items()}

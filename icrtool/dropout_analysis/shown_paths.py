@@ -45,13 +45,14 @@ FIXES_COMPARED_S = 1.0
 
 def worst_trials(
     run: Run, compared: ComparedModels | None = None, horizon_m: float = WORST_HORIZON_M, count: int = WORST_COUNT, *,
-    starts: Starts = "moving",
+    starts: Starts = "moving", further: Sequence[ComparedRow] = (),
 ) -> tuple[ExampleTrial, ...]:  # fmt: skip
     """Return the trials with the largest error that do not overlap, worst first.
 
     Parameters
     ----------
     compared : held-out models, of which ``recommended`` is evaluated; without them the momentary ICRs
+    further : rows whose paths are shown too
     """
     track, models = track_of(run), models_of(run)
     ends, rows = counted_ends(track, np.array([horizon_m]), starts), compared.rows if compared is not None else ()
@@ -69,6 +70,7 @@ def worst_trials(
         before_its_end = slice(ends[worst] + 1)
         left[before_its_end][ends[before_its_end] >= worst] = -1.0
     name = held_out.name if held_out is not None else models[0].name
+    rows = (*rows, *further)
     return tuple(_example(run, track, models, rows, name, start, int(ends[start]), horizon_m) for start in chosen)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -21,6 +21,7 @@ import numpy as np
 
 from icrtool.config import Config
 from icrtool.errors import DataError, DefinitionError, LogError
+from icrtool.kernels.arrays import Bools, Floats
 from icrtool.logs.containers.container import LATEST_NS, WHOLE, Channel, Container, Cut
 from icrtool.logs.containers.open_log import check_unchanged, open_log, plain_file, states_of
 from icrtool.logs.containers.recording_files import PACKED_SUFFIX, log_name
@@ -137,15 +138,38 @@ def _collect(
     container: Container, config: Config, progress: Progress | None, cut: Cut
 ) -> tuple[list[TopicTable], dict[str, str]]:
     """Return the columns of all channels that some role may need, read in one pass over the log."""
+    wanted = fields_to_take(container.channels, config)
+    static = frozenset(channel.id for channel in container.channels if is_static(channel))
+    cut = cut._replace(whole=static) if cut != WHOLE else cut
+    tables, unread = collect_tables(container, wanted, cut, progress)
+    by_id = {channel.id: channel for channel in container.channels}
+    moving = {number for number in wanted if by_id[number].message_type in TRANSFORM_TYPES} - static
+    poses = {by_id[number].topic for number in moving}
+    for place, table in enumerate(tables):
+        if table.topic in poses and len(table):
+            try:
+                tables[place] = transform_pose(table)
+            except DefinitionError as err:
+                unread[table.topic] = err.why
+    return tables, unread
+
+
+def collect_tables(
+    container: Container, wanted: Mapping[int, tuple[str, ...]], cut: Cut = WHOLE, progress: Progress | None = None
+) -> tuple[list[TopicTable], dict[str, str]]:
+    """Return the columns of some channels, read in one pass over the log, and by topic why others could not be read.
+
+    Parameters
+    ----------
+    wanted : fields by channel id
+    progress : called with the share of the log read so far
+    """
     unread: dict[str, str] = {}
     collectors: dict[int, TopicCollector | None] = {}
     by_topic: dict[tuple[str, str], TopicCollector] = {}
     budget = DefinitionBudget()
     by_id = {channel.id: channel for channel in container.channels}
     topics = {channel.id: (channel.topic, channel.message_type) for channel in container.channels}
-    wanted = fields_to_take(container.channels, config)
-    static = frozenset(channel.id for channel in container.channels if is_static(channel))
-    cut = cut._replace(whole=static) if cut != WHOLE else cut
     with contextlib.closing(container.blocks(frozenset(wanted), cut)) as blocks:
         for whole in blocks:
             block = cut.of(whole)
@@ -171,14 +195,6 @@ def _collect(
         by_topic.setdefault(topics[number], TopicCollector(by_id[number]))
     in_order = dict.fromkeys(topics[number] for number in wanted)
     tables = [by_topic[topic].table() for topic in in_order if topic in by_topic]
-    moving = {number for number in wanted if by_id[number].message_type in TRANSFORM_TYPES} - static
-    poses = {by_id[number].topic for number in moving}
-    for place, table in enumerate(tables):
-        if table.topic in poses and len(table):
-            try:
-                tables[place] = transform_pose(table)
-            except DefinitionError as err:
-                unread[table.topic] = err.why
     return tables, unread
 
 
@@ -333,6 +349,13 @@ TOPIC_GAP_IN_INTERVALS, SHORTEST_GAP_S = 5.0, 0.1
 """A gap is longer than so many times the median interval, and than this."""
 
 
+def long_intervals(interval_s: Floats) -> Bools:
+    """Return which intervals (n,) [s] between messages are gaps; of one alone nothing shows it."""
+    if len(interval_s) < 2:
+        return np.zeros(len(interval_s), np.bool_)
+    return np.asarray(interval_s > max(TOPIC_GAP_IN_INTERVALS * float(np.median(interval_s)), SHORTEST_GAP_S))
+
+
 class SurveyedTopic(Record, frozen=True, kw_only=True):
     """A topic of a log.
 
@@ -383,9 +406,8 @@ def survey_document(survey: Survey) -> SurveyDocument:
     for channel in {channel.topic: channel for channel in survey.channels}.values():
         table = tables.get(channel.topic)
         stamps = np.empty(0, np.int64) if table is None else table.log_time_ns
-        interval, long = np.diff(stamps) / 1e9, np.zeros(0, np.bool_)
-        if len(interval) > 1:
-            long = interval > max(TOPIC_GAP_IN_INTERVALS * float(np.median(interval)), SHORTEST_GAP_S)
+        interval = np.diff(stamps) / 1e9
+        long = long_intervals(interval)
         topics.append(
             SurveyedTopic(
                 topic=str(channel.topic), message_type=str(channel.message_type),

@@ -136,6 +136,16 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
 }
 """Codes of findings after which the ICRs of a run must not be used; they make `unusable_because`."""
 
+OF_REPORTS: dict[str, Explanation] = {
+    "topic_not_open_loop": Explanation(
+        "warning",
+        "The error of a scored topic does not grow with distance, where that of the wheels does.",
+        "GNSS or a map is in its poses: its row does not show how far it goes without.",
+        "Record a drive in which the localisation runs without GNSS, and score that topic.",
+    ),
+}
+"""Codes of findings about a dropout report."""
+
 OF_CALIBRATIONS: dict[str, Explanation] = {
     "run_not_usable": Explanation(
         "grave",
@@ -184,6 +194,7 @@ GROUPS: dict[str, dict[str, Explanation]] = {
     "Headings": OF_HEADINGS,
     "The run": OF_RUNS,
     "Do not use this run": OF_UNUSABLE_RUNS,
+    "Dropout reports": OF_REPORTS,
     "Calibrations": OF_CALIBRATIONS,
 }
 """All codes by what they are about, under the headings of docs/warnings.md."""

@@ -57,6 +57,7 @@ class ReportRequest(Record, frozen=True, kw_only=True):
     without_events : trials that cross a slip event are left out
     with_jumps : trials that cross a jump of the reference are counted too, and models are fitted across it
     ladder : all models are also tested on distance that they were not fitted to
+    score : topics of poses in the log, each compared with the reference as a row ``topic:NAME``
     seed : of the random draws
     """
 
@@ -72,6 +73,7 @@ class ReportRequest(Record, frozen=True, kw_only=True):
     without_events: bool = False
     with_jumps: bool = False
     ladder: bool = True
+    score: tuple[str, ...] = ()
     seed: int = DEFAULT_SEED
 
     @property

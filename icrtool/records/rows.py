@@ -40,6 +40,9 @@ GIVEN_SPREAD = Spread(shift=0.0, between=0.45, horizon_std=0.95)
 TURNED_SPREAD = Spread(shift=0.0, between=0.15, horizon_std=0.75)
 """The same, of rows that turn by a gyro or a measured heading."""
 
+TOPIC_ROW = "topic"
+"""Kind of the rows that stand for a topic of the log."""
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
@@ -113,7 +116,7 @@ REPORT_ROWS: dict[str, Row] = {
             shown=True, pictured=True, in_csv=True, on_robot=True, compared=True,
         ),
         Row(
-            "topic", "pose or odometry recorded in the log", "not known: computed on the robot", "olive", "dashed",
+            TOPIC_ROW, "pose or odometry recorded in the log", "not known: computed on the robot", "olive", "dashed",
             shown=True, pictured=True, on_robot=True,
         ),
     )
@@ -135,7 +138,12 @@ FURTHER_LOOKS: tuple[tuple[Color, Dash], ...] = (
 
 
 def turned_by(name: str) -> str:
-    """Return ``gyro`` or ``heading`` where a row turns by it, empty where it turns by the wheels alone."""
+    """Return ``gyro`` or ``heading`` where a row turns by it, empty where it turns by the wheels alone.
+
+    A topic's row has the topic's name, whatever that ends in.
+    """
+    if name.startswith(f"{TOPIC_ROW}:"):
+        return ""
     return next((one for one in TURNED_BY if name.endswith(f"_{one}")), "")
 
 

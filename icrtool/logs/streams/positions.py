@@ -355,6 +355,62 @@ def transform_pose(table: TopicTable) -> TopicTable:
     DefinitionError
         No base frame moves, or the root is no reference.
     """
+    base = _base_in_root(table)
+    step = base.step
+    if not (REFERENCE_WORDS.search(base.root) or base.root in REFERENCE_FRAMES):
+        why = f"its root, {base.root}, does not show a position reference: it may be the wheels' dead reckoning"
+        raise DefinitionError(table.topic, why)
+    if not step.any():
+        why = f"its {base.root} never moves against the odometry: that is dead reckoning"
+        raise DefinitionError(table.topic, why)
+    return base.table_of(table, step)
+
+
+def every_transform_pose(table: TopicTable) -> TopicTable:
+    """Return the poses of the robot's base in the root of the transforms, one for each message that moves the base.
+
+    Raises
+    ------
+    DefinitionError
+        No base frame moves.
+    """
+    base = _base_in_root(table)
+    return base.table_of(table, np.ones(len(base.rows), np.bool_))
+
+
+class _BasePoses(NamedTuple):
+    """Poses of the base in the root of the transforms: messages (n,) and places in them (n,), position, quaternion.
+
+    `step` (n,) marks those after the root moved against an odometry; all, where the base is the root's own child.
+    """
+
+    root: LogText
+    rows: Ints
+    places: Ints
+    place: Floats
+    turn: Floats
+    step: Bools
+
+    def table_of(self, table: TopicTable, some: Bools) -> TopicTable:
+        """Return some of them (n,) as messages of PoseStamped."""
+        stamps = (table.column(path)[self.rows[some], self.places[some]] for path in TRANSFORM_STAMP)
+        frame = np.zeros(np.count_nonzero(some), np.int64)
+        values = [*stamps, frame, *self.place[some].T, *self.turn[some].T]
+        columns = dict(zip((*STAMPS[0], FRAME_FIELD, *_POSE), values, strict=True))
+        return replace(
+            table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[self.rows[some]],
+            columns=columns, texts={FRAME_FIELD: [self.root]},
+        )  # fmt: skip
+
+
+def _base_in_root(table: TopicTable) -> _BasePoses:
+    """Return the poses of the base, through every frame between it and the root.
+
+    Raises
+    ------
+    DefinitionError
+        No base frame moves.
+    """
     links = _links(table)
     base = next((one for last in BASE_FRAMES for one in links if one.rsplit("/", 1)[-1] == last), None)
     if base is None:
@@ -375,20 +431,7 @@ def transform_pose(table: TopicTable) -> TopicTable:
         place = above.place[held] + sum(along[:, None] * axis for along, axis in zip(place.T, axes, strict=True))
         turn = quaternion_product(outer, turn[known])
         root, lowest = above.parent, False
-    if not (REFERENCE_WORDS.search(root) or root in REFERENCE_FRAMES):
-        why = f"its root, {root}, does not show a position reference: it may be the wheels' dead reckoning"
-        raise DefinitionError(table.topic, why)
-    step |= lowest
-    if not step.any():
-        raise DefinitionError(table.topic, f"its {root} never moves against the odometry: that is dead reckoning")
-    stamps = (table.column(path)[rows[step], places[step]] for path in TRANSFORM_STAMP)
-    frame = np.zeros(np.count_nonzero(step), np.int64)
-    values = [*stamps, frame, *place[step].T, *turn[step].T]
-    columns = dict(zip((*STAMPS[0], FRAME_FIELD, *_POSE), values, strict=True))
-    return replace(
-        table, message_type=LogText("geometry_msgs/PoseStamped"), log_time_ns=table.log_time_ns[rows[step]],
-        columns=columns, texts={FRAME_FIELD: [root]},
-    )  # fmt: skip
+    return _BasePoses(root, rows, places, place, turn, step | lowest)
 
 
 def _links(table: TopicTable) -> dict[str, _Link]:

@@ -40,7 +40,16 @@ from icrtool.output.text_format import (
 from icrtool.records.acceptance import CHOICE_HORIZON_M, NEAR_HORIZONS_M, BudgetDistance
 from icrtool.records.dropout_document import DropoutDocument, TrialDocument
 from icrtool.records.notes import is_grave
-from icrtool.records.rows import LONGEST_ROW_NAME, MOST_USEFUL, WITHOUT_IT, in_order, row_of, shown_rows
+from icrtool.records.rows import (
+    LONGEST_ROW_NAME,
+    MOST_USEFUL,
+    TOPIC_ROW,
+    WITHOUT_IT,
+    in_order,
+    kind_of,
+    row_of,
+    shown_rows,
+)
 from icrtool.records.run_document import RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
@@ -113,6 +122,7 @@ def reach_rows(report: DropoutDocument, budget_m: float, events: int) -> tuple[l
     order = in_order(by_model)
     first = sorted(shown_rows(order), key=lambda name: name != best)
     notes = {one.name: one.fitted for one in report.calibrations}
+    notes |= {one.name: one.knows for one in report.models if kind_of(one.name) == TOPIC_ROW}
     if report.best is not None:
         notes[best] = "best by wheels"
         notes |= dict.fromkeys(report.best.as_good, "as good here")

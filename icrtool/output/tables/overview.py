@@ -18,7 +18,7 @@ from icrtool.output.text_format import driven_text, duration_text
 from icrtool.records.run import Run
 from icrtool.records.samples import ROLE_WORDS
 from icrtool.records.tables import RobotLog
-from icrtool.records.text import counted
+from icrtool.records.text import counted, listed
 
 OLDEST_DATE_NS = 946_684_800_000_000_000
 """1 January 2000: stamps before it count from the start of a computer or a simulation."""
@@ -52,7 +52,7 @@ def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
 
 def info_blocks(
     survey: SurveyDocument | None, log: RobotLog | None, run: Run | None, problem: IcrToolError | None,
-    names: tuple[str, str], config: Config, command: str | None,
+    names: tuple[str, str], config: Config, command: str | None, scorable: Sequence[str] = (),
 ) -> list[Block]:  # fmt: skip
     """Return what `icrtool info` prints: the verdict, what was driven, each topic once, what is missing and next.
 
@@ -62,6 +62,7 @@ def info_blocks(
     problem : why the log cannot be fitted
     names : of the log, and its path; they stand before the problem where it is printed alone
     command : to run next
+    scorable : topics of poses that are not the reference
     """
     decision, good = verdict(run, problem, names), run is not None and run.usable
     rows: list[Row] = []
@@ -85,6 +86,9 @@ def info_blocks(
             "--set robot.track_width_m=…"
         )
         rows.append(("missing", missing))
+    if command and scorable:
+        score = "dropout-report LOG --score TOPIC states how far such poses drift"
+        rows.append(("poses", f"{listed(scorable, 3)} ({score})"))
     answer = Section("", [], lead=decision, label="verdict", grade="good" if good else "bad")
     return [answer, Facts(rows), next_line(command or ""), *_survey_sections(names[1], survey, log)]
 

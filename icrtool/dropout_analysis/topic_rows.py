@@ -1,0 +1,182 @@
+"""Rows of poses that the robot's own localisation computed: a topic of the log in the trials of the other rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.calibration.run_models import ComparedRow
+from icrtool.errors import ConfigError
+from icrtool.estimation.odometry import drive_wheels
+from icrtool.kernels.arrays import Complexes, Floats, Ints, rows_at_steps
+from icrtool.kernels.track import OpenLoopPath, Track
+from icrtool.motion.recording import TrialErrors, Trials
+from icrtool.records.notes import Note, note
+from icrtool.records.rows import TOPIC_ROW
+from icrtool.records.run import Run
+from icrtool.records.text import distance_text
+from icrtool.records.topic_poses import TopicPoses
+
+PIECES = 8
+"""Parts of equal distance of a drive, whose errors are compared with that of the whole drive."""
+
+GROWTH_OF_RANDOM_WALK = math.sqrt(PIECES)
+"""Ratio of the errors over the whole drive and over a part, of a position that drifts as a random walk; a heading that
+drifts makes it larger, a position that is measured makes it about 1."""
+
+FEWEST_COMPARED, MOST_COMPARED = 200, 4000
+"""States in which a topic is compared with the reference over the whole drive."""
+
+NOT_OPEN_LOOP = "GNSS or a map while it drives: not open loop"
+GROWS = "not known: computed on the robot; its error grows with distance, as of dead reckoning"
+UNDECIDED = "not known: computed on the robot; whether GNSS or a map is in it does not show"
+
+
+class Departure(NamedTuple):
+    """How far a path departs from the reference, rms [m], after the best turn, scale and shift.
+
+    Attributes
+    ----------
+    whole_m : over the whole drive
+    piece_m : over `PIECES` parts of it, each with a turn, scale and shift of its own
+    log_std : standard deviation of the logarithm of `piece_m`
+    """
+
+    whole_m: float
+    piece_m: float
+    log_std: float
+
+    @property
+    def grows(self) -> bool | None:
+        """Whether the error grows with distance, by two standard deviations; None where neither shows."""
+        if not (self.whole_m > 0.0 and self.piece_m > 0.0):
+            return None
+        log_ratio, drifting = math.log(self.whole_m / self.piece_m), math.log(GROWTH_OF_RANDOM_WALK)
+        if log_ratio - 2.0 * self.log_std > drifting / 2.0:
+            return True
+        return False if log_ratio + 2.0 * self.log_std < drifting else None
+
+
+def topic_rows(run: Run, track: Track, scored: Iterable[TopicPoses]) -> tuple[list[ComparedRow], list[Note]]:
+    """Return the row of each topic, and findings about them.
+
+    Parameters
+    ----------
+    track : of the run's states
+
+    Raises
+    ------
+    ConfigError
+        A topic is the run's reference, or has no pose while the run lasts.
+    """
+    rows, notes = list[ComparedRow](), list[Note]()
+    streams = {stream.role: stream for stream in run.document.streams}
+    reference = streams["gnss"].topic if "gnss" in streams else ""
+    by_log_time = "wheels" in streams and streams["wheels"].clock == "log"
+    for poses in scored:
+        if poses.topic == reference:
+            why = f"{poses.topic} is the reference of this run: its error is 0"
+            raise ConfigError("score", why, "topics.gnss names another reference")
+        name = f"{TOPIC_ROW}:{poses.topic}"
+        t = (poses.stamps(by_log_time=by_log_time) - run.table.stamp_ns[0]) / 1e9 + run.table.t_s[0]
+        if not (covered := poses.covered(t, track.t, track.t)).any():
+            why = f"{poses.topic} has no pose between the first and the last state of the run"
+            raise ConfigError("score", why, "give the log that the run was made of")
+        departs = departure_of(poses, t, track, covered)
+        knows = UNDECIDED
+        if departs is not None and departs.grows:
+            knows = GROWS
+        elif departs is not None and departs.grows is False and _wheels_depart(run, track, covered):
+            knows = NOT_OPEN_LOOP
+            driven = float(track.distance[-1])
+            within = f"{departs.piece_m:.2g} m (rms) over parts of {distance_text(driven / PIECES)}"
+            over_all = f"{departs.whole_m:.2g} m over {distance_text(driven)}"
+            why = f"its error does not grow with distance: {within}, {over_all}"
+            meaning = "GNSS or a map is in it, or its drift is below the noise of the reference"
+            advice = "its row does not show how far it goes without GNSS; record a drive in which it has none"
+            notes.append(note("topic_not_open_loop", f"{name}: {why}: {meaning}; {advice}"))
+        errors_of, path = partial(_errors, poses, t, track), partial(_path, poses, t, track)
+        rows.append(ComparedRow(name, errors_of, path, knows))
+    return rows, notes
+
+
+def _errors(poses: TopicPoses, t: Floats, track: Track, trials: Trials) -> TrialErrors:
+    """Return the errors (k, h) of a topic's displacement and turn, position and heading aligned at each start.
+
+    A trial needs poses all along: without one before, after, or across a gap there is none.
+
+    Notes
+    -----
+    The translation part of the relative pose error of Sturm et al. (2012), and the angle of its rotation part.
+    """
+    errors = TrialErrors.none(trials.ends.shape)
+    for h in range(trials.ends.shape[1]):
+        some = np.flatnonzero(trials.ends[:, h] >= 0)
+        some = some[poses.covered(t, track.t[trials.starts[some]], track.t[trials.ends[some, h]])]
+        s, e = trials.starts[some], trials.ends[some, h]
+        (from_place, from_heading), (to_place, to_heading) = (poses.at(t, track.t[rows]) for rows in (s, e))
+        moved = np.exp(1j * (track.heading[s] - from_heading)) * (to_place - from_place)
+        driven = track.north[e] - track.north[s] + 1j * (track.east[e] - track.east[s])
+        errors.position[some, h] = np.abs(moved - driven)
+        errors.heading[some, h] = np.abs(to_heading - from_heading - track.heading[e] + track.heading[s])
+    return errors
+
+
+def _path(poses: TopicPoses, t: Floats, track: Track, start: int, end: int) -> OpenLoopPath | None:
+    """Return a topic's path from one state to another, aligned at the first; None across a gap."""
+    at = track.t[start : end + 1]
+    if not poses.covered(t, at[:1], at[-1:]).all():
+        return None
+    place, heading = poses.at(t, at)
+    turn = track.heading[start] - heading[0]
+    moved = np.exp(1j * turn) * (place - place[0])
+    return OpenLoopPath(track.north[start] + moved.real, track.east[start] + moved.imag, heading + turn)
+
+
+def departure_of(poses: TopicPoses, t: Floats, track: Track, covered: np.ndarray) -> Departure | None:
+    """Return how far a topic departs from the reference; None where it covers too little of the drive."""
+    rows = _compared_rows(track, covered)
+    return _departure(poses.at(t, track.t[rows])[0], track.place[rows], track.distance[rows])
+
+
+def _wheels_depart(run: Run, track: Track, covered: np.ndarray) -> bool:
+    """Return whether the error of the wheels' path grows over the drive, so that the reference shows such errors."""
+    path = drive_wheels(run.table, run.in_gap, run.table.icrs_at(-1))
+    rows = _compared_rows(track, covered)
+    found = _departure(path.north_m[rows] + 1j * path.east_m[rows], track.place[rows], track.distance[rows])
+    return found is not None and found.grows is True
+
+
+def _compared_rows(track: Track, covered: np.ndarray) -> Ints:
+    """Return the states at equal steps of distance at which a topic has poses and the reference is one."""
+    rows = rows_at_steps(track.distance, max(float(track.distance[-1]) / MOST_COMPARED, 1e-6))
+    return np.asarray(rows[covered[rows] & ~track.in_outage[rows]])
+
+
+def _departure(place: Complexes, reference: Complexes, distance: Floats) -> Departure | None:
+    """Return the departure of places (n,) from a reference (n,), at distances (n,) [m]; None of too few."""
+    if len(place) < FEWEST_COMPARED:
+        return None
+    parts = np.searchsorted(distance, distance[0] + (distance[-1] - distance[0]) * np.arange(1, PIECES) / PIECES)
+    whole = _misfit(place, reference)
+    pieces = [
+        _misfit(one, other)
+        for one, other in zip(np.split(place, parts), np.split(reference, parts), strict=True)
+        if len(one) >= FEWEST_COMPARED // PIECES
+    ]
+    if len(pieces) < PIECES or not min(pieces) > 0.0:
+        return None
+    logs = np.log(pieces)
+    return Departure(whole, float(np.exp(logs.mean())), float(logs.std(ddof=1)) / math.sqrt(PIECES))
+
+
+def _misfit(place: Complexes, reference: Complexes) -> float:
+    """Return what the best turn, scale and shift of places (n,) leave of a reference (n,), rms [m] (Umeyama 1991)."""
+    ours, theirs = place - place.mean(), reference - reference.mean()
+    size = float(np.vdot(ours, ours).real)
+    fitted = ours * (np.vdot(ours, theirs) / size) if size > 0.0 else 0.0
+    return float(np.sqrt(np.mean(np.abs(theirs - fitted) ** 2)))

@@ -1,0 +1,152 @@
+"""Read poses of topics that feed no role: what a localisation on the robot computed while the log was recorded."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from icrtool.errors import ConfigError, DataError, DefinitionError
+from icrtool.kernels.arrays import Bools, turned_axis, unwrapped
+from icrtool.logs.containers.container import Channel
+from icrtool.logs.containers.open_log import open_log
+from icrtool.logs.messages.topic_table import HEADER, TopicTable
+from icrtool.logs.read_log import Progress, SurveyDocument, collect_tables, is_table, long_intervals
+from icrtool.logs.streams.headings import Orientation, frame_convention
+from icrtool.logs.streams.message_types import MESSAGE_TYPES
+from icrtool.logs.streams.positions import (
+    GOAL_WORDS,
+    TRANSFORM_FIELDS,
+    TRANSFORM_STAMP,
+    TRANSFORM_TYPES,
+    Fix,
+    every_transform_pose,
+    is_static,
+)
+from icrtool.logs.streams.sources import increasing, number, stamp_rows
+from icrtool.records.places import place_of
+from icrtool.records.text import did_you_mean, listed
+from icrtool.records.topic_poses import TopicPoses
+
+LEAST_QUATERNION, LARGEST_QUATERNION = 0.1, 10.0
+"""Norms outside are those of messages without an orientation; between them the norm is taken to be 1."""
+
+
+def _pose_fields() -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the types of metric poses, and of each the fields: x and y, then the quaternion x, y, z, w."""
+    for name, fix in MESSAGE_TYPES["gnss"].items():
+        turn = MESSAGE_TYPES["heading"].get(name)
+        if isinstance(fix, Fix) and fix.metric and isinstance(turn, Orientation):
+            yield name, (*fix.place[:2], *(f"{turn.path}.{axis}" for axis in "xyzw"))
+
+
+POSE_FIELDS = dict(_pose_fields())
+"""By message type, the fields of position x, y and of the quaternion x, y, z, w."""
+
+
+def scorable_topics(survey: SurveyDocument, used: Iterable[str]) -> tuple[str, ...]:
+    """Return the topics of a log that hold poses and are not among those `used` as reference, nor goals."""
+    taken = set(used)
+    return tuple(
+        one.topic
+        for one in survey.topics
+        if one.message_type in POSE_FIELDS
+        and one.topic not in taken
+        and one.messages != 0
+        and not GOAL_WORDS.search(one.topic)
+    )
+
+
+def read_topic_poses(path: str | Path, topics: Sequence[str], progress: Progress | None = None) -> list[TopicPoses]:
+    """Return the poses of some topics of a log, read in one pass over it.
+
+    Parameters
+    ----------
+    path : as `icrtool.read_log` takes it
+    topics : names; of ``tf2_msgs/TFMessage`` the poses of the robot's base in the root of the moving transforms
+    progress : called with the share of the log read so far
+
+    Raises
+    ------
+    LogError
+        The log cannot be read.
+    ConfigError
+        A topic is not in the log, or holds no poses.
+    DataError
+        A topic holds fewer than two poses.
+    """
+    path = place_of(path) if isinstance(path, str) else path
+    if is_table(path):
+        raise ConfigError("score", f"{path} is a table, which has no topics", "name a bag or MCAP file")
+    with contextlib.closing(open_log(path, progress)) as container:
+        chosen = _channels_of(topics, container.channels)
+        wanted = {one.id: _fields_of(one) for one in chosen}
+        tables, unread = collect_tables(container, wanted, progress=progress)
+    by_topic = {str(table.topic): table for table in tables}
+    found = []
+    for topic in topics:
+        if topic in unread:
+            raise ConfigError("score", f"{topic}: {unread[topic]}", "name another topic")
+        try:
+            found.append(_poses_of(by_topic[topic], path))
+        except DefinitionError as err:
+            raise ConfigError("score", f"{topic}: {err.why}", "name another topic") from err
+    return found
+
+
+def _channels_of(topics: Sequence[str], channels: Sequence[Channel]) -> list[Channel]:
+    """Return the channels of some topics.
+
+    Raises
+    ------
+    ConfigError
+        The log has no such topic, or its messages are no poses.
+    """
+    chosen: list[Channel] = []
+    by_topic: dict[str, list[Channel]] = {}
+    for one in channels:
+        by_topic.setdefault(str(one.topic), []).append(one)
+    poses = [name for name, of_name in by_topic.items() if _fields_of(of_name[0])]
+    held = f"the log's poses are in {listed(poses)}" if poses else "the log has no topic of poses"
+    for topic in topics:
+        if topic not in by_topic:
+            raise ConfigError("score", f"the log has no topic {topic}", f"{did_you_mean(topic, poses)}{held}")
+        for one in by_topic[topic]:
+            if not _fields_of(one):
+                raise ConfigError("score", f"{topic} is a {one.message_type}, which holds no pose", held)
+            chosen.append(one)
+    return chosen
+
+
+def _fields_of(channel: Channel) -> tuple[str, ...]:
+    """Return the fields that poses of a channel are read from; empty where it holds none."""
+    if channel.message_type in TRANSFORM_TYPES:
+        return () if is_static(channel) else (*HEADER, *TRANSFORM_FIELDS, *TRANSFORM_STAMP)
+    fields = POSE_FIELDS.get(channel.message_type)
+    return () if fields is None else (*HEADER, *fields)
+
+
+def _poses_of(table: TopicTable, log: Path) -> TopicPoses:
+    """Return the poses that a topic's messages hold."""
+    kind = str(table.message_type)
+    if table.message_type in TRANSFORM_TYPES:
+        table = every_transform_pose(table)
+    x, y, *q = (number(table, one, needed=True) for one in POSE_FIELDS[table.message_type])
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = np.sqrt(sum(one * one for one in q))
+        usable: Bools = (norm > LEAST_QUATERNION) & (norm < LARGEST_QUATERNION) & np.isfinite(x) & np.isfinite(y)
+    stamps = stamp_rows(table)
+    order = stamps.header_ns if stamps.header_ns is not None else stamps.log_ns
+    kept, _, _ = increasing(order, usable)
+    if len(order[kept]) < 2:
+        raise DataError(log, f"{table.topic} holds {len(order[kept])} usable poses", "at least two are needed")
+    ahead, left, _ = turned_axis(0, *(one[kept] / norm[kept] for one in q))
+    # Seen from above, y is left of x; in a frame whose z points down it is right of x.
+    side = 1.0 if frame_convention(table)[0] == "ned" else -1.0
+    heading = unwrapped(np.arctan2(side * left, ahead))
+    header_ns = None if stamps.header_ns is None else stamps.header_ns[kept]
+    log_ns = np.maximum.accumulate(stamps.log_ns[kept])
+    gap = long_intervals(np.diff(order[kept]) / 1e9)
+    return TopicPoses(str(table.topic), kind, header_ns, log_ns, x[kept] + side * 1j * y[kept], heading, gap)

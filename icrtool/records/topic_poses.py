@@ -1,0 +1,48 @@
+"""Poses of one topic of a log, as the robot's own localisation computed them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from icrtool.kernels.arrays import Bools, Complexes, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class TopicPoses:
+    """Poses of one topic, in the topic's own frame, at least two.
+
+    Attributes
+    ----------
+    topic, message_type : as in the log
+    header_ns : int64 (n,) header stamps, increasing; None where they cannot be used
+    log_ns : int64 (n,) log times, increasing
+    place : (n,) position [m]; the imaginary axis is 90 deg clockwise of the real one, seen from above
+    heading : (n,) of the body's forward axis, clockwise from the real axis, unwrapped [rad]
+    gap : (n - 1,) intervals without messages, far longer than the others
+    """
+
+    topic: str
+    message_type: str
+    header_ns: Ints | None
+    log_ns: Ints
+    place: Complexes
+    heading: Floats
+    gap: Bools
+
+    def stamps(self, *, by_log_time: bool) -> Ints:
+        """Return the stamps (n,): header stamps, or log times where those cannot be used or are asked for."""
+        return self.log_ns if by_log_time or self.header_ns is None else self.header_ns
+
+    def at(self, t: Floats, at: Floats) -> tuple[Complexes, Floats]:
+        """Return place and heading at some times (m,), linear between poses at times `t` (n,) [s]."""
+        return np.interp(at, t, self.place), np.interp(at, t, self.heading)
+
+    def covered(self, t: Floats, begin: Floats, end: Floats) -> Bools:
+        """Return which spans of time (m,) have poses at `t` (n,) [s] all along: before, after, and no gap between."""
+        gaps = np.append(0, np.cumsum(self.gap))
+        first = np.searchsorted(t, begin, side="right") - 1
+        last = np.searchsorted(t, end, side="left")
+        inside = (first >= 0) & (last < len(t))
+        return np.asarray(inside & (gaps[np.minimum(last, len(t) - 1)] == gaps[np.maximum(first, 0)]))
