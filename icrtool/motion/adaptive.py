@@ -25,13 +25,13 @@ from icrtool.motion.models import GYRO_TERMS, MODELS, RECOMMENDED, TERMS, Fitted
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, size_of
 from icrtool.motion.window_fit import RESIDUAL_KINDS, Residuals, constant_std, heading_wander, residuals_of
 
-WINDOWS_AS_ONE = 40.0
-"""Number of windows that count as one independent one. A stretch of 20 m holds 80, and shows a term about twice."""
+WINDOWS_AS_ONE = 60.0
+"""Number of windows that count as one independent one. A stretch of 20 m holds 120, and shows a term about twice."""
 
 GAUSS_NEWTON_STEPS = 3
 """Steps from one solution to the next."""
 
-SHARE_OF_DISTANCE, SHORTEST_M, LONGEST_M = 0.02, 2.0, 6.0
+SHARE_OF_DISTANCE, SHORTEST_M, LONGEST_M = 0.02, 1.0, 6.0
 """The parameters are solved for again after this share of the driven distance, within these bounds [m]."""
 
 REBUILT_SHARE, REBUILT_TO_M = 0.3, 150.0
