@@ -15,13 +15,19 @@ from msgspec.structs import asdict
 
 from icrtool import __version__
 from icrtool.calibration import held_out
-from icrtool.calibration.record import Calibration, fitted_document, parameter_documents
+from icrtool.calibration.record import (
+    MULTIPLIER_BETWEEN_SHARE,
+    Calibration,
+    fitted_document,
+    parameter_documents,
+)
 from icrtool.errors import ConfigError, DataError
 from icrtool.estimation.odometry import measured_headings
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Complexes, Floats
-from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, Lever
+from icrtool.kernels.error_statistics import between_variance, pooled_variance
+from icrtool.motion.models import FIVE, MODELS, RECOMMENDED, Lever, TrackGeometry
 from icrtool.motion.recording import ErrorsOf, GyroLine, PastLines, Recording, cut_windows, fit_gyro_line
-from icrtool.motion.window_fit import Fold, Prediction, own_constants
+from icrtool.motion.window_fit import Fold, Pool, Prediction, own_constants
 from icrtool.records import calibration_document as documents
 from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.notes import Note, note
@@ -198,7 +204,9 @@ def calibration_from(
         gyro = documents.GyroDocument(turned.model.name, *parameter_documents(turned), sources)
     robot = robot if robot is not None else documents.CalibratedRobot(track_width_m=recordings[0].width_m)
     geometry, covariance = table.fits[FIVE].fitted.geometry(robot.track_width_m)
-    found, errors = fitted_document(best.fitted, geometry, covariance, robot), held_out.measure_controller_errors(table)
+    shared_std = multiplier_between_std(table, robot.track_width_m, geometry.multiplier)
+    found = fitted_document(best.fitted, geometry, covariance, robot, shared_std=shared_std)
+    errors = held_out.measure_controller_errors(table)
     return Calibration(
         schema=documents.CALIBRATION_SCHEMA,
         tool_version=__version__,
@@ -218,6 +226,28 @@ def calibration_from(
         notes=findings,
         warnings=tuple(one.sentence for one in findings),
     )
+
+
+FEWEST_POOLED = 3
+"""Fewer logs show no spread between drives."""
+
+
+def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: float) -> float | None:
+    """Return the standard deviation of the multiplier between the logs of a calibration; None of one or two logs.
+
+    Notes
+    -----
+    The variance that the logs show beyond their own (`between_variance`), pooled with the one that other robots have.
+    """
+    if len(table.recordings) < FEWEST_POOLED:
+        return None
+    pool = table.fits[FIVE].pool
+    found = [Pool([windows], [width_m]).fit(MODELS[FIVE]).fitted.geometry(width_m) for windows in pool.windows]
+    place = TrackGeometry._fields.index("multiplier")
+    values = np.array([geometry.multiplier for geometry, _ in found])
+    measured = between_variance(values, np.array([covariance[place, place] for _, covariance in found]))
+    known = (MULTIPLIER_BETWEEN_SHARE * multiplier) ** 2
+    return math.sqrt(pooled_variance(measured, len(values) - 1.0, known)[0])
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:

@@ -186,6 +186,20 @@ def pooled_variance(measured: float, freedom: float, known: float) -> tuple[floa
     return (PRIOR_FREEDOM * known + freedom * measured) / together, together
 
 
+def between_variance(values: Floats, variances: Floats) -> float:
+    """Return the variance between values (k,) beyond their own variances (k,); zero where these explain it.
+
+    Notes
+    -----
+    DerSimonian and Laird 1986, Eq. 8: moments of the weighted squares about the weighted mean.
+    """
+    weights = 1.0 / variances
+    mean = float(weights @ values / weights.sum())
+    squares = float(weights @ (values - mean) ** 2)
+    scale = float(weights.sum() - weights @ weights / weights.sum())
+    return max((squares - (len(values) - 1.0)) / scale, 0.0)
+
+
 def error_intervals(
     errors_m: Floats, blocks: Blocks | None, sums: BlockSums | None, p50_m: float, p95_m: float, spread: Spread
 ) -> Intervals:

@@ -5,6 +5,7 @@ A key that a later version adds has a default, so that older runs can still be r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Annotated, Generic, Literal, TypeVar
 
@@ -291,6 +292,8 @@ class ControllerNumbers(Record, frozen=True):
     ----------
     multiplier : (y_r - y_l) / b, beside the radius factors
     left_radius, right_radius : wheel radius over the configured one, configured scales included
+    multiplier_between_std, radius_between_std : by how much they differ from drive to drive of one robot on one kind of
+        ground, whatever is known of one drive
     """
 
     multiplier: float
@@ -299,6 +302,23 @@ class ControllerNumbers(Record, frozen=True):
     left_radius_std: float
     right_radius: float
     right_radius_std: float
+    multiplier_between_std: float = 0.0
+    radius_between_std: float = 0.0
+
+    @property
+    def multiplier_next_std(self) -> float:
+        """Standard deviation of the multiplier on the next drive."""
+        return math.hypot(self.multiplier_std, self.multiplier_between_std)
+
+    @property
+    def left_radius_next_std(self) -> float:
+        """Standard deviation of the left radius factor on the next drive."""
+        return math.hypot(self.left_radius_std, self.radius_between_std)
+
+    @property
+    def right_radius_next_std(self) -> float:
+        """Standard deviation of the right radius factor on the next drive."""
+        return math.hypot(self.right_radius_std, self.radius_between_std)
 
 
 class GeometryDocument(Record, frozen=True, kw_only=True):

@@ -107,6 +107,7 @@ def format_export(calibration: Calibration, target: ControllerTarget) -> str:
             "created": calibration.created or "",
             "separation_multiplier": numbers.multiplier,
             "separation_multiplier_std": numbers.multiplier_std,
+            "separation_multiplier_next_std": numbers.multiplier_next_std,
             "left_radius_multiplier": numbers.left_radius,
             "left_radius_multiplier_std": numbers.left_radius_std,
             "right_radius_multiplier": numbers.right_radius,
@@ -140,12 +141,18 @@ def _parameters(calibration: Calibration, errors: ControllerErrors, target: Cont
     lines = [f"wheel_separation: {_number(calibration.width_m)}"]
     if radius is not None:
         lines.append(f"wheel_radius: {_number(radius)}")
-    for key, value, std in (
-        ("wheel_separation_multiplier", numbers.multiplier, numbers.multiplier_std),
-        ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std),
-        ("right_wheel_radius_multiplier", numbers.right_radius, numbers.right_radius_std),
+    for key, value, std, next_std in (
+        ("wheel_separation_multiplier", numbers.multiplier, numbers.multiplier_std, numbers.multiplier_next_std),
+        ("left_wheel_radius_multiplier", numbers.left_radius, numbers.left_radius_std, numbers.left_radius_next_std),
+        (
+            "right_wheel_radius_multiplier",
+            numbers.right_radius,
+            numbers.right_radius_std,
+            numbers.right_radius_next_std,
+        ),
     ):
-        lines.append(f"{key}: {value:.4f}  # {f'± {std:.4f}' if std > 0.0 else 'not estimated'}")
+        known = f"± {std:.4f} here, ± {next_std:.4f} on the next drive" if std > 0.0 else "not estimated"
+        lines.append(f"{key}: {value:.4f}  # {known}")
     lines += [
         f"# after {POSE_AFTER_M:g} m; x forward, y left, z, roll, pitch, yaw",
         f"pose_covariance_diagonal: {pose}",

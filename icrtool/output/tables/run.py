@@ -151,8 +151,9 @@ def blocks_of_numbers(
     """Return the numbers of a controller with one standard deviation each, and the ICRs."""
     radii = f"{numbers.left_radius:.3f}, {numbers.right_radius:.3f}"
     std = max(numbers.left_radius_std, numbers.right_radius_std)
+    multiplier = plus_minus(numbers.multiplier, numbers.multiplier_std, sign="")
     rows = [
-        ("wheel_separation_multiplier", plus_minus(numbers.multiplier, numbers.multiplier_std, sign="")),
+        ("wheel_separation_multiplier", f"{multiplier} here, ± {numbers.multiplier_next_std:.2g} on the next drive"),
         ("left, right wheel radius", f"{radii} ± {std:.3f} of the configured"),
     ]
     without = f"(right - left) / {width_m:g} m is the multiplier; without slip: ±{width_m / 2:.3g} m"

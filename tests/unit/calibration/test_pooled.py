@@ -141,7 +141,7 @@ def test_twist_and_odometry_are_the_models(result: CalibrationResult) -> None:
     assert step == pytest.approx(
         np.hypot(*calibration.twist(log.wheels.v_left_mps[0], log.wheels.v_right_mps[0])[:2]) * 0.02
     )
-    icrs, covariance, _ = astuple(calibration.warm_start())
+    icrs, covariance, *_ = astuple(calibration.warm_start())
     assert icrs[0] > 0.0 > icrs[1]
     assert np.all(np.linalg.eigvalsh(covariance) > -1e-12)
     del v_y

@@ -10,10 +10,12 @@ from icrtool.kernels.error_statistics import (
     PRIOR_FREEDOM,
     RankedTrials,
     Spread,
+    between_variance,
     block_sums,
     cut_blocks,
     error_intervals,
     error_summary,
+    pooled_variance,
     round_bin_width,
     student_factor,
 )
@@ -204,3 +206,27 @@ class TestHistogram:
         bins = RankedTrials.of(errors).histogram(0.001)
         middle = 0.5 * (bins.left + bins.right)
         assert np.sum(middle * bins.percent) / 100.0 == pytest.approx(errors.mean(), abs=0.0005)
+
+
+class TestBetweenVariance:
+    def test_of_values_that_differ_by_their_own_deviation_is_near_zero(self):
+        rng = np.random.default_rng(1)
+        found = [between_variance(rng.normal(0.0, 0.1, 8), np.full(8, 0.01)) for _ in range(400)]
+        assert np.mean(found) < 0.004
+
+    def test_is_found_on_average(self):
+        rng = np.random.default_rng(2)
+        found = []
+        for _ in range(400):
+            variances = rng.uniform(0.5, 2.0, 10) * 0.01
+            found.append(between_variance(rng.normal(0.0, 0.3, 10) + rng.normal(0.0, np.sqrt(variances)), variances))
+        assert np.mean(found) == pytest.approx(0.09, rel=0.08)
+
+    def test_of_equal_variances_is_the_closed_form(self):
+        values, variance = np.array([1.0, 2.0, 4.0]), 0.2
+        expected = values.var(ddof=1) - variance
+        assert between_variance(values, np.full(3, variance)) == pytest.approx(expected)
+
+    def test_pools_with_what_is_known_by_degrees_of_freedom(self):
+        assert pooled_variance(4.0, 0.0, 1.0) == (1.0, PRIOR_FREEDOM)
+        assert pooled_variance(4.0, PRIOR_FREEDOM, 1.0)[0] == pytest.approx(2.5)

@@ -10,6 +10,7 @@ import icrtool
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.output.dropout_directory import COMPARISON_COLUMNS, comparison_rows
 from icrtool.output.files.formats import json_bytes
+from icrtool.records.rows import REPORT_ROWS
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def test_rows_are_those_of_the_summary(report: DropoutReport) -> None:
         assert [row[name] for row in rows] == pytest.approx(list(summary[name]), nan_ok=True)
     assert {row["heading"] for row in rows} == {"wheels", "heading"}
     learned = {row["model"]: row["fitted"] for row in rows}
-    assert learned["icr"] == "the drive before each start"
+    assert learned["icr"] == REPORT_ROWS["icr"].knows
     assert learned["no_slip"] == "the track width"
     assert learned["recommended"] == learned["controller"] == "the rest of the drive"
     assert "whole drive" in learned["icr_final"]
