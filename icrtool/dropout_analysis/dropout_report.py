@@ -431,11 +431,12 @@ def _calibration_rows(
         kept = msgspec.structs.replace(one, models={}, held_out=(), name=UNSET, **of_sensors)
         seen = one.fitted_to(recording.sha256)
         fitted = "fitted to this log" if seen else "not fitted to this log"
+        knows = f"other logs ({fitted}); heading offset, wheel delay and gyro bias from this drive"
         rows = [(name, one.recommended, False)]
         if one.gyro is not None and recording.track.gyro is not None:
             rows.append((f"{name}_gyro", one.gyro.model, True))
         for name, model, with_gyro in rows:
             errors_of = predictor(one, recording, with_gyro=with_gyro)
-            models.append(ComparedRow(name, errors_of, knows=fitted))
+            models.append(ComparedRow(name, errors_of, knows=knows))
             used.append(UsedCalibration(name, model, len(one.logs), seen, created, with_gyro, kept, fitted))
     return tuple(used), models
