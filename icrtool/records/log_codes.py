@@ -65,6 +65,12 @@ OF_FILES: dict[str, Explanation] = {
         "The rows are sorted by their stamps.",
         "Check that the stamps are those of the measurements. If the clock was set, use each part of the log alone.",
     ),
+    "wheel_bursts": Explanation(
+        "info",
+        "Wheel samples arrive several at a time: a serial adapter or a radio link passes on packets.",
+        "Their stamps are spread over the time since the packet before; what was measured when is known to some samples.",
+        "Have the driver stamp each sample when it is measured.",
+    ),
     "stamps_shared": Explanation(
         "warning",
         "More than 1 % of the wheel samples have the stamp of another sample.",

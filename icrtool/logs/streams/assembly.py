@@ -16,6 +16,7 @@ from icrtool.errors import ConfigError, DataError, LogError
 from icrtool.kernels.arrays import Floats, Ints
 from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.topic_table import DISORDER_NS, TopicTable
+from icrtool.logs.streams.bursts import spread_bursts
 from icrtool.logs.streams.gyro_units import DEGREE, is_in_degrees, is_too_fast
 from icrtool.logs.streams.headings import GYRO_AXES, GYRO_TYPE, find_gyro, inertial_units
 from icrtool.logs.streams.positions import antenna_place
@@ -316,13 +317,17 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
         Fewer than two usable samples.
     """
     topic, notes = motion.topic, list[Note]()
+    left, right, unit, is_position = _pick(motion, config)
+    if not _is_doubled(stamps, left, right):
+        bursts = spread_bursts(stamps)
+        stamps = bursts.stamp_ns
+        notes += [note("wheel_bursts", f"{topic}: {bursts.note}")] if bursts.note else []
     rows, backwards, dropped = increasing(stamps)
     if backwards:
         notes.append(note("rows_sorted", f"{topic}: {backwards} wheel stamps go back; sorted"))
     if dropped > len(stamps) // 100:
         shared = f"{dropped} of {len(stamps)} wheel samples share a stamp with another"
         notes.append(note("stamps_shared", f"{topic}: {shared}; the last was kept"))
-    left, right, unit, is_position = _pick(motion, config)
     left, right = left[rows], right[rows]
     finite = np.isfinite(left) & np.isfinite(right)
     lost = len(finite) - int(np.count_nonzero(finite))
@@ -343,6 +348,14 @@ def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: s
         why = f"{topic} holds a body twist: {undone}; {advice}, else the estimated ICRs are too close together"
         notes.append(note("wheels_from_twist", why))
     return WheelSamples(stamps, left, right, unit, is_position), notes
+
+
+def _is_doubled(stamps: Ints, left: Floats, right: Floats) -> bool:
+    """Return whether samples with the stamp of the one before mostly have its values: messages recorded twice."""
+    again = np.flatnonzero(np.diff(stamps) == 0)
+    moving = again[(left[again] != 0.0) | (right[again] != 0.0)]
+    same = (left[moving] == left[moving + 1]) & (right[moving] == right[moving + 1])
+    return len(moving) > 0 and float(same.mean()) > 0.5
 
 
 def _pick(motion: WheelSource, config: Config) -> tuple[Floats, Floats, WheelUnit, bool]:

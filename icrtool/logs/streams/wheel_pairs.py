@@ -19,6 +19,7 @@ from icrtool.logs.containers.container import Channel
 from icrtool.logs.messages.decoded_values import number_fields
 from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.logs.messages.topic_table import TopicTable
+from icrtool.logs.streams.bursts import spread_bursts
 from icrtool.logs.streams.counters import TURN_MODULI, Modulus, continued, find_modulus, register_size
 from icrtool.logs.streams.message_types import KNOWN_TYPES
 from icrtool.logs.streams.sources import Sides, StampedRows, WheelSource, motion_of, of_topic, share_clock, stamp_rows
@@ -351,11 +352,11 @@ def _common_stamps(left: TopicTable, right: TopicTable) -> tuple[StampedRows, In
     clock_set = max(one.clock_set for one in rows)
     stamps = replace(rows[0], set_back=max(one.set_back for one in rows), clock_set=clock_set)
     if len(headers) == 2:
-        return stamps, headers[0], headers[1]
+        return stamps, spread_bursts(headers[0]).stamp_ns, spread_bursts(headers[1]).stamp_ns
     note = rows[0].note or rows[1].note or "the header stamps of a side go back"
     far = rows[0].far_ns if share_clock(rows) else None
     stamps = replace(stamps, header_ns=None, note=note, delay_ns=0, replaced=0, far_ns=far)
-    return stamps, rows[0].log_ns, rows[1].log_ns
+    return stamps, spread_bursts(rows[0].log_ns).stamp_ns, spread_bursts(rows[1].log_ns).stamp_ns
 
 
 def _half_interval(times: Ints) -> int:
