@@ -17,6 +17,7 @@ from icrtool.calibration.pooled import predictor, turning_recording_of
 from icrtool.calibration.record import Calibration
 from icrtool.calibration.run_models import ComparedModels, ComparedRow, Model, compare_models
 from icrtool.dropout_analysis import report, shown_paths
+from icrtool.dropout_analysis.guard import why_unusable
 from icrtool.dropout_analysis.starts import split_by_turning, with_smoothed_reference
 from icrtool.dropout_analysis.topic_rows import topic_rows
 from icrtool.dropout_analysis.trials import ErrorSink, measure_errors
@@ -230,6 +231,14 @@ def report_on(
         starts_of_further=sparse, track=track,
     )  # fmt: skip
     give_back_freed()
+    if found is not None and (against := why_unusable(run.document, errors, [row.name for row in rows])):
+        # The errors stay in the report: they show the contradiction.
+        document = msgspec.structs.replace(
+            run.document, usable=False, unusable_because=against.text, recommended=None,
+            notes=(*run.document.notes, against),
+        )  # fmt: skip
+        compared, errors = replace(compared, document=document), replace(errors, run_document=document)
+        found, unusable = found._replace(calibration=None), "" if request.allow_unusable else against.text
     cost = None
     if request.without_events:
         crossed = replace(compared, in_gap=whole.in_gap)

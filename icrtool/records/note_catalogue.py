@@ -73,6 +73,18 @@ OF_RUNS: dict[str, Explanation] = {
 """Codes of what a run shows."""
 
 OF_UNUSABLE_RUNS: dict[str, Explanation] = {
+    "few_trials": Explanation(
+        "grave",
+        "A row of the report rests on few trials, or on few of those that other rows have.",
+        "Its errors are those of a chosen part of the drive.",
+        "Drive further; check the stamps of the wheels (`icrtool info -v`).",
+    ),
+    "rows_contradict": Explanation(
+        "grave",
+        "The drive does not show its ICRs, and the filter and the motion model err by very different amounts.",
+        "One of both is wrong, and nothing shows which.",
+        "Check the other findings: stamps, wheel radius, slip.",
+    ),
     "wheels_filtered": Explanation(
         "grave",
         "The wheel speeds are filtered or fused odometry.",

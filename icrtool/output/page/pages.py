@@ -28,7 +28,14 @@ from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, ren
 from icrtool.output.run_directory import PAGE_FILE, check_sum, is_page
 from icrtool.output.tables.calibration import transfer_blocks
 from icrtool.output.tables.configuration import format_settings
-from icrtool.output.tables.dropout import answer_sections, model_section, outage_blocks, verdict_lines, worst_section
+from icrtool.output.tables.dropout import (
+    answer_sections,
+    judged,
+    model_section,
+    outage_blocks,
+    verdict_lines,
+    worst_section,
+)
 from icrtool.output.tables.errors import errors_section
 from icrtool.output.tables.run import advice, streams_section, unusable_line
 from icrtool.output.text_blocks import PAGE, Block, Cell, Facts, Figure, Items, Line, Section, Table, Title
@@ -134,6 +141,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
 
 def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
+    summary = judged(summary, report)
     rows = [
         (
             one.kind, duration_text(one.begin_s), duration_text(one.end_s - one.begin_s),

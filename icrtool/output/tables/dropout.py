@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from msgspec import UNSET
+from msgspec.structs import replace
 
 from icrtool.calibration.record import fitted_model, stored_calibration
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.errors import DataError
 from icrtool.motion.models import TERMS, FittedModel
 from icrtool.output.exports.controllers import format_export
-from icrtool.output.tables.errors import baseline_sections, errors_section, model_of
+from icrtool.output.tables.errors import baseline_sections, errors_section, model_of, trials_of_first
 from icrtool.output.tables.run import advice, number_blocks, run_checks, unusable_line
 from icrtool.output.text_blocks import (
     PAGE,
@@ -78,9 +79,11 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     summary : of the run
     report : what report.json holds; null for a number that is not known
     """
-    # How many trials the numbers rest on, at the horizon nearest to `CHOICE_HORIZON_M` that has any.
-    row = min(report.trials, key=lambda one: (not one.trials, abs(one.horizon_m - CHOICE_HORIZON_M)))
-    trials = f"{distance_text(report.run.drive.distance_m)}, {row.trials:,} trials of {row.horizon_m:g} m"
+    summary = judged(summary, report)
+    # How many trials the first row rests on, at the horizon nearest to `CHOICE_HORIZON_M` that has any.
+    counts = zip(report.trials, trials_of_first(report), strict=True)
+    row, count = min(counts, key=lambda one: (not one[1], abs(one[0].horizon_m - CHOICE_HORIZON_M)))
+    trials = f"{distance_text(report.run.drive.distance_m)}, {count:,} trials of {row.horizon_m:g} m"
     return [
         unusable_line(summary),
         Title(run_title(summary), trials),
@@ -91,6 +94,13 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
         model_section(report),
         Section("", verdict_lines(report)),
     ]
+
+
+def judged(summary: RunDocument, report: DropoutDocument) -> RunDocument:
+    """Return the document of a run with the verdict of its report, whose trials may show that it must not be used."""
+    if report.usable or not summary.usable:
+        return summary
+    return replace(summary, usable=False, unusable_because=report.unusable_because)
 
 
 def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Section]:

@@ -56,6 +56,13 @@ def ordered(models: Sequence[ModelDocument]) -> list[ModelDocument]:
     return [by_name[name] for name in in_order(by_name)]
 
 
+def trials_of_first(report: DropoutDocument) -> list[int]:
+    """Return the number of trials of the row that is shown first, at each horizon of a report."""
+    first = shown_rows([one.name for one in report.models])[:1]
+    found = model_of(report, first[0]) if first else None
+    return [row.trials for row in (report.trials if found is None else found.by_horizon)]
+
+
 def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     """Return the errors over distance: what counts first, then all of them, and what they rest on."""
     shown = shown_horizons(np.array([row.horizon_m for row in report.trials]))
@@ -63,7 +70,8 @@ def errors_section(report: DropoutDocument, summary: RunDocument) -> Section:
     main, models = shown_rows([one.name for one in report.models]), ordered(report.models)
     rows = [_error_row(one, shown) for one in models if one.name in main]
     others = [_error_row(one, shown) for one in models if one.name not in main]
-    rows.append(["trials", "", *(f"{row.trials:,}" for row in counts)])
+    trials = trials_of_first(report)
+    rows.append(["trials", "", *(f"{trials[h]:,}" for h in shown)])
     head = ("distance without GNSS", "", *(f"{row.horizon_m:g} m" for row in counts))
     sentences = [*_source_lines(report), *_count_lines(report, summary)]
     rests = [Table("llr", list(_other_rows(report, shown)), head), *sentences, *_learned_blocks(report, shown)]

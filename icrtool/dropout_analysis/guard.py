@@ -1,0 +1,66 @@
+"""Whether the rows of a report can be used: enough trials in each, and no contradiction between rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from icrtool.dropout_analysis.report import OpenLoopErrors
+from icrtool.motion.recording import LONGEST_STEP_S, MOST_TRIALS
+from icrtool.records.acceptance import CHOICE_HORIZON_M
+from icrtool.records.notes import Note, note
+from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS
+from icrtool.records.run_document import RunDocument
+
+FEWEST_TRIALS = 30
+"""Number of trials that a row needs. The 95th percentile of fewer trials is their largest or second largest error."""
+
+SMALLEST_SHARE_TRIED = 0.1
+"""Share of the starts from which a row needs an error. A row with fewer was tested on a chosen part of the drive."""
+
+LARGEST_RATIO = 3.0
+"""Ratio of the errors of `recommended` and `icr` from which on they contradict each other."""
+
+
+def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterable[str]) -> Note | None:
+    """Return why the rows of a report must not be used; None where they can be.
+
+    Parameters
+    ----------
+    summary : of the run
+    errors : of its rows
+    held_out : names of the rows that are tested on distance they were not fitted to
+
+    Notes
+    -----
+    Rows are compared at the horizon nearest to `CHOICE_HORIZON_M` at which each has `FEWEST_TRIALS`. Starts of trials
+    of held-out rows are up to `LONGEST_STEP_S` apart, at most `MOST_TRIALS` of a drive.
+    """
+    rows = {one.name: one.document.by_horizon for one in errors.results}
+    names = [name for name in held_out if name in rows]
+    if not names:
+        return None
+    trials = np.array([[row.trials for row in rows[name]] for name in names])
+    enough = np.flatnonzero(trials.min(axis=0) >= FEWEST_TRIALS)
+    of = enough if len(enough) else np.arange(len(errors.horizons_m))
+    h = int(of[np.abs(errors.horizons_m[of] - CHOICE_HORIZON_M).argmin()])
+    horizon, least = f"{errors.horizons_m[h]:g} m", int(trials[:, h].argmin())
+    seconds = int(errors.counts.trials[h]) * summary.drive.duration_s / max(errors.states, 1)
+    expected = min(int(errors.counts.trials[h]), seconds / LONGEST_STEP_S, MOST_TRIALS)
+    if trials[least, h] < max(FEWEST_TRIALS, SMALLEST_SHARE_TRIED * expected):
+        rests = f"{names[least]} rests on {trials[least, h]:,} trials of {horizon}"
+        if errors.counts.trials[h] < FEWEST_TRIALS:
+            return note("few_trials", f"{rests}: the drive is too short")
+        of_icr = f"where icr has {errors.counts.trials[h]:,}"
+        return note("few_trials", f"{rests}, {of_icr}: are the stamps of the wheels regular?")
+    hidden = [ICR_WORDS[column] for column in ICR_COLUMNS[:2] if summary.icr_of_drive(column) is None]
+    icr, recommended = (rows[name][h].p95_m if name in rows else None for name in (WITHOUT_IT, MOST_USEFUL))
+    if not hidden or icr is None or recommended is None:
+        return None
+    if max(icr, recommended) <= LARGEST_RATIO * min(icr, recommended):
+        return None
+    apart = f"{WITHOUT_IT} errs by {icr:.3g} m and {MOST_USEFUL} by {recommended:.3g} m after {horizon} (95 %)"
+    text = f"the drive does not show {' and '.join(hidden)}, and {apart}: wheels and fixes contradict each other"
+    return note("rows_contradict", text)
