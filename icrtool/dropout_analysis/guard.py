@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from icrtool.dropout_analysis.report import OpenLoopErrors
-from icrtool.motion.recording import LONGEST_STEP_S, MOST_TRIALS
+from icrtool.motion.recording import LONGEST_RECORDING_STEP_S, MOST_TRIALS
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.notes import Note, note
 from icrtool.records.rows import MOST_USEFUL, WITHOUT_IT
@@ -36,7 +36,7 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
     Notes
     -----
     Rows are compared at the horizon nearest to `CHOICE_HORIZON_M` at which each has `FEWEST_TRIALS`. Starts of trials
-    of held-out rows are up to `LONGEST_STEP_S` apart, at most `MOST_TRIALS` of a drive.
+    of held-out rows are up to `LONGEST_RECORDING_STEP_S` apart, at most `MOST_TRIALS` of a drive.
     """
     rows = {one.name: one.document.by_horizon for one in errors.results}
     names = [name for name in held_out if name in rows]
@@ -48,7 +48,7 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
     h = int(of[np.abs(errors.horizons_m[of] - CHOICE_HORIZON_M).argmin()])
     horizon, least = f"{errors.horizons_m[h]:g} m", int(trials[:, h].argmin())
     seconds = int(errors.counts.trials[h]) * summary.drive.duration_s / max(errors.states, 1)
-    expected = min(int(errors.counts.trials[h]), seconds / LONGEST_STEP_S, MOST_TRIALS)
+    expected = min(int(errors.counts.trials[h]), seconds / LONGEST_RECORDING_STEP_S, MOST_TRIALS)
     if trials[least, h] < max(FEWEST_TRIALS, SMALLEST_SHARE_TRIED * expected):
         rests = f"{names[least]} rests on {trials[least, h]:,} trials of {horizon}"
         if errors.counts.trials[h] < FEWEST_TRIALS:

@@ -115,8 +115,8 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
     controller = summary.controller
     if controller is None and report.calibration is not None:
         controller = report.calibration.controller
-    judged = report.document
-    unusable = f"not usable: {judged.unusable_because}" if not judged.usable else ""
+    stated = report.document
+    unusable = f"not usable: {stated.unusable_because}" if not stated.usable else ""
     cut = next((one.sentence for one in summary.notes if one.code == "log_cut_off"), "")
     within = [(f"{one.model}_within_{one.budget_m:g}m_m", one) for one in report.document.budgets]
     earlier = report.baseline.document.models if report.baseline is not None else ()
@@ -124,7 +124,7 @@ def _results(request: LogRequest, stage: Stage) -> FleetLog:
         request.known,
         status="done",
         reason="; ".join(filter(None, [unusable, f"truncated: {cut}" if cut else ""])),
-        usable=judged.usable,
+        usable=stated.usable,
         start_utc=datetime.fromtimestamp(int(run.table.stamp_ns[0]) // 10**9, UTC).isoformat().replace("+00:00", "Z"),
         duration_s=summary.drive.duration_s,
         distance_m=summary.drive.distance_m,

@@ -68,7 +68,7 @@ OF_FILES: dict[str, Explanation] = {
     "wheel_bursts": Explanation(
         "info",
         "Wheel samples arrive several at a time: a serial adapter or a radio link passes on packets.",
-        "Their stamps are spread over the time since the packet before; what was measured when is known to some samples.",
+        "Their stamps are spread over the time since the packet before.",
         "Have the driver stamp each sample when it is measured.",
     ),
     "stamps_shared": Explanation(

@@ -30,7 +30,7 @@ from icrtool.output.tables.calibration import transfer_blocks
 from icrtool.output.tables.configuration import format_settings
 from icrtool.output.tables.dropout import (
     answer_sections,
-    judged,
+    with_verdict,
     model_section,
     outage_blocks,
     verdict_lines,
@@ -141,7 +141,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
 
 def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
-    summary = judged(summary, report)
+    summary = with_verdict(summary, report)
     rows = [
         (
             one.kind, duration_text(one.begin_s), duration_text(one.end_s - one.begin_s),

@@ -79,7 +79,7 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     summary : of the run
     report : what report.json holds; null for a number that is not known
     """
-    summary = judged(summary, report)
+    summary = with_verdict(summary, report)
     # How many trials the first row rests on, at the horizon nearest to `CHOICE_HORIZON_M` that has any.
     counts = zip(report.trials, trials_of_first(report), strict=True)
     row, count = min(counts, key=lambda one: (not one[1], abs(one[0].horizon_m - CHOICE_HORIZON_M)))
@@ -96,7 +96,7 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     ]
 
 
-def judged(summary: RunDocument, report: DropoutDocument) -> RunDocument:
+def with_verdict(summary: RunDocument, report: DropoutDocument) -> RunDocument:
     """Return the document of a run with the verdict of its report, whose trials may show that it must not be used."""
     if report.usable or not summary.usable:
         return summary
