@@ -30,10 +30,10 @@ from icrtool.output.tables.calibration import transfer_blocks
 from icrtool.output.tables.configuration import format_settings
 from icrtool.output.tables.dropout import (
     answer_sections,
-    with_verdict,
     model_section,
     outage_blocks,
     verdict_lines,
+    with_verdict,
     worst_section,
 )
 from icrtool.output.tables.errors import errors_section
