@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.clock_search import take_shifts, with_shifts
 from icrtool.alignment.conventions import apply_convention, decide_conventions
 from icrtool.alignment.corrections import AlignedStreams, align_streams
 from icrtool.alignment.estimator import estimate_alignment
@@ -50,6 +51,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
         # it takes its wheels as they are
         return _align_once(log, config)
     log, width = without_frozen(log), width_or_usual_m(config.robot.track_width_m)
+    log, config, shifts = take_shifts(log, config)
     found = _align_once(log, config)
     seen = find_disagreements(found.sensors, width)
     if seen.events:
@@ -58,9 +60,10 @@ def align(log: RobotLog, config: Config) -> Measurements:
             spans = tuple((event.begin_ns, event.end_ns) for event in seen.events)
             found = _align_once(replace(log, slipping_ns=spans), config)
             seen = find_disagreements(found.sensors, width)
-    filled, bridge = bridged(found.sensors.wheels, config.filter.wheel_gap_s)
-    notes = () if bridge is None else about(log.name, [bridge])
+    filled, bridge = bridged(found.sensors.wheels, config.filter.wheel_gap_s, found.sensors.fixes)
+    notes = about(log.name, [*shifts.notes, *([] if bridge is None else [bridge])])
     sensors = replace(found.sensors, wheels=filled, events=seen.events, jumps=seen.jumps)
+    found = replace(found, findings=with_shifts(found.findings, shifts))
     return replace(found, sensors=sensors, notes=(*found.notes, *notes))
 
 

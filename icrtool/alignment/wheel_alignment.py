@@ -18,10 +18,10 @@ from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
-from icrtool.kernels.arrays import rows_at_steps, unwrapped
+from icrtool.kernels.arrays import Bools, rows_at_steps, unwrapped
 from icrtool.kernels.robust import robust_regression, sandwich_covariance
 from icrtool.kernels.track import Track
-from icrtool.records.measurements import WheelFacts
+from icrtool.records.measurements import Fixes, WheelFacts
 from icrtool.records.notes import Note, note
 from icrtool.records.plain_data import known
 from icrtool.records.samples import WheelSamples
@@ -51,6 +51,10 @@ wheels usually roll at."""
 LONGEST_BRIDGE_S = 5.0
 """In a longer gap the robot may have stopped and turned: what the counts show at its ends is no path."""
 
+CONTRADICTED_SIGMAS, CONTRADICTED_SHARE = 3.0, 0.5
+"""Wheels and fixes contradict each other in a gap where their distances differ by more than this many standard
+deviations and this part of the wheels' distance: speed and turn vary within a gap."""
+
 FUSED_CORRELATION = 0.9995
 """A turn rate of the wheels that follows the gyro this closely was made of it."""
 
@@ -69,12 +73,35 @@ def scaled(log: RobotLog, left: float, right: float) -> RobotLog:
     return replace(log, wheels=replace(wheels, left=left * wheels.v_left_mps, right=right * wheels.v_right_mps))
 
 
-def bridged(wheels: WheelSamples, gap_s: float) -> tuple[WheelSamples, Note | None]:
+def _contradicted(wheels: WheelSamples, fixes: Fixes) -> Bools:
+    """Return in which intervals (n - 1,) the fixes move further than the wheels, or much less, and beyond their noise.
+
+    What a robot drives in a gap at constant speed it may drive along an arc, so that a chord may be shorter than the
+    distance; the wheels then turn by as much as the sides differ.
+    """
+    stamps = wheels.stamp_ns
+    if len(fixes.stamp_ns) < 2:
+        return np.zeros(len(stamps) - 1, np.bool_)
+    seconds = np.diff(stamps) / 1e9
+    left, right = wheels.v_left_mps[:-1] * seconds, wheels.v_right_mps[:-1] * seconds
+    at = [np.interp(stamps, fixes.stamp_ns, axis) for axis in (fixes.north_m, fixes.east_m)]
+    chord = np.hypot(*(np.diff(axis) for axis in at))
+    after = np.clip(np.searchsorted(fixes.stamp_ns, stamps), 1, len(fixes.stamp_ns) - 1)
+    seen = np.minimum(np.abs(fixes.stamp_ns[after] - stamps), np.abs(stamps - fixes.stamp_ns[after - 1])) < 10**9
+    along, across = np.abs(left + right) / 2, np.abs(left - right) / 2
+    noise = CONTRADICTED_SIGMAS * math.sqrt(2.0 * float(np.median(fixes.var_north_m2 + fixes.var_east_m2)))
+    slack = CONTRADICTED_SHARE * np.maximum(along, across) + noise
+    apart = (chord > along + across + slack) | ((along > chord + across + slack) & (along > 2.0 * chord + noise))
+    return np.asarray(apart & seen[:-1] & seen[1:])
+
+
+def bridged(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[WheelSamples, Note | None]:
     """Return wheels that report positions with samples in their gaps, and what to report.
 
     Parameters
     ----------
     gap_s : a longer interval between samples is a gap
+    fixes : gaps in which they contradict the positions of the wheels stay gaps
 
     Notes
     -----
@@ -85,6 +112,7 @@ def bridged(wheels: WheelSamples, gap_s: float) -> tuple[WheelSamples, Note | No
     usual = float(np.median(interval)) if len(interval) else math.inf
     steps = np.ones(len(wheels.stamp_ns), np.int64)
     filled = (interval > gap_s) & (interval <= LONGEST_BRIDGE_S) & (interval >= 2.0 * usual)
+    filled &= ~np.isin(wheels.stamp_ns[:-1], wheels.restarts_ns) & ~_contradicted(wheels, fixes)
     if not (wheels.from_position and filled.any()):
         return wheels, None
     steps[:-1][filled] = np.round(interval[filled] / usual).astype(np.int64)

@@ -27,6 +27,7 @@ from icrtool.kernels.robust import mad_std
 from icrtool.records.notes import Note, about, note
 from icrtool.records.samples import NO_HEADINGS, PositionFixes, WheelSamples, WheelUnit
 from icrtool.records.tables import RobotLog
+from icrtool.records.text import counted
 
 STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
 """The distance by the position reference is compared with that of the wheels over spans of time: straight
@@ -37,6 +38,10 @@ FASTEST_MPS = 100.0
 
 SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
 """A single sample faster than this, and that much faster than almost all and than its neighbours, is no driving."""
+
+GAP_IN_USUAL, FASTER = 2.5, 1.5
+"""Positions that change in a gap, this many usual intervals long, this many times faster than in almost all other
+intervals began again: the base restarted."""
 
 PARKED_M, PARKED_SIGMAS, TURNING_SHARE = 0.5, 3.0, 0.2
 """A robot stands where 95 % of its positions lie within this, or within so many of their standard deviations, while its
@@ -86,7 +91,12 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     notes = [*estimated]
     with np.errstate(over="ignore"):
         left, right = wheels.left * factor, wheels.right * factor
-    stamps = wheels.stamp_ns
+    stamps, restarts = wheels.stamp_ns, np.zeros(0, np.int64)
+    if wheels.from_position and (again := _restarts(stamps, left, right)).any():
+        restarts = stamps[again]
+        left, right = (np.where(again, np.append(side[:1], side[:-1]), side) for side in (left, right))
+        why = f"{topic}: the wheel positions begin again in {counted(len(restarts), 'gap')}: the base restarted"
+        notes.append(note("wheel_positions_restart", f"{why}; what was driven there is not known"))
     possible = (np.abs(left) <= FASTEST_MPS) & (np.abs(right) <= FASTEST_MPS)
     if not possible.all():
         count = np.count_nonzero(~possible)
@@ -107,7 +117,8 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
         replace(stream, count=len(stamps), why=f"{stream.why}{how}") if stream.role == "wheels" else stream
         for stream in log.streams
     )
-    samples = WheelSamples(stamps, left, right, from_position=wheels.from_position)
+    kept = tuple(np.intersect1d(restarts, stamps).tolist())
+    samples = WheelSamples(stamps, left, right, from_position=wheels.from_position, restarts_ns=kept)
     return replace(log, wheels=samples, streams=streams, notes=(*log.notes, *about(log.name, notes)))
 
 
@@ -153,6 +164,21 @@ def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
         f"the wheels turn{gone} and the robot does not move",
         f"95 % of the positions lie within {reach_m:.2f} m: is it on a stand?",
     )
+
+
+def _restarts(stamps: Ints, left: Floats, right: Floats) -> Bools:
+    """Return after which samples (n,) positions began again: a gap whose mean speed no other interval has nearly.
+
+    A robot is on average no faster in a gap than its fastest samples.
+    """
+    interval = np.append(np.diff(stamps), 0)
+    if len(interval) < 3:
+        return np.zeros(len(stamps), np.bool_)
+    gap = interval > GAP_IN_USUAL * float(np.median(interval[:-1]))
+    fastest = np.maximum(np.abs(left), np.abs(right))
+    if not gap.any() or gap.all():
+        return np.zeros(len(stamps), np.bool_)
+    return np.asarray(gap & (fastest > FASTER * float(np.quantile(fastest[~gap], USUAL_SHARE))) & (fastest > 0.0))
 
 
 def _spikes(speed: Floats) -> Bools:

@@ -55,6 +55,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
     if width is None:
         raise ConfigError("robot.track_width_m", f"not known to {run.name}", "fit the log again with it, or --robot")
     inputs = run.document.inputs
+    left, right = (scale / error for scale, error in zip(run.wheel_scales, run.radius_errors, strict=True))
     plain = Recording(
         name=run.name,
         track=track_of(run),
@@ -64,7 +65,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
         begin_ns=int(run.table.stamp_ns[0]),
         lever=Lever(*(place is not None for place in known_antenna_m(run))),
         x_clock_std_m=run.document.icr.x_clock_std_m,
-        wheel_scales=run.wheel_scales,
+        wheel_scales=(left, right),
     )
     return plain if heading is None else with_turn_rate(plain, heading, run.config.frames.gyro_delay_s)
 
@@ -395,11 +396,14 @@ def _why_left_out(run: Run, one: _Taken, before: Sequence[_Taken], *, allow_unus
 def robot_of(run: Run, width_m: float) -> documents.CalibratedRobot:
     """Return what a calibration holds of the robot of a run, of track width `width_m`."""
     robot = run.config.robot
+    left, right = (UNSET if error == 1.0 else error for error in run.radius_errors)
     return documents.CalibratedRobot(
         name=robot.name,
         wheel_radius_m=robot.wheel_radius_m,
         encoder_counts_per_rev=robot.encoder_counts_per_rev or UNSET,
         twist_width_m=(run.config.wheels.twist_width_m or UNSET) if are_twist(run.document.streams) else UNSET,
+        left_scale=left,
+        right_scale=right,
         track_width_m=width_m,
     )
 

@@ -58,7 +58,7 @@ class Recording:
     begin_ns : stamp of the first state; 0 where it is not known
     lever : what is known of the place of the position on the robot
     x_clock_std_m : what is not known of the time between position and heading looks like an x_icr so far off
-    wheel_scales : of left and right, from speeds at the configured wheel radius to those of `track`
+    wheel_scales : of left and right, from the speeds that models are fitted to to those of `track`
     """
 
     name: str
@@ -73,7 +73,7 @@ class Recording:
     wheel_scales: tuple[float, float] = (1.0, 1.0)
 
     def wheels(self, rows: Ints | slice = slice(None)) -> Track:
-        """Return the track with some of its wheel samples, with their speeds at the configured wheel radius."""
+        """Return the track with some of its wheel samples, with the speeds that models are fitted to."""
         some, (left, right) = self.track.wheels(rows), self.wheel_scales
         if (left, right) == (1.0, 1.0):
             return some

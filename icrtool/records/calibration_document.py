@@ -26,7 +26,7 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
 
 
 class CalibratedRobot(Record, frozen=True, kw_only=True):
-    """The robot; `left_scale` and `right_scale`, as configured, stand in older files alone."""
+    """The robot; `left_scale` and `right_scale` are `Run.radius_errors`, left out where they are 1."""
 
     name: str | None = None
     wheel_radius_m: UpTo1000 | None = None

@@ -71,6 +71,12 @@ OF_FILES: dict[str, Explanation] = {
         "Their stamps are spread over the time since the packet before.",
         "Have the driver stamp each sample when it is measured.",
     ),
+    "wheel_positions_restart": Explanation(
+        "warning",
+        "Positions of the wheels begin again: the base restarted, or lost its counts.",
+        "The distance driven in that gap is not known; no trial crosses it.",
+        "None is needed.",
+    ),
     "stamps_shared": Explanation(
         "warning",
         "More than 1 % of the wheel samples have the stamp of another sample.",
@@ -87,6 +93,12 @@ OF_FILES: dict[str, Explanation] = {
 """Codes of what was found while files were read."""
 
 OF_CLOCKS: dict[str, Explanation] = {
+    "clock_shifted": Explanation(
+        "warning",
+        "Speeds or turns of positions or headings are those of the wheels seconds earlier or later: another clock.",
+        "The stream was moved by that time.",
+        "Set the clocks of robot and receiver; GPS time is 18 s ahead of UTC.",
+    ),
     "log_time_used": Explanation(
         "warning",
         "The header stamps of a stream, or of some of its messages, are missing or wrong.",

@@ -236,6 +236,19 @@ class Run:
         return self.document.wheels.applied_left_scale, self.document.wheels.applied_right_scale
 
     @property
+    def radius_errors(self) -> tuple[float, float]:
+        """Factors of `wheel_scales`, left and right, that correct a wrong radius or resolution, not tyres and soil.
+
+        Configured scales, or the power of two nearest to the estimated ones. Motion models are fitted to speeds with
+        these factors, and estimate the rest: their prior is of wheels that roll near their radius.
+        """
+        given = self.config.wheels
+        if given.left_scale != "auto" or given.right_scale != "auto":
+            return self.wheel_scales
+        left, right = (2.0 ** round(math.log2(abs(one))) if one else 1.0 for one in self.wheel_scales)
+        return left, right
+
+    @property
     def usable(self) -> bool:
         """Whether the ICRs may be used; ``unusable_because`` of `document` is the reason where not."""
         return self.document.usable

@@ -64,6 +64,7 @@ class WheelSamples(Samples):
     unit : ``mps``: speeds that are ready to use; else as the log sends them, in this unit per second, without the
         configured scales, until `icrtool.alignment.wheel_units` has made speeds of them
     from_position : the log sends positions, of which these are the mean speeds to the next sample
+    restarts_ns : stamps of the samples after which the positions began again, in a gap of which nothing is known
     """
 
     stamp_ns: Ints
@@ -71,6 +72,7 @@ class WheelSamples(Samples):
     right: Floats
     unit: WheelUnit = "mps"
     from_position: bool = False
+    restarts_ns: tuple[int, ...] = ()
 
     @property
     def v_left_mps(self) -> Floats:

@@ -14,6 +14,7 @@ from icrtool.config import load_config
 from icrtool.dropout_analysis.dropout_report import dropout_report
 from icrtool.errors import DataError
 from icrtool.pipeline import fit
+from icrtool.records.measurements import Fixes
 from icrtool.records.notes import warnings_of
 from icrtool.records.samples import GyroSamples, HeadingSamples, PositionFixes, WheelSamples
 from icrtool.records.tables import RobotLog
@@ -23,6 +24,10 @@ from support.drives import ICRS, make_log
 
 CONFIG = load_config(sets=["robot.track_width_m=0.8"])
 ICR_TOLERANCE_M = 0.05
+
+
+NONE = np.empty(0)
+NO_FIXES = Fixes(np.empty(0, np.int64), *[NONE] * 4, np.empty(0, np.uint8), *[np.empty(0, np.bool_)] * 2)
 
 
 def with_wheels(log: RobotLog, left: np.ndarray, right: np.ndarray) -> RobotLog:
@@ -178,15 +183,15 @@ def test_gaps_of_wheels_that_report_positions_are_bridged() -> None:
 def test_few_wheel_samples_have_nothing_to_bridge(count: int) -> None:
     stamps = np.arange(count, dtype=np.int64) * 100_000_000
     wheels = WheelSamples(stamps, np.ones(count), np.ones(count), from_position=True)
-    assert bridged(wheels, 0.5) == (wheels, None)
+    assert bridged(wheels, 0.5, NO_FIXES) == (wheels, None)
 
 
 def test_a_gap_of_more_than_five_seconds_stays_a_gap() -> None:
     stamps = np.concatenate([np.arange(50), np.arange(200, 250)]).astype(np.int64) * 100_000_000
     wheels = WheelSamples(stamps, np.ones(100), np.ones(100), from_position=True)
-    assert bridged(wheels, 0.5)[0] is wheels
+    assert bridged(wheels, 0.5, NO_FIXES)[0] is wheels
     short = replace(wheels, stamp_ns=np.where(stamps > 10**10, stamps - 12 * 10**9, stamps))
-    filled, note = bridged(short, 0.5)
+    filled, note = bridged(short, 0.5, NO_FIXES)
     assert np.diff(filled.stamp_ns).tolist() == [100_000_000] * (len(filled.stamp_ns) - 1)
     assert note is not None
     assert note.text.startswith("1 gaps")

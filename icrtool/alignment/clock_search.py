@@ -1,0 +1,226 @@
+"""Streams that are stamped wrongly by seconds: configured delays, and those that correlations of speeds show."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from icrtool.config import Config
+from icrtool.kernels.arrays import Bools, Floats, Ints, unwrapped
+from icrtool.records.measurements import Finding
+from icrtool.records.notes import Note, note
+from icrtool.records.tables import RobotLog
+
+LONGEST_SHIFT_S, SHORTEST_SHIFT_S = 30.0, 3.0
+"""Shifts are searched up to the first, and made from the second on: smaller ones the alignment finds by itself."""
+
+GRID_S, MOST_STEPS = 0.1, 100_000
+"""Step of the search, and the number of steps of a drive that are compared."""
+
+SPEED_OVER_S = 1.0
+"""Speeds and turn rates are those over this time: noise of fixes hides what is faster."""
+
+INDEPENDENT_S = 4.0
+"""Speeds of a robot this far apart are taken as independent."""
+
+DECISIVE_GAIN, RIVAL_GAIN, RIVAL_S = 25.0, 9.0, 3.0
+"""A shift is made where twice its log-likelihood is larger by the first than without it, and by the second than that of
+any other shift further away than this time: a drive that repeats itself shows none."""
+
+LEAST_CORRELATION = 0.8
+"""Speeds that correlate less are not those of one robot, whatever the shift."""
+
+LARGEST_R2 = 0.98
+"""A better correlation shows no more: a robot answers its wheels a little later, and differently each time."""
+
+LEAP_S = 18.0
+"""GPS time is ahead of UTC by this much since 2017."""
+
+
+class Shifts(NamedTuple):
+    """Times by which streams are stamped later than the wheels [s], already taken off the stamps.
+
+    Attributes
+    ----------
+    gnss, heading : of positions and headings; 0 where nothing was moved
+    notes : what was found
+    """
+
+    gnss: float
+    heading: float
+    notes: tuple[Note, ...]
+
+
+NO_SHIFTS = Shifts(0.0, 0.0, ())
+
+
+def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts]:
+    """Return a log whose streams are moved by their configured delays, or by what their speeds show.
+
+    Returns
+    -------
+    log; the configuration with which it is to be aligned, in which no configured delay is left; what was moved
+    """
+    frames, notes = config.frames, list[Note]()
+    shifts: dict[str, float] = {}
+    own = _Rates.of_wheels(log)
+    for word, key, given in (
+        ("gnss", "reference_delay_s", frames.reference_delay_s), ("heading", "heading_delay_s", frames.heading_delay_s),
+    ):  # fmt: skip
+        if given != "auto":
+            shifts[word] = float(given)
+            continue
+        rates = _Rates.of_fixes(log) if word == "gnss" else _Rates.of_headings(log)
+        shifts[word] = find_shift(own, rates)
+        if shifts[word] and not (word == "heading" and log.heading_is_of_position):
+            notes.append(note("clock_shifted", _sentence(word, shifts[word], key)))
+    if log.heading_is_of_position:
+        shifts["heading"] = shifts["gnss"]
+    if not any(shifts.values()):
+        return log, config, NO_SHIFTS
+    moved = {name: replace(getattr(log, name), stamp_ns=getattr(log, name).stamp_ns - round(by * 1e9))
+             for name, by in shifts.items()}  # fmt: skip
+    given_keys = {
+        key: 0.0
+        for key, given in (("reference_delay_s", frames.reference_delay_s), ("heading_delay_s", frames.heading_delay_s))
+        if given != "auto"
+    }
+    inner = replace(config, frames=replace(frames, **given_keys))
+    return replace(log, **moved), inner, Shifts(shifts["gnss"], shifts["heading"], tuple(notes))
+
+
+def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Finding]:
+    """Return the findings of a log whose streams were moved, counted from the stamps that were sent."""
+    by = {
+        "position_delay_s": shifts.gnss,
+        "heading_delay_s": shifts.heading,
+        "position_delay_against_heading_s": shifts.gnss - shifts.heading,
+    }
+
+    def moved(one: Finding, shift: float) -> Finding:
+        value = None if one.value is None else one.value + shift
+        return replace(one, value=value, applied=one.applied + shift, why="corrected") if shift else one
+
+    return {name: moved(one, by.get(name, 0.0)) for name, one in findings.items()}
+
+
+def _sentence(word: str, shift_s: float, key: str) -> str:
+    """Return what was found of a stream's clock, and what was done."""
+    subject = "positions" if word == "gnss" else "headings"
+    fact = f"{subject} are stamped {abs(shift_s):.1f} s {'later' if shift_s > 0 else 'earlier'} than the wheels"
+    leap = abs(abs(shift_s) - LEAP_S) < 2 * GRID_S
+    cause = " (GPS time is 18 s ahead of UTC)" if leap else ""
+    return f"{fact}, as their speeds show: their clock{cause}; corrected; frames.{key} sets it"
+
+
+class _Rates(NamedTuple):
+    """Speed [m/s] and turn rate [rad/s] on the grid of a log; NaN where not known, None where a stream shows none."""
+
+    speed: Floats | None
+    turn: Floats | None
+
+    @classmethod
+    def of_wheels(cls, log: RobotLog) -> _Rates:
+        wheels = log.wheels
+        held = np.diff(wheels.stamp_ns, append=wheels.stamp_ns[-1:]) / 1e9
+        left, right = (
+            np.cumsum(np.append(0.0, (side * held)[:-1])) for side in (wheels.v_left_mps, wheels.v_right_mps)
+        )
+        known = _known(wheels.stamp_ns, log)
+        speed = np.abs(_rate(wheels.stamp_ns, (left + right) / 2, log))
+        return cls(np.where(known, speed, np.nan), np.where(known, _rate(wheels.stamp_ns, left - right, log), np.nan))
+
+    @classmethod
+    def of_fixes(cls, log: RobotLog) -> _Rates:
+        gnss = log.gnss
+        if len(gnss.stamp_ns) < 2:
+            return cls(None, None)
+        velocity = _rate(gnss.stamp_ns, gnss.north_m, log) + 1j * _rate(gnss.stamp_ns, gnss.east_m, log)
+        speed, known = np.abs(velocity), _known(gnss.stamp_ns, log)
+        # a robot on the spot has no course
+        step = max(round(SPEED_OVER_S / GRID_S), 1)
+        turned = np.angle(velocity[step:] * np.conj(velocity[:-step])) / SPEED_OVER_S
+        turn = np.full(len(speed), np.nan)
+        turn[step // 2 : step // 2 + len(turned)] = turned
+        clear = known & (speed > 0.5 * float(np.median(speed[known])) if known.any() else known)
+        return cls(np.where(known, speed, np.nan), np.where(clear, turn, np.nan))
+
+    @classmethod
+    def of_headings(cls, log: RobotLog) -> _Rates:
+        heading = log.heading
+        if len(heading.stamp_ns) < 2:
+            return cls(None, None)
+        turn = _rate(heading.stamp_ns, unwrapped(heading.heading_rad), log)
+        return cls(None, np.where(_known(heading.stamp_ns, log), turn, np.nan))
+
+
+def _grid(log: RobotLog) -> Ints:
+    """Return the times of the grid [ns]: those of the wheels, and as much around as streams may be moved."""
+    first, last = int(log.wheels.stamp_ns[0]), int(log.wheels.stamp_ns[-1])
+    count = min(int((last - first) / (GRID_S * 1e9)) + 1, MOST_STEPS)
+    around = round(LONGEST_SHIFT_S / GRID_S)
+    return first + np.arange(-around, count + around) * round(GRID_S * 1e9)
+
+
+def _rate(stamps: Ints, values: Floats, log: RobotLog) -> Floats:
+    """Return the mean change per second of a column over `SPEED_OVER_S` around each time of the grid."""
+    grid, half = _grid(log), round(SPEED_OVER_S * 1e9 / 2)
+    t = (stamps - grid[0]) / 1e9
+    first, last = ((grid - grid[0] + shift) / 1e9 for shift in (-half, half))
+    return np.asarray((np.interp(last, t, values) - np.interp(first, t, values)) / SPEED_OVER_S)
+
+
+def _known(stamps: Ints, log: RobotLog) -> Bools:
+    """Return at which times of the grid a stream was sampled just before and just after."""
+    grid, usual = _grid(log), float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    after = np.searchsorted(stamps, grid)
+    inside = (after > 0) & (after < len(stamps))
+    after = np.clip(after, 1, len(stamps) - 1)
+    return np.asarray(inside & (stamps[after] - stamps[after - 1] < max(1.5e9, 3.0 * usual)))
+
+
+def find_shift(wheels: _Rates, other: _Rates) -> float:
+    """Return how much later than the wheels a stream is stamped [s]; 0 where it is less than 3 s, or not shown.
+
+    Notes
+    -----
+    Twice the log-likelihood of a line through n independent pairs is -n log(1 - r^2): the correlations of speeds and of
+    turn rates add up. Their signs do not count: sides may be exchanged.
+    """
+    lags = np.arange(-round(LONGEST_SHIFT_S / GRID_S), round(LONGEST_SHIFT_S / GRID_S) + 1)
+    gain, best_r = np.zeros(len(lags)), np.zeros(len(lags))
+    for own, seen in ((wheels.speed, other.speed), (wheels.turn, other.turn)):
+        if own is None or seen is None:
+            continue
+        r2, count = _correlations(own, seen, lags)
+        # all lags with one number of pairs: how much streams overlap shows no clock
+        gain -= count.max() * GRID_S / INDEPENDENT_S * np.log1p(-np.minimum(r2, LARGEST_R2))
+        best_r = np.maximum(best_r, np.sqrt(r2))
+    at = int(gain.argmax())
+    shift = float(lags[at]) * GRID_S
+    near = np.abs(lags) * GRID_S <= SHORTEST_SHIFT_S
+    rivals = np.abs(lags - lags[at]) * GRID_S > RIVAL_S
+    if abs(shift) <= SHORTEST_SHIFT_S or best_r[at] < LEAST_CORRELATION or at in (0, len(lags) - 1):
+        return 0.0
+    if gain[at] - float(gain[near].max()) < DECISIVE_GAIN or gain[at] - float(gain[rivals].max()) < RIVAL_GAIN:
+        return 0.0
+    before, peak, behind = gain[at - 1 : at + 2]
+    bend = before - 2.0 * peak + behind
+    return shift + GRID_S * (0.5 * float((before - behind) / bend) if bend < 0.0 else 0.0)
+
+
+def _correlations(own: Floats, seen: Floats, lags: Ints) -> tuple[Floats, Floats]:
+    """Return squared correlations (l,) of a column with one that is `lags` steps later, and numbers of pairs."""
+    found, counts = np.zeros(len(lags)), np.zeros(len(lags))
+    for row, lag in enumerate(lags.tolist()):
+        a, b = (own[: len(own) - lag], seen[lag:]) if lag >= 0 else (own[-lag:], seen[:lag])
+        both = np.isfinite(a) & np.isfinite(b)
+        a, b = a[both] - a[both].mean() if both.any() else a[both], b[both] - b[both].mean() if both.any() else b[both]
+        scale = math.sqrt(float(a @ a) * float(b @ b)) if len(a) > 2 else 0.0
+        found[row], counts[row] = (float(a @ b) / scale) ** 2 if scale > 0.0 else 0.0, len(a)
+    # few pairs at the ends would seem to fit
+    found[counts < 0.5 * counts.max(initial=0.0)] = 0.0
+    return found, counts

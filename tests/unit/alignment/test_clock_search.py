@@ -1,0 +1,79 @@
+"""Streams that are stamped wrongly by seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from icrtool.alignment.clock_search import take_shifts
+from icrtool.config import load_config
+from icrtool.pipeline import fit
+from icrtool.records.run import Run
+from icrtool.records.tables import RobotLog
+from support.drives import ICRS, make_log
+
+WIDTH_M = 0.8
+SETS = (f"robot.track_width_m={WIDTH_M}",)
+
+
+def later(log: RobotLog, **by_s: float) -> RobotLog:
+    """Return a log whose streams are stamped later."""
+    moved: dict[str, Any] = {
+        name: replace(getattr(log, name), stamp_ns=getattr(log, name).stamp_ns + round(shift * 1e9))
+        for name, shift in by_s.items()
+    }
+    return replace(log, **moved)
+
+
+def check(run: Run) -> list[str]:
+    """Check the ICRs of a run, and return the codes of its findings."""
+    assert run.usable
+    numbers = run.document.controller
+    assert numbers is not None
+    assert numbers.multiplier == pytest.approx((ICRS[0] - ICRS[1]) / WIDTH_M, abs=0.02)
+    return [one.code for one in run.document.notes]
+
+
+@pytest.mark.parametrize("shift_s", [18.0, -18.0, 7.3, -26.0])
+def test_fixes_of_another_clock_are_moved_back(shift_s: float) -> None:
+    run = fit(later(make_log(seconds=120.0), gnss=shift_s), load_config(sets=SETS))
+    assert "clock_shifted" in check(run)
+    assert run.document.alignment["position_delay_s"].applied == pytest.approx(shift_s, abs=0.1)
+    (text,) = [one.text for one in run.document.notes if one.code == "clock_shifted"]
+    assert ("GPS time is 18 s ahead of UTC" in text) is (abs(shift_s) == 18.0)
+
+
+@pytest.mark.parametrize("streams", [("heading",), ("gnss", "heading")], ids=" and ".join)
+def test_headings_of_another_clock_are_moved_back(streams: tuple[str, ...]) -> None:
+    run = fit(later(make_log(seconds=120.0), **dict.fromkeys(streams, 18.0)), load_config(sets=SETS))
+    check(run)
+    assert run.document.alignment["heading_delay_s"].applied == pytest.approx(18.0, abs=0.1)
+
+
+@pytest.mark.parametrize("shift_s", [18.0, -45.0])
+def test_a_configured_delay_moves_the_fixes_before_they_are_looked_at(shift_s: float) -> None:
+    config = load_config(sets=[*SETS, f"frames.reference_delay_s={shift_s}"])
+    run = fit(later(make_log(seconds=120.0), gnss=shift_s), config)
+    assert "clock_shifted" not in check(run)
+    assert run.document.alignment["position_delay_s"].applied == pytest.approx(shift_s, abs=1e-9)
+    assert run.document.config.frames.reference_delay_s == shift_s
+
+
+def test_clocks_that_agree_are_left_alone() -> None:
+    run = fit(make_log(seconds=120.0), load_config(sets=SETS))
+    assert "clock_shifted" not in check(run)
+
+
+def test_a_drive_that_repeats_itself_shows_no_shift() -> None:
+    log = make_log(seconds=120.0)
+    t = (log.wheels.stamp_ns - log.wheels.stamp_ns[0]) / 1e9
+    speed = 0.5 + 0.2 * np.sign(np.sin(2 * np.pi * t / 10.0))
+    wheels = replace(log.wheels, left=speed, right=speed)
+    north = np.interp(log.gnss.stamp_ns, log.wheels.stamp_ns, np.cumsum(speed) * 0.02)
+    repeated = replace(log, wheels=wheels, gnss=replace(log.gnss, north_m=north, east_m=0.0 * north))
+    heading = replace(log.heading, heading_rad=0.0 * log.heading.heading_rad)
+    found = take_shifts(later(replace(repeated, heading=heading), gnss=12.0), load_config(sets=SETS))[2]
+    assert found.gnss == 0.0
