@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,7 +83,7 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
         return log, config, NO_SHIFTS
     moved = {name: replace(getattr(log, name), stamp_ns=getattr(log, name).stamp_ns - round(by * 1e9))
              for name, by in shifts.items()}  # fmt: skip
-    given_keys = {
+    given_keys: dict[str, Any] = {
         key: 0.0
         for key, given in (("reference_delay_s", frames.reference_delay_s), ("heading_delay_s", frames.heading_delay_s))
         if given != "auto"
