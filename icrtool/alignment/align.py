@@ -15,7 +15,13 @@ from icrtool.alignment.corrections import AlignedStreams, align_streams
 from icrtool.alignment.estimator import estimate_alignment
 from icrtool.alignment.gnss_quality import grade_fixes
 from icrtool.alignment.log_track import check_streams, cut_drive_windows, track_of_log
-from icrtool.alignment.sensor_noise import fixes_of, heading_variance, reference_noise, without_frozen
+from icrtool.alignment.sensor_noise import (
+    fixes_of,
+    heading_variance,
+    reference_noise,
+    without_bad_start,
+    without_frozen,
+)
 from icrtool.alignment.slip_events import find_disagreements
 from icrtool.alignment.wheel_alignment import bridged
 from icrtool.alignment.wheel_units import with_wheel_speeds
@@ -50,7 +56,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     if not config.filter.rules.corrects:
         # it takes its wheels as they are
         return _align_once(log, config)
-    log, width = without_frozen(log), width_or_usual_m(config.robot.track_width_m)
+    log, width = without_bad_start(without_frozen(log)), width_or_usual_m(config.robot.track_width_m)
     log, config, shifts = take_shifts(log, config)
     found = _align_once(log, config)
     seen = find_disagreements(found.sensors, width)

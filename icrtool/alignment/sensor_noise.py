@@ -140,6 +140,29 @@ def unbroken(interval_s: Floats) -> Floats:
     return np.where(is_hole(interval_s, WHEEL_HOLE_S), 0.0, interval_s)
 
 
+FIRST_FIXES, STEP_SPEEDS, STEP_M = 5, 3.0, 3.0
+"""Fixes before a step among the first ones are bad where it is longer than this many times what the wheels drive
+meanwhile, and more; and no later step is."""
+
+
+def without_bad_start(log: RobotLog) -> RobotLog:
+    """Return a log without first fixes that lie apart from all others; the same log where none do."""
+    gnss, wheels = log.gnss, log.wheels
+    if len(gnss.stamp_ns) < 4 * FIRST_FIXES or len(wheels.stamp_ns) < 2:
+        return log
+    seconds = np.diff(gnss.stamp_ns[: 4 * FIRST_FIXES]) / 1e9
+    step = np.hypot(np.diff(gnss.north_m[: 4 * FIRST_FIXES]), np.diff(gnss.east_m[: 4 * FIRST_FIXES]))
+    speed = float(np.quantile(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps), 0.99)) / 2
+    noise = NOISIER * (float(np.median(step[FIRST_FIXES:])) + USUAL_POSITION_STD_M)
+    jumps = np.flatnonzero(step > STEP_SPEEDS * speed * seconds + max(STEP_M, STEP_SPEEDS * noise))
+    if not len(jumps) or jumps[-1] >= FIRST_FIXES:
+        return log
+    count = int(jumps[-1]) + 1
+    rows = slice(count, None)
+    why = f"{count} of the first fixes lie {step[jumps].max():.4g} m from the others: left out"
+    return replace(log, gnss=gnss.cut(rows), notes=(*log.notes, note("first_fixes_apart", why, log.name)))
+
+
 def without_frozen(log: RobotLog) -> RobotLog:
     """Return a log without fixes that a driver sent again while its receiver had none; the same log where none is."""
     gnss, wheels = log.gnss, log.wheels

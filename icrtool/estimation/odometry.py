@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from typing import Literal
@@ -14,7 +14,7 @@ from icrtool.kernels.arrays import ROWS_AT_ONCE, Bools, Floats, Ints, trapezoids
 from icrtool.kernels.kinematics import chord_rows
 from icrtool.kernels.open_loop import open_loop_pieces
 from icrtool.kernels.track import OpenLoopPath
-from icrtool.records.measurements import MeasuredHeading
+from icrtool.records.measurements import MeasuredHeading, ReferenceJump
 from icrtool.records.run import Run, no_slip_icrs, track_of_states
 from icrtool.records.run_document import DriveDocument
 from icrtool.records.tables import Icrs, States
@@ -104,8 +104,34 @@ def _pieces(table: States, in_gap: Bools, icrs: Icrs) -> Iterator[tuple[slice, O
         turned = float(path.heading[-1] - track.heading[last])
 
 
-def drive_summary(table: States) -> DriveDocument:
+def _without_jumps(table: States, jumps: Iterable[ReferenceJump]) -> tuple[Floats, Floats]:
+    """Return the positions of states (n,), north and east [m], without the steps that the reference made alone.
+
+    Across a jump the robot is taken to have driven on as its states did before it, for the distance of its wheels.
+    """
+    north, east = table.north_m.copy(), table.east_m.copy()
+    for jump in jumps:
+        if jump.undecided:
+            continue
+        first = max(int(np.searchsorted(table.stamp_ns, jump.begin_ns, side="right")) - 1, 0)
+        last = min(int(np.searchsorted(table.stamp_ns, jump.end_ns)), len(table) - 1)
+        if last <= first:
+            continue
+        gone = table.distance_m[first : last + 1] - table.distance_m[first]
+        heading = table.heading_rad[last]
+        for axis, along in ((north, math.cos(heading)), (east, math.sin(heading))):
+            moved = axis[last] - axis[first] - gone[-1] * along
+            axis[last:] -= moved
+            axis[first : last + 1] = axis[first] + gone * along
+    return north, east
+
+
+def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDocument:
     """Return duration, distance of the positions, and mean and standard deviation of the speed over time.
+
+    Parameters
+    ----------
+    jumps : of the reference; what it jumps is not driven
 
     Notes
     -----
@@ -115,8 +141,9 @@ def drive_summary(table: States) -> DriveDocument:
     """
     interval, duration = np.diff(table.t_s), float(table.t_s[-1])
     noise = float(np.median(np.hypot(table.std_north_m, table.std_east_m), overwrite_input=True))
-    rows = chord_rows(table.north_m, table.east_m, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
-    chords = np.hypot(np.diff(table.north_m[rows]), np.diff(table.east_m[rows]))
+    north, east = _without_jumps(table, jumps)
+    rows = chord_rows(north, east, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
+    chords = np.hypot(np.diff(north[rows]), np.diff(east[rows]))
     if rows[-1] != len(table) - 1:
         # what is left at the end is shorter than a step, and counts for nothing
         rows, chords = np.append(rows, len(table) - 1), np.append(chords, 0.0)

@@ -125,7 +125,7 @@ def summarise(
         notes=notes,
         warnings=warnings_of(notes),
         alignment=measurements.findings,
-        drive=drive_summary(table),
+        drive=drive_summary(table, sensors.jumps),
         usable=not unusable,
         unusable_because=unusable_because(notes),
         icr=icr_summary(table, convergence, covariance, filtered.covariance[3:, 3:], x_clock_std_m, multiplier, hidden),

@@ -287,6 +287,12 @@ OF_WHEELS: dict[str, Explanation] = {
 """Codes of what was found of the wheels."""
 
 OF_POSITIONS: dict[str, Explanation] = {
+    "first_fixes_apart": Explanation(
+        "warning",
+        "The first fixes lie further from the others than the robot can drive.",
+        "They are left out.",
+        "Begin to record when the receiver has a fix.",
+    ),
     "reference_chosen": Explanation(
         "info",
         "Another position reference agrees better with wheels and heading than the first choice.",

@@ -260,6 +260,10 @@ def common_clock(streams: Sequence[StampedRows]) -> Clock:
     return "log" if len(delays) < len(streams) and any(abs(delay) > FAR_NS for delay in delays) else "header"
 
 
+FAR_DEG = 0.2
+"""A fix this far from the median of all, about 20 km, is no origin of the local plane."""
+
+
 def _fixes(
     source: PositionSource, config: Config, clock: Clock, given: Datum | None = None
 ) -> tuple[PositionFixes, Datum | None]:
@@ -273,7 +277,10 @@ def _fixes(
 
         latitude, longitude, height = source.geodetic[rows].T
         if datum is None:
-            first = float(latitude[0]), float(longitude[0])
+            # a bad first fix would lay the plane far away
+            apart = np.abs(latitude - np.median(latitude)) + np.abs(longitude - np.median(longitude))
+            row = int(np.argmax(apart < FAR_DEG)) if (apart < FAR_DEG).any() else 0
+            first = float(latitude[row]), float(longitude[row])
             datum = Datum(*(config.frames.datum or first), float(height[0]))
         origin = datum.latitude_deg, datum.longitude_deg, datum.height_m
         north, east, _ = geodetic2ned(latitude, longitude, height, *origin)
