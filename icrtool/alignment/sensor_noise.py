@@ -140,7 +140,7 @@ def unbroken(interval_s: Floats) -> Floats:
     return np.where(is_hole(interval_s, WHEEL_HOLE_S), 0.0, interval_s)
 
 
-FIRST_FIXES, STEP_SPEEDS, STEP_M = 5, 3.0, 3.0
+FIRST_FIXES, BAD_STEP_SPEEDS, BAD_STEP_M = 5, 3.0, 3.0
 """Fixes before a step among the first ones are bad where it is longer than this many times what the wheels drive
 meanwhile, and more; and no later step is."""
 
@@ -154,7 +154,7 @@ def without_bad_start(log: RobotLog) -> RobotLog:
     step = np.hypot(np.diff(gnss.north_m[: 4 * FIRST_FIXES]), np.diff(gnss.east_m[: 4 * FIRST_FIXES]))
     speed = float(np.quantile(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps), 0.99)) / 2
     noise = NOISIER * (float(np.median(step[FIRST_FIXES:])) + USUAL_POSITION_STD_M)
-    jumps = np.flatnonzero(step > STEP_SPEEDS * speed * seconds + max(STEP_M, STEP_SPEEDS * noise))
+    jumps = np.flatnonzero(step > BAD_STEP_SPEEDS * speed * seconds + max(BAD_STEP_M, BAD_STEP_SPEEDS * noise))
     if not len(jumps) or jumps[-1] >= FIRST_FIXES:
         return log
     count = int(jumps[-1]) + 1

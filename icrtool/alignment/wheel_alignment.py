@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit
+from icrtool.alignment.estimator import EVIDENCE_SIGMAS, AlignmentFit, residuals_by_estimate
+from icrtool.alignment.ground_change import find_change
 from icrtool.alignment.log_track import FEWEST_ALIGNMENT_WINDOWS
 from icrtool.alignment.sensor_noise import unbroken
 from icrtool.config import Config
@@ -164,7 +165,8 @@ def align_wheels(
     sound : no side is dead or a copy of the other
     """
     wheels, notes, applied = log.wheels, list[Note](), (1.0, 1.0)
-    filtered = "" if fit is None or not sound else find_filtering(fit)
+    change = None if fit is None or not sound else find_change(fit)
+    filtered = "" if fit is None or not sound or change is not None else find_filtering(fit)
     if fit is not None and not filtered:
         applied, notes = _find_scales(fit, config, sound=sound)
     moving = (np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps))[1:] > 0
@@ -176,6 +178,7 @@ def align_wheels(
         notes.append(note("wheel_values_held", why))
     scale, std = (math.nan, math.nan) if fit is None else fit.estimate("scale")
     windows = 0 if fit is None else len(fit.windows.begin)
+    turn_left, turn_left_std = (math.nan, math.nan) if fit is None else turn_variance_left(fit)
     facts = WheelFacts(
         scale=known(scale),
         scale_std=known(std),
@@ -187,8 +190,31 @@ def align_wheels(
         windows=windows,
         stretches=0 if fit is None else len(np.union1d(fit.windows.group, fit.windows.turn_group)),
         residual_m=None if fit is None else known(math.hypot(*fit.fit.scale[[0, windows]].tolist())),
+        turn_left=known(turn_left),
+        turn_left_std=known(turn_left_std),
+        ground_change_s=None if change is None else change.t_s,
     )
+    notes += [] if change is None else [note("ground_changed", change.text)]
     return facts, applied, [*notes, *_fused_note(log)]
+
+
+def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
+    """Return the share of the variance of the turns that the wheels do not explain, 1 - R^2, and its deviation.
+
+    Notes
+    -----
+    The deviation is of a jackknife over stretches of distance (Efron and Stein 1981). NaN without two stretches that
+    turn.
+    """
+    of = residuals_by_estimate(fit)
+    groups, row = np.unique(fit.windows.turn_group, return_inverse=True)
+    left, turned = (np.bincount(row, one**2, len(groups)) for one in (of.turn_after, of.turn_rad))
+    if len(groups) < 2 or not (turned > 0.0).sum() >= 2:
+        return math.nan, math.nan
+    without = (left.sum() - left) / (turned.sum() - turned)
+    count = len(groups)
+    std = math.sqrt((count - 1) * float(np.mean((without - without.mean()) ** 2)))
+    return float(left.sum() / turned.sum()), std
 
 
 def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[Note]]:

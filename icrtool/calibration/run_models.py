@@ -29,7 +29,7 @@ from icrtool.records.measurements import MeasuredHeading
 from icrtool.records.notes import Note, note
 from icrtool.records.process_resources import give_back_freed
 from icrtool.records.rows import INSTALLATION, PAST, row_of
-from icrtool.records.run import ICR_COLUMNS, Run, no_slip_icrs, vendor_icrs, width_or_usual_m
+from icrtool.records.run import ICR_COLUMNS, ICR_WORDS, Run, no_slip_icrs, vendor_icrs, width_or_usual_m
 from icrtool.records.run_document import GeometryDocument, RunDocument
 
 
@@ -58,7 +58,8 @@ def with_motion(run: Run) -> RunDocument:
     elif FIVE in fits:
         geometry, covariance = fits[FIVE].geometry(width)
     else:
-        return run.document
+        short = "the drive is too short for a motion model: the filter's ICRs alone are known"
+        return msgspec.structs.replace(run.document, partly_because=short if run.usable else None)
     robot = pooled.robot_of(run, width)
     found = None
     if run.usable and run.track_width_m is not None and RECOMMENDED in fits:
@@ -70,13 +71,45 @@ def with_motion(run: Run) -> RunDocument:
     for name, value, std in zip(ICR_COLUMNS, geometry, np.sqrt(np.diag(covariance)).tolist(), strict=False):
         if of_filter or (verdicts[name] != "not shown" and std <= largest):
             shown |= {name: float(value), f"{name}_std": std}
-    return msgspec.structs.replace(
+    document = msgspec.structs.replace(
         run.document,
         recommended=found,
         geometry=GeometryDocument(**shown, covariance_m2=covariance[:ICR_VALUES, :ICR_VALUES].tolist()),
-        controller=controller_numbers(geometry, covariance, robot)
-        if found is not None and set(ICR_COLUMNS[:2]) <= shown.keys()
-        else None,
+    )
+    if found is None:
+        return _with_verdict(document)
+    # The common error of both y ICRs cancels in the multiplier: each number is shown by its own deviation.
+    numbers = controller_numbers(geometry, covariance, robot)
+    if of_filter or numbers.multiplier_std <= WEAK_SHARE * abs(numbers.multiplier):
+        document = msgspec.structs.replace(document, controller=numbers)
+    return _with_verdict(document, f" (σ {numbers.multiplier_std:.2f})")
+
+
+def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocument:
+    """Return the document of a run with what it does not show; not usable where it shows no y ICR and no multiplier.
+
+    Parameters
+    ----------
+    multiplier_std : of a multiplier that is not shown, in words
+    """
+    if not document.usable:
+        return document
+    changed = next((one.text for one in document.notes if one.code == "ground_changed"), "")
+    if changed and not document.request.changes_s:
+        return msgspec.structs.replace(document, partly_because=changed)
+    hidden = [ICR_WORDS[name] for name in ICR_COLUMNS if document.icr_of_drive(name) is None]
+    has_width = document.config.robot.track_width_m is not None
+    if has_width and document.controller is None:
+        hidden = [f"multiplier{multiplier_std}", *hidden]
+    if not hidden:
+        return document
+    words = f"{', '.join(hidden)} not shown: drive two full turns on the spot to each side"
+    known = [name for name in ICR_COLUMNS[:2] if document.icr_of_drive(name) is not None]
+    if known or document.controller is not None:
+        return msgspec.structs.replace(document, partly_because=words)
+    grave = note("nothing_shown", words)
+    return msgspec.structs.replace(
+        document, usable=False, unusable_because=grave.text, notes=(*document.notes, grave), recommended=None
     )
 
 

@@ -20,7 +20,7 @@ FEWEST_TRIALS = 30
 SMALLEST_SHARE_TRIED = 0.1
 """Share of the starts from which a row needs an error. A row with fewer was tested on a chosen part of the drive."""
 
-LARGEST_RATIO = 3.0
+LARGEST_ROW_RATIO = 3.0
 """Ratio of the errors of `recommended` and `icr` from which on they contradict each other."""
 
 
@@ -59,7 +59,7 @@ def why_unusable(summary: RunDocument, errors: OpenLoopErrors, held_out: Iterabl
     icr, recommended = (rows[name][h].p95_m if name in rows else None for name in (WITHOUT_IT, MOST_USEFUL))
     if not hidden or icr is None or recommended is None:
         return None
-    if max(icr, recommended) <= LARGEST_RATIO * min(icr, recommended):
+    if max(icr, recommended) <= LARGEST_ROW_RATIO * min(icr, recommended):
         return None
     apart = f"{WITHOUT_IT} errs by {icr:.3g} m and {MOST_USEFUL} by {recommended:.3g} m after {horizon} (95 %)"
     text = f"the drive does not show {' and '.join(hidden)}, and {apart}: wheels and fixes contradict each other"

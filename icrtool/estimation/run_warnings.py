@@ -13,7 +13,7 @@ from icrtool.estimation.filter_setup import configured_noise
 from icrtool.estimation.run_filter import LARGEST_POSITION_MPS, STEP
 from icrtool.kernels.arrays import Bytes, Floats
 from icrtool.kernels.filter_records import GATED, UNSEEN
-from icrtool.records.measurements import Finding
+from icrtool.records.measurements import Finding, WheelFacts
 from icrtool.records.notes import Note, about, note
 from icrtool.records.presets import ProcessNoise
 from icrtool.records.run import ICR_WORDS
@@ -39,6 +39,10 @@ standard deviations: its controller knows the slip, or it is fused with a gyro."
 
 WORTH_WARNING_SHARE = 0.1
 DELAY_SIGMAS = 3.0
+LARGEST_TURN_LEFT, LEFT_SIGMAS = 0.5, 2.0
+"""Wheels explain almost none of the turns where more than this share of their variance is left, by so many standard
+deviations."""
+
 USELESS_HEADING_DEGPS = 50.0
 """The heading by wheels with more noise than this errs by 5 deg after a second."""
 
@@ -61,6 +65,7 @@ def unusable_reasons(
     twist_separation: tuple[float, float] | None = None,
     contradiction: str = "",
     filtered: str = "",
+    wheels: WheelFacts | None = None,
     *,
     inverted: bool = False,
 ) -> list[Note]:
@@ -73,6 +78,7 @@ def unusable_reasons(
     filtered : how the wheels show that a filter made them; nothing else is then worth a reason
     twist_separation : (y_r - y_l) / b by a body twist that was converted with b, and its standard deviation; None for
         other wheels
+    wheels : what is known of them; without turns that were compared, the filter's noise of the heading decides
     inverted : the right ICR ended left of the left one
     """
     if filtered:
@@ -90,9 +96,8 @@ def unusable_reasons(
             reasons.append(note(MOSTLY_REJECTED[word], f"{100 * share:.0f} % of the {word} rejected"))
     if noise.position_mps * STEP > LARGEST_POSITION_MPS:
         reasons.append(note("motion_unexplained", "the wheels explain almost none of the motion"))
-    elif noise.heading_degps > USELESS_HEADING_DEGPS:
-        slip = "do they slip, as on ice?"
-        reasons.append(note("turns_unexplained", f"the wheels explain almost none of the turns: {slip}"))
+    elif noise.heading_degps > USELESS_HEADING_DEGPS and (why := _why_turns_unexplained(wheels)):
+        reasons.append(note("turns_unexplained", why))
     elif contradiction and not hidden:
         reasons.append(note("windows_contradict", contradiction))
     if wheel_scale is not None and wheel_scale.value is not None and wheel_scale.std is not None:
@@ -103,6 +108,17 @@ def unusable_reasons(
     if twist_separation is not None and not hidden:
         reasons += _twist_reasons(*twist_separation)
     return reasons
+
+
+def _why_turns_unexplained(wheels: WheelFacts | None) -> str:
+    """Return that the wheels do not show the turns; empty where they explain most of their variance, or may."""
+    slip = "do they slip, as on ice?"
+    if wheels is None or wheels.turn_left is None or wheels.turn_left_std is None:
+        return f"the wheels explain almost none of the turns: {slip}"
+    left, std = wheels.turn_left, wheels.turn_left_std
+    if left - LEFT_SIGMAS * std < LARGEST_TURN_LEFT:
+        return ""
+    return f"the wheels explain {100 * max(1.0 - left, 0.0):.0f} ± {100 * std:.0f} % of the turns' variance: {slip}"
 
 
 def _twist_reasons(separation: float, std: float) -> list[Note]:

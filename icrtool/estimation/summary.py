@@ -100,10 +100,12 @@ def summarise(
         "fixes": rejected_share(filtered.gnss.code[of_fixes]),
         "headings": rejected_share(filtered.heading.code[of_headings]),
     }
+    one_ground = not changes_s and measurements.wheels.ground_change_s is None
     unusable = unusable_reasons(
         excitation, rejected, filtered.noise, scale, multiplier if of_twist else None,
-        contradicts_windows(table, covariance, measurements.findings) if rules.corrects and not changes_s else "",
+        contradicts_windows(table, covariance, measurements.findings) if rules.corrects and one_ground else "",
         measurements.wheels.filtered or "" if rules.corrects else "",
+        measurements.wheels,
         inverted=inverted,
     )  # fmt: skip
     notes = _notes(

@@ -133,6 +133,12 @@ OF_CLOCKS: dict[str, Explanation] = {
 """Codes of what was found of clocks."""
 
 OF_WHEELS: dict[str, Explanation] = {
+    "ground_changed": Explanation(
+        "warning",
+        "The robot turns differently per turn of its wheels from some time on: another ground, load or tyre pressure.",
+        "ICRs and multiplier of the whole drive lie between those of its stretches.",
+        "Fit with `--terrain-change T`, or each stretch by itself with `--from` and `--to`.",
+    ),
     "wheels_commanded": Explanation(
         "warning",
         "No measured wheel speeds were found: the topic holds commanded ones.",

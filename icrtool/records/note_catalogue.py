@@ -73,6 +73,12 @@ OF_RUNS: dict[str, Explanation] = {
 """Codes of what a run shows."""
 
 OF_UNUSABLE_RUNS: dict[str, Explanation] = {
+    "nothing_shown": Explanation(
+        "grave",
+        "Neither the y ICRs nor the multiplier are known to a tenth.",
+        "The run has no number that could be used.",
+        "Drive two full turns on the spot to each side; check the other findings.",
+    ),
     "few_trials": Explanation(
         "grave",
         "A row of the report rests on few trials, or on few of those that other rows have.",

@@ -354,6 +354,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
     ----------
     notes : all findings; the grave ones make `unusable_because`, the others are the sentences of `warnings`
     recommended, geometry, controller : the robot's motion, of a run that `icrtool.fit` made
+    partly_because : which numbers of a usable run are not shown; None where all are, and of a run that is not usable
     """
 
     schema: Literal["icrtool/run/1"]
@@ -387,6 +388,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
     recommended: RecommendedDocument | None = None
     geometry: GeometryDocument | None = None
     controller: ControllerNumbers | None = None
+    partly_because: str | None = None
 
     def __post_init__(self) -> None:
         if self.usable != (self.unusable_because is None):

@@ -8,11 +8,11 @@ import numpy as np
 
 from icrtool.kernels.arrays import Ints
 
-SHORT = 0.2
+SHORT_INTERVAL = 0.2
 """Part of the mean interval. Samples that arrive closer together than this are of one packet: no sensor that samples
 at a steady rate has such an interval, and random arrivals have one in six of them."""
 
-LEAST_SHARE = 0.02
+LEAST_BURST_SHARE = 0.02
 """Share of the intervals that are short, from which on stamps are spread. Damage makes single ones."""
 
 PAUSE_IN_LONGEST = 3.0
@@ -61,8 +61,8 @@ def spread_bursts(stamp_ns: Ints) -> Bursts:
     interval = np.diff(stamps)
     usual = interval[interval <= PAUSE_IN_LONGEST * float(np.quantile(interval, 0.98))]
     mean_ns = float(usual.mean()) if len(usual) else 0.0
-    short = interval < SHORT * mean_ns
-    if not short.mean() >= LEAST_SHARE:
+    short = interval < SHORT_INTERVAL * mean_ns
+    if not short.mean() >= LEAST_BURST_SHARE:
         return none
     ends = np.append(np.flatnonzero(~short), len(stamps) - 1)
     count = np.diff(ends, prepend=-1)

@@ -189,6 +189,8 @@ def trust_section(summary: RunDocument, report: DropoutDocument) -> Section:
     """Return whether the numbers of a report can be trusted, the reasons for care, and what was checked."""
     checks = run_checks(summary)
     cares = [f"{one.what} {one.text}" for one in checks if one.grade == "care" and one.what != "slip events"]
+    if summary.partly_because:
+        cares.insert(0, summary.partly_because)
     if events := summary.events:
         crossed = "trials across them count" if report.without_events is None else "left out"
         cares.append(f"{counted(len(events), 'slip event')}, {crossed}")

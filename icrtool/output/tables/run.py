@@ -85,7 +85,8 @@ def run_blocks(summary: RunDocument) -> list[Block]:
     excitation = summary.excitation
     turned = f"{excitation.turned_right_deg:,.0f}° right, {excitation.turned_left_deg:,.0f}° left"
     driven = f"{distance_text(summary.drive.distance_m)}, {duration_text(summary.drive.duration_s)}"
-    line = f"{'USABLE' if summary.usable else '':12}{warnings_line(summary.notes)}".rstrip()
+    verdict = "" if not summary.usable else "PARTLY" if summary.partly_because else "USABLE"
+    line = f"{verdict:12}{summary.partly_because or warnings_line(summary.notes)}".rstrip()
     shown = line if len(line) <= BRIEF_WIDTH else f"{line[: BRIEF_WIDTH - 1].rstrip()}…"
     roles: dict[str, list[str]] = {}
     for stream in summary.streams:
@@ -106,6 +107,8 @@ def run_blocks(summary: RunDocument) -> list[Block]:
 def next_blocks(summary: RunDocument, place: str, examine: str) -> list[Block]:
     """Return where a run was written, and what to do next; `examine`: command that names what is wrong in its log."""
     command = shlex.join(["icrtool", "dropout-report", place]) if summary.usable else examine
+    if (change_s := summary.wheels.ground_change_s) is not None and summary.inputs and not summary.request.changes_s:
+        command = shlex.join(["icrtool", "fit", summary.inputs[0].path, "--terrain-change", f"{change_s:.0f}"])
     drive = advice(summary)
     return [Section("", [Facts([("written to", place), ("next", drive)]), next_line("" if drive else command)])]
 
@@ -141,7 +144,7 @@ def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None)
     why = "no multiplier and no no-slip model: robot.track_width_m is not known (--robot, --set)"
     if width_m is not None:
         unknown = [ICR_WORDS[name] for name, icr in zip(ICR_COLUMNS[:2], icrs, strict=False) if icr is None]
-        why = f"no multiplier: {' and '.join(unknown) or 'the ICRs'} could not be found"
+        why = f"no multiplier: {' and '.join(unknown) or 'it'} could not be found"
     return [Facts([("controller", why), _icr_row(icrs)])]
 
 
