@@ -140,7 +140,7 @@ class _Rates(NamedTuple):
             return cls(None, None)
         velocity = _rate(gnss.stamp_ns, gnss.north_m, log) + 1j * _rate(gnss.stamp_ns, gnss.east_m, log)
         speed, known = np.abs(velocity), _known(gnss.stamp_ns, log)
-        # a robot on the spot has no course
+        # a robot on the spot has no course over ground
         step = max(round(SPEED_OVER_S / GRID_S), 1)
         turned = np.angle(velocity[step:] * np.conj(velocity[:-step])) / SPEED_OVER_S
         turn = np.full(len(speed), np.nan)

@@ -13,12 +13,12 @@ from icrtool.kernels.arrays import Floats, Ints
 CHANGE_WINDOW_S, CHANGE_GROUP_S = 2.0, 10.0
 """Turns are compared over the first time; what is nearer than the second counts as one observation."""
 
-FEWEST_CHANGE_GROUPS, CHANGE_TIMES = 4, 60
+FEWEST_CHANGE_GROUPS, CHANGE_CANDIDATES = 4, 60
 """A stretch has so many groups that turn; so many times of the change are compared."""
 
 CHANGE_SIGMAS, CHANGE_SHARE = 5.0, 0.1
-"""Stretches differ where by more than both: 3 sigma of one comparison are 4.3 of the best of `CHANGE_TIMES`, and few
-groups show a deviation that is itself uncertain."""
+"""Stretches differ where by more than both: the best of many candidates differs by
+more than 3 sigma by chance, and few groups show a deviation that is itself uncertain."""
 
 LEAST_MULTIPLIER = 0.8
 """Stretches in which the robot turns more than its wheels are no ground: sides, units or another robot's wheels."""
@@ -46,7 +46,7 @@ class GroundChange(NamedTuple):
         stretches = " and ".join(f"{value:.3f} ± {max(std, 0.001):.3f}" for value, std in (self.before, self.after))
         return (
             f"the ground changes at about {self.t_s:.0f} s: multiplier {stretches} before and after; one number "
-            f"fits neither: --terrain-change {self.t_s:.0f} tells the filter, --from and --to fit each stretch"
+            f"fits neither: --terrain-change {self.t_s:.0f} states it to the filter, --from and --to fit each stretch"
         )
 
 
@@ -75,7 +75,7 @@ def find_change(fit: AlignmentFit) -> GroundChange | None:
     weight = np.cumsum(x**2)
     if not len(x) or weight[-1] <= 0.0:
         return None
-    places = np.unique(np.searchsorted(weight, np.linspace(0.1, 0.9, CHANGE_TIMES) * weight[-1]))
+    places = np.unique(np.searchsorted(weight, np.linspace(0.1, 0.9, CHANGE_CANDIDATES) * weight[-1]))
     whole = float(np.sum((y - x * float(x @ y) / weight[-1]) ** 2))
     best, found = math.inf, None
     for place in places.tolist():
