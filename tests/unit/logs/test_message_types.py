@@ -32,7 +32,7 @@ from icrtool.logs.messages.topic_table import DYNAMIC_JOINT_STATE, HEADER, Topic
 from icrtool.logs.read_log import survey_log
 from icrtool.logs.streams.assembly import Survey
 from icrtool.logs.streams.message_types import MESSAGE_TYPES
-from icrtool.logs.streams.wheel_pairs import PAIR_TYPES
+from icrtool.logs.streams.wheel_pairs import BYTE_TYPES, PAIR_TYPES
 from icrtool.records.samples import ROLE_WORDS, Role
 from support.tables import fields_of
 
@@ -59,7 +59,8 @@ def full(message_type: str) -> str:
 
 
 def topic_of(message_type: str) -> str:
-    side = "left_" if message_type in PAIR_TYPES else ""
+    # A number of 8 bits may be the state of a lamp: the topic's name states that it is of wheels.
+    side = "left_wheel_" if message_type in BYTE_TYPES else "left_" if message_type in PAIR_TYPES else ""
     return f"/robot_7/{side}{message_type.replace('/', '_')}"
 
 
@@ -502,7 +503,7 @@ def test_a_damaged_message_is_left_out_and_counted(tmp_path: Path) -> None:
             for i in range(6):
                 raw = bytes(store.serialize_cdr(draw(store, name, rng), name))
                 stamp_ns = START_NS + i * STEP_NS
-                writer.add_message(channel, stamp_ns, raw[:5] if i == 3 else raw, stamp_ns)
+                writer.add_message(channel, stamp_ns, raw[: min(5, len(raw) - 1)] if i == 3 else raw, stamp_ns)
                 if message_type in PAIR_TYPES:
                     writer.add_message(twin, stamp_ns, raw, stamp_ns)
         writer.finish()
