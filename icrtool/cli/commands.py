@@ -14,7 +14,7 @@ _COMMANDS = {
     "info": "List what logs hold, which topics would be used, and the problems found.",
     "fit": "Learn the track ICRs of a robot from its logs.",
     "dropout-report": "Report the open-loop error without GNSS, over 1 to 20 m from every recorded state.",
-    "report": "Write a run, a fleet or a comparison as one HTML file.",
+    "report": "Answer the whole question of a log on one screen, or write the page of a result.",
     "calibrate": "Calibrate the motion model of a robot from one log or many.",
     "forecast": "Forecast the error of driving a path without GNSS, with a calibration.",
     "export": "Write a calibration for a controller, or a run for evo, Google Earth, QGIS or Foxglove.",

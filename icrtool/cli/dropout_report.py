@@ -106,7 +106,7 @@ def dropout_report_command(
         if number:
             printer.text("")
         with inputs.each(source) as document:
-            found = _report_one(source, places.get(source), config, report, files, given, printer)
+            found = report_one(source, places.get(source), config, report, files, given, printer)
             reports[str(source)] = found
             if printer.as_json:
                 document["report"] = found.document
@@ -152,7 +152,7 @@ class Given(NamedTuple):
     baseline: Baseline | None
 
 
-def _report_one(
+def report_one(
     source: Path, place: RunPlace | None, config: Config, request: ReportRequest, files: ResultFiles, given: Given,
     printer: Printer,
 ) -> DropoutReport:  # fmt: skip

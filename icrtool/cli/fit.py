@@ -16,6 +16,7 @@ from icrtool.cli.inputs import ResultPlace, RunPlace, logs_of, run_directories
 from icrtool.cli.options import PLACE, choice, flag, option
 from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.choices import StatesFormat
+from icrtool.records.places import UrlPath
 from icrtool.records.text import LogText, escaped
 
 with when_used():
@@ -23,7 +24,7 @@ with when_used():
     from icrtool.alignment import wheel_units
     from icrtool.logs import read_log, topic_poses
     from icrtool.logs.streams import assembly
-    from icrtool.output import text_format
+    from icrtool.output import run_directory, text_format
     from icrtool.output.tables import overview
     from icrtool.output.tables import run as run_tables
     from icrtool.records import notes, plain_data
@@ -90,7 +91,13 @@ def fitted_log(
     log: Path, place: RunPlace, config: Config, request: FitRequest, files: ResultFiles, printer: Printer,
     warm_start: Path | None = None,
 ) -> Iterator[tuple[Run, Path]]:  # fmt: skip
-    """Fit a log, and give as `icrtool.pipeline.fit_into` does; print warnings and chosen streams on stderr."""
+    """Fit a log, and give as `icrtool.pipeline.fit_into` does; print warnings and chosen streams on stderr.
+
+    A run of other settings is not replaced, unless that is asked for.
+    """
+    if not (files.overwrite or isinstance(place.directory, UrlPath)):
+        run_directory.check_target(place.directory, log, inside=place.inside)
+        run_directory.check_settings(place.directory, config, request)
     reported: list[str] = []
     with (
         printer.stages(LogText(log.name)) as stages,

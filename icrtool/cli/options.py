@@ -228,7 +228,7 @@ PLACES = together(
     option("-o --output", "DIR", PLACE, "Run directory of the log; with several logs: the folder of their run "
            "directories."),
     option("--into", "DIR", PLACE, "Folder of the run directories, also for one log."),
-    flag("--overwrite", "Also replace the run of another recording."),
+    flag("--overwrite", "Also replace the run of another recording, or one that was made with other settings."),
 )  # fmt: skip
 """-o and --into as `place`, and --overwrite."""
 

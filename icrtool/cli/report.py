@@ -1,4 +1,4 @@
-"""``icrtool report``, the page of a result, and ``icrtool compare``, which makes one of groups of runs."""
+"""``icrtool report``, the answer on a log or the page of a result, and ``icrtool compare``, which compares groups."""
 
 from __future__ import annotations
 
@@ -9,62 +9,126 @@ from typing import TYPE_CHECKING
 
 import click
 
-from icrtool.cli import options, when_used
-from icrtool.cli.inputs import RUNS_FOLDER, runs_named, runs_or_logs
+from icrtool.cli import dropout_report, options, when_used
+from icrtool.cli.inputs import (
+    RUNS_FOLDER,
+    ResultPlace,
+    RunPlace,
+    check_run_config,
+    run_directories,
+    runs_named,
+    runs_or_logs,
+)
 from icrtool.cli.options import FILE, NEW_FILE, NEW_PICTURE, flag, option
-from icrtool.cli.printing import Printer
+from icrtool.cli.printing import Inputs, Printer
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special, place_of
 from icrtool.records.text import LogText
 
 with when_used():
     from icrtool import errors
     from icrtool.calibration import transfer
-    from icrtool.dropout_analysis import dropout_report
+    from icrtool.dropout_analysis import dropout_report as analysis
     from icrtool.fleet import fleet_files
+    from icrtool.logs.containers import recording_files
     from icrtool.output import run_directory
     from icrtool.output.files import atomic, formats
     from icrtool.output.page import pages, render
     from icrtool.output.tables import calibration as tables
-    from icrtool.records import calibration_document, fleet_document
+    from icrtool.records import calibration_document, fleet_document, requests
 
 if TYPE_CHECKING:
-    from icrtool.config import ConfigSources
+    from icrtool.config import Config, ConfigSources
     from icrtool.records.run import Run
 
 
 @click.command("report")
-@click.argument("sources", metavar="[RUN|FLEET|COMPARISON]...", nargs=-1, type=FILE)
+@click.argument("sources", metavar="[LOG|RUN|FLEET|COMPARISON|CAL.json]...", nargs=-1, type=options.LOG)
 @option("-o --output", "FILE", FILE, "The page; default: report.html in the directory of the run or fleet.")
 @flag("--no-coordinates", "Leave out the place on the globe, for a page that others will read.")
-@options.printing(options.QUIET_RESULTS)
-def report_command(sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, printer: Printer) -> None:
-    """Write a run, a fleet or a comparison as one HTML file that needs no network.
+@option("--into", "DIR", FILE, "Folder of the run directories of logs; default: icrtool-runs.")
+@flag("--overwrite", "Also replace the run of another recording, or one that was made with other settings.")
+@options.CONFIGURATION
+@options.printing(options.QUIET, options.VERBOSE_OPTION)
+def report_command(
+    sources: tuple[Path, ...], output: Path | None, no_coordinates: bool, into: Path | None, overwrite: bool,
+    settings: ConfigSources, printer: Printer,
+) -> None:  # fmt: skip
+    """Answer the whole question of a LOG on one screen and one page; or write the page of a result.
 
-    RUN is a directory that `icrtool fit` wrote, with or without its dropout report; FLEET the folder of `icrtool
-    batch`; COMPARISON what `icrtool compare -o` wrote. Without an argument: the newest run below icrtool-runs/.
+    A LOG is fitted, unless its run is there, and tested: numbers for the controller, how far without GNSS, whether to
+    trust them, and the worst case. RUN is a directory that `icrtool fit` wrote, with or without its dropout report;
+    FLEET the folder of `icrtool batch`; COMPARISON what `icrtool compare -o` wrote, CAL.json what `icrtool calibrate
+    -o` wrote. Without an argument: the newest run below icrtool-runs/. A page is one HTML file that needs no network.
 
     \b
     Example:
-      icrtool report
+      icrtool report field.mcap --robot husky-a200
       icrtool report icrtool-runs/field -o field.html --no-coordinates
       icrtool report results/
+      icrtool report season.json
     """  # noqa: D301 - click reads the escape
+    config = settings.load()
     sources = sources or (run_directory.newest_run(RUNS_FOLDER),)
     if output is not None and len(sources) > 1:
         advice = "leave it out: each page goes to its own directory"
         raise errors.ConfigError("-o", "names one file for several pages", advice)
+    logs = tuple(source for source in sources if _is_log(source))
+    if not logs:
+        check_run_config(config)
+    places = dict(zip(logs, run_directories(logs, ResultPlace(into=into)), strict=True))
+    inputs = Inputs("source")
     for source in sources:
-        place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
-        # A page in its usual place is beside what a stranger may have put there.
-        inside, ours = (place.parent, run_directory.is_page) if output is None else (None, None)
-        atomic.check_place(place, inside, ours)
-        page = _page_of(source, coordinates=not no_coordinates)
-        atomic.write_file(place, page, inside, ours)
-        printer.text(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
+        with inputs.each(source):
+            result = source
+            if source in places:
+                files = requests.ResultFiles(overwrite=overwrite, page=output is None and not no_coordinates)
+                _report_on_log(source, places[source], config, files, printer)
+                if files.page:
+                    continue
+                result = places[source].directory
+            _write_page(result, output, coordinates=not no_coordinates, printer=printer)
+    inputs.leave("sources")
+
+
+def _is_log(source: Path) -> bool:
+    """Return whether an argument is to be read as a log: a file that is no JSON, a bag directory, an address."""
+    if isinstance(source, UrlPath):
+        return not run_directory.is_run_directory(source)
+    if source.is_file():
+        with source.open("rb") as file:
+            return source.suffix != ".json" and file.read(1) != b"{"
+    return recording_files.is_bag_directory(source) or bool(recording_files.split_files(source))
+
+
+def _report_on_log(
+    source: Path, place: RunPlace, config: Config, files: requests.ResultFiles, printer: Printer
+) -> None:
+    """Print what a log shows, fitted unless its run is there, and write its run and report."""
+    request = requests.ReportRequest().configured(config)
+    given = dropout_report.Given((), None)
+    there = run_directory.holds_run_of(place.directory, source, config, request.fit)
+    if there:
+        dropout_report.report_one(place.directory, None, config, request, files, given, printer)
+    else:
+        dropout_report.report_one(source, place, config, request, files, given, printer)
+
+
+def _write_page(source: Path, output: Path | None, *, coordinates: bool, printer: Printer) -> None:
+    """Write the page of a result, into its folder or as `output`."""
+    if isinstance(source, UrlPath):
+        advice = "copy it to a place on disk, or write its page there: icrtool dropout-report ADDRESS"
+        raise errors.RunError(source, "is a run at an address", advice)
+    place = output or (source / run_directory.PAGE_FILE if source.is_dir() else source.with_suffix(".html"))
+    # A page in its usual place is beside what a stranger may have put there.
+    inside, ours = (place.parent, run_directory.is_page) if output is None else (None, None)
+    atomic.check_place(place, inside, ours)
+    page = _page_of(source, coordinates=coordinates)
+    atomic.write_file(place, page, inside, ours)
+    printer.text(f"written to {place} ({place.stat().st_size / 1e6:.1f} MB)")
 
 
 def _page_of(source: Path, *, coordinates: bool) -> str:
-    """Return the page of a run, a fleet or a comparison."""
+    """Return the page of a run, a fleet, a comparison or a calibration."""
     if run_directory.is_run_directory(source):
         with _as_written(source, "fit the log again, or make its report again with icrtool dropout-report"):
             return _page_of_run(source, coordinates=coordinates)
@@ -77,10 +141,13 @@ def _page_of(source: Path, *, coordinates: bool) -> str:
             inside = source if source.is_dir() else None
             comparison = formats.read_document(file, calibration_document.GroupComparison, inside)
             return pages.comparison_page(comparison, file.stem)
+    if formats.schema_of(source) == calibration_document.CALIBRATION_SCHEMA:
+        with _as_written(source, "make it again with icrtool calibrate -o"):
+            return pages.calibration_page(formats.open_calibration(source))
     if is_special(source):
         raise errors.RunError(source, NOT_REGULAR, SAVE_IT)
-    what = "no run, fleet or comparison in it" if source.exists() else "no such file or directory"
-    raise errors.RunError(source, what, "icrtool fit, batch and compare make one")
+    what = "no run, fleet, comparison or calibration in it" if source.exists() else "no such file or directory"
+    raise errors.RunError(source, what, "icrtool fit, batch, compare and calibrate -o make one")
 
 
 def _page_of_run(directory: Path, *, coordinates: bool) -> str:
@@ -90,7 +157,7 @@ def _page_of_run(directory: Path, *, coordinates: bool) -> str:
     if "trajectory" not in pictures:
         pictures = pages.draw_pictures(run) | pictures
     if report is None:
-        made = dropout_report.dropout_report(run).document
+        made = analysis.dropout_report(run).document
         return pages.run_page(run, made, pictures, coordinates=coordinates)
     with _as_written(directory / "dropout", "make it again with icrtool dropout-report"):
         return pages.run_page(run, report, pictures, coordinates=coordinates)

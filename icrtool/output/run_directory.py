@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +14,8 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from icrtool.config import parse_config
+from icrtool import __version__
+from icrtool.config import Config, parse_config
 from icrtool.errors import ConfigError, OutputError, RunError
 from icrtool.logs.containers.recording_files import file_sha256, files_of_log, numbered_file, split_path
 from icrtool.output import figure_catalogue
@@ -24,13 +26,14 @@ from icrtool.output.files.remote_place import lies_there, on_disk
 from icrtool.output.files.run_columns import MEASUREMENTS_FILE
 from icrtool.records.choices import FigureSet, StatesFormat
 from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_regular, is_special, place_of, read_regular
-from icrtool.records.plain_data import Record
+from icrtool.records.plain_data import Record, plain
 from icrtool.records.process_resources import give_back_freed
+from icrtool.records.requests import FitRequest
 from icrtool.records.run import Run
 from icrtool.records.run_document import EVENT_COLUMNS, RUN_SCHEMA, EventDocument, RunDocument
 from icrtool.records.samples import InputFile
 from icrtool.records.tables import States
-from icrtool.records.text import LONGEST_NAME, escaped_texts, listed, shortened
+from icrtool.records.text import LONGEST_NAME, escaped, escaped_texts, listed, shortened
 
 RUN_FILE = "run.json"
 EVENTS_FILE = "events.csv"
@@ -95,6 +98,74 @@ def _is_made_from(directory: Path, log: Path) -> bool:
     return bool(inputs) and all(
         any(file.stat().st_size == one.bytes and file_sha256(file) == one.sha256 for file in files) for one in inputs
     )
+
+
+def check_settings(directory: Path, config: Config, request: FitRequest) -> None:
+    """Refuse to replace a run that was made with other settings, before any work is done.
+
+    Raises
+    ------
+    OutputError
+        Another configuration, or another part of the log, was asked of the run that is there.
+    """
+    if changed := changed_settings(directory, config, request):
+        advice = "give them again, name another place (-o, --into), or replace it with --overwrite"
+        why = f"holds a run of this recording with other settings ({listed(changed, 3)})"
+        raise OutputError(directory, why, advice)
+
+
+def holds_run_of(directory: Path, log: Path, config: Config, request: FitRequest) -> bool:
+    """Return whether the run in a directory was made from a log with the same settings by this version."""
+    if isinstance(directory, UrlPath) or not is_run_directory(directory) or not _is_made_from(directory, log):
+        return False
+    asked = _asked_of(directory)
+    return asked is not None and asked.tool_version == __version__ and not changed_settings(directory, config, request)
+
+
+def changed_settings(directory: Path, config: Config, request: FitRequest) -> list[str]:
+    """Return what is asked of a fit otherwise than of the run in a directory, as ``robot.name was 'a', now 'b'``.
+
+    The section ``dropout`` is not of the fit. A run that cannot be read has no settings.
+    """
+    asked = _asked_of(directory)
+    if asked is None:
+        return []
+    now: dict[str, Any] = config.effective() | {"request": msgspec.to_builtins(request)}
+    before: dict[str, Any] = {**asked.config, "request": asked.request}
+    named = {"request.start": "--from", "request.end": "--to", "request.changes_s": "--terrain-change"}
+    left_out = {"request.smooth"}
+    found = []
+    for section, values in now.items():
+        stored = before.get(section)
+        for key, value in values.items() if section != "dropout" and isinstance(stored, dict) else ():
+            name = f"{section}.{key}"
+            if name not in left_out and key in stored and not _same(stored[key], value):
+                found.append(f"{named.get(name, name)} was {_stated(stored[key])}, now {_stated(value)}")
+    return found
+
+
+def _same(one: object, other: object) -> bool:
+    return json.dumps(plain(one), sort_keys=True) == json.dumps(plain(other), sort_keys=True)
+
+
+def _stated(value: object) -> str:
+    return "not given" if value is None or value == [] else shortened(escaped(str(value)), LONGEST_NAME)
+
+
+class _Asked(Record, frozen=True):
+    config: dict[str, Any]
+    request: dict[str, Any] = msgspec.field(default_factory=dict)
+    tool_version: str = ""
+
+
+def _asked_of(directory: Path) -> _Asked | None:
+    """Return what was asked of a run that nobody checked yet; None where it is none."""
+    if isinstance(directory, UrlPath) or not is_run_directory(directory):
+        return None
+    try:
+        return formats.read_document(directory / RUN_FILE, _Asked, directory, escape=False)
+    except (OSError, ValueError, RecursionError):
+        return None
 
 
 def write_run(run: Run, directory: Path, **options: Any) -> None:

@@ -77,6 +77,7 @@ def test_info_without_a_track_width_names_it_as_missing(icrtool) -> None:
     assert status == 0
     assert out.startswith("verdict     can be fitted")
     assert "\nmissing     robot.track_width_m" in out
+    assert out.splitlines()[-1].endswith("tracked_curved.bag --robot NAME")
 
 
 def test_info_of_a_log_that_cannot_be_fitted_states_why(icrtool, tmp_path: Path) -> None:

@@ -12,6 +12,8 @@ import pytest
 from icrtool.pipeline import fit
 from support.barn import configured, simulate
 
+MOWER = Path(__file__).resolve().parents[2] / "sample_logs" / "wheeled_lawnmower.mcap"
+
 Command = Callable[..., tuple[int, str, str]]
 
 
@@ -41,7 +43,7 @@ def test_the_page_of_the_newest_run_is_in_its_directory(icrtool: Command, run_di
     assert str(Path("icrtool-runs", "barn", "report.html")) in output
     page = spaced((run_directory / "report.html").read_text(encoding="utf-8"))
     # Neither a dropout report nor pictures were there: both were made for the page, and only for it.
-    assert "within 0.5 m (95 %), by wheel speeds alone" in page
+    assert "within 0.5 m (95 %) on this drive, by wheel speeds alone" in page
     assert "data:image/png;base64," in page
     assert not (run_directory / "dropout").exists()
 
@@ -89,6 +91,68 @@ def test_what_is_no_result_has_no_page(icrtool: Command, place: str) -> None:
     status, _, errors = icrtool("report", place)
     assert status == 1
     assert errors.startswith(f"Error: {place}: no ")
+
+
+def test_report_of_a_log_answers_the_whole_question_and_fits_it_once(icrtool: Command, run_place: Path) -> None:
+    status, first, errors = icrtool("report", MOWER, "--robot", "segway-rmp400")
+    assert (status, errors) == (0, "")
+    labels = [line.partition(" ")[0] for line in first.splitlines()]
+    for label in ("controller", "Trust?", "Worst", "page"):
+        assert label in labels
+    assert "How far without GNSS?" in first
+    assert "wheel_separation_multiplier" in first
+    run = run_place / "icrtool-runs" / MOWER.stem
+    assert str(run.relative_to(run_place) / "report.html") in first
+    fitted, made = (run / "run.json").stat(), (run / "report.html").stat()
+    # The run is there: only the test is made again, with the same answer.
+    assert icrtool("report", MOWER, "--robot", "segway-rmp400") == (0, first, "")
+    assert (run / "run.json").stat().st_mtime_ns == fitted.st_mtime_ns
+    assert (run / "report.html").stat().st_mtime_ns > made.st_mtime_ns
+    status, second, _ = icrtool("report", MOWER, "--robot", "segway-rmp400", "-o", "mine.html", "--no-coordinates")
+    assert status == 0
+    assert "written to mine.html" in second
+    assert "left out" in Path("mine.html").read_text(encoding="utf-8")
+
+
+def test_a_run_of_other_settings_is_lost_only_with_overwrite(icrtool: Command, run_place: Path) -> None:
+    assert icrtool("fit", MOWER, "--robot", "segway-rmp400", "--plots", "none", "-q")[0] == 0
+    file = run_place / "icrtool-runs" / MOWER.stem / "run.json"
+    kept = file.read_bytes()
+    for command in (("fit", MOWER), ("report", MOWER), ("dropout-report", MOWER),
+                    ("fit", MOWER, "--robot", "segway-rmp400", "--from", "20")):  # fmt: skip
+        status, _, errors = icrtool(*command)
+        assert status == 1
+        assert "--overwrite" in errors
+        assert ("robot.name was segway-rmp400, now not given" in errors) == ("--from" not in command)
+        assert ("--from was not given, now 20" in errors) == ("--from" in command)
+        assert file.read_bytes() == kept
+    # The same settings again, in other words, and what is no setting of a fit.
+    words = ("--set", "dropout.horizons_m=[1, 2]", "--smooth", "--plots", "none", "-q")
+    assert icrtool("fit", MOWER, "--robot", "segway-rmp400", *words)[0] == 0
+    assert icrtool("fit", MOWER, "--overwrite", "--plots", "none", "-q")[0] == 0
+    assert json.loads(file.read_bytes())["config"]["robot"]["name"] is None
+
+
+def test_a_calibration_has_a_page(icrtool: Command, run_directory: Path) -> None:
+    assert icrtool("calibrate", run_directory, "-o", "season.json", "-q")[0] == 0
+    document = json.loads(Path("season.json").read_bytes())
+    status, output, errors = icrtool("report", "season.json")
+    assert (status, errors) == (0, "")
+    assert "season.html" in output
+    page = spaced(Path("season.html").read_text(encoding="utf-8"))
+    controller = document["controller"]
+    assert f"{controller['multiplier']:.3f} ± {controller['multiplier_std']:.3f}" in page
+    held_out = next(one for one in document["held_out_pooled"] if (one["model"], one["horizon_m"]) == ("no_slip", 10))
+    assert f"{held_out['p95_m']:.2f} / {held_out['expected_m']:.2f}" in page
+    for name in document["terms"]:
+        assert name.replace("_", "_<wbr>") in page
+    assert "diff_drive_controller" in page
+    assert document["logs"][0]["name"] in page
+    Path("season.json").write_text(json.dumps(document | {"parameters": {}}), encoding="utf-8")
+    status, _, errors = icrtool("report", "season.json", "-o", "other.html")
+    assert status == 1
+    assert errors.startswith("Error: season.json: ")
+    assert not Path("other.html").exists()
 
 
 def test_several_pages_do_not_go_into_one_file(icrtool: Command, run_directory: Path) -> None:

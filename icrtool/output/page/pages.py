@@ -15,6 +15,7 @@ from urllib.parse import quote
 
 import msgspec
 
+from icrtool.calibration.record import Calibration
 from icrtool.dropout_analysis.report import DropoutReport
 from icrtool.dropout_analysis.starts import with_smoothed_reference
 from icrtool.errors import RunError
@@ -26,7 +27,7 @@ from icrtool.output.files.formats import CHECKSUM_FILE, read_document, read_sums
 from icrtool.output.page.drive_data import ERROR_KEYS, drive_data, row_look
 from icrtool.output.page.render import Picture, drawn_pictures, pictures_in, render
 from icrtool.output.run_directory import PAGE_FILE, check_sum, is_page
-from icrtool.output.tables.calibration import transfer_blocks
+from icrtool.output.tables.calibration import calibration_file_blocks, transfer_blocks
 from icrtool.output.tables.configuration import format_settings
 from icrtool.output.tables.dropout import (
     answer_sections,
@@ -359,6 +360,15 @@ def _cell(value: float | None, text: Callable[[Any], str]) -> Cell:
 
 def _with_std(value: float | None, std: float | None, sign: str) -> Cell:
     return _cell(value, lambda number: plus_minus(number, std, sign=sign))
+
+
+def calibration_page(found: Calibration) -> str:
+    """Return the page of a calibration as HTML."""
+    title = found.name or found.robot.name or "calibration"
+    return render(
+        (), None, title=title, kind="Drive without GNSS: calibration of a robot",
+        blocks=calibration_file_blocks(found, title),
+    )  # fmt: skip
 
 
 COMPARISON_FAMILY = "icrtool/compare/"

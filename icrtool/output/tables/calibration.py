@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Iterator
+from contextlib import suppress
+from datetime import UTC, datetime
 from itertools import product
 
 from msgspec import UNSET
@@ -12,21 +15,23 @@ from icrtool import __version__
 from icrtool.calibration.error_growth import Forecast
 from icrtool.calibration.held_out import HeldOut
 from icrtool.calibration.pooled import CalibrationResult
-from icrtool.calibration.record import Calibration
+from icrtool.calibration.record import Calibration, unfit_reasons
 from icrtool.calibration.sensor_findings import LABELS
+from icrtool.errors import DataError
 from icrtool.kernels.arrays import Floats
 from icrtool.kernels.error_statistics import within_budget
 from icrtool.motion.models import TERMS
+from icrtool.output.exports.controllers import format_export
 from icrtool.output.files.formats import csv_bytes
 from icrtool.output.tables.dropout import parameter_table, reach_row
 from icrtool.output.tables.run import blocks_of_numbers
 from icrtool.output.text_blocks import PAGE, VERBOSE, Block, Chart, Facts, Figure, Items, Line, Section, Table, Title
-from icrtool.output.text_format import model_text, plus_minus
+from icrtool.output.text_format import controller_error_text, model_text, plus_minus
 from icrtool.records import calibration_document as documents
 from icrtool.records.acceptance import CHOICE_HORIZON_M
 from icrtool.records.fleet_document import BUDGET_M
 from icrtool.records.plain_data import known
-from icrtool.records.rows import shown_rows
+from icrtool.records.rows import MOST_USEFUL, in_order, shown_rows
 from icrtool.records.run import ICR_COLUMNS
 from icrtool.records.text import counted, distance_text, with_interval, with_std
 
@@ -60,6 +65,66 @@ def _result_blocks(result: CalibrationResult) -> list[Block]:
         Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
         Section(f"Motion model: {model_text(calibration.fitted)}", model, VERBOSE),
     ]
+
+
+def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
+    """Return what the page of a calibration file states: numbers, errors on other distance, parameters, logs."""
+    icrs = [(found.geometry[name], found.geometry_std[name]) for name in ICR_COLUMNS]
+    driven = distance_text(sum(log.distance_m for log in found.logs))
+    about = f"{found.robot.name or 'robot'}: {counted(len(found.logs), 'log')}, {driven}, {model_text(found.fitted)}"
+    made = f"{about}. Made {found.created or 'at an unknown time'} with icrtool {found.tool_version or 'unknown'}."
+    numbers = blocks_of_numbers(found.controller, found.width_m, icrs)
+    if alone := controller_error_text(found.controller_errors):
+        numbers.append(alone)
+    with suppress(DataError):
+        numbers += ["As a diff_drive_controller takes them:"]
+        numbers += [Line(format_export(found, "diff_drive_controller"), "as is")]
+    unknown = "; ".join(TERMS[name].meaning for name in found.fitted.not_shown)
+    parameters = [
+        parameter_table(found.fitted, found.fitted_with_gyro),
+        Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
+    ]
+    unfit = [one.text for one in unfit_reasons(found)]
+    head = ("log", "distance", "begins", "heading off", "wheels late")
+    logs = [
+        (one.name, distance_text(one.distance_m), _date_text(one.begin_ns), f"{one.heading_offset_deg:+z.2f}°",
+         f"{one.wheels_delay_s:+z.3f} s")
+        for one in found.logs
+    ]  # fmt: skip
+    return [
+        Line(f"Not fit for use: {'; '.join(unfit)}" if unfit else "", "bad"),
+        Title(title, made),
+        Section("Numbers for the controller", numbers, name="numbers"),
+        Section("Errors on distance that was not fitted", list(_held_out_tables(found)), name="held-out"),
+        Section("Parameters of the motion model", parameters, name="parameters"),
+        Section("Logs", [Table("lr", logs, head)], name="logs"),
+        Section("Warnings", [Items(found.warnings) if found.warnings else "None."], name="warnings"),
+    ]
+
+
+def _held_out_tables(found: Calibration) -> Iterator[Block]:
+    """Yield p95 and expected error of each model by horizon, of all held-out trials and of each log or block."""
+    horizons = sorted({one.horizon_m for one in found.held_out_pooled})
+    pooled = {(one.model, one.horizon_m): one for one in found.held_out_pooled}
+    head = ("model", *(f"{horizon:g} m" for horizon in horizons))
+    rows = [
+        (name, *(_errors_text(pooled.get((name, horizon))) for horizon in horizons))
+        for name in in_order({one.model for one in found.held_out_pooled})
+    ]
+    yield Table("lr", rows, head, "95 % / expected error [m] of all trials together")
+    each = {(one.log, one.horizon_m): one for one in found.held_out if one.model == MOST_USEFUL}
+    names = dict.fromkeys(one.log for one in found.held_out)
+    rows = [(name, *(_errors_text(each.get((name, horizon))) for horizon in horizons)) for name in names]
+    caption = f"The row {MOST_USEFUL}, each log or block of distance predicted without itself"
+    yield Table("lr", rows, ("left out", *head[1:]), caption)
+
+
+def _date_text(stamp_ns: int) -> str:
+    return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC" if stamp_ns else "not known"
+
+
+def _errors_text(one: documents.PooledScore | None) -> str:
+    return "–" if one is None else f"{one.p95_m:.2f} / {one.expected_m:.2f}"
 
 
 def held_out_blocks(table: HeldOut) -> list[Block]:

@@ -304,13 +304,13 @@ def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Tab
 def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:
     """Return what a controller is given, the error with these numbers alone, and its configuration."""
     if report.recommended is None or summary.config.robot.track_width_m is None:
-        return Section("Which numbers into the controller?", number_blocks(summary), VERBOSE)
+        return Section("Which numbers into the controller?", number_blocks(summary))
     calibration = stored_calibration(report.recommended)
     blocks = number_blocks(summary, calibration.controller)
     if alone := controller_error_text(calibration.controller_errors):
-        blocks.append(alone)
+        blocks.append(Section("", [alone], VERBOSE))
     with suppress(DataError):
         text = format_export(calibration, "diff_drive_controller")
         other = "Other controllers: icrtool export --for clearpath RUN"
         blocks.append(Section("As a diff_drive_controller takes them", [Line(text, "as is"), other], PAGE))
-    return Section("Which numbers into the controller?", blocks, VERBOSE)
+    return Section("Which numbers into the controller?", blocks)

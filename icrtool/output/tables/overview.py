@@ -175,9 +175,13 @@ def verdict(run: Run | None, problem: IcrToolError | None, names: Sequence[str])
 
 
 def next_command(log: str, options: Sequence[str], run: Run | None) -> str | None:
-    """Return the command to run next with a log, by the options of this one; None where it is of no use."""
+    """Return the command to run next with a log, by the options of this one; None where it is of no use.
+
+    Without a track width it has ``--robot NAME``, which stands for what the user has to give.
+    """
     if run is None or not run.usable:
         return None
+    options = [*options, *(() if run.document.config.robot.track_width_m is not None else ("--robot", "NAME"))]
     cut = "--from" in options or "--to" in options
     command = "fit" if cut else "dropout-report"
     return shlex.join(["icrtool", command, log, *options])
