@@ -137,7 +137,9 @@ def changed_settings(directory: Path, config: Config, request: FitRequest) -> li
     found = []
     for section, values in now.items():
         stored = before.get(section)
-        for key, value in values.items() if section != "dropout" and isinstance(stored, dict) else ():
+        if section == "dropout" or not isinstance(stored, dict):
+            continue
+        for key, value in values.items():
             name = f"{section}.{key}"
             if name not in left_out and key in stored and not _same(stored[key], value):
                 found.append(f"{named.get(name, name)} was {_stated(stored[key])}, now {_stated(value)}")

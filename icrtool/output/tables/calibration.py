@@ -80,7 +80,7 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
         numbers += ["As a diff_drive_controller takes them:"]
         numbers += [Line(format_export(found, "diff_drive_controller"), "as is")]
     unknown = "; ".join(TERMS[name].meaning for name in found.fitted.not_shown)
-    parameters = [
+    parameters: list[Block] = [
         parameter_table(found.fitted, found.fitted_with_gyro),
         Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
     ]
