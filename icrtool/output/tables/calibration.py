@@ -85,7 +85,7 @@ def calibration_file_blocks(found: Calibration, title: str) -> list[Block]:
         Facts([("not found", unknown and f"too small, or not driven; taken as usual: {unknown}")]),
     ]
     unfit = [one.text for one in unfit_reasons(found)]
-    head = ("log", "distance", "begins", "heading off", "wheels late")
+    head = ("log", "distance", "begins", "heading off", "wheels lag")
     logs = [
         (one.name, distance_text(one.distance_m), _date_text(one.begin_ns), f"{one.heading_offset_deg:+z.2f}°",
          f"{one.wheels_delay_s:+z.3f} s")
