@@ -1,4 +1,4 @@
-"""Types of arrays; integrals, rows at steps of what never decreases, runs and spans, angles, turns by quaternions."""
+"""Types of arrays; integrals, rows at steps of ascending values, runs and spans, angles, turns by quaternions."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def unwrapped(angle: Floats) -> Floats:
 
 
 ROWS_AT_ONCE = 1 << 16
-"""Bounds memory."""
+"""Rows that are processed at once: the number bounds the memory."""
 
 
 def rows_at_steps(progress: Floats, step: float) -> Ints:
@@ -59,7 +59,7 @@ def rows_at_steps(progress: Floats, step: float) -> Ints:
 
 
 def rows_of_cells(progress: Floats, cells_of: Callable[[Floats], Floats]) -> Ints:
-    """Return the first row of each cell (from 0 on) of what never decreases; `cells_of` is called for parts of it."""
+    """Return the first row of each cell, from 0 on, of values that never decrease; `cells_of` gets parts of them."""
     found, last = [np.empty(0, np.int64)], -1.0
     for lo in range(0, len(progress), ROWS_AT_ONCE):
         cell = cells_of(progress[lo : lo + ROWS_AT_ONCE])

@@ -1,7 +1,7 @@
 """One decorator for every compiled kernel, and where its machine code is kept.
 
 numba compiles a kernel when it is first called on a computer. The object file is kept, and later processes run it
-through llvmlite, on which numba stands: to import numba takes longer than all else that a command loads.
+through llvmlite, the library below numba, because to import numba takes longer than all other imports of a command.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ _OPTIONS = {"nogil": True, "error_model": "numpy"}
 lets another thread read files while a kernel runs."""
 
 _BARE = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
-"""Options of machine code that `Kernel` calls itself: without the wrappers by which Python and C would, which take a
-fifth of the time to compile. No kernel allocates an array, so none counts references to them (``_nrt``): that took a
-third of the filter's time."""
+"""Options of machine code that `Kernel` calls itself. The wrappers for calls from Python and C are left out: they take
+a fifth of the compile time. Reference counts of arrays (``_nrt``) are left out, because no kernel allocates an array:
+they took a third of the filter's time."""
 
 _MATHEMATICS = {"atan2", "ceil", "cos", "exp", "floor", "fmod", "hypot", "log", "pow", "sin", "sqrt", "tan"}
-"""Functions of the C library, which every process has. Machine code that calls others runs only beside numba."""
+"""Functions of the C library, which every process has. Machine code that calls other functions needs numba in the
+process."""
 
 _POINTER, _INTEGER, _FLOAT, _BOOL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_bool
 _LLVM_TYPES = {_POINTER: "ptr", _INTEGER: "i64", _FLOAT: "double", _BOOL: "i8"}
@@ -235,8 +236,8 @@ def _writable(value: object) -> object:
 def _numba() -> ModuleType:
     """Return numba, loaded without scipy's BLAS, with the parts of kernels that were marked until now.
 
-    To look for BLAS takes longer than all the rest. No kernel multiplies matrices; numba finds it again when someone
-    else's does.
+    The search for BLAS takes longer than the rest of the import. No kernel multiplies matrices; numba searches again
+    when a function of another package does.
     """
     numba, extending = (importlib.import_module(name) for name in ("numba", "numba.extending"))
     blas = "scipy.linalg.cython_blas"
@@ -265,7 +266,7 @@ def _machine(level: int = 0) -> llvm.TargetMachine:
 def processor() -> tuple[str, str]:
     """Return the name of the processor that is compiled for, and its features.
 
-    By numba's settings for both, of which ``NUMBA_ENABLE_AVX`` counts for what numba itself runs alone.
+    Numba's settings for both apply; ``NUMBA_ENABLE_AVX`` applies only to code that numba itself runs.
     """
     name = os.environ.get("NUMBA_CPU_NAME") or llvm.get_host_cpu_name()
     own = "" if name == "generic" else llvm.get_host_cpu_features().flatten()
@@ -290,7 +291,7 @@ def _stamp() -> tuple[str, ...]:
 
 
 def cache_places() -> list[Path]:
-    """Return where machine code may be kept: ``NUMBA_CACHE_DIR``, else beside the package, or in the user's cache."""
+    """Return where machine code may be kept: ``NUMBA_CACHE_DIR``, else a folder of the package, or the user's cache."""
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(given)]
     found = [Path(__file__).parent / "__pycache__"]
@@ -312,11 +313,11 @@ def writable_place() -> Path | None:
 
 
 def _keep(name: str, content: bytes) -> None:
-    """Keep a file where it can be; on a full disk, or where nothing can be written, it serves this process alone."""
+    """Write a file to the cache; if that fails (full disk, no place to write), only this process uses the code."""
     place = writable_place()
     if place is None:
         return
-    # as readable as other files: who builds an image is not who runs it
+    # readable for other users: one user builds an image, another one runs it
     temporary = place / f"{name}.{os.urandom(8).hex()}"
     with suppress(OSError):
         try:
@@ -341,7 +342,7 @@ def njit_part(function: Function) -> Function:
 
     Notes
     -----
-    A plain number in a call is a constant to the compiled function, of which there is one copy for each.
+    Numba takes a plain number in a call as a constant, and compiles one copy of the function for each number.
     """
     _parts.append(function)
     return function

@@ -41,7 +41,8 @@ from icrtool.kernels.kalman import correct, propagate, smooth_passes, store
 from icrtool.kernels.kinematics import step_jacobian, wheel_speed
 
 NORTH, EAST, PSI = (cast(int, np.int64(axis)) for axis in range(3))
-"""Which state is measured. Typed: numba compiles one more copy of a function for every plain number in a call."""
+"""Rows of the state that are measured. They are typed, because numba compiles a further copy of a function for every
+plain number in a call."""
 
 CHANGE, FIX, HEADING, WHEELS = range(4)
 """Kinds of events, in their order at equal stamps: terrain changes, fixes, headings, wheel samples."""
@@ -115,9 +116,9 @@ def keep_sides(x: Floats, P: Floats, least: float) -> None:
 def take_fix(
     data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, out: FilterOutput
 ) -> tuple[float, float, float]:
-    """Gate and apply a fix, and fill its row of the output; return what it adds to P (3,) first.
+    """Gate and apply a fix, and fill its row of the output; return the variances (3,) added to P before the update.
 
-    A fix that ends a lock-out makes north and east uncertain by its innovation [m^2]; others add nothing.
+    A fix that ends a lock-out adds its squared innovation to the variances of north and east [m^2]; others add 0.
     North and east are applied one after the other, which equals the joint update since their noises are independent.
     """
     x, P, run = state.x, state.P, state.rejected[0]
@@ -155,7 +156,7 @@ def take_fix(
 def take_heading(
     data: FilterInputs, row: int, state: FilterState, parameters: FilterParameters, PH: Floats, out: FilterOutput
 ) -> tuple[float, float, float]:
-    """Gate and apply a heading, and fill its row of the output; return what it adds to P (3,) first.
+    """Gate and apply a heading, and fill its row of the output; return the variances (3,) added to P before the update.
 
     The gate tests this sample alone (variance r). The update uses variance r times the correlation, because the errors
     of neighbouring samples are not independent.
@@ -186,12 +187,12 @@ def advance(
     """Propagate by dt [s] (Eqs. 14, 16) and add the process noise and the path length by the wheels.
 
     Through a gap in the wheel data, and through slip, the pose is not dead-reckoned: only its uncertainty grows, and
-    the next measurement does not change the ICRs; ``space.G`` becomes 0. These wander with the wheels' travel, through
-    a gap as before it: a parked robot keeps what it has learned.
+    the next measurement does not change the ICRs; ``space.G`` becomes 0. The variance of the ICRs grows with the
+    distance that the wheels travel, in a gap too: the ICRs of a parked robot keep their variance.
 
     Parameters
     ----------
-    k : next wheel sample, before which the speeds of the one before hold
+    k : next wheel sample; until its stamp the speeds of sample k - 1 hold
     """
     x, P, G, held = state.x, state.P, space.G, max(k - 1, 0)
     v_left, v_right = data.v_left[held], data.v_right[held]
@@ -223,7 +224,7 @@ def advance(
 
 @njit_part
 def begin_node(nodes: Nodes, m: int, state: FilterState, dt: float, G: Floats) -> None:
-    """Keep in node m what is predicted there, dt [s] after the node before."""
+    """Store in node m the state that is predicted there, dt [s] after the node before."""
     store(state.x, state.P, nodes.x_predicted, nodes.P_predicted, m)
     for i in range(3):
         for j in range(4):
@@ -232,7 +233,7 @@ def begin_node(nodes: Nodes, m: int, state: FilterState, dt: float, G: Floats) -
 
 @njit_part
 def end_node(nodes: Nodes, m: int, state: FilterState, row: int, more: tuple[float, float, float]) -> None:
-    """Keep in node m what is left after an event, which added to P first, and the wheel sample recorded there."""
+    """Store in node m the state after an event, the variances that the event added to P, and the wheel sample."""
     store(state.x, state.P, nodes.x, nodes.P, m)
     nodes.row[m] = row
     for axis in range(3):
@@ -257,7 +258,7 @@ def filter_events(
     Parameters
     ----------
     first, begin : wheel sample of the first column of ``out.states``, and of the first state that is recorded now
-    nodes : filled with every time of events; None: nothing is kept, compiled as a function of its own
+    nodes : filled with every time of events; None: no node is stored (numba compiles a function of its own for None)
     """
     count, recorded, k = 0, True, begin
     for i in range(len(events.t)):
@@ -373,7 +374,7 @@ def run_smoother(
     for (begin, end), state in zip(reversed(chunks), reversed(saved), strict=True):
         nodes = filter_rows(data, begin, end, state, parameters, forward, begin, keep=True)
         count = len(nodes.row)
-        # the last node is smoothed: the first of the chunk that follows, or that of the end
+        # the last node is smoothed already: it is the first node of the next chunk, or the end of the run
         nodes = Nodes._make(np.concatenate(columns) for columns in zip(nodes, following, strict=True))
         F = np.tile(np.eye(6), (len(nodes.row) - 1, 1, 1))
         F[:, :3, 2:] += nodes.G[1:]

@@ -19,8 +19,8 @@ class Parts(NamedTuple):
     Attributes
     ----------
     first : (p + 1,) first residual of each part, and the number of all
-    own : so many parameters, c, are each part's own. A Jacobian (m, k + c) has them behind the k shared ones; all
-        parameters (k + p c,) are the shared ones, then those of each part
+    own : number c of parameters that each part has for itself. A Jacobian (m, k + c) has their columns behind the k
+        shared ones; the vector of all parameters (k + p c,) holds the shared ones, then part after part
     """
 
     first: Ints
@@ -32,7 +32,7 @@ class Parts(NamedTuple):
         return jacobian[:, :shared], jacobian[:, shared:]
 
     def by_residual(self, of_parts: Floats) -> Floats:
-        """Return what belongs to the part of each residual (m, ...), from that of each part (p, ...)."""
+        """Return for each residual (m, ...) the entry of its part, from entries by part (p, ...)."""
         return np.repeat(of_parts, np.diff(self.first), axis=0)
 
     def change(self, jacobian: Floats, step: Floats) -> Floats:
@@ -50,8 +50,8 @@ class Elimination(NamedTuple):
     Attributes
     ----------
     step : (k + p c,) of all parameters
-    decrease : of twice the cost, as far as the normal equations predict it
-    gain : (p, c, k): a step s of the shared parameters moves those of a part by -gain s
+    decrease : decrease of twice the cost that the normal equations predict
+    gain : (p, c, k): a step s of the shared parameters moves the parameters of a part by -gain s
     """
 
     step: Floats
@@ -78,7 +78,7 @@ def eliminate(
     Parameters
     ----------
     residuals, jacobian, weights : (m,), (m, k + c), (m,)
-    pull, away : (k + p c,) information of the prior, and parameters less its mean
+    pull, away : (k + p c,) information of the prior; parameters minus the prior's mean
     """
     count, q, c = len(parts.first) - 1, jacobian.shape[1], parts.own
     k = q - c

@@ -42,20 +42,26 @@ class Histogram(NamedTuple):
 
 SHARES = {"p50": 0.5, "p95": 0.95}
 
-FEWEST_PATH_BLOCKS, MOST_PATH_BLOCKS, HORIZONS_A_BLOCK = 3, 8, 4
-"""Blocks of at least so many horizons: what wanders over some horizons makes shorter ones alike. A path of less than
-twelve horizons is too short for an interval. More than eight blocks would be narrower by a sixth at most (Student's
-factor is 2.36, without limit 1.96), and less independent."""
+FEWEST_PATH_BLOCKS = 3
+"""Least number of blocks of path for an interval: a path of less than twelve horizons has no interval."""
+
+MOST_PATH_BLOCKS = 8
+"""Largest number of blocks of path. More blocks make an interval narrower by at most a sixth (Student's factor is 2.36
+with eight blocks, 1.96 without limit), and the blocks are less independent."""
+
+HORIZONS_A_BLOCK = 4
+"""Least length of a block, in horizons: errors that change slowly over some horizons make shorter blocks alike."""
 
 PRIOR_FREEDOM = 6.0
-"""Degrees of freedom of the spread that is known of other drives: it counts as much as seven blocks of path."""
+"""Degrees of freedom of the spread that is known of other drives: it has the weight of seven blocks of path."""
 
 LEVEL, NORMAL_FACTOR = 0.95, 1.959964
-"""Probability that the interval of a number of this drive holds the truth, and the standard deviations of a normal
-value that reach it."""
+"""Probability that the interval of a number of this drive contains the true value, and the normal quantile of that
+probability (two-sided) in standard deviations."""
 
 NEXT_LEVEL, NEXT_NORMAL_FACTOR = 0.90, 1.644854
-"""The same of the interval of the next drive's number."""
+"""Probability that the interval of the next drive contains its number, and the normal quantile of that probability
+(two-sided)."""
 
 
 class Spread(NamedTuple):
@@ -151,12 +157,12 @@ def variance_of_sum(influence: Floats) -> float:
 
 
 def student_factor(freedom: float, z: float = NORMAL_FACTOR) -> float:
-    """Return the standard deviations that half an interval is long, for a deviation estimated from data.
+    """Return half the length of an interval in standard deviations, where the deviation is estimated from data.
 
     Parameters
     ----------
     freedom : degrees of freedom of the estimate
-    z : the standard deviations of a normal value
+    z : half the length in standard deviations, where the deviation is known
 
     Notes
     -----
@@ -179,8 +185,8 @@ def pooled_variance(measured: float, freedom: float, known: float) -> tuple[floa
 
     Notes
     -----
-    The mean of both, each with its degrees of freedom (those of the known one: `PRIOR_FREEDOM`): the posterior scale of
-    a normal variance under its conjugate prior.
+    The mean of both, weighted by their degrees of freedom (`PRIOR_FREEDOM` for the known variance): the posterior scale
+    of a normal variance under its conjugate prior.
     """
     together = PRIOR_FREEDOM + freedom
     return (PRIOR_FREEDOM * known + freedom * measured) / together, together
@@ -217,14 +223,14 @@ def error_intervals(
 
     Notes
     -----
-    Normal logarithms, Student's t (1908). The variance of a drive is the one that its blocks show, pooled with the one
-    that drives of its length have (`pooled_variance`): few blocks alone would give intervals of any width. p95 moves
-    as the root mean square does, which blocks show better than the few trials above p95; their variance is the larger
-    of both. Of short paths p95 is smaller than of long ones, in its logarithm by about its variance: the upper end is
-    further away by it. The interval of this drive's p95 does not go below its median, nor above the interval of the
-    next drive.
+    Normal logarithms, Student's t (1908). The variance of a drive is the variance that its blocks show, pooled with the
+    variance of drives of its length (`pooled_variance`), because few blocks alone would give intervals of any width.
+    p95 changes as the root mean square does, which blocks show better than the few trials above p95; the larger of both
+    variances is used. p95 is smaller on short paths than on long ones: its logarithm by about its variance, and the
+    upper end is raised by that variance. The interval of this drive's p95 does not go below its median, nor above the
+    interval of the next drive.
 
-    The next drive, of the same length, has its own variance of a finite path, and the variance between drives.
+    The next drive, of the same length, adds the variance of its own finite path and the variance between drives.
     """
     if blocks is None or not math.isfinite(p95_m):
         return Intervals(*(math.nan,) * 6)
@@ -315,7 +321,7 @@ def block_sums(
 
 
 PERCENTILE_CELLS = 1024
-"""So many that few errors are in one."""
+"""Cells into which errors are sorted to find a percentile: one cell then holds few errors."""
 
 
 def count_cells(errors_m: Floats, width_m: float) -> tuple[NDArray[np.int16], Ints]:
@@ -355,7 +361,7 @@ class RankedTrials(NamedTuple):
         last = len(self.errors_m) - 1
         rank = share * last
         ranks = np.array([math.floor(rank), min(math.floor(rank) + 1, last)])
-        # plain numbers: comparing with those of numpy would widen the cells
+        # Python numbers: a comparison with numpy's numbers would widen the type of the cells
         begin, end = (np.searchsorted(self.before, ranks, side="right") - 1).tolist()
         near = self.errors_m[(self.cell >= begin) & (self.cell <= end)]
         ranks -= self.before[begin]
@@ -377,9 +383,9 @@ class RankedTrials(NamedTuple):
 
 
 BLOCK_PARTS = 4
-"""Blocks begin at every quarter of a horizon."""
+"""Parts of a horizon: blocks begin at every quarter of a horizon."""
 HISTOGRAM_BINS = 50
-"""Of a histogram, up to its largest error or less."""
+"""Number of bins from zero to the largest error; a histogram has this number or fewer."""
 
 
 def error_summary(errors_m: Floats) -> Summary:
@@ -396,7 +402,7 @@ def error_summary(errors_m: Floats) -> Summary:
 
 
 def cut_blocks(tried: Bools, path_m: Floats, horizon_m: float) -> Blocks | None:
-    """Cut the path of one horizon's trials into blocks of equal length, so many horizons at least.
+    """Cut the path of one horizon's trials into blocks of equal length, at least `HORIZONS_A_BLOCK` horizons.
 
     Parameters
     ----------
@@ -432,17 +438,17 @@ def round_bin_width(largest_m: float) -> float:
 
 
 def within_budget(horizons_m: Floats, p95_m: Floats, budget_m: float) -> tuple[float, bool, tuple[float, float]] | None:
-    """Return how far an error (h,) [m] stays within a budget, over the distance (h,) [m] and from 0 m at 0 m on.
+    """Return the distance up to which errors (h,) [m] at distances (h,) [m] stay within a budget; 0 m at 0 m.
 
     Returns
     -------
-    The interpolated distance, whether the error is within the budget at the last one, and the distances interpolated
-    between; None without errors.
+    The interpolated distance, whether the error is within the budget at the last distance, and the two distances
+    between which it was interpolated; None without errors.
 
     Notes
     -----
-    Errors at few trials may fall with the distance; here they are those that never fall and are nearest to the given
-    ones (isotonic regression, Barlow et al. 1972: the largest over beginnings of the smallest mean over ends).
+    With few trials the errors may fall with the distance. They are replaced by the nearest values that never fall
+    (isotonic regression, Barlow et al. 1972: the largest over beginnings of the smallest mean over ends).
     """
     known = np.isfinite(p95_m)
     if not known.any():

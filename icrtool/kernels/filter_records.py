@@ -31,18 +31,18 @@ class FilterParameters(NamedTuple):
     Attributes
     ----------
     process_variance : diagonal of Q, six of [(m/s)^2, (m/s)^2, (rad/s)^2, (m/s)^2 x 3], Eq. 30
-    rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q, that of the ICRs by the wheels' travel: dt times
-        their speed over 1 m/s
-    step_heading : the part of a step's turn after which its displacement is turned into the world: 0 at the start
-        (Euler, Eq. 14), 0.5 in the middle, where the displacement of an arc points
+    rate_invariant : add Q * 0.01 s * dt instead of the paper's dt^2 Q; for the ICRs, dt is multiplied by the speed of
+        the wheels over 1 m/s
+    step_heading : share of a step's turn that is added to the heading before the displacement is rotated into the
+        world: 0 for the heading at the start (Euler, Eq. 14), 0.5 for the middle, the direction of an arc's chord
     gnss_gate, heading_gate : largest NIS accepted; inf accepts all
-    heading_correlation : a heading sample counts as 1 / this of an independent one: neighbours err together
+    heading_correlation : number of heading samples that count as one: the errors of neighbours are correlated
     antenna_forward, antenna_right : lever arm of the antenna [m], body frame
     wheel_gap_s : a longer interval between wheel samples is not dead-reckoned
     gap_speed_variance, gap_turn_variance : growth through such a gap [m^2/s, rad^2/s]
     recovery_count, recovery_s : consistent rejected measurements, and their least duration, that end a lock-out
     icr_inflation_m2 : ICR variances after a terrain change (Section 5.2)
-    least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: anywhere
+    least_icr : y_icr_right stays above this, y_icr_left below its negative [m]; -inf: no limit
     guard : sign guard of the kinematics, one of the above: PRINTED in preset ``paper``, UNGUARDED in studies only
     """
 
@@ -118,7 +118,7 @@ class FilterOutput(NamedTuple):
 
     @classmethod
     def empty(cls, data: FilterInputs, rows: int) -> FilterOutput:
-        """Return the output of a run of so many recorded states, before it has run."""
+        """Return the output of a run that records `rows` states, before it has run."""
         m, h = len(data.gnss_t), len(data.heading_t)
         shapes = (m, m, (m, 2), h, h)
         nis, det, residual, heading_nis, innovation = (np.full(shape, np.nan) for shape in shapes)
@@ -208,6 +208,6 @@ class Nodes(NamedTuple):
 
     @classmethod
     def empty(cls, count: int) -> Nodes:
-        """Return so many nodes, to be filled."""
+        """Return `count` nodes, to be filled."""
         x, P, G = (count, 6), (count, 6, 6), (count, 3, 4)
         return cls(np.empty(x), np.empty(P), np.empty(x), np.empty(P), np.zeros(G), np.empty(count, np.int64))

@@ -135,5 +135,5 @@ def slide(  # noqa: PLR0915 - the equations of one step, in the order in which t
             east += dt * (u * math.sin(middle) + v_y * math.cos(middle))
             psi += dt * omega
             driven += dt * math.sqrt(u * u + v_y * v_y)
-        # What is held over the step is what the tracks travelled.
+        # The mean speed over the step, which gives the distance that the tracks travelled.
         tracks[k, 0], tracks[k, 1] = mean_left, mean_right

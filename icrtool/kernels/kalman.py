@@ -4,11 +4,11 @@ One propagate, one correct, one step back. The covariance P is (k, k), symmetric
 x (k,). Kalman 1960; Rauch, Tung, Striebel 1965. Sizes are arguments: a plain number in a call is a constant to the
 compiler, which then unrolls the loops.
 
-The heading has linear constants and slowly varying errors beside it, event by event: x = (heading, bias, scale error,
-further ones). Between events the heading grows by (1 + scale) turn - bias dt, with turn the integrated rate; further
-states stay, or decay to zero. Every event measures one number: z = h x + noise, wrapped where it is an angle. An
-innovation beyond `HUBER_SIGMAS` counts as one of that size (bounded influence: Masreliez and Martin 1977). States that
-are uncertain, but not estimated: Schmidt 1966.
+The filter of a heading goes event by event. Its state is x = (heading, bias, scale error, further ones): the heading,
+constants and slowly varying errors. Between events the heading grows by (1 + scale) turn - bias dt, with turn the
+integrated rate; further states stay, or decay to zero. Every event measures one number: z = h x + noise, wrapped where
+it is an angle. An innovation beyond `HUBER_SIGMAS` counts as one of that size (bounded influence: Masreliez and Martin
+1977). States that are uncertain, but not estimated: Schmidt 1966.
 """
 
 from __future__ import annotations

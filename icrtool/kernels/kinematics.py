@@ -1,6 +1,6 @@
 """The skid-steer ICR kinematics (Pentzer 2014, Eqs. 8-12, 14, 17, 27-29, 32-34): velocities, one step, its Jacobian.
 
-And the true motion of a robot of known ICRs. While track speeds and ICRs are constant the body moves on a circle
+Also the true motion of a robot with known ICRs. While track speeds and ICRs are constant the body moves on a circle
 (Section 2), so a true step is an arc, not an Euler step: it does not depend on the filter's own steps (Eq. 14).
 """
 
@@ -47,7 +47,7 @@ def body_velocity(
 
 @njit_part
 def wheel_speed(v_left: Number, v_right: Number) -> Number:
-    """Return the speed of the wheels (|V_l| + |V_r|) / 2 [m/s]: that of a spin on the spot is not zero."""
+    """Return the speed of the wheels (|V_l| + |V_r|) / 2 [m/s]: it is not zero in a spin on the spot."""
     return 0.5 * (abs(v_left) + abs(v_right))
 
 
@@ -72,7 +72,7 @@ def step_jacobian(
 
     Parameters
     ----------
-    step_heading : the part of the step's turn after which its displacement is turned into the world
+    step_heading : as in `FilterParameters`
     guard : `GUARDED`, `UNGUARDED` or `PRINTED`
     G : (3, 4) becomes F - I: derivatives of the step by psi, y_r, y_l, x_v; all others are zero
 
@@ -152,7 +152,7 @@ def poses_at(
 
 
 def follow(command: Floats, t: Floats, lag_s: float) -> Floats:
-    """Return the speed (n,) of a track that follows its command (n,) [m/s] as a first-order lag, from rest with it.
+    """Return the speed (n,) of a track that follows its command (n,) [m/s] with a first-order lag, from command[0] on.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def follow(command: Floats, t: Floats, lag_s: float) -> Floats:
 
 @njit
 def lag(speed: Floats, kept: Floats) -> None:
-    """Replace a command (n,) by what follows it; (n - 1,) of the difference is kept from one to the next."""
+    """Replace a command (n,) by the lagged speed; `kept` (n - 1,): share of the difference left after each step."""
     command = speed[0]
     for k in range(len(kept)):
         command, speed[k + 1] = speed[k + 1], command + (speed[k] - command) * kept[k]
@@ -198,7 +198,7 @@ def model_states(
 
 
 def chord_rows(north: Floats, east: Floats, step_m: float) -> Ints:
-    """Return the first row (c,) and each that is the first at least a step away from the one before it.
+    """Return rows (c,): the first one, then each first row at least `step_m` away from the row returned before.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Open-loop propagation from recorded states: one path, all trials step by step, and the same errors far sooner.
+"""Open-loop propagation from recorded states: one path, all trials step by step, and a fast form of the same errors.
 
 The dropout analysis of Pentzer 2014, Section 6.4: freeze the ICRs estimated at a state, drive on with wheel speeds
 alone, and compare with the reference when the path has grown by a horizon. `open_loop_errors_direct` integrates every
@@ -16,7 +16,7 @@ around the centre a_c of a block of starts, with half width w and a = a_c + w q,
 
 so a few prefix sums (the moments m = 0, 1, ...) serve every start of the block by a polynomial in q. Their number
 follows from w max|D|. One sine and cosine a state do for all moments; interpolation between Chebyshev nodes in a takes
-as many sums but a sine and cosine for each of them, and was 1.7 times slower.
+the same number of sums, but a sine and cosine for each sum, and was 1.7 times slower.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from icrtool.kernels.kinematics import MIN_ICR_SEPARATION_M, euler_step
 from icrtool.kernels.track import FrozenIcrs, OpenLoopPath, Track
 
 Columns = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
-"""Of a track that is made of states: held, v_left, v_right, north, east, heading."""
+"""Columns of a track that is made of states: held, v_left, v_right, north, east, heading."""
 
 
 @njit
@@ -89,7 +89,7 @@ def compiled_columns(track: Track) -> Columns:
 
     Notes
     -----
-    Kernels refuse a read-only column, as pandas hands those out.
+    Kernels refuse a read-only column, and pandas returns read-only columns.
     """
     columns = (track.held, track.v_left, track.v_right, track.north, track.east, track.heading)
     held, left, right, north, east, heading = (np.require(one, np.float64, ["C", "A", "W"]) for one in columns)
@@ -175,9 +175,11 @@ MAX_MOMENTS = 16
 MIN_BLOCK = 8
 """Blocks of this size are integrated directly instead of split: that is not slower."""
 BLOCK = 4096
-"""Starts a block (at least as many as the states of its first trial: then the window is about twice the block)."""
+"""Starts of a block. A block has at least one start for each state of its first trial: the window is then about twice
+the block."""
 CONSTANT_BLOCK = 8192
-"""The same where every start has the same ICRs: one moment is enough for any block, and longer blocks share more."""
+"""Starts of a block where every start has the same ICRs: one moment is enough for any block, and longer blocks share
+more."""
 MAX_BLOCK = 32768
 """Starts of the longest block, and states whose moments are kept at once: bounds the memory to a few MB."""
 _EPS = 2.220446049250313e-16
@@ -281,7 +283,7 @@ def sum_moments(
 
 
 def freeze_starts(plan: BlockPlan, icrs: FrozenIcrs, heading: Floats, turn: Floats) -> Floats:
-    """Return what each start keeps (k, 7): q, the factors of the left and the right sum, and, still 0, its own place.
+    """Return the constants of each start (k, 7): q, the factors of the left and the right sum, and its place, still 0.
 
     The factors are a e^{j(psi - a D)} (y_r - j x) and a e^{j(psi - a D)} (y_l - j x).
     """
@@ -305,11 +307,12 @@ def fill_errors(
     Parameters
     ----------
     ends, errors : (horizons, starts); row_lo : the block's first start there, which is state `start`
-    frozen : of `freeze_starts`; the place of each start is filled in where its state is among those of `sums`
+    frozen : of `freeze_starts`; the place of each start is filled in where its state is a state of `sums`
 
     Notes
     -----
-    A trial is the polynomial in q whose coefficients are the moments at its end (Horner), less that at its start.
+    The displacement of a trial is the polynomial in q with the moments at its end as coefficients (Horner), minus the
+    polynomial at its start.
     """
     for h in range(-1, len(ends)):
         for s in range(len(frozen)):
@@ -367,7 +370,7 @@ def solve_block(
 
 
 def open_loop_errors(track: Track, icrs: FrozenIcrs, ends: Rows, lo: int = 0) -> Floats:
-    """Return what `open_loop_errors_direct` returns, equal to 1e-9 m, far sooner."""
+    """Return what `open_loop_errors_direct` returns, equal to 1e-9 m, in far less time."""
     by_horizon = np.ascontiguousarray(ends.T)
     errors = np.empty(by_horizon.shape)
     fill_open_loop_errors(track, icrs, by_horizon, errors, 0, len(ends), lo)

@@ -1,8 +1,8 @@
 """Robust statistics and robust least squares: median absolute deviation, loss weights, Gauss-Newton with priors.
 
-The one place for them. Residuals of overlapping windows are not independent of one another: the data count as one
-residual in `overlap` beside the prior, and the covariance takes its spread from groups of residuals (a stretch of
-distance of one log), not from single ones.
+Residuals of overlapping windows are not independent. Where the data are weighed against the prior, `overlap` residuals
+count as one. The covariance is computed from the spread between groups of residuals (a stretch of distance of one log),
+not between single residuals.
 """
 
 from __future__ import annotations
@@ -23,16 +23,20 @@ LOSS_SIGMAS = 2.0
 """Where the loss turns from square to linear, in robust standard deviations."""
 
 SMALLEST_SCALE = 1e-5
-"""Residuals of an exact fit have no spread. No sensor is as exact as this [m, rad]; with less, the information of what
-exact data show is beyond 16 digits of that of a prior, and the covariance of what they do not show is of rounding."""
+"""Smallest robust standard deviation of residuals [m, rad]; no sensor is as exact. Residuals of an exact fit have no
+spread: with a smaller value the information of exact data would exceed the information of a prior by 16 digits, and the
+covariance of parameters that the data do not show would be rounding error."""
 
 LAST_STEP_SIGMAS = 0.03
 """A Gauss-Newton step shorter than this in standard deviations, all parameters together, is the last one."""
 
 MOST_HALVINGS = 6
 
-FEWEST_CORRELATED_BLOCKS, LARGEST_CORRELATION = 8, 0.9
-"""A correlation between neighbours is estimated from at least so many, and limited to this."""
+FEWEST_CORRELATED_BLOCKS = 8
+"""Least number of values from which a correlation between neighbours is estimated."""
+
+LARGEST_CORRELATION = 0.9
+"""Limit of an estimated correlation between neighbours."""
 
 
 def mad_std(values: Floats, centre: float | None = None) -> float:
@@ -40,7 +44,7 @@ def mad_std(values: Floats, centre: float | None = None) -> float:
 
     Parameters
     ----------
-    centre : deviations are from here; default the median. Residuals, which belong about zero, take 0.
+    centre : point from which deviations are measured; default the median. Residuals take 0.
 
     Notes
     -----
@@ -70,14 +74,14 @@ def soft_l1_weights(z: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
-    """A robust least squares problem about its minimum, to first order: what covariances are made of.
+    """A robust least squares problem to first order about its minimum: covariances are computed from it.
 
     Attributes
     ----------
     residuals : (m,), jacobian : (m, k)
-    scale : (m,) robust standard deviation of each residual, that of its kind
+    scale : (m,) robust standard deviation of the kind of each residual
     prior : (k, k) information of the prior
-    overlap : so many residuals count as one independent one
+    overlap : number of residuals that count as one independent residual
     """
 
     residuals: Floats
@@ -114,7 +118,7 @@ class RobustFit(Linearised):
 
     Attributes
     ----------
-    x : (k + p c,) parameters, those of the parts behind the k shared ones
+    x : (k + p c,) parameters: the k shared ones, then part after part
     own_prior, own_pull : (p, k, k), (p, k) information and gradient of the priors of each part's own parameters, which
         follow the shared ones
     gain : (p, c, k) negative derivative of each part's own parameters by the shared ones
@@ -151,7 +155,7 @@ def robust_least_squares(
     prior_mean, prior_std : (k + p c,); an infinite deviation is no prior
     kind : (m,) residuals of one kind share one robust scale, which is their own; default one kind
     parts : of the data, which have parameters of their own; default one part without
-    overlap : so many residuals count as one independent one
+    overlap : number of residuals that count as one independent residual
     most_steps : at most this many steps
     settled : length of the last step in standard deviations, all parameters together
 
@@ -167,7 +171,7 @@ def robust_least_squares(
         weights = robust_weights(residuals, scale, overlap)
         step, decrease, _ = eliminate(residuals, jacobian, weights, parts, pull, x - prior_mean)
         if decrease < settled**2:
-            # too short to evaluate for: residuals follow it to first order
+            # a short step: the residuals follow it to first order, without a further evaluation
             x, residuals = x + step, residuals + parts.change(jacobian, step)
             break
         before = _cost(residuals / scale, overlap, pull, x - prior_mean)
@@ -179,7 +183,7 @@ def robust_least_squares(
             step = step / 2.0
             tried = evaluate(x + step)
         else:
-            # no part of the step lowers the cost: the Jacobian of noisy data shows no further
+            # no fraction of the step lowers the cost: with noisy data the Jacobian shows no better estimate
             break
         x, (residuals, jacobian) = x + step, tried
         if before - after < settled**2:
@@ -226,20 +230,21 @@ def robust_weights(residuals: Floats, scale: Floats, overlap: float) -> Floats:
 
 
 def sandwich_covariance(fit: Linearised, group: Ints, group_std: Floats | None = None) -> Floats:
-    """Return the covariance (k, k) of a robust fit, nowhere less than its information allows.
+    """Return the covariance (k, k) of a robust fit; no variance is below the bound of its information.
 
     Parameters
     ----------
     group : (m,) residuals of one group depend on one another, others do not
-    group_std : (k,) how far the parameters of a group are expected to lie from the common ones, an expectation that
-        counts as one group; None: the groups alone show it
+    group_std : (k,) expected standard deviation of the parameters of a group about the common ones; it counts as one
+        group; None: the groups alone show the spread
 
     Notes
     -----
     H^-1 (sum g g^T + P) H^-1 with g the gradient of a group, H the Gauss-Newton matrix and P the prior (White 1982;
     Liang and Zeger 1986 for groups, with their B / (B - 1)). Few groups show too little spread: no variance is less
-    than that of H^-1. A group with parameters of its own, T their covariance about the common ones, and information A
-    has a gradient of covariance A T A: so is the spread expected with `group_std`, and the two are averaged.
+    than the variance in H^-1. If T is the covariance of a group's own parameters about the common ones and A its
+    information, its gradient has the covariance A T A. This is the spread expected with `group_std`, and it is averaged
+    with the spread of the groups.
     """
     expected = None
     if group_std is not None:
@@ -309,9 +314,10 @@ def student_covariance(fit: Linearised, levels: Sequence[Ints]) -> Floats:
 
     Notes
     -----
-    The variance of the gradient is that of residuals which are independent but for their overlap, then, level by level,
-    the spread between groups, with the variance that the level below expects counted as one group more. The spread is
-    an estimate too: Student's t (1908), expanded about the normal quantile 2 (Abramowitz and Stegun 1964, 26.7.5).
+    The variance of the gradient is first computed for residuals that are independent but for their overlap. Then, level
+    by level, it is the spread between groups, and the variance of the level below counts as one further group. The
+    spread is an estimate too: Student's t (1908), expanded about the normal quantile 2 (Abramowitz and Stegun 1964,
+    26.7.5).
     """
     variance = fit.of_data
     for group in levels:

@@ -15,11 +15,12 @@ from icrtool.kernels.compiled import njit
 Rate = TypeVar("Rate", Floats, Complexes)
 
 LONGEST_DELAY_S = 1.0
-"""Of the wheels against the reference."""
+"""Longest delay of the wheels with respect to the reference [s]."""
 
 SHORT, GAP, OUTAGE, STANDING, JUMP = -1, -2, -3, -4, -5
-"""No row is so far away: the drive ends before; a gap in the wheel data, no reference there, the robot stands at the
-start and another start counts for this standstill, the reference jumps in between."""
+"""Codes in place of the row at which a trial ends, all negative. `SHORT`: the drive ends before. `GAP`: a gap in the
+wheel data. `OUTAGE`: no reference at the end. `STANDING`: the robot stands at the start, and another start counts for
+this standstill. `JUMP`: the reference jumps in between."""
 
 
 class Track(NamedTuple):
@@ -30,15 +31,16 @@ class Track(NamedTuple):
     Attributes
     ----------
     t : (n,) begin of each wheel sample; held : (n,) how long it holds [s], 0 over gaps and for the last one
-    v_left, v_right : (n,) [m/s], held so long
+    v_left, v_right : (n,) [m/s], constant for the time `held`
     place_t : (m,); north, east : (m,) position of the reference [m]
     heading_t : (h,); heading : (h,) of the reference [rad], unwrapped, clockwise from north
     distance : (m,) path length at the positions [m], non-decreasing
     in_outage : (m,) positions that are no reference to compare with
     jump, slipping : (m,) intervals after a position in which the reference jumps, or that lie in a slip event
     gyro : (n,) turn rate while a wheel sample holds [rad/s], read when the reference turns; None without one
-    into : share of a wheel sample's time at which its heading is taken: 0 of Euler steps, (k - 1) / 2k of k joined ones
-    place_std_m : noise of the positions, an axis; 0 where it is not asked for
+    into : share of a wheel sample's time after which its heading is taken: 0 for Euler steps, (k - 1) / 2k for k joined
+        samples
+    place_std_m : standard deviation of the positions on each axis [m]; 0 where it is not needed
     same_clock : position and heading are fields of the same messages
     """
 
@@ -83,7 +85,7 @@ class Track(NamedTuple):
 
     @property
     def half_difference(self) -> Floats:
-        """Half of what left is faster than right (n,) [m/s]."""
+        """Half of the left speed minus the right speed (n,) [m/s]."""
         return (self.v_left - self.v_right) / 2
 
     @property
@@ -98,7 +100,7 @@ class Track(NamedTuple):
 
     @property
     def travel(self) -> Floats:
-        """Mean distance of the sides until each wheel sample (n,) [m], forward or not."""
+        """Mean distance of the sides until each wheel sample (n,) [m]; backward counts as forward does."""
         speed = np.abs(self.v_left)
         speed += np.abs(self.v_right)
         speed /= 2.0
@@ -117,7 +119,7 @@ class Track(NamedTuple):
 
     @property
     def laid(self) -> Complexes:
-        """Mean distance of the sides laid along the heading, until each position (m,), north + j east [m]."""
+        """Integral of the sides' mean speed along the heading, until each position (m,), north + j east [m]."""
         return self.at_places(np.asarray(self.mean_speed * self.nose))
 
     def heading_at(self, t: Floats) -> Floats:
@@ -141,7 +143,7 @@ class Track(NamedTuple):
         return self._replace(t=self.t[rows], held=self.held[rows], v_left=left, v_right=right, gyro=gyro)
 
     def rows_around(self, begin_s: float, end_s: float) -> slice:
-        """Return the wheel samples from a begin to an end, and of a little more for delays."""
+        """Return the wheel samples from a begin to an end, with `LONGEST_DELAY_S` more on both sides."""
         edges = [begin_s - LONGEST_DELAY_S, end_s + LONGEST_DELAY_S]
         first, stop = np.searchsorted(self.t, edges, side="right").tolist()
         return slice(max(first - 1, 0), stop)
@@ -179,7 +181,7 @@ class Windows:
 
     Attributes
     ----------
-    track : that they are cut from; its wheel samples may have been joined since
+    track : the track that they are cut from; its wheel samples may have been joined since
     begin, end : (w,) rows of its positions, first and last of a window
     length_m : (w,) distance [m], nominal
     """
@@ -216,14 +218,14 @@ def cut(track: Track, lengths_m: Sequence[float], every_m: float) -> Windows:
 
     Parameters
     ----------
-    every_m : a window of each length starts every so much distance
+    every_m : distance between the starts of windows of one length [m]
     """
     lengths, begins = np.asarray(lengths_m, np.float64), rows_at_steps(track.distance, every_m)
     begins = begins[~track.in_outage[begins]]
     ends = ends_from(track, lengths, begins)
     column, row = np.nonzero(ends.T >= 0)
     begin, end = begins[row], ends[row, column].astype(np.int64)
-    # as many flags are set before one end as before the other
+    # the number of slipping rows before both ends is the same: none lies between them
     slips = np.flatnonzero(track.slipping)
     quiet = np.searchsorted(slips, begin) == np.searchsorted(slips, end)
     return Windows(track, begin[quiet], end[quiet], lengths[column][quiet])

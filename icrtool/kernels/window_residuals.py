@@ -22,8 +22,8 @@ VX, VY, OMEGA = 0, 1, 2
 """Axes of the body twist."""
 
 Twists = Callable[[slice], tuple[Floats, Ints, Floats]]
-"""Gives of some steps the twist without the free terms (3, n), v_x, v_y [m/s], omega [rad/s], the axis of each free
-term (k,), and the twist per unit parameter of each (k, n)."""
+"""Returns for a slice of n steps: the twist without the free terms (3, n), v_x, v_y [m/s], omega [rad/s]; the axis of
+each free term (k,); the twist per unit of each parameter (k, n)."""
 
 
 class PathKnots(NamedTuple):
@@ -44,7 +44,7 @@ class PathKnots(NamedTuple):
 
 
 def sums_from(first: NDArray[Number], parts: NDArray[Number]) -> NDArray[Number]:
-    """Return the sums (..., n + 1) of parts (..., n), each of those before it, from the first ones (...) on."""
+    """Return cumulative sums (..., n + 1) of parts (..., n), beginning with the first values (...)."""
     sums = np.empty((*parts.shape[:-1], parts.shape[-1] + 1), parts.dtype)
     sums[..., 0] = first
     sums[..., 1:] = parts
@@ -57,7 +57,7 @@ def path_at(track: Track, twists: Twists, parameters: Floats, at: Floats) -> Pat
 
     Parameters
     ----------
-    twists : called for some steps at a time: of a long drive, columns of all would take much memory
+    twists : called for some steps at a time, because the columns of a long drive would take much memory
     parameters : (k,) of the free terms
     at : (m,) time of each knot [s], ascending
     """
@@ -133,7 +133,7 @@ def window_residuals(
     ----------
     start, end : (w,) knots of each window; reference : complex (w,) displacement [m]; root : (w,) [m^0.5]
     offset : added to the reference's heading [rad]
-    shortened : (w,) share of its displacement that a path goes whose heading wanders, on average
+    shortened : (w,) mean displacement of a path whose heading wanders, over its displacement without wandering
     """
     moved, by = displacements(path, start, end)
     turned = np.exp(-1j * offset) * reference
@@ -145,7 +145,7 @@ def window_residuals(
 def turn_residuals(path: PathKnots, start: Ints, end: Ints, turned: Floats, root: Floats) -> tuple[Floats, Floats]:
     """Return residuals (w,) of the turns of windows, (turn - turn_ref) / sqrt(length), and derivatives (w, k + 2).
 
-    These are as those of `window_residuals`.
+    The derivatives are by the same quantities as in `window_residuals`.
 
     Parameters
     ----------
