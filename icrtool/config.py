@@ -24,13 +24,13 @@ from icrtool.records.text import LONGEST_NAME, did_you_mean, shortened
 
 LARGEST_FILE_BYTES = 1 << 20
 MOST_LIST_ITEMS = 1000
-"""Horizons, or outages."""
+"""Most entries in a list of horizons or outages."""
 
 _DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]+\s*\.\s*){64}")
-"""So many parts of a key, one after the other."""
+"""A key of more than 64 parts, which is refused."""
 
 _BARE_POINT = re.compile(r"(?<![\w.])(?=\.\d)|(?<=\d\.)(?![\w.])|(?<=\d\.)(?=[eE])")
-"""Places in numbers where TOML, but no person, asks for a zero."""
+"""Places in numbers where TOML requires a zero that people leave out."""
 
 Horizon = Annotated[float, msgspec.Meta(ge=0.001, le=1e5)]
 Duration = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
@@ -116,7 +116,8 @@ class FilterConfig:
     """The EKF of Pentzer 2014, Section 3.
 
     `process_*` are the square roots of Q's diagonal (Eq. 30), as at the paper's 100 Hz; `gnss_std_m` and
-    `heading_std_deg` those of R (Eq. 31); `terrain_icr_std_m`: Section 5.2. A value left out is the preset's.
+    `heading_std_deg` the standard deviations of R (Eq. 31); `terrain_icr_std_m`: Section 5.2. A value left out is the
+    preset's.
     """
 
     preset: Literal["field", "paper"] = "field"
@@ -188,7 +189,7 @@ class Config:
         return {section: document[section] for section in SECTIONS}
 
     def with_filter(self, **changes: float | str) -> Config:
-        """Return it with other values in ``[filter]``."""
+        """Return the configuration with other values in ``[filter]``."""
         return replace(self, filter=replace(self.filter, **changes))  # type: ignore[arg-type]  # as the caller names them
 
 

@@ -1,4 +1,4 @@
-"""A batch: hand the logs to an executor, skip what is done, retry what died, give a row each."""
+"""A batch: hand logs to an executor, skip logs that are done, retry logs whose process died, give a row for each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from icrtool.records.places import UrlPath, read_regular
 from icrtool.records.requests import BatchRequest, LogRequest
 
 POLL_S = 1.0
-"""Time between two looks at a cluster."""
+"""Time between two checks of a cluster [s]."""
 
 Watch = Callable[[str, str], None]
 """Called with the name of a log and its stage."""
@@ -41,7 +41,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
     Parameters
     ----------
     output : folder of the results
-    folder : on disk, that stands for it where it is an address
+    folder : folder on disk in place of `output`, where that is an address
 
     Raises
     ------
@@ -50,7 +50,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
     ConfigError
         A manifest or a configuration cannot be used, or a gate cannot be read.
     OutputError
-        `output` is a run, or something else than a directory, or holds somebody's own file of the name of a result.
+        `output` is a run, or something else than a directory, or holds a file of the user with the name of a result.
     """
     for gate in batch.report.gates:
         parse_gate(gate)
@@ -77,13 +77,13 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
     for one in find_recordings(searched):
         known, settings = about_recording(one.path, entries), batch.settings
         builtin = known.robot in builtin_robots()
-        # A robot that is not built in is a name, which needs a configuration of its own.
+        # The name of a robot that is not built in needs a configuration of its own.
         if known.robot and not builtin and known.config is None and settings.file is None:
             advice = f"one of {', '.join(builtin_robots())}, or give its configuration in the column config"
             raise ConfigError(f"{one.log}: robot {known.robot!r}", "not a built-in robot", advice)
         robot = known.robot if builtin else settings.robot if not known.robot else None
         config = settings._replace(file=known.config or settings.file, robot=robot).load()
-        # Whether the page is there is seen by its file.
+        # The file report.html shows whether the page is there.
         files = replace(batch.files, page=True, overwrite=False)
         asked = [config.effective(), __version__, batch.report, files, known.robot, baseline]
         row = FleetLog(
@@ -103,11 +103,11 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
 def finished(request: LogRequest, folder: Path) -> FleetLog | None:
     """Return the row of a log that an earlier batch processed with the same input, configuration and version.
 
-    A log that failed for a reason of its own, and would fail again, counts as processed.
+    A log that failed by its content, and would fail again, counts as processed.
 
     Parameters
     ----------
-    folder : on disk, of the results
+    folder : folder of the results, on disk
     """
     try:
         row = msgspec.json.decode(read_regular(folder / request.row_file, folder), type=FleetLog)
@@ -126,14 +126,14 @@ def run_batch(
     requests: Sequence[LogRequest], executor: Executor, batch: BatchRequest, watch: Watch | None = None,
     lost: Lost = str, folder: Path | None = None,
 ) -> Generator[FleetLog, None, None]:  # fmt: skip
-    """Yield the row of each log as it comes; what died or hung is tried once more when all others are done.
+    """Yield the row of each log when it is done; logs whose process died or hung are tried once more at the end.
 
     Parameters
     ----------
     executor : runs `process_apart`; threads on this machine, or workers of a cluster
     watch : called when a log comes to its next stage, where the executor is on this machine
-    lost : of the executor
-    folder : on disk, that stands for the place of the results where that is an address
+    lost : returns why the executor can process no log any more; empty while it can
+    folder : folder on disk in place of the place of the results, where that is an address
     """
     todo: list[LogRequest] = []
     for request in requests:
@@ -151,7 +151,7 @@ def run_batch(
         else:
             yield row
     for request in again:
-        # One at a time: what wanted too much memory beside others may find enough alone.
+        # One at a time: a log that lacked memory while others ran may have enough alone.
         for _, row in _all_of([request], executor, batch, watch, lost):
             yield replace(row, reason=f"{row.reason} (tried twice)") if row.status == "failed" else row
 
@@ -190,7 +190,7 @@ def _all_of(
 
 
 def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
-    """Return whether a log's files are those of an earlier batch; content is compared where their time differs."""
+    """Return whether a log's files are the files of an earlier batch; content is compared where times differ."""
     if isinstance(path, UrlPath):
         return bool(stored) and _is_unchanged(stored[0], path)
     try:
@@ -208,7 +208,7 @@ def _same_files(stored: Sequence[FleetFile], path: Path) -> bool:
 
 
 def _is_unchanged(before: FleetFile, path: UrlPath) -> bool:
-    """Return whether what lies at an address has the size and version that it had."""
+    """Return whether the file at an address still has the size and version of the earlier batch."""
     try:
         now = RemoteFile(path)
     except LogError:

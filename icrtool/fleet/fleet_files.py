@@ -1,4 +1,4 @@
-"""What a batch leaves: tables, figures, acceptance limits for machines that watch pull requests, and calibrations.
+"""What a batch writes: tables, figures, acceptance limits for machines that watch pull requests, and calibrations.
 
 There is one calibration per robot and group, tested on each log left out.
 """
@@ -34,28 +34,29 @@ from icrtool.records.text import LogText, counted, escaped
 
 BEFORE_ICRS = ("log", "status", "this_time", "reason", "robot", "group", "start_utc", "duration_s", "distance_m")
 AFTER_ERRORS = ("events", "outages", "warnings", "tool_version", "run")
-"""Columns of fleet.csv that a log has as they are."""
+"""Columns of fleet.csv that are fields of a log's row, before and after the columns of ICRs and errors."""
 
 WITHIN, IS_BOUND = "_within_", "_is_bound"
-"""Parts of the names of the columns of a distance within a budget, and of whether that is a lower bound (1) or not."""
+"""Parts of column names: of a distance within a budget, and of whether it is a lower bound (1) or not (0)."""
 
 FAILURES = ("log", "reason", "details", "robot", "group", "run", "took_s")
 
 PLOTS = "plots"
 
 CALIBRATIONS = "calibrations"
-"""Folder of the calibration files below that of the batch."""
+"""Folder of the calibration files, below the folder of the batch."""
 
 MOST_POOLED_S = 86_400.0
-"""Of the logs of a robot and group, so much time is calibrated together, evenly spaced over all: about 1 GB."""
+"""Longest time of the logs of a robot and group that is calibrated together [s], evenly spaced over all logs. It takes
+about 1 GB of memory."""
 
 FOLDERS = (RUNS, ROWS, CALIBRATIONS, PLOTS)
-"""Of a batch."""
+"""Folders that a batch writes."""
 
 TABLES = ("fleet.csv", "failures.csv", "fleet.parquet", "calibrations.txt", FLEET_FILE)
 
 SHOWN_ERRORS = {MOST_USEFUL: documents.SHOWN_ERROR, WITHOUT_IT: documents.SHOWN_WITHOUT}
-"""By whose errors the picture shows: the first that a log has."""
+"""The rows whose errors the picture shows, and their columns: the first that a log has."""
 
 
 def check_tables(folder: Path, *, page: bool) -> None:
@@ -127,7 +128,7 @@ def write_fleet(
     *,
     page: bool = False,
 ) -> FleetDocument:
-    """Write the tables, figures and page of a batch, and return its document; those of an earlier one are replaced.
+    """Write the tables, figures and page of a batch, and return its document; files of an earlier batch are replaced.
 
     Parameters
     ----------
@@ -137,7 +138,7 @@ def write_fleet(
     Raises
     ------
     OutputError
-        The disk does not take them.
+        They cannot be written to the disk.
     """
     cells = fleet_rows(rows)
     write_file(directory / "fleet.csv", formats.csv_bytes(cells[0], (row.values() for row in cells)), directory)
@@ -150,7 +151,7 @@ def write_fleet(
     if plots:
         write_figures(rows, directory, plots)
     document = fleet_document(rows, calibrations)
-    # After the tables: where it is, these are of the same batch.
+    # Written after the tables: where it exists, the tables are of the same batch.
     write_file(directory / FLEET_FILE, formats.json_bytes(document), directory)
     if page:
         from icrtool.output.page.pages import fleet_page
@@ -160,7 +161,7 @@ def write_fleet(
 
 
 def calibrations_text(calibrations: Sequence[FleetCalibration], *, tables: bool = True) -> str:
-    """Return the pooled calibrations, a line each, or with their leave-one-log-out tables."""
+    """Return the pooled calibrations, one line each or with their leave-one-log-out tables."""
     parts = []
     for one in calibrations:
         name = ", ".join(str(LogText(part)) for part in (one.robot, one.group) if part) or "all logs"
@@ -217,7 +218,7 @@ def _write_parquet(rows: Sequence[Mapping[str, object]], file: Path) -> None:
     texts.add("notes")
     counts = {"events", "outages", "warnings", "gates_failed", *(name for name in rows[0] if name.endswith(IS_BOUND))}
     kinds = {name: pa.string() if name in texts else pa.int64() if name in counts else pa.float64() for name in rows[0]}
-    # Names of files need not be text. As JSON, since to convert lists pyarrow would load pandas.
+    # Names of files need not be text. Lists are written as JSON, because pyarrow would load pandas to convert them.
     cells = ({name: as_text(one) if name in texts else one for name, one in row.items()} for row in rows)
     lines = b"\n".join(map(msgspec.json.encode, cells))
     table = pj.read_json(
@@ -241,7 +242,7 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
     ----------
     missing : logs of the baseline that the batch does not have
     """
-    # Not at import: a process that fits logs needs none of it.
+    # Not at import: a process that fits logs does not need these modules.
     from icrtool.output.exports.acceptance import limit_section
 
     errors, changes = [], changes_of(rows, missing)
@@ -262,7 +263,7 @@ def fleet_blocks(rows: Sequence[FleetLog], missing: Sequence[str] = ()) -> list[
 
 
 def changes_of(rows: Sequence[FleetLog], missing: Sequence[str]) -> list[str]:
-    """Return how the logs, their configuration and the version differ from those of the baseline, a sentence each."""
+    """Return how the logs, their configuration and the version differ from the baseline, a sentence each."""
     found = [f"not in this batch, but in the baseline: {', '.join(missing)}"] if missing else []
     new = [row.log for row in rows if row.status != "failed" and not row.baseline]
     if new and len(new) < len(rows):
@@ -286,7 +287,7 @@ def pooled_calibrations(
     Parameters
     ----------
     directory : of the batch, on disk; calibration files are written below it
-    place : the address that it stands for, where the runs are
+    place : the address in place of which `directory` is used; the runs are there
     allow_unusable : also from runs that are not usable
     """
     try:
@@ -333,7 +334,7 @@ def runs_of_fleet(directory: Path) -> dict[str, list[Path]]:
 
 
 def is_fleet(directory: Path) -> bool:
-    """Return whether a folder is that of a batch."""
+    """Return whether a folder is the folder of a batch."""
     return is_regular(directory / FLEET_FILE, directory)
 
 
@@ -383,5 +384,5 @@ def _pooled(
 
 
 def _content(inputs: Sequence[FleetFile]) -> tuple[str, ...]:
-    """Return what copies of a log have in common, whatever their names; of content that is not known, the place."""
+    """Return the content of a log's files, equal for copies whatever their names; the place where it is not known."""
     return tuple(sorted(file.sha256 or f"at {file.path} {file.bytes} {file.version} {file.address}" for file in inputs))

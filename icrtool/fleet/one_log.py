@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from icrtool.records.dropout_document import ModelDocument
 
 FLEET_HORIZONS_M = (1.0, 5.0, 10.0, 20.0)
-"""Distances whose errors a batch collects."""
+"""Distances at which a batch collects errors [m]."""
 
 
 def path_of(name: bytes) -> Path:
@@ -40,7 +40,7 @@ def path_of(name: bytes) -> Path:
 
 
 def process(request: LogRequest, stage: Stage) -> FleetLog:
-    """Fit a log, analyse the run, write both, and return its row; one that cannot be used gives a row with the reason.
+    """Fit a log, analyse the run, write both, and return its row; the row of an unusable log states the reason.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def process(request: LogRequest, stage: Stage) -> FleetLog:
     try:
         row = _results(request, stage)
     except IcrToolError as err:
-        # A full disk may not be full the next time, nor a log be written to; the log's own errors come again.
+        # A full disk may have space the next time, a log may be complete; errors of its content come again.
         reason = err.beside(str(path), str(folder / request.known.run), log_name(path))
         row = failed(request, reason, repeatable=not isinstance(err, OutputError | LogChangedError))
     except OSError as err:
@@ -78,9 +78,9 @@ def failed(request: LogRequest, reason: str, *, details: str = "", repeatable: b
 
 
 def files_of(path: Path, inputs: Sequence[InputFile] = ()) -> tuple[FleetFile, ...]:
-    """Return the files of a log with their sha256; those in `inputs` are not read again.
+    """Return the files of a log with their sha256; files in `inputs` are not read again.
 
-    Of an address, `inputs` is all that is known.
+    For a log at an address only `inputs` is known.
     """
     if isinstance(path, UrlPath):
         return tuple(

@@ -1,11 +1,11 @@
-"""Processes of their own for the work on logs: what hangs is killed, what dies costs one log.
+"""Processes that work on logs: a process that hangs is killed, a process that dies costs one log.
 
 A process is started once and processes log after log, so that libraries and compiled code are loaded once. Requests
 travel as lines of JSON through its standard input, stages (texts) and rows (objects) through its standard output. The
-same function per log serves the threads of a batch on this machine and those of the workers of a cluster.
+same function per log serves the threads of a batch on this machine and the threads of the workers of a cluster.
 
 `pebble.ProcessPool` and `concurrent.futures` are not used: an exception that cannot be unpickled, or a process killed
-while it starts, ends all logs of their pools (pebble 5.2.3), and the second ends no log that takes too long.
+while it starts, ends all logs of their pools (pebble 5.2.3), and `concurrent.futures` has no time limit for a log.
 """
 
 from __future__ import annotations
@@ -44,16 +44,18 @@ KILL_GRACE_S = 0.3
 """Time in which a process may remove what it is writing before it is killed [s]."""
 
 LONGEST_DETAILS = 4000
-"""Letters kept of what a process printed before it died."""
+"""Characters kept of the output of a process that died."""
 
 ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MPLBACKEND": "agg",
     "MALLOC_ARENA_MAX": "1", "ARROW_DEFAULT_MEMORY_POOL": "system",
 }  # fmt: skip
-"""One thread a log: the logs are what runs at the same time. Memory as `icrtool.cli.main` has it."""
+"""Environment of a process: one thread for each log, because several logs run at the same time; memory settings as in
+`icrtool.cli.main`."""
 
 NOT_INHERITED = "MALLOC_TRIM_THRESHOLD_"
-"""Dask sets it for its workers: memory then goes back to the system again and again, which doubles system time."""
+"""Environment variable that Dask sets for its workers, and that our processes do not get: with it, memory goes back to
+the system again and again, which doubles system time."""
 
 PROCESS_COMMAND = (sys.executable, "-P", "-m", "icrtool.fleet.processes")
 
@@ -63,10 +65,10 @@ Lost = Callable[[], str]
 """Returns why no log can be processed any more (a scheduler that is gone); empty while they can."""
 
 PROCESS_BYTES = 400 << 20
-"""Memory of a process with a small log."""
+"""Memory of a process with a small log [bytes]."""
 
 LOG_FACTOR, LOG_BYTES = 4.0, 3 << 30
-"""Memory of a log: so many times its size, at most that of 10 h at 100 Hz."""
+"""Memory of a log: `LOG_FACTOR` times its size, at most `LOG_BYTES`, the memory of 10 h at 100 Hz."""
 
 _ANSWER: msgspec.json.Decoder[str | FleetLog] = msgspec.json.Decoder(str | FleetLog)
 """Made at import: msgspec crashes where several threads are the first to use a type."""
@@ -74,11 +76,11 @@ _ANSWER: msgspec.json.Decoder[str | FleetLog] = msgspec.json.Decoder(str | Fleet
 _over = threading.Event()
 _all: set[Worker] = set()
 _idle: list[Worker] = []
-"""Those of them that wait for a log; each thread that asks takes one, or starts one."""
+"""Processes that wait for a log; each thread that asks takes one, or starts one."""
 
 
 def process_apart(request: bytes, timeout_s: float, stage: Stage | None = None) -> FleetLog:
-    """Process a log in a process of its own; one that hangs, or kills its process, gives a row with the reason.
+    """Process a log in a process of its own; if the process hangs or dies, the row states the reason.
 
     Parameters
     ----------
@@ -118,13 +120,13 @@ def close_all() -> None:
 def executor_of(
     logs: Sequence[Path], jobs: int | None, scheduler: str | None, worker_timeout_s: float
 ) -> Iterator[tuple[Executor, Lost]]:
-    """Give what runs `process_apart` for logs, threads or a Dask cluster, and what reports whether that is lost.
+    """Yield an executor of `process_apart`, threads or a Dask cluster, and a function that reports whether it is lost.
 
     Parameters
     ----------
     jobs : logs at the same time on this machine; default: as `default_jobs`
     scheduler : address of the cluster; None: this machine
-    worker_timeout_s : a cluster that has no scheduler or no worker for so long is lost
+    worker_timeout_s : a cluster without scheduler or worker for this time [s] is lost
 
     Raises
     ------
@@ -143,19 +145,19 @@ def executor_of(
     except ImportError as err:
         raise ConfigError("--scheduler", "needs Dask", "pip install 'icrtool[cluster]'") from err
     for name in ("distributed", "distributed.client", "distributed.utils", "tornado", "asyncio"):
-        # They log tracebacks where a scheduler is lost; the rows of the logs state it.
+        # These loggers print tracebacks when a scheduler is lost; the rows of the logs state it.
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError) as err:
         raise ConfigError(f"--scheduler {scheduler}", "no Dask scheduler answers there", str(err)) from err
     with client:
-        # Its shutdown would wait for logs that a lost cluster never ends; all others are done by then.
+        # A shutdown that waits would wait for ever for the logs of a lost cluster; all other logs are done by then.
         yield client.get_executor(), _loss_of(client, worker_timeout_s)
 
 
 def _loss_of(client: Client, worker_timeout_s: float) -> Lost:
-    """Return what reports that a cluster had no scheduler, or no worker, for some time: it is then given up."""
+    """Return a function that reports that a cluster had no scheduler or no worker for `worker_timeout_s`."""
     fine_s, given_up = time.monotonic(), ""
 
     def lost() -> str:
@@ -212,7 +214,7 @@ class Worker:
         assert self._process.stdin is not None  # noqa: S101 - for the type checker
         assert self._process.stdout is not None  # noqa: S101 - as above
         self._requests = self._process.stdin
-        # At its end, a line that is no answer.
+        # At the end of the output, a line that is no answer.
         self._answers = _lines_of(self._process.stdout, lambda lines: lines.put(b""))
         _all.add(self)
 
@@ -232,7 +234,7 @@ class Worker:
                     stage(answer)
         except queue.Empty:
             why = f"took longer than {timeout_s:g} s and was ended"
-        except (OSError, ValueError):  # it died, or what it wrote was cut off when it did
+        except (OSError, ValueError):  # it died, perhaps in the middle of a line
             why = self._how_it_ended()
             with suppress(ValueError):  # closed, where the batch was interrupted
                 self._errors.seek(begin_of_errors)
@@ -243,12 +245,12 @@ class Worker:
         return replace(failed(request, why, details=details, repeatable=False), took_s=took_s)
 
     def ask_to_end(self) -> None:
-        """Close its input: it removes what it is writing, and ends."""
+        """Close its input: the process removes unfinished files and ends."""
         with suppress(OSError):  # its other end is gone
             self._requests.close()
 
     def close(self, grace_s: float = KILL_GRACE_S) -> None:
-        """End the process, after some time whatever it does."""
+        """End the process; after `grace_s` it is killed."""
         _all.discard(self)
         self.ask_to_end()
         with suppress(subprocess.TimeoutExpired):
@@ -284,7 +286,8 @@ def _lines_of(stream: IO[bytes], at_end: Callable[[Lines], object]) -> Lines:
 
 def main() -> None:
     """Process the logs that standard input asks for, until it ends."""
-    # What a library prints goes with the errors. Files of our own: Python's are locked by who waits for a line.
+    # What a library prints goes to standard error. The files are opened anew, because a thread that waits for a line
+    # locks Python's own.
     requests, output = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""Which logs: the recordings in files and folders, found by content, with a name for the run of each; and manifests.
+"""The logs of a batch: recordings in files and folders, found by content, a name for the run of each; manifests.
 
 A manifest states which logs are of which robot, with which configuration, in which group (CSV or TOML).
 """
@@ -41,10 +41,10 @@ OWN_FILES = (RUN_FILE, "fleet.json", "study.json")
 """A folder that holds one of these is a result, not a place of recordings."""
 
 LONGEST_RESTART_S = 60.0
-"""A recorder that was restarted begins again within this time; two drives are further apart."""
+"""Longest pause of a recorder that was restarted [s]; two drives are further apart."""
 
 SQLITE_PAGE_BYTES = 65536
-"""The tables of an SQLite file are named on its first page, which is at most this long."""
+"""Length of the longest first page of an SQLite file, which names its tables [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,14 +84,14 @@ def find_recordings(places: Sequence[Path]) -> list[FoundRecording]:
 
 
 def joined(found: Mapping[str, Path]) -> dict[str, Path]:
-    """Return recordings with the files of a split one, or of a recorder that was restarted, as one.
+    """Return recordings in which the files of a split recording, or of a restarted recorder, are joined to one.
 
     They are files of one folder whose names differ only in a count or a date, that have the same topics, and of which
     each begins at most `LONGEST_RESTART_S` after the end of the one before it. A file without index has no known end.
 
     Parameters
     ----------
-    found : paths by real path; a file of a range that is there too is left out
+    found : paths by real path; the single files of a split recording that is also in `found` are left out
     """
     of_ranges = {os.path.realpath(file) for path in found.values() for file in split_files(path)}
     single = {real: path for real, path in found.items() if real not in of_ranges}
@@ -139,10 +139,10 @@ def _extent(path: Path) -> tuple[int, int, frozenset[tuple[str, str]]] | None:
 
 
 def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Return the logs that a command is to use, each once, and the files beside them that are no logs.
+    """Return the logs that a command is to use, each once, and the files among the places that are no logs.
 
     A folder that is no recording and no run stands for the recordings below it, if there are any. A file that only has
-    the name of a recording among `places` (``drive.json`` beside ``drive.mcap``, from a pattern of the shell) is left
+    the name of a recording among `places` (``drive.json`` next to ``drive.mcap``, from a pattern of the shell) is left
     out.
     """
     found: dict[str, Path] = {}
@@ -159,7 +159,7 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     stems = {_absolute(path).parent / f"{log_name(path)}." for path in recordings}
     beside = []
     for path in logs:
-        # A file with a recording's name and another suffix: drive.truth.csv beside drive.bag.
+        # A file with a recording's name and another suffix: drive.truth.csv next to drive.bag.
         file, parts = _absolute(path), path.name.split(".")
         named = {file.parent / f"{'.'.join(parts[:k])}." for k in range(1, len(parts))}
         if path not in recordings and file.is_file() and not stems.isdisjoint(named):
@@ -168,7 +168,7 @@ def logs_among(places: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def distinct_names(logs: Sequence[Path]) -> list[str]:
-    """Return a name for the run of each log: that of the log, or where two share it, what their paths differ in."""
+    """Return a name for the run of each log: the log's name, or where two logs share it, what their paths differ in."""
     names = [log_name(log) for log in logs]
     if len({name.casefold() for name in names}) == len(names):
         return names
@@ -182,7 +182,7 @@ def distinct_names(logs: Sequence[Path]) -> list[str]:
 
 
 def common_parent(places: Sequence[Path]) -> Path:
-    """Return the folder that all places lie in; a folder that was given alone is that one, unless it is a recording."""
+    """Return the folder that all places lie in; a single folder is returned itself, unless it is a recording."""
     folders = [place if place.is_dir() and not is_bag_directory(place) else _absolute(place).parent for place in places]
     return Path(os.path.commonpath([_absolute(folder) for folder in folders]))
 
@@ -207,7 +207,7 @@ def is_recording(file: Path) -> bool:
 
 
 def _search(folder: Path) -> Iterable[Path]:
-    """Yield the recordings below a folder; hidden entries and folders with results of ours are left out."""
+    """Yield the recordings below a folder; hidden entries and folders with results of icrtool are left out."""
     if is_bag_directory(folder):
         yield folder
         return
@@ -230,7 +230,7 @@ def _named(paths: Sequence[Path], root: Path) -> list[FoundRecording]:
     """Name each recording after its path below `root`; where names collide, with the suffix of the file."""
     logs = [PurePosixPath(Path(os.path.relpath(_absolute(path), root)).as_posix()) for path in paths]
     short = [str(log.parent / log_name(path)) for log, path in zip(logs, paths, strict=True)]
-    # A run cannot lie in another one either.
+    # A run cannot lie in another run either.
     count = Counter(name.casefold() for name in short)
     parents = {str(parent).casefold() for name in short for parent in PurePosixPath(name).parents}
     names = [
@@ -245,7 +245,7 @@ def _named(paths: Sequence[Path], root: Path) -> list[FoundRecording]:
 
 
 def unique_name(name: str, taken: set[str]) -> str:
-    """Return a name, with a number where it is taken; add it to those that are."""
+    """Return a name, with a number where it is taken; add it to the taken names."""
     unique, number = name, 2
     while unique.casefold() in taken:
         unique, number = f"{name}-{number}", number + 1
@@ -315,7 +315,7 @@ def is_manifest(path: Path) -> bool:
 
 
 def read_manifest(path: Path) -> list[ManifestEntry]:
-    """Read a manifest: CSV with the columns of `MANIFEST_COLUMNS`, or TOML with a table ``[[logs]]`` each.
+    """Read a manifest: CSV with the columns of `MANIFEST_COLUMNS`, or TOML with a table ``[[logs]]`` for each line.
 
     Paths and patterns are relative to the manifest's folder. Tags in a CSV are separated by semicolons.
 
@@ -387,7 +387,7 @@ def _entry(path: Path, row: Mapping[str, Any]) -> ManifestEntry:
 
 
 def _matching(path: Path, pattern: str) -> tuple[Path, ...]:
-    """Return what a pattern matches; a name with a bracket or a star of its own is taken as it is, if it is there."""
+    """Return what a pattern matches; a file whose own name has a bracket or a star is taken as it is."""
     if isinstance(address := place_of(pattern), UrlPath):
         return tuple(find(address))
     named = path.parent / pattern
