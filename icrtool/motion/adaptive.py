@@ -25,13 +25,13 @@ from icrtool.motion.models import GYRO_TERMS, MODELS, RECOMMENDED, TERMS, Fitted
 from icrtool.motion.recording import NO_CONSTANTS, LogConstants, size_of
 from icrtool.motion.window_fit import RESIDUAL_KINDS, Residuals, constant_std, heading_wander, residuals_of
 
-WINDOWS_AS_ONE = 60.0
-"""Number of windows that count as one independent one. A stretch of 20 m holds 120, and shows a term about twice."""
+WINDOWS_AS_ONE = 80.0
+"""Number of windows that count as one independent one. A stretch of 20 m holds 160, and shows a term about twice."""
 
 GAUSS_NEWTON_STEPS = 3
 """Steps from one solution to the next."""
 
-SHARE_OF_DISTANCE, SHORTEST_M, LONGEST_M = 0.02, 1.0, 6.0
+SHARE_OF_DISTANCE, SHORTEST_M, LONGEST_M = 0.02, 0.5, 6.0
 """The parameters are solved for again after this share of the driven distance, within these bounds [m]."""
 
 REBUILT_SHARE, REBUILT_TO_M = 0.3, 150.0
@@ -311,7 +311,7 @@ class AdaptiveModel:
             self._next_m = at_m + float(np.clip(SHARE_OF_DISTANCE * at_m, SHORTEST_M * size, LONGEST_M * size))
             if self._solve(knot, at_m):
                 found.append(self.now._replace(t_s=self._drive.time_of(knot), distance_m=at_m))
-        if self._next_anew_m > REBUILT_TO_M * self._drive.size:
+        if self._drive.distance_m > REBUILT_TO_M * self._drive.size:
             self._drive.forget_until(self._used)
         return found
 

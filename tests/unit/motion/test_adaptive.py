@@ -123,14 +123,16 @@ class Transcription:
         inverse[8:, 8:] = np.diag(std**-2)
         mean = np.append(self.prior.mean, [0.0, 0.0])
         x, matrix, vector = mean, np.zeros((10, 10)), np.zeros(10)
-        used, due, anew_at, found = 0, 1.0, 0.0, []
+        used, due, anew_at, found = 0, 0.5, 0.0, []
         for knot, row in enumerate(self.knots):
             if knot * 0.5 < due:
                 continue
-            due = knot * 0.5 + min(max(0.02 * knot * 0.5, 1.0), 6.0)
+            due = knot * 0.5 + min(max(0.02 * knot * 0.5, 0.5), 6.0)
             last = max(k for k, one in enumerate(self.knots) if self.track.t[one] <= self.track.t[row] - 0.5)
             anew = knot * 0.5 >= anew_at
-            windows = [(e - n, e, n / 2.0) for n in (4, 10, 20) for e in range(max(0 if anew else used, n), last + 1)]
+            windows = [
+                (e - n, e, n / 2.0) for n in (2, 4, 10, 20) for e in range(max(0 if anew else used, n), last + 1)
+            ]
             if not windows:
                 continue
             used = last + 1
@@ -143,7 +145,7 @@ class Transcription:
                     at = x
                     values, by = (values, by) if step == 0 else self.linearised(windows, at)
                     mad = [1.4826 * np.median(np.abs(values[rows])) for rows in ([0, 1], [2])]
-                    count = len(windows) / 60.0
+                    count = len(windows) / 80.0
                     scale = [math.sqrt((count * one**2 + 4.0 * 0.03**2) / (count + 4.0)) for one in mad]
                 added = self.equations(values, by, scale, at, x)
                 x = np.linalg.solve(inverse + matrix + added[0], inverse @ mean + vector + added[1])
@@ -159,7 +161,7 @@ class Transcription:
             s = scale[0] if direction < 2 else scale[1]
             for value, row in zip(values[direction], by[direction], strict=True):
                 z = (value + row @ (x - at)) / s
-                weight = 1.0 / math.sqrt(1.0 + (z / 2.0) ** 2) / 60.0 / s**2
+                weight = 1.0 / math.sqrt(1.0 + (z / 2.0) ** 2) / 80.0 / s**2
                 matrix += weight * np.outer(row, row)
                 vector += weight * row * (row @ at - value)
         return matrix, vector
