@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from icrtool.alignment.log_track import IMPOSSIBLE_M
 from icrtool.config import Config
 from icrtool.kernels.arrays import Bools, Floats, Ints, unwrapped
 from icrtool.records.measurements import Finding
@@ -66,12 +67,15 @@ def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts
     """
     frames, notes = config.frames, list[Note]()
     shifts: dict[str, float] = {}
-    own = _Rates.of_wheels(log)
+    own = _Rates.of_wheels(log) if _can_be_compared(log) else None
     for word, key, given in (
         ("gnss", "reference_delay_s", frames.reference_delay_s), ("heading", "heading_delay_s", frames.heading_delay_s),
     ):  # fmt: skip
         if given != "auto":
             shifts[word] = float(given)
+            continue
+        if own is None:
+            shifts[word] = 0.0
             continue
         rates = _Rates.of_fixes(log) if word == "gnss" else _Rates.of_headings(log)
         shifts[word] = find_shift(own, rates)
@@ -114,6 +118,16 @@ def _sentence(word: str, shift_s: float, key: str) -> str:
     leap = abs(abs(shift_s) - LEAP_S) < 2 * GRID_S
     cause = " (GPS time is 18 s ahead of UTC)" if leap else ""
     return f"{fact}, as their speeds show: their clock{cause}; corrected; frames.{key} sets it"
+
+
+def _can_be_compared(log: RobotLog) -> bool:
+    """Return whether wheels and positions hold two finite values or more; what else is wrong is refused later."""
+    wheels, gnss = log.wheels, log.gnss
+    if min(len(wheels.stamp_ns), len(gnss.stamp_ns)) < 2:
+        return False
+    columns = (wheels.left, wheels.right, gnss.north_m, gnss.east_m, log.heading.heading_rad)
+    in_order = all((np.diff(one) >= 0).all() for one in (wheels.stamp_ns, gnss.stamp_ns, log.heading.stamp_ns))
+    return in_order and all(bool((np.abs(one) < IMPOSSIBLE_M).all()) for one in columns)
 
 
 class _Rates(NamedTuple):

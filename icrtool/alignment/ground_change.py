@@ -85,7 +85,7 @@ def find_change(fit: AlignmentFit) -> GroundChange | None:
         (first, first_std, left), (second, second_std, right) = (one for one in parts if one is not None)
         if left + right < best:
             best, found = left + right, (place, (first, first_std), (second, second_std))
-    if found is None or len(x) / 2 * math.log(whole / max(best, 1e-12)) < CHANGE_GAIN:
+    if found is None or len(x) / 2 * math.log(max(whole, 1e-12) / max(best, 1e-12)) < CHANGE_GAIN:
         return None
     place, before, after = found
     apart = abs(before[0] - after[0])

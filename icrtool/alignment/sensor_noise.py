@@ -150,6 +150,9 @@ def without_bad_start(log: RobotLog) -> RobotLog:
     gnss, wheels = log.gnss, log.wheels
     if len(gnss.stamp_ns) < 4 * FIRST_FIXES or len(wheels.stamp_ns) < 2:
         return log
+    if not all(np.isfinite(one).all() for one in (gnss.north_m, gnss.east_m, wheels.left, wheels.right)):
+        # refused later
+        return log
     seconds = np.diff(gnss.stamp_ns[: 4 * FIRST_FIXES]) / 1e9
     step = np.hypot(np.diff(gnss.north_m[: 4 * FIRST_FIXES]), np.diff(gnss.east_m[: 4 * FIRST_FIXES]))
     speed = float(np.quantile(np.abs(wheels.v_left_mps) + np.abs(wheels.v_right_mps), 0.99)) / 2

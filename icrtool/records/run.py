@@ -32,6 +32,9 @@ ICR_WORDS: dict[str, str] = dict(zip(ICR_COLUMNS, ("y right", "y left", "x"), st
 STATE_COLUMNS = ("north_m", "east_m", "heading_rad", *ICR_COLUMNS)
 """The state's entries, in the kernel's order."""
 
+ROLLING_SCALE = 0.15
+"""Tyres and soil change the distance of a turn of the wheel by up to this share."""
+
 USUAL_WIDTH_M = 0.6
 """Track width of a small field robot [m], used where that of the robot is not known."""
 
@@ -239,13 +242,17 @@ class Run:
     def radius_errors(self) -> tuple[float, float]:
         """Factors of `wheel_scales`, left and right, that correct a wrong radius or resolution, not tyres and soil.
 
-        Configured scales, or the power of two nearest to the estimated ones. Motion models are fitted to speeds with
-        these factors, and estimate the rest: their prior is of wheels that roll near their radius.
+        Scales of tyres and soil are within `ROLLING_SCALE` of 1, and no error; else the configured scales, or the power
+        of two nearest to the estimated ones. Motion models are fitted to speeds with these factors, and estimate the
+        rest: their prior is of wheels that roll near their radius.
         """
         given = self.config.wheels
-        if given.left_scale != "auto" or given.right_scale != "auto":
-            return self.wheel_scales
-        left, right = (2.0 ** round(math.log2(abs(one))) if one else 1.0 for one in self.wheel_scales)
+        configured = given.left_scale != "auto" or given.right_scale != "auto"
+        left, right = (
+            1.0 if not one or abs(abs(one) - 1.0) <= ROLLING_SCALE
+            else abs(one) if configured else 2.0 ** round(math.log2(abs(one)))
+            for one in self.wheel_scales
+        )  # fmt: skip
         return left, right
 
     @property
