@@ -7,24 +7,25 @@ import math
 from icrtool.records.plain_data import Record
 
 DEFAULT_SEED = 20140311
-"""Seed of random draws: any number, but the same for every run and every model."""
+"""Seed of random draws. Its value is arbitrary; it is the same for every run and every model."""
 
 CHOICE_HORIZON_M = 10.0
-"""The distance that headlines, tables of calibrations and the worst trials are about."""
+"""Distance of the errors in headlines, tables of calibrations and lists of the worst trials [m]."""
 
 
 METRICS = {
     "expected": "expected_error_m", "p50": "p50_m", "p95": "p95_m", "max": "max_m", "p95_next": "p95_next_high_m",
 }  # fmt: skip
-"""By its name in an acceptance limit: an error's name in files. ``p95_next`` is the upper end of what is expected of
-the next drive."""
+"""Names of errors in files, by their names in acceptance limits. ``p95_next`` is the upper end of the interval of the
+next drive."""
 
 DISTANCES = {"within": "p95_m", "within_next": "p95_next_high_m"}
-"""By the name of a distance in an acceptance limit: the error in files that stays within a budget over it."""
+"""Names of errors in files, by the names of distances in acceptance limits: over the distance, the error stays within a
+budget."""
 
 
 NEAR_HORIZONS_M = 1.5
-"""Between horizons that are further apart an interpolated distance is marked as one."""
+"""Largest distance between horizons at which an interpolated distance is stated without ``about`` [m]."""
 
 
 class BudgetDistance(Record, frozen=True):
@@ -35,10 +36,11 @@ class BudgetDistance(Record, frozen=True):
     distance_m : interpolated between horizons, from 0 m at 0 m
     beyond : `distance_m` is a lower bound: the error is within the budget at the last horizon with trials
     between_m : horizons interpolated between
-    without_events_m, beyond_without_events : the same of the trials that touch no slip event; None without an event
+    without_events_m, beyond_without_events : distance_m and beyond of trials that touch no slip event; None without an
+        event
     low_m, high_m : distances at which the upper and the lower end of the interval of p95 leave the budget; None where
         they stay within it, and where there is no interval
-    next_low_m, next_high_m : the same of the next drive of this robot on this kind of ground, 9 of 10
+    next_low_m, next_high_m : these distances for the next drive of this robot on this kind of ground, in 9 of 10 cases
     """
 
     model: str
@@ -90,7 +92,7 @@ class Gate(Record, frozen=True):
     ----------
     horizon_m : distance at which an error is bounded; None of a limit on the distance itself
     budget_m : of ``recommended.within@0.5m >= 10``, the error within which the distance counts; else None
-    bound_m : [m] the bound, beside the share of the baseline
+    bound_m : [m] the bound, without the share of the baseline
     baseline_factor : what the baseline's number is multiplied with; 0 where the limit does not name the baseline
     """
 

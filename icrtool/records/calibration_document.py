@@ -19,7 +19,7 @@ CALIBRATION_SCHEMA: Literal["icrtool/calibration/1"] = "icrtool/calibration/1"
 CALIBRATION_FRAME = "x forward, y right, turn rate clockwise; wheel speeds at the configured radius"
 
 WIDEST_M = 20.0
-"""Bound of `robot.track_width_m` in a configuration."""
+"""Largest `robot.track_width_m` in a configuration [m]."""
 
 UpTo1000 = Annotated[float, msgspec.Meta(gt=0, le=1000)]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1e300)]
@@ -57,8 +57,8 @@ class CalibrationLog(Record, frozen=True):
 
     Attributes
     ----------
-    heading_offset_deg : what its reference's heading is off; wheels_delay_s : its wheels against its poses, positive
-        for later
+    heading_offset_deg : offset of its reference's heading; wheels_delay_s : delay of its wheels with respect to its
+        poses, positive where the wheels lag
     begin_ns : stamp of its first state; 0 where it is not known
     """
 
@@ -79,7 +79,7 @@ class ControllerErrors(Record, frozen=True):
     pose_variance : (3,) of x forward, y left, yaw [m^2, m^2, rad^2] after 10 m
     twist_variance : (3,) of velocities averaged over 1 m [m^2/s^2, m^2/s^2, rad^2/s^2]
     turn_noise, way_noise : shares of variance, AMCL's alpha1 alpha2 and alpha3 alpha4
-    p95_m, full_p95_m : after 10 m, of the controller's model and of the whole one; None without a trial of 10 m
+    p95_m, full_p95_m : after 10 m, of the controller's model and of the recommended model; None without a trial of 10 m
     """
 
     pose_variance: tuple[float, float, float]
@@ -102,18 +102,18 @@ class ControllerDocument(ControllerNumbers, frozen=True, kw_only=True):
 
 
 class ErrorSources(Record, frozen=True):
-    """Variances of what a model leaves out, and what its quantiles are scaled by.
+    """Variances of errors that a model leaves out, and the factors on its quantiles.
 
     Attributes
     ----------
-    heading_start_rad2 : of the heading at the start
-    heading_rate_rad2pm2 : of a turn per metre that stays the same along the path
-    turn_share : of the share by which every turn is off
-    heading_wander_rad2pm : of the heading, for each metre
-    speed_share : of the share by which the distance is off
-    distance_wander_m2pm : of the distance, for each metre
-    heading_noise_rad2, position_noise_m2 : of the reference alone, beside the others
-    p95_factor, expected_factor : measured over predicted
+    heading_start_rad2 : variance of the heading at the start
+    heading_rate_rad2pm2 : variance of a turn per metre that is constant along the path
+    turn_share : variance of the relative error of turns
+    heading_wander_rad2pm : growth of the variance of the heading for each metre
+    speed_share : variance of the relative error of the distance
+    distance_wander_m2pm : growth of the variance of the distance for each metre
+    heading_noise_rad2, position_noise_m2 : variances of the reference's noise
+    p95_factor, expected_factor : measured error over predicted error
     measured_to_m : length of the longest windows; a longer forecast extrapolates
     """
 
@@ -131,7 +131,7 @@ class ErrorSources(Record, frozen=True):
 
 
 class FittedDocument(Record, frozen=True):
-    """A motion model that was fitted: its terms, their parameters, and the covariance of those."""
+    """A motion model that was fitted: its terms, their parameters, and the covariance of the parameters."""
 
     terms: tuple[str, ...]
     parameters: dict[str, ParameterDocument]
@@ -149,11 +149,11 @@ class GyroDocument(Record, frozen=True):
 
 
 SensorVerdict = Literal["shown", "weak", "not shown", "not separable", "given"]
-"""Whether a drive shows a parameter; `not separable`: no drive does; `given`: by the user."""
+"""Whether a drive shows a parameter. `not separable`: no drive shows it; `given`: the user gave it."""
 
 
 class SensorParameter(Record, frozen=True):
-    """What one log shows of antenna, offsets, delays and scales; null where it is not determined. `note`: why."""
+    """One parameter of antenna, offsets, delays or scales by one log; null where not determined. `note`: why."""
 
     value: float | None
     std: float | None
@@ -162,7 +162,7 @@ class SensorParameter(Record, frozen=True):
 
 
 class SensorDrive(Record, frozen=True):
-    """Distance, turns and speeds of the drive of one log; speeds are those while moving."""
+    """Distance, turns and speeds of the drive of one log; speeds are taken while the robot moves."""
 
     distance_m: float = field(name="way_m")
     turned_right_deg: float
@@ -173,14 +173,14 @@ class SensorDrive(Record, frozen=True):
 
 
 class CalibrationFile(Record, frozen=True, kw_only=True):
-    """What every calibration file has, and what it has of one log alone.
+    """The fields that every calibration file has, and the fields that only the file of one log has.
 
     Attributes
     ----------
     log, inputs : name and files of the log
     windows, independent_stretches : windows of driven distance, and how many count as independent
     window_miss_m : robust standard deviation of their displacements
-    settings : configuration keys that are worth setting
+    settings : configuration keys whose values the log shows
     alignment : estimates of the sensors
     """
 
@@ -200,7 +200,7 @@ class SensorDocument(CalibrationFile, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    parameters : as `alignment`: the estimates, then those derived from them, by the keys of
+    parameters : as `alignment`: the estimates, then estimates derived from them, by the keys of
         `icrtool.calibration.sensor_findings.LABELS`
     """
 
@@ -262,7 +262,7 @@ class ErrorsAt(Record, frozen=True):
 
 
 class TransferCost(ErrorsAt, frozen=True, kw_only=True):
-    """What the calibration of one group costs in the runs of another: its errors minus those of the tested group's own.
+    """Cost of one group's calibration in another's runs: its errors minus the errors of the tested group's own.
 
     Both in the same trials; the own calibration is held out.
     """
@@ -342,7 +342,7 @@ class ForecastSource(Record, frozen=True):
 
 
 class ForecastBudget(Record, frozen=True):
-    """The distance up to which 95 % of the errors stay within a budget; of wheels with a gyro too where it is known."""
+    """The distance up to which 95 % of the errors stay within a budget; also with a gyro, where known."""
 
     budget_m: float
     distance_m: float | None

@@ -1,4 +1,4 @@
-"""report.json: what a dropout report holds; numbers that are not known are null. And what pictures need beside it."""
+"""report.json: what a dropout report holds; unknown numbers are null. Also paths for pictures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DROPOUT_SCHEMA: Literal["icrtool/dropout/1"] = "icrtool/dropout/1"
 """Version of what report.json holds."""
 
 LARGEST_M = 1e12
-"""Of a number in a report: beyond it is damage, whose squares overflow."""
+"""Largest number in a report. A larger number is damage, and its square overflows."""
 
 Number = Annotated[float, Meta(ge=-LARGEST_M, le=LARGEST_M)] | None
 Numbers = list[Number]
@@ -62,10 +62,10 @@ class ErrorRow(Record, frozen=True):
 
 
 class SummaryRow(ErrorRow, frozen=True):
-    """A row of summary.csv: errors in percent of the distance too, with intervals, and of the heading.
+    """A row of summary.csv: errors in metres and in percent of the distance, their intervals, errors of the heading.
 
-    The intervals of this drive hold the truth with 95 %. `p95_next_low_m` to `p95_next_high_m` is where p95 of the next
-    drive of this robot on this kind of ground lies in 9 of 10 cases.
+    The intervals of this drive contain the true value with 95 %. `p95_next_low_m` to `p95_next_high_m` is where p95 of
+    the next drive of this robot on this kind of ground lies in 9 of 10 cases.
     """
 
     expected_pct: Number
@@ -179,7 +179,7 @@ class FitDocument(Record, frozen=True):
 
 
 class LadderDocument(Record, frozen=True):
-    """The comparison of models; `left_out`: why there is none, and then nothing else."""
+    """The comparison of models; `left_out`: why there is none: then all other fields are empty."""
 
     left_out: str | UnsetType = UNSET
     horizons_m: list[float] | UnsetType = UNSET
@@ -202,9 +202,9 @@ class UsedCalibration(Record, frozen=True):
     logs : how many it was fitted to; fitted_to_this : this log is among them
     created : date and time, UTC
     with_gyro : its row uses the gyro of the log
-    calibration : what its file holds, without the models that were not recommended, its scores, and what it shows of
+    calibration : content of its file, without the models that were not recommended, the scores and the findings on
         sensors
-    fitted : whether this log was among those it was fitted to, in words
+    fitted : whether this log was among the logs that it was fitted to, in words
     """
 
     name: str
@@ -218,7 +218,7 @@ class UsedCalibration(Record, frozen=True):
 
 
 class BestRow(Record, frozen=True):
-    """The row to drive with: the smallest expected error of those that a robot can drive with, by wheels alone.
+    """The row to drive with: the row of smallest expected error among the rows by wheels alone for a robot.
 
     Attributes
     ----------
@@ -242,7 +242,7 @@ class TurningSplit(Record, frozen=True):
 
 
 class BaselineDocument(Record, frozen=True):
-    """What the report was compared with, and what differs beside the numbers."""
+    """What the report was compared with, and what differs in addition to the numbers."""
 
     path: str
     log: str
@@ -357,7 +357,8 @@ class DropoutDocument(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    notes : the findings of the run and of the comparison of models; `warnings` : the sentences of those not grave
+    notes : the findings of the run and of the comparison of models; `warnings` : the sentences of the findings that are
+        not grave
     """
 
     schema: Literal["icrtool/dropout/1"]

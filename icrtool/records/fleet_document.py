@@ -15,19 +15,20 @@ FLEET_SCHEMA: Literal["icrtool/fleet/1"] = "icrtool/fleet/1"
 """Version of what fleet.json holds."""
 
 FLEET_FILE = "fleet.json"
-"""What a batch found, in its folder."""
+"""Name of the file with the result of a batch, in its folder."""
 
 FLEET_FAMILY = "icrtool/fleet/"
-"""Begin of the schema of a fleet.json."""
+"""First characters of the schema of a fleet.json, of any version."""
 
 RUNS, ROWS = "runs", ".rows"
-"""Folders of a batch: of the runs, and of the rows of the logs, written as they come."""
+"""Folders of a batch: the runs, and the rows of the logs, each written when its log is done."""
 
 BUDGET_M = 0.5
-"""Position error of the distance that a calibration is stated to keep within [m]."""
+"""Position error that defines the distance stated for a calibration [m]."""
 
 SHOWN_ERROR, SHOWN_WITHOUT = f"{MOST_USEFUL}_p95_10m_m", f"{WITHOUT_IT}_p95_10m_m"
-"""The error of each log that is printed, drawn, and compared with the baseline; without a held-out one the second."""
+"""The error of each log that is printed, drawn and compared with the baseline; the second where no held-out error
+exists."""
 
 Status = Literal["done", "failed"]
 ThisTime = Literal["processed", "skipped"]
@@ -59,14 +60,15 @@ def fleet_verdict(one: Verdict, log: str) -> FleetVerdict:
 
 
 class FleetFile(Record, frozen=True):
-    """A file of a log as it was when it was read.
+    """A file of a log, when it was read.
 
     Attributes
     ----------
-    mtime_ns : with `bytes` spares hashing it again; 0 of one that is not on a disk
+    mtime_ns : time of modification: where it and `bytes` are the same, the file is not hashed again; 0 for a file that
+        is not on a disk
     sha256 : None where not all of it was read
-    version : what its store states about the content, of one that is not on a disk
-    address : SHA-256 of the whole address of one that is not on a disk
+    version : what its store states about the content, for a file that is not on a disk
+    address : SHA-256 of the whole address, for a file that is not on a disk
     """
 
     path: str
@@ -83,20 +85,20 @@ class FleetLog(Record, frozen=True):
     Attributes
     ----------
     log : path below the common parent
-    run : directory of the run below that of the batch
+    run : directory of the run, below the directory of the batch
     status : of the result
-    this_time : ``skipped``: the result is that of an earlier batch from the same input, configuration and version
+    this_time : ``skipped``: the result is from an earlier batch with the same input, configuration and version
     reason : why it failed, its ICRs are not usable, or that the log is truncated; `usable` : whether they are
     details : last lines of the process that failed
     repeatable : whether the same input, configuration and version give this result again
     icr : final ICRs [m] and, as ``std_…``, their standard deviations
     multiplier : (y_r - y_l)/b, wheel separation multiplier of a differential-drive controller, with `multiplier_std`
     errors : ``<model>_p95_<h>m_m``, ``<model>_expected_<h>m_m`` and ``<model>_within_<budget>m_m``
-    bounds : those of the names in `errors` whose distance is a lower bound
+    bounds : the names in `errors` whose distance is a lower bound
     outages, warnings : how many
     notes : findings of the run, the grave ones among them
-    baseline : of the same names as `errors`, numbers of the log's report in the baseline
-    changes : how log, configuration and version differ from those of the baseline
+    baseline : numbers of the log's report in the baseline, by the names of `errors`
+    changes : how log, configuration and version differ from the baseline
     key : hash of configuration, request and version
     """
 
@@ -152,12 +154,13 @@ class FleetCalibration(Record, frozen=True):
 
     Attributes
     ----------
-    logs : that it is fitted to
+    logs : the logs that it is fitted to
     left_out : logs that are not usable, copies, parts of another, or beyond the time that is calibrated together
     file : calibration file below the folder of the batch; empty where there is no calibration, `reason` states why
-    recommended, multiplier, multiplier_std : of the calibration
+    recommended, multiplier, multiplier_std : recommended model and multiplier of the calibration
     icrs_m : right, left, x of the calibration
-    within_m : distance over which 95 % of the held-out errors stay within `BUDGET_M`; within_beyond : at least that
+    within_m : distance over which 95 % of the held-out errors stay within `BUDGET_M`; within_beyond : it is a lower
+        bound
     table : leave-one-log-out table as text
     key : hash of the logs and their content
     """

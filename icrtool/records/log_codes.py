@@ -15,13 +15,13 @@ OF_FILES: dict[str, Explanation] = {
         "warning",
         "Bytes, records, chunks or rows of a file are damaged.",
         "The damaged part is left out; there may be gaps in the drive.",
-        "Copy the log again, and compare its size and checksum with those of the original.",
+        "Copy the log again, and compare its size and checksum with the original.",
     ),
     "table_form": Explanation(
         "info",
         "The columns of a table are parted by semicolons or tabs, perhaps with decimal commas.",
         "It is read in that form.",
-        "None is needed. Check that the named form is that of the table.",
+        "None is needed. Check that the table has the named form.",
     ),
     "log_part_unreadable": Explanation(
         "warning",
@@ -51,7 +51,7 @@ OF_FILES: dict[str, Explanation] = {
         "warning",
         "Messages of a used topic do not fit their type, cannot be decompressed, or have an impossible time.",
         "These messages are left out; there are gaps in the stream.",
-        "Check that the message definitions in the log are those that the driver was built with.",
+        "Check that the driver was built with the message definitions in the log.",
     ),
     "definition_bundled": Explanation(
         "warning",
@@ -63,7 +63,7 @@ OF_FILES: dict[str, Explanation] = {
         "warning",
         "The stamps of a table or of wheel messages go back.",
         "The rows are sorted by their stamps.",
-        "Check that the stamps are those of the measurements. If the clock was set, use each part of the log alone.",
+        "Check that the stamps are times of the measurements. If the clock was set, use each part of the log alone.",
     ),
     "wheel_bursts": Explanation(
         "info",
@@ -142,7 +142,7 @@ OF_WHEELS: dict[str, Explanation] = {
     "wheels_commanded": Explanation(
         "warning",
         "No measured wheel speeds were found: the topic holds commanded ones.",
-        "What the wheels did not do of the commands goes into the ICRs and delays.",
+        "The difference between commands and wheel speeds goes into the ICRs and delays.",
         "Record encoders or joint states. `topics.wheels` chooses a topic.",
     ),
     "wheel_dead": Explanation(
@@ -178,7 +178,7 @@ OF_WHEELS: dict[str, Explanation] = {
     "counter_begins_again": Explanation(
         "info",
         "The numbers of a wheel begin again at a limit, as counters of few bits and angles do.",
-        "They are counted on.",
+        "The numbers are continued beyond the limit.",
         "None is needed. Check the named limit.",
     ),
     "header_clock": Explanation(
@@ -189,7 +189,7 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "gyro_in_degrees": Explanation(
         "info",
-        "The turn rates of an inertial unit agree with those of headings or fixes in deg/s, not in rad/s.",
+        "The turn rates of an inertial unit agree with headings or fixes in deg/s, not in rad/s.",
         "They are converted.",
         "None is needed. Send rad/s (REP-103).",
     ),
@@ -225,7 +225,7 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "wheel_speeds_impossible": Explanation(
         "warning",
-        "Wheel speeds are beyond what a robot can drive, or unlike those around them.",
+        "Wheel speeds are beyond what a robot can drive, or unlike the samples around them.",
         "These samples are left out.",
         "Check whether encoder counters were reset or overflow.",
     ),
@@ -243,7 +243,7 @@ OF_WHEELS: dict[str, Explanation] = {
     ),
     "wheels_slip": Explanation(
         "warning",
-        "Distance or turns of the wheels differ from those of the robot by changing amounts.",
+        "Distance or turns of the wheels differ from the robot's distance or turns by changing amounts.",
         "No scale and no delay is corrected; the errors without GNSS are large.",
         "Expected on ice, mud and loose ground. Else check tyres, tracks and encoders.",
     ),
@@ -420,7 +420,7 @@ OF_HEADINGS: dict[str, Explanation] = {
     "heading_scatters": Explanation(
         "warning",
         "The heading scatters about the course over ground.",
-        "Its noise is raised to that.",
+        "Its noise is raised to the measured scatter.",
         "Keep magnetometers away from motors; use a heading of two antennas.",
     ),
     "headings_rejected": Explanation(

@@ -14,10 +14,10 @@ from icrtool.records.plain_data import Record
 from icrtool.records.samples import GyroSamples, HeadingSamples, Samples, StreamChoice, WheelSamples
 
 RESPONSE_S = 0.1
-"""A robot answers its wheels by up to so much later, on rigid-body simulated drives."""
+"""Longest lag of the body's motion behind the wheel speeds [s]. Source: rigid-body simulations."""
 
 MOVING_S, TURNING_MPS = 60.0, 0.01
-"""A robot is in use, and counts as moving, for so long before and after its wheels turn faster than that."""
+"""A robot counts as moving for `MOVING_S` [s] before and after its wheels turn faster than `TURNING_MPS` [m/s]."""
 
 Triple = tuple[float, float, float]
 
@@ -71,13 +71,13 @@ class IcrStart(Record, frozen=True):
 
 
 class LogFacts(Record, frozen=True, kw_only=True):
-    """What is known of a log beside its streams; ``facts`` of run.json.
+    """What is known of a log in addition to its streams; ``facts`` of run.json.
 
     Attributes
     ----------
     heading_from_position : heading and position are fields of the same messages: they have the same delay
     heading_correlation_s : the errors of headings closer together than this are correlated
-    heading_is_estimated : the headings are estimated, with the positions; they do not exist without them
+    heading_is_estimated : the headings are estimated with the positions, and do not exist without positions
     heading_is_measured : the variance of the headings is that of a reference's poses, as measured
     turn_wander_rad : how far the heading wanders from the turn of the wheels in a second (rms), noise included; None:
         not known
@@ -97,20 +97,20 @@ class LogFacts(Record, frozen=True, kw_only=True):
 
     @property
     def headings_are_precise(self) -> bool:
-        """Whether the variance of a heading is its own, and not that of an error which lasts."""
+        """Whether the variance of a heading is its own noise, and not the variance of a lasting error."""
         return self.heading_is_estimated or self.heading_is_measured
 
 
 @dataclass(frozen=True, slots=True)
 class SensorData:
-    """The streams of one log as the filter uses them: all it needs of the log.
+    """The streams of one log as the filter uses them: everything that the filter needs of the log.
 
     Attributes
     ----------
     name : of the log
     headings : clockwise from north, offset corrected; every variance finite
-    gyro : not used by the filter; None without one
-    facts : all that is no column and no span of time
+    gyro : turn rates, not used by the filter; None without a gyro
+    facts : everything that is no column and no span of time
     losses_ns : half-open spans in which RTK was lost, (k, 2)
     events : slip events, in order of time
     jumps : of the reference, likewise
@@ -129,9 +129,9 @@ class SensorData:
     attitude: HeadingSamples | None = None
 
     def moving(self) -> tuple[Bools, Bools]:
-        """Return at which fixes (m,) and headings (h,) the wheels turn, or do within `MOVING_S`; all where at none.
+        """Return at which fixes (m,) and headings (h,) the wheels turn within `MOVING_S`; all where they never turn.
 
-        What a robot measures while it stands shows neither delays nor contradictions, however long it stands.
+        Measurements of a standing robot show neither delays nor contradictions, however long it stands.
         """
         stamps = self.wheels.stamp_ns
         turning = np.empty(len(stamps), np.bool_)
@@ -183,7 +183,7 @@ class WheelFacts(Record, frozen=True, kw_only=True):
     applied_scale : mean of what both sides were multiplied with
     applied_left_scale, applied_right_scale : what each was multiplied with, configured scales included
     held_share : share of samples, while moving, that repeat the one before
-    filtered : how they show that a filter made them; None for none
+    filtered : in words, how the wheels show that a filter made them; None where they do not
     windows, stretches : windows in which wheels and positions were compared, and how many count as independent
     residual_m : robust standard deviation of their displacements; None without windows
     turn_left, turn_left_std : share of the variance of the robot's turns over a second that the wheels do not explain,
@@ -212,13 +212,13 @@ class HeadingFacts(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     source : orientation, dual_antenna_message, antenna_pair, gyro_course, wheels_course or fused
-    parts : of an estimated heading, in words; None for a stated one
+    parts : the sensors of an estimated heading, in words; None for a stated heading
     windows : stretches of distance compared
-    applied_mirror : the heading is turned over
+    applied_mirror : the sense of the heading is reversed
     offset_deg, offset_std_deg : heading minus course over ground; None when there was nothing to compare
     scatter_deg : robust standard deviation of the differences
     applied_offset_deg : what is subtracted; applied_std_deg : the least noise that the filter uses
-    std_deg : median standard deviation of an estimated heading, as the filter is given it; None for a stated one
+    std_deg : median standard deviation of an estimated heading, as the filter uses it; None for a stated heading
     offset_name : what a significant offset may come from
     agreement, mirrored_agreement : mean resultant length of heading minus course over ground, in either sense
     """
@@ -246,7 +246,7 @@ class Measurements:
 
     Attributes
     ----------
-    findings : by name with unit; run.json has them as ``alignment``
+    findings : estimates by name with unit; run.json has them as ``alignment``
     streams : the log's chosen topics; ``why`` also names the unit of the wheels
     wheels, heading : what is known of them, for run.json
     notes : findings, in the order they were made
@@ -289,7 +289,7 @@ class SlipEvent(Record, frozen=True):
     north_m, east_m : position at the begin, in the local plane
     distance_m : length of the robot's path through the event, by the position reference
     severity : share of the wheels' motion that the robot did not make, 0 to 1
-    confidence : probability that model error and sensor noise alone would not have made any such event in the log
+    confidence : probability that model error and sensor noise alone make no such event in the log
     """
 
     kind: SlipKind
@@ -315,9 +315,9 @@ class ReferenceJump(Record, frozen=True):
     north_m, east_m : position before it, in the local plane
     size_m : largest step of the position within it, beyond the motion of the wheels
     turn_deg : likewise of the heading, clockwise; 0 where the heading is not stated with the position
-    moved_north_m, moved_east_m : sum of its steps
+    moved_north_m, moved_east_m : sum of its steps [m]
     why : what shows it
-    undecided : it may as well be the robot: its trials count
+    undecided : it may be the robot's own motion: its trials count
     """
 
     kind: JumpKind

@@ -1,6 +1,6 @@
 """The codes of all findings, each with its grade, cause, consequence and what to do. docs/warnings.md is made of it.
 
-Those of logs are in `icrtool.records.log_codes`; those of runs and calibrations are here.
+The codes of logs are in `icrtool.records.log_codes`; the codes of runs, reports and calibrations are here.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ OF_RUNS: dict[str, Explanation] = {
     "robot_does_not_slip": Explanation(
         "info",
         "The ICRs are as far apart as the tracks: the robot turns as a differential drive.",
-        "ICRs improve nothing over the track width.",
+        "ICRs predict the motion no better than the track width.",
         "None is needed. Check that `robot.track_width_m` was measured, not fitted.",
     ),
     "multiplier_unusual": Explanation(
         "warning",
-        "The ICRs are closer together or further apart than those of robots that slip.",
+        "The ICRs are closer together or further apart than the ICRs of robots that slip.",
         "Track width, radius, sides or units are probably wrong.",
         "Check `robot.track_width_m`, `robot.wheel_radius_m` and the sides.",
     ),
@@ -94,7 +94,7 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
     "wheels_filtered": Explanation(
         "grave",
         "The wheel speeds are filtered or fused odometry.",
-        "The ICRs are those of the filter that made them.",
+        "The ICRs describe the filter that made the speeds, not the robot.",
         "Name the topic of the wheels themselves with `topics.wheels`.",
     ),
     "icrs_not_shown": Explanation(
@@ -135,13 +135,13 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
     ),
     "windows_contradict": Explanation(
         "grave",
-        "The ICRs of the filter contradict those of windows of the same drive.",
+        "The ICRs of the filter contradict the ICRs of windows of the same drive.",
         "Clocks or slip make at least one of them wrong.",
         "Synchronise the clocks; drive on one ground.",
     ),
     "wheel_scale_wrong": Explanation(
         "grave",
-        "The robot goes a quite different distance than the wheels report.",
+        "The robot's distance is quite different from the distance that the wheels report.",
         "Radius, resolution or unit is wrong, and with it every ICR.",
         "Check `robot.wheel_radius_m`, `robot.encoder_counts_per_rev` and `wheels.quantity`.",
     ),
@@ -157,8 +157,8 @@ OF_UNUSABLE_RUNS: dict[str, Explanation] = {
 OF_REPORTS: dict[str, Explanation] = {
     "topic_not_open_loop": Explanation(
         "warning",
-        "The error of a scored topic does not grow with distance, where that of the wheels does.",
-        "GNSS or a map is in its poses: its row does not show how far it goes without.",
+        "The error of a scored topic does not grow with distance, while the error of the wheels grows.",
+        "GNSS or a map is in its poses: its row does not show the distance without GNSS.",
         "Record a drive in which the localisation runs without GNSS, and score that topic.",
     ),
 }
@@ -174,25 +174,25 @@ OF_CALIBRATIONS: dict[str, Explanation] = {
     "calibration_error_large": Explanation(
         "grave",
         "The 95 % error of the calibration, held out of the fit, is more than half of the distance.",
-        "It predicts no motion.",
+        "It does not predict the motion.",
         "Calibrate on drives of the ground that the robot works on.",
     ),
     "calibration_no_better": Explanation(
         "grave",
-        "The expected error of the calibration, held out of the fit, is not less than without slip.",
+        "The expected error of the calibration, held out of the fit, is not less than the error of the no-slip model.",
         "It improves nothing.",
         "Calibrate on more drives, with turns to both sides.",
     ),
     "turning_not_shown": Explanation(
         "grave",
         "The driving did not show how the robot turns.",
-        "The multiplier is that of the prior.",
+        "The multiplier is the value of the prior.",
         "Drive two full turns on the spot to each side.",
     ),
     "parameter_not_shown": Explanation(
         "warning",
         "The driving did not show a parameter of the motion model.",
-        "Its value is that of the prior.",
+        "Its value is the value of the prior.",
         "Drive with turns to both sides and changes of speed.",
     ),
     "multiplier_below_one": Explanation(
@@ -202,7 +202,7 @@ OF_CALIBRATIONS: dict[str, Explanation] = {
         "Check track width, radius and whether the wheels are read from a body twist.",
     ),
 }
-"""Codes of what is to be known of a calibration."""
+"""Codes of findings about a calibration."""
 
 GROUPS: dict[str, dict[str, Explanation]] = {
     "Files": OF_FILES,
@@ -215,7 +215,7 @@ GROUPS: dict[str, dict[str, Explanation]] = {
     "Dropout reports": OF_REPORTS,
     "Calibrations": OF_CALIBRATIONS,
 }
-"""All codes by what they are about, under the headings of docs/warnings.md."""
+"""All codes by subject, under the headings of docs/warnings.md."""
 
 CATALOGUE: dict[str, Explanation] = {code: entry for group in GROUPS.values() for code, entry in group.items()}
 """All codes."""

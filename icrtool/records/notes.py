@@ -36,7 +36,7 @@ class Note(Record, frozen=True):
 
     @property
     def sentence(self) -> str:
-        """The text after the name of what it is about."""
+        """The text, after the name of its subject."""
         return f"{self.subject}: {self.text}" if self.subject else self.text
 
 
@@ -53,7 +53,7 @@ def note(code: str, text: str, subject: str = "") -> Note:
 
 
 def about(subject: str, notes: Iterable[Note]) -> tuple[Note, ...]:
-    """Return findings as those of a log or file of this name."""
+    """Return findings with a log or file of this name as their subject."""
     plain = str.__str__(subject)
     return tuple(msgspec.structs.replace(one, subject=plain) for one in notes)
 
@@ -64,7 +64,7 @@ def is_grave(one: Note) -> bool:
 
 
 def warnings_of(notes: Iterable[Note]) -> tuple[str, ...]:
-    """Return the sentences of the findings that are not grave: `unusable_because` gives the others."""
+    """Return the sentences of the findings that are not grave; `unusable_because` returns the grave ones."""
     return tuple(one.sentence for one in notes if not is_grave(one))
 
 

@@ -23,7 +23,7 @@ else:
     from pathlib import PosixPath as _LocalPath
 
 LARGEST_DOCUMENT_BYTES = 1 << 28
-"""Of a file that is read into memory whole: the run.json of a long drive has some MB."""
+"""Largest file that is read into memory whole [bytes]. The run.json of a long drive has some MB."""
 
 _READ_ON_BYTES = 1 << 20
 
@@ -40,7 +40,7 @@ SCHEMES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "http", "https")
 its memory, or programs (``file``, ``memory``, ``github``, chains with ``::``)."""
 
 _LEAST_SECRET = 4
-"""Characters of the shortest part of an address that is looked for in the texts of libraries."""
+"""Length of the shortest secret that is removed from texts of libraries, in characters."""
 
 
 class NotRegularFileError(OSError):
@@ -56,7 +56,8 @@ def open_regular(path: Path, inside: Path | None = None) -> BufferedReader:
 
     Parameters
     ----------
-    inside : a directory above the file; below it no link is followed. None: the user named this file, links are
+    inside : a directory above the file; below it no link is followed. None: links are followed, because the user named
+        the file
 
     Raises
     ------
@@ -89,7 +90,7 @@ def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGE
         As `open_regular`; the file is larger than `most_bytes`.
     """
     with open_regular(path, inside) as file:
-        # as large as the file, not as the limit: so much memory is asked for
+        # the size of the file, not the limit: this is the memory that is allocated
         size = min(os.fstat(file.fileno()).st_size, most_bytes)
         content = file.read(size + 1)
         while len(content) <= most_bytes and (more := file.read(min(_READ_ON_BYTES, most_bytes + 1 - len(content)))):
@@ -100,7 +101,7 @@ def read_regular(path: Path, inside: Path | None = None, most_bytes: int = LARGE
 
 
 def is_special(path: Path) -> bool:
-    """Return whether there is a pipe or a device, which could be read for ever."""
+    """Return whether there is a pipe or a device, whose reading may never end."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
@@ -154,7 +155,7 @@ class UrlPath(_LocalPath):
 
     @property
     def url(self) -> str:
-        """The address, with all that it takes to read it."""
+        """The whole address, with password and query."""
         return self._url
 
     @property
@@ -168,7 +169,7 @@ class UrlPath(_LocalPath):
         return Path(*self.parts[:-1])
 
     def with_segments(self, *segments: object) -> Path:
-        """Return what is made of parts of it: a path like any other."""
+        """Return a path of parts of the address: a path like any other."""
         return Path(*map(str, segments))
 
     def __truediv__(self, name: object) -> Self:
@@ -188,13 +189,13 @@ class UrlPath(_LocalPath):
 
     @property
     def digest(self) -> str:
-        """SHA-256 (hex) of the whole address: two that differ in their query alone have the same text."""
-        import hashlib  # here, since the help of a command needs none
+        """SHA-256 (hex) of the whole address: addresses that differ only in their queries have the same text."""
+        import hashlib  # here, because the help of a command does not need it
 
         return hashlib.sha256(self._url.encode("utf-8", "surrogateescape")).hexdigest()
 
     def problem(self) -> str:
-        """Return in words why it is no address that can be read, empty where it is one."""
+        """Return in words why the address cannot be read; empty where it can."""
         if "::" in self._url.partition("?")[0]:
             return "chains with :: are not read"
         if self.scheme not in SCHEMES:
@@ -230,7 +231,7 @@ def place_of(text: str) -> Path:
 
 
 def _parts(url: str) -> tuple[str, str, str, str]:
-    """Return an address as scheme, user and password, what is shown of it, and what stands behind that."""
+    """Return the parts of an address: scheme, user and password, the part that is shown, and the rest."""
     scheme, _, rest = url.partition("://")
     is_web, first = scheme.lower().startswith("http"), rest.partition("/")[0]
     known, mark, host = first.rpartition("@")

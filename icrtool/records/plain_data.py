@@ -1,4 +1,4 @@
-"""Plain data: what JSON holds and gives back unchanged; and the records that JSON documents are made of."""
+"""Plain data, which JSON holds and returns unchanged; and the records of JSON documents."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def known(value: float) -> float | None:
 def plain(value: object) -> Any:  # noqa: ANN401 - whatever JSON holds
     """Return a value as JSON gives it back: lists, dicts, text, numbers; None for what is not a finite number.
 
-    Of a dataclass the fields that are compared count: the others are no content; nor is what is not set.
+    Of a dataclass, only fields that are compared and set are content.
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
-    # most values are single ones: they are asked for before what takes longer to find out
+    # most values are single ones: they are tested first, because the other tests take longer
     if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, float):

@@ -31,12 +31,12 @@ class Preset:
     keeps_sides : the right ICR stays right of the robot, the left one left
     final_of_filter : the ICRs of a run are the filter's last ones; else they come from a fit to windows of the drive
     rate_invariant : process noise does not depend on the number of steps
-    step_heading : part of the turn of a step after which the robot moves along its heading
+    step_heading : share of a step's turn that is added to the heading before the step's displacement
     process_noise : of the pose, where none is configured
     printed_derivatives : the Jacobian is that of Eqs. 28-29 as printed, with the difference of Eqs. 32-34; else it has
         the true derivatives. Both are the same where the right ICR is right of the left one
-    initial_icrs_m : right, left, x [m]; None: those of skid-steer robots of the track width
-    initial_icr_std_m : None: as those differ
+    initial_icrs_m : right, left, x [m]; None: the ICRs of usual skid-steer robots of the track width
+    initial_icr_std_m : standard deviation [m]; None: the spread of the ICRs of usual robots
     terrain_icr_std_m : of the ICRs after a change of terrain [m]; None: the track width
     """
 
@@ -94,7 +94,7 @@ FIELD = Preset(
     printed_derivatives=False,
     initial_icrs_m=None,
     initial_icr_std_m=None,
-    # 10 m is far beyond what a linearised filter of ICRs a metre apart bears: some drives end with wrong ICRs.
+    # With 10 m a linearised filter of ICRs about 1 m apart ends with wrong ICRs on some drives.
     terrain_icr_std_m=None,
 )
 """What logs from the field need: their sensors have errors, and their robots have known tracks."""

@@ -1,4 +1,4 @@
-"""What a process has to clear: files that it is writing, where it is ended by force, and memory that it freed."""
+"""What a process has to clear: unfinished files, where it is ended by force, and memory that it freed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pathlib import Path  # its import would be a tenth of ``icrtool --help``
 
 TRIES = 20
-"""Another thread may still add files to a directory while it is removed."""
+"""Attempts to remove a directory: another thread may still add files to it."""
 
 _paths: set[Path] = set()
 _undisturbed: list[bool] = []
@@ -40,7 +40,7 @@ def unfinished(path: Path) -> Iterator[None]:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Have a signal end the process behind the block: a short one that makes a file under a name of its choice."""
+    """Let a signal end the process only after the block, which is short and makes a file under an unknown name."""
     _undisturbed.append(True)
     try:
         yield
@@ -72,21 +72,22 @@ def remove(path: Path) -> None:
 
 
 LARGE_BYTES = 600 << 20
-"""A process that never took more has nothing to give back that would matter: all logs of up to an hour."""
+"""Memory below which a process does not give freed memory back [bytes]: logs of up to an hour take less, and the gain
+would not matter."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Of glibc's ``malloc.h``."""
 
 KEPT_BYTES, OWN_PAGES_BYTES = 1 << 27, 1 << 24
-"""The free end of the memory is given back when it is larger; an array that is larger has pages of its own, which go
-back with it."""
+"""Sizes for glibc [bytes]: a free end of the memory larger than `KEPT_BYTES` is given back; an array larger than
+`OWN_PAGES_BYTES` has pages of its own, which are given back with it."""
 
 
 def keep_freed() -> None:
-    """Have all threads that start from now on allocate where the main thread does, and use what others freed again.
+    """Let new threads allocate in the main thread's memory, and use memory again that other threads freed.
 
-    glibc gives each thread an arena of its own, whose free end `malloc_trim` does not give back; and it gives the
-    memory of a column of an hour back to take it anew for the next one, half of all pages that a fit is given.
+    glibc gives each thread an arena of its own, whose free end `malloc_trim` does not give back; and glibc gives the
+    memory of a column of 1 h back and requests it again for the next column: half of all pages of a fit.
     """
     _call_libc("mallopt", M_ARENA_MAX, 1)
     _call_libc("mallopt", M_TRIM_THRESHOLD, KEPT_BYTES)
@@ -96,8 +97,8 @@ def keep_freed() -> None:
 def give_back_freed() -> None:
     """Have the C library give freed memory back.
 
-    glibc keeps freed blocks of up to 32 MB, in pieces that no other column of a long log fits into: after reading 10 h
-    at 100 Hz they are 0.3 GB.
+    glibc keeps freed blocks of up to 32 MB, in pieces that are too small for another column of a long log: 0.3 GB after
+    reading 10 h at 100 Hz.
     """
     if sys.platform == "linux":
         from resource import RUSAGE_SELF, getrusage

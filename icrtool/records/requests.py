@@ -119,7 +119,7 @@ class BatchRequest:
     settings : a manifest's line comes before its file and robot
     report, files : of every log
     redo : logs that are done are processed again
-    timeout_s : a log that takes longer is ended
+    timeout_s : longest time of a log [s]; a longer process is ended
     baseline : earlier report, run or batch to compare with
     """
 
@@ -137,7 +137,7 @@ class LogRequest(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     path : of the log
-    known : its row as far as it is known before
+    known : the fields of its row that are known before the fit
     folder : of the batch
     baseline : place of an earlier report or batch to compare with; empty: none
     """

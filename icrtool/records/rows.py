@@ -12,33 +12,33 @@ from typing import Literal
 from icrtool.kernels.error_statistics import Spread
 
 Color = Literal["green", "purple", "blue", "orange", "grey", "brown", "pink", "teal", "olive", "slate"]
-"""Name of a colour; `icrtool.output.figures.style` and page.css state which it is on paper and on a screen."""
+"""Name of a colour; `icrtool.output.figures.style` and page.css state its value on paper and on a screen."""
 
 Dash = Literal["solid", "dashed", "dotted", "dashdot"]
 
 TURNED_BY = ("gyro", "heading")
-"""What a row can turn by in place of the wheels alone; the row's name then ends with it, as ``icr_gyro``."""
+"""Sensors that a row can take its turns from in place of the wheels; its name ends with the sensor: ``icr_gyro``."""
 
 REST_OF_DRIVE = "the rest of the drive"
-"""What the numbers of a row were learned from that is tested on distance it was not fitted to."""
+"""In `knows`: the row is tested on distance that its numbers were not fitted to."""
 
 WHOLE_DRIVE = "the whole drive, its trials too"
 
 PAST = "the drive before each start"
-"""What the numbers of a row were learned from that knows nothing of its trials."""
+"""In `knows`: the numbers of the row were learned before each trial begins."""
 
 INSTALLATION = "sensors corrected by all of the drive"
-"""What a row knows of all of the drive: conventions, heading offset, delays, scales, and the noise of the sensors."""
+"""In `knows`: conventions, heading offset, delays, scales and sensor noise come from all of the drive."""
 
 
 FITTED_SPREAD = Spread(shift=0.3, between=0.45, horizon_std=1.0)
 """Spread of p95 between drives, of rows whose numbers were fitted to the drive and turn by the wheels."""
 
 GIVEN_SPREAD = Spread(shift=0.0, between=0.45, horizon_std=0.95)
-"""The same, of rows whose numbers do not depend on the rest of the drive."""
+"""Spread of p95 between drives, of rows whose numbers do not depend on the rest of the drive."""
 
 TURNED_SPREAD = Spread(shift=0.0, between=0.15, horizon_std=0.75)
-"""The same, of rows that turn by a gyro or a measured heading."""
+"""Spread of p95 between drives, of rows that turn by a gyro or a measured heading."""
 
 TOPIC_ROW = "topic"
 """Kind of the rows that stand for a topic of the log."""
@@ -53,12 +53,12 @@ class Row:
     name : as in summary.csv, in limits and in every output
     words : what predicts the motion, in a few words
     knows : what its numbers were learned from
-    color, dash, width : its line, in pictures and on pages; width 1 is that of most
+    color, dash, width : its line, in pictures and on pages; most lines have width 1
     shown : stands in the first table and is drawn on a page from the start; the others are a click or ``-v`` away
     pictured : drawn in pictures, and its path is made for single trials
     in_csv : has a column where a table has one column a row: worst.csv, the page of a batch
     on_robot : a user can run it on a robot; the others analyse a log
-    compared : stands for comparison: a thin line without interval, beside every other row in pictures of paths
+    compared : stands for comparison: a thin line without interval, drawn with every other row in pictures of paths
     turned_shown : `shown` of the row with a gyro or heading
     turned_knows : `knows` of the row with a gyro or heading
     spread : how its p95 differs between drives of one robot on one kind of ground
@@ -121,20 +121,20 @@ REPORT_ROWS: dict[str, Row] = {
         ),
     )
 }  # fmt: skip
-"""The rows by name, in the order in which they are shown. ``calibration:STEM`` and ``topic:/its/name`` are kinds of
-the rows ``calibration`` and ``topic``."""
+"""The rows by name, in the order in which they are shown. ``calibration:STEM`` is a row of kind ``calibration``,
+``topic:/its/name`` a row of kind ``topic``."""
 
 MOST_USEFUL, WITHOUT_IT = "recommended", "icr"
-"""The row that stands for a log, and the one that does where a report has no held-out rows."""
+"""The row that stands for a log, and the row in its place where a report has no held-out rows."""
 
 LONGEST_ROW_NAME = 28
-"""Characters of a row's name in tables and titles; of a longer one the middle is left out."""
+"""Characters of a row's name in tables and titles; the middle of a longer name is left out."""
 
 FURTHER_LOOKS: tuple[tuple[Color, Dash], ...] = (
     ("teal", "dashdot"), ("olive", "dashed"), ("slate", "solid"), ("teal", "dotted"), ("olive", "solid"),
     ("slate", "dashdot"), ("teal", "dashed"), ("olive", "dotted"), ("slate", "dotted"),
 )  # fmt: skip
-"""Looks of rows of one kind (calibrations, topics) and of those of a caller, in turn."""
+"""Colours and dashes of further rows of one kind (calibrations, topics) and of a caller's rows, in turn."""
 
 
 def turned_by(name: str) -> str:
@@ -154,7 +154,7 @@ def base_of(name: str) -> str:
 
 
 def kind_of(name: str) -> str:
-    """Return the name of a row's entry in `REPORT_ROWS`; of a row that is in none, its own without what it turns by."""
+    """Return the name of a row's entry in `REPORT_ROWS`; for a row without entry, its own name without `turned_by`."""
     return base_of(name).partition(":")[0]
 
 
@@ -190,7 +190,7 @@ def rows_of(names: Iterable[str]) -> dict[str, Row]:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Return names of rows in the order in which they are shown, those with a gyro behind those without."""
+    """Return names of rows in the order in which they are shown, rows with a gyro after rows without."""
     return list(rows_of(names))
 
 

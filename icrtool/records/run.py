@@ -36,10 +36,10 @@ ROLLING_SCALE = 0.15
 """Tyres and soil change the distance of a turn of the wheel by up to this share."""
 
 USUAL_WIDTH_M = 0.6
-"""Track width of a small field robot [m], used where that of the robot is not known."""
+"""Track width of a small field robot [m], used where the robot's track width is not known."""
 
 MAKE_RUN = "icrtool.fit(log) makes one, icrtool.open_run(directory) reads one"
-"""What to call for a run."""
+"""Advice where something else than a run is given."""
 
 
 def check_type(value: object, kind: type, advice: str) -> None:
@@ -234,7 +234,7 @@ class Run:
     def wheel_scales(self) -> tuple[float, float]:
         """Factors, left and right, from the speeds at the nominal wheel radius to the recorded ones.
 
-        They hold configured and estimated scales; speeds divided by them are those that the wheels reported.
+        They include configured and estimated scales; speeds divided by them are the speeds that the wheels reported.
         """
         return self.document.wheels.applied_left_scale, self.document.wheels.applied_right_scale
 
@@ -273,9 +273,9 @@ class Run:
         Parameters
         ----------
         path : the directory
-        states : format of the states; default: ``csv``, of over a million states ``parquet``
+        states : format of the states; default: ``csv``, or ``parquet`` for over a million states
         plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
-        figures : ``all``: those of the paper too
+        figures : ``all``: the figures of the paper too
 
         Raises
         ------
@@ -339,7 +339,7 @@ def vendor_icrs(document: RunDocument) -> Icrs | None:
 
     Notes
     -----
-    The robot turns as if it were m times as wide: these are the ICRs of no slip with a track width of m b.
+    The robot turns as a robot of track width m b without slip: these are its no-slip ICRs.
     """
     robot = document.config.robot
     if robot.skid_factor is None or robot.track_width_m is None or why_no_vendor(document):
@@ -355,7 +355,7 @@ def track_of(run: Run) -> Track:
 def track_of_states(
     table: States, in_gap: Bools, outages_ns: Ints, *, jumping: Bools | None = None, slipping: Bools | None = None
 ) -> Track:
-    """Return states as a track; `jumping` and `slipping` as those of `Run`, None for none."""
+    """Return states as a track; `jumping` and `slipping` as in `Run`, None where there are none."""
     in_outage = np.zeros(len(table), np.bool_)
     for begin, end in outages_ns:
         # The last fix is still good at `begin`, and the first one again at `end`.

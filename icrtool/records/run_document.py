@@ -1,4 +1,4 @@
-"""run.json: what a run holds beside its columns. `icrtool.fit` makes it, and it is written and read as this record.
+"""run.json: what a run holds in addition to its columns. `icrtool.fit` makes this record.
 
 A key that a later version adds has a default, so that older runs can still be read.
 """
@@ -263,8 +263,8 @@ class ExcitationDocument(Record, frozen=True):
 
     Attributes
     ----------
-    std_m : standard deviation that the drive's information allows (Cramer-Rao, constants, some slip)
-    turned_right_deg, turned_left_deg : heading changes summed to either side; spun_*: of these, on the spot
+    std_m : least standard deviation by the drive's information (Cramer-Rao bound, constant ICRs, some slip)
+    turned_right_deg, turned_left_deg : sums of the heading changes to each side; spun_*: their part on the spot
     notes : the verdict in words, and what to drive next; empty where all is shown
     """
 
@@ -290,10 +290,10 @@ class ControllerNumbers(Record, frozen=True):
 
     Attributes
     ----------
-    multiplier : (y_r - y_l) / b, beside the radius factors
+    multiplier : (y_r - y_l) / b, used together with the radius factors
     left_radius, right_radius : wheel radius over the configured one, configured scales included
-    multiplier_between_std, radius_between_std : by how much they differ from drive to drive of one robot on one kind of
-        ground, whatever is known of one drive
+    multiplier_between_std, radius_between_std : standard deviation between drives of one robot on one kind of ground,
+        in addition to the uncertainty of one drive
     """
 
     multiplier: float
@@ -396,7 +396,7 @@ class RunDocument(Record, frozen=True, kw_only=True):
 
     @property
     def content(self) -> tuple[str, ...]:
-        """SHA-256 of each file of the log; none where one is not known: it is not known to be a copy of another."""
+        """SHA-256 of each file of the log; empty where one is not known: copies of the log are then not recognised."""
         return known_content(file.sha256 for file in self.inputs)
 
     def icr_of_drive(self, column: IcrColumn) -> tuple[float, float] | None:

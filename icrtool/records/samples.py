@@ -15,7 +15,7 @@ from icrtool.kernels.arrays import Bools, Bytes, Floats, Ints
 Role = Literal["wheels", "gnss", "heading"]
 
 ROLE_WORDS: dict[Role, str] = {"wheels": "wheels", "gnss": "position", "heading": "heading"}
-"""What a role is called in messages: a position may come from a lidar."""
+"""Names of the roles in messages. ``gnss`` is called position, because a lidar may be its source."""
 
 
 NOT_STATED, OTHER_FIX, FLOAT_FIX, FIXED_FIX, RTK_FIX = 0, 1, 2, 3, 4
@@ -24,7 +24,7 @@ fixed, RTK fixed or float."""
 
 
 class Samples:
-    """Columns of one sensor, as many values in each as there are stamps in `stamp_ns`."""
+    """Columns of one sensor, each with one value for each stamp in `stamp_ns`."""
 
     __slots__ = ()
 
@@ -46,7 +46,7 @@ class Samples:
 
 
 def thin(column: Floats) -> Floats:
-    """Return a column that takes no memory where all its values are the same."""
+    """Return a column; one whose values are all equal takes no memory."""
     return np.broadcast_to(column[:1].copy(), column.shape) if len(column) and (column == column[0]).all() else column
 
 
@@ -63,7 +63,7 @@ class WheelSamples(Samples):
     left, right : float64 (n,), forward positive, each held over [k, k+1); [m/s], or in `unit` per second
     unit : ``mps``: speeds that are ready to use; else as the log sends them, in this unit per second, without the
         configured scales, until `icrtool.alignment.wheel_units` has made speeds of them
-    from_position : the log sends positions, of which these are the mean speeds to the next sample
+    from_position : the log sends positions; these are their mean speeds to the next sample
     restarts_ns : stamps of the samples after which the positions began again, in a gap of which nothing is known
     """
 
@@ -189,9 +189,9 @@ TWIST_TYPES = frozenset(
         "bunker_msgs/BunkerStatus",
     }
 )
-"""Message types whose wheels are a body twist, measured or commanded: wheel speeds are made of it with a width.
+"""Message types that hold a body twist, measured or commanded. Wheel speeds are computed from it with a width.
 
-Its turn rate is the difference of the sides over the width that the controller takes.
+Its turn rate is the difference of the sides over the width that the controller uses.
 """
 
 
@@ -262,7 +262,7 @@ class InputFile:
 
     @property
     def identity(self) -> tuple[object, ...]:
-        """What two files have in common that hold the same: SHA-256, else size and version, else size and address."""
+        """Equal for files of equal content: SHA-256, else size and version, else size and address."""
         if self.sha256 is not None:
             return (self.sha256,)
         stated = self.version if self.version is not msgspec.UNSET else self.etag

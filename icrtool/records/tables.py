@@ -36,7 +36,7 @@ Icrs = tuple[float, float, float]
 """y_icr_right, y_icr_left, x_icr [m]."""
 
 LARGEST_STATE = 1e30
-"""Of a state or a measurement: squares of larger numbers overflow."""
+"""Largest number of a state or a measurement: squares of larger numbers overflow."""
 
 WHEEL_COLUMN_UNITS: dict[tuple[str, ...], tuple[WheelUnit, bool]] = {
     ("v_left_mps", "v_right_mps"): ("m", False),
@@ -98,10 +98,10 @@ class RobotLog:
         cls, wheels: pd.DataFrame, position: pd.DataFrame, heading: pd.DataFrame, gyro: pd.DataFrame | None = None,
         name: str = "table",
     ) -> RobotLog:  # fmt: skip
-        """Return a log from a data frame a sensor, or the same one for several; all stamps on one clock.
+        """Return a log from one data frame for each sensor, or one frame for several; all stamps on one clock.
 
-        Columns are found by their names, which end in their units. Stamps: ``stamp_ns``, or ``t_s`` (seconds). Of each
-        group one pair or column is needed; a row without numbers in it is no sample of that group.
+        Columns are found by their names, which end in their units. Stamps: ``stamp_ns``, or ``t_s`` (seconds). Each
+        group needs one pair or column; a row without numbers in it is no sample of that group.
 
         ======== ======================================================================================================
         wheels   ``v_left_mps, v_right_mps`` · ``v_left_radps, v_right_radps`` · ``pos_left_m, pos_right_m`` ·
@@ -181,7 +181,7 @@ class RobotLog:
 
 
 def _chosen(frame: pd.DataFrame, options: Sequence[tuple[str, ...]], group: str, name: str) -> tuple[str, ...]:
-    """Return the first of the column groups of which the frame has all.
+    """Return the first of the column groups that is complete in the frame.
 
     Raises
     ------
@@ -257,7 +257,7 @@ def _position(frame: pd.DataFrame, name: str) -> tuple[PositionFixes, Datum | No
         height = np.nan_to_num(extra.get("height_m", unknown))
         datum = Datum(float(first[0]), float(second[0]), float(height[0]))
         north, east, _ = geodetic2ned(first, second, height, datum.latitude_deg, datum.longitude_deg, datum.height_m)
-    # Of a standard deviation that is no real one, the square may overflow.
+    # The square of a standard deviation that is no real one may overflow.
     real = {std: np.where(np.abs(extra[std]) < LARGEST_STD, extra[std], np.nan) for std in stds}
     var_north, var_east = (real[stds[0]] ** 2, real[stds[1]] ** 2) if stds else (unknown, unknown.copy())
     covariance = np.zeros(len(stamps)) if stds else unknown.copy()
@@ -338,7 +338,7 @@ class States:
 
     @property
     def fault(self) -> str:
-        """What no filter's states can be: none, not in order, not finite; empty where nothing is wrong."""
+        """Why these cannot be states of a filter: none, not in order, not finite; empty where nothing is wrong."""
         if not len(self):
             return "there are no states"
         if np.any(self.stamp_ns[1:] <= self.stamp_ns[:-1]):

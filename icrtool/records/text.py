@@ -7,20 +7,21 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Self
 
 LONGEST_NAME = 80
-"""Characters of a name that are printed; of a longer one the beginning and the end are."""
+"""Characters of a name that are printed; of a longer name, the beginning and the end are printed."""
 
 LONGEST_TEXT = 512
 """Characters of a text from a log that are used (a topic of ROS has up to 255): long ones take time to look through."""
 
 LONGEST_STORED = 1000
-"""Characters of a text of a file of ours that are used: a warning has a few hundred."""
+"""Characters of a text from a file of icrtool that are used; a warning has a few hundred."""
 
 LONGEST_MESSAGE = 4000
 """Characters of an error or a warning that are printed."""
 
 
 LEAST_LIKENESS, LEAST_LETTERS = 0.6, 3
-"""A word is proposed from this similarity on (`difflib`), or where it contains what was given, of so many letters."""
+"""Least similarity (`difflib`) of a word that is proposed, and least length of a given text that a proposed word
+contains."""
 
 
 class LogText(str):
@@ -116,7 +117,7 @@ def shortened(text: str, longest: int) -> str:
 
 
 MOST_NAMED = 12
-"""Names that one message to the user lists at most, where it is about them."""
+"""Largest number of names that one message to the user lists."""
 
 
 def listed(names: Sequence[str], most: int = MOST_NAMED) -> str:
@@ -126,7 +127,7 @@ def listed(names: Sequence[str], most: int = MOST_NAMED) -> str:
 
 
 MOST_DIGITS = 5
-"""Decimals that are printed at most."""
+"""Largest number of decimals that are printed."""
 
 
 def digits_of(std: float, least: int = 2) -> int:

@@ -32,7 +32,7 @@ class TopicPoses:
     gap: Bools
 
     def stamps(self, *, by_log_time: bool) -> Ints:
-        """Return the stamps (n,): header stamps, or log times where those cannot be used or are asked for."""
+        """Return the stamps (n,): header stamps, or log times where these cannot be used or `by_log_time` is set."""
         return self.log_ns if by_log_time or self.header_ns is None else self.header_ns
 
     def at(self, t: Floats, at: Floats) -> tuple[Complexes, Floats]:
