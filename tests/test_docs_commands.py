@@ -6,8 +6,10 @@ import contextlib
 import re
 import shlex
 import shutil
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
@@ -61,11 +63,12 @@ for found_on, line in shown_commands():
 
 def shown_python() -> Iterator[tuple[str, str]]:
     """Yield each page with Python, and its blocks as one program."""
+    block_of_python = re.compile(r"^ *```(?:python|py)\n(.*?)```", re.DOTALL | re.MULTILINE)
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         name = page.relative_to(ROOT).as_posix()
-        blocks = re.findall(r"```(?:python|py)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+        blocks = block_of_python.findall(page.read_text(encoding="utf-8"))
         if blocks and name not in ELSEWHERE:
-            yield name, "\n".join(blocks)
+            yield name, "\n".join(textwrap.dedent(block) for block in blocks)
 
 
 PYTHON = dict(shown_python())
@@ -97,6 +100,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         shutil.copytree("icrtool-runs/field", "season2/field")
         assert run("calibrate", "icrtool-runs/field", "-o", "season.json", "-q").exit_code == 0
         assert run("compare", "season1/", "season2/", "-o", "comparison.json", "-q").exit_code == 0
+        for day in ("monday", "tuesday", "friday"):
+            shutil.copy("field.mcap", f"{day}.mcap")
+        shutil.copy("season.json", "husky.json")
         Path("plan.csv").write_text("east_m,north_m\n0,0\n5,0\n5,8\n", encoding="utf-8")
         yield folder
 
@@ -112,6 +118,22 @@ def test_a_command_that_a_page_shows_runs(folder: Path, command: str) -> None:
 @pytest.mark.parametrize("page", PYTHON)
 def test_the_python_of_a_page_runs_as_it_stands(folder: Path, page: str) -> None:
     exec(compile(PYTHON[page], page, "exec"), {})
+
+
+def test_the_callback_of_the_page_on_board_publishes_the_twist_of_its_model(folder: Path) -> None:
+    published: list[tuple[float, float, float]] = []
+    names: dict[str, Any] = {
+        "stamp_s": lambda msg: msg[0],
+        "wheel_speeds": lambda msg: msg[1:],
+        "filtered_pose": lambda: None,
+        "publish": lambda *twist: published.append(twist),
+    }
+    exec(compile(PYTHON["docs/how-to/on-board.md"], "on-board.md", "exec"), names)
+    names["on_wheels"]((0.02, 0.5, 0.7))
+    v_x, v_y, omega = names["model"].twist(0.5, 0.7)
+    assert published == [(v_x, -v_y, -omega)]
+    assert 0.5 < v_x < 0.7
+    assert omega < 0.0
 
 
 def test_what_is_run_elsewhere_or_not_at_all_is_still_shown() -> None:
