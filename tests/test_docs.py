@@ -6,6 +6,7 @@ import ast
 import contextlib
 import inspect
 import itertools
+import math
 import re
 import shlex
 from collections.abc import Iterator
@@ -196,4 +197,36 @@ def test_the_readmes_icrs_are_those_of_the_sample_log(readme_session: dict[str, 
     rows = dict(row[:2] for row in readme_table("of the drive"))
     for label, column in (("y right", "y_icr_right_m"), ("y left", "y_icr_left_m"), ("x", "x_icr_m")):
         assert rows[label] == f"{geometry[column]:+.3f} ± {geometry[f'{column}_std']:.3f} m"
-    assert rows["multiplier"] == f"{controller['multiplier']:.3f} ± {controller['multiplier_std']:.3f}"
+    next_std = math.hypot(controller["multiplier_std"], controller["multiplier_between_std"])
+    here = f"{controller['multiplier']:.3f} ± {controller['multiplier_std']:.3f}"
+    assert rows["multiplier"] == f"{here} here, ± {next_std:.2g} on the next drive"
+
+
+def test_the_readmes_distances_are_those_of_the_sample_log(readme_session: dict[str, Any]) -> None:
+    by_model = {one.model: one for one in icrtool.dropout_report(readme_session["run"]).document.budgets}
+    rows = readme_table("within 0.5 m (95 %)")
+    assert len(rows) == 4
+    for row in rows:
+        one = by_model[row[0].strip("`")]
+        assert [one.short_text, one.next_text] == row[1:]
+
+
+def test_the_lines_of_the_first_change_stand_in_the_files_they_name() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Set-up")[0]
+    blocks = re.findall(r"```diff\n(.*?)```", text, re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines()]
+    assert len(lines) > 10
+    file = ""
+    for line in lines:
+        if line.startswith("+++ "):
+            file = (ROOT / line.removeprefix("+++ ")).read_text(encoding="utf-8")
+        else:
+            assert f"{line.removeprefix('+')}\n" in file, line
+
+
+def test_the_page_on_results_shows_the_distances_of_the_readme() -> None:
+    page = (ROOT / "docs" / "how-to" / "read-the-result.md").read_text(encoding="utf-8")
+    for row, *cells in readme_table("within 0.5 m (95 %)"):
+        shown = re.search(rf"^ +{row.strip('`')} +(\S+ m) +(\S.*? m(?: or more)?)(?:  |$)", page, re.MULTILINE)
+        assert shown is not None
+        assert list(shown.groups()) == cells
