@@ -30,7 +30,7 @@ AXE           = $(VENV)/axe-core/axe.min.js
 AXE_VERSION   = 4.14.1
 AXE_SHA256    = 29348999450cdf2849a8e70b7912fc2da85a849da39c0d0d5394f51d4a9ed95c
 
-.PHONY: axe help setup setup-dev demo format format-check lint words types test stress fuzz bench bench-quick unseen docs schemas samples quick wheel-check check constraints clean
+.PHONY: axe help setup setup-dev demo format format-check lint words types test stress fuzz bench bench-quick unseen docs schemas samples quick where wheel-check check constraints clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -72,8 +72,11 @@ lint: $(DEV)  ## ruff, and the spelling
 	$(BIN)/ruff check .
 	$(BIN)/codespell
 
-words: $(DEV)  ## count the words that docs/glossary.md asks to avoid, by package
+words: $(DEV)  ## count the words that CONTRIBUTING.md asks to avoid, by package
 	@$(BIN)/python tests/test_language.py
+
+where: $(READY)  ## where something is in the code: make where WORDS="wheel radius"
+	@$(BIN)/python scripts/where.py $(WORDS)
 
 types: $(DEV)  ## mypy, strict
 	$(BIN)/mypy

@@ -1,4 +1,4 @@
-"""The words of docs/glossary.md: those not to use do not occur in the packages and pages that are listed as done.
+"""The words of CONTRIBUTING.md that are not used do not occur in the packages and pages that are listed as done.
 
 ``python tests/test_language.py`` counts them for every package.
 """
@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8").partition("## Words not to use")[2]
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+NOT_USED = CONTRIBUTING.partition("## Words not to use")[2].partition("\n## ")[0]
 
 DONE: tuple[str, ...] = (
     "__init__",
@@ -57,21 +58,17 @@ PAGES = (
     "CONTRIBUTING.md",
     "SECURITY.md",
     "sample_logs/README.md",
-    *(
-        page.relative_to(ROOT).as_posix()
-        for page in sorted((ROOT / "docs").rglob("*.md"))
-        if page.name != "glossary.md"
-    ),
+    *(page.relative_to(ROOT).as_posix() for page in sorted((ROOT / "docs").rglob("*.md"))),
 )
 
 
-def glossary() -> dict[str, str]:
+def words_not_to_use() -> dict[str, str]:
     """Return for each word not to use what to use instead."""
-    rows = re.findall(r"^\| (`.*?) \| (.+?) \|$", GLOSSARY, re.MULTILINE)
+    rows = re.findall(r"^\| (`.*?) \| (.+?) \|$", NOT_USED, re.MULTILINE)
     return {word: instead for words, instead in rows for word in re.findall(r"`([^`]+)`", words)}
 
 
-WORDS = glossary()
+WORDS = words_not_to_use()
 PATTERN = re.compile(rf"\b(?:{'|'.join(sorted(map(re.escape, WORDS), key=len, reverse=True))})\b", re.IGNORECASE)
 INSTEAD = re.compile(
     "|".join(re.escape(one) for text in set(WORDS.values()) for one in text.split(", ")), re.IGNORECASE
@@ -128,17 +125,17 @@ def found_in_part(part: str) -> list[str]:
 
 
 @pytest.mark.parametrize("part", DONE)
-def test_package_uses_the_words_of_the_glossary(part: str) -> None:
+def test_package_has_no_word_that_is_not_used(part: str) -> None:
     assert not (found := found_in_part(part)), "\n".join(found)
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_page_uses_the_words_of_the_glossary(page: str) -> None:
+def test_page_has_no_word_that_is_not_used(page: str) -> None:
     text = re.sub(r"```.*?```|`[^`]*`", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
     assert not (found := found_in_text(text)), "\n".join(found)
 
 
-def test_the_glossary_is_read() -> None:
+def test_the_table_of_words_is_read() -> None:
     assert WORDS["misses"] == "residuals, Jacobian"
     assert "taken out" in WORDS
 
