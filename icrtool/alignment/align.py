@@ -50,7 +50,7 @@ def align(log: RobotLog, config: Config) -> Measurements:
     Raises
     ------
     DataError
-        Streams that cannot be used together, or a heading that has nothing to do with the course over ground.
+        Streams that cannot be used together, or a heading without any relation to the course over ground.
     """
     log = with_wheel_speeds(log, config)
     if not config.filter.rules.corrects:
@@ -154,7 +154,7 @@ NOT_A_CORRECTION = "compared with the filter's ICRs"
 
 
 def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) -> dict[str, Finding]:
-    """Return all estimates of the alignment, by name with unit; side scales and ICRs where there is an estimate.
+    """Return all estimates of the alignment, by name with unit; side scales and ICRs where they were estimated.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def alignment_findings(found: AlignedStreams, antenna_m: tuple[float, float]) ->
 
 
 def _finding(value: float | None, std: float | None, applied: float, nothing: float = 0.0) -> Finding:
-    """Return one estimate, None or no finite number where it is not known; `nothing` is the correction that is none."""
+    """Return one estimate; None or not finite: not known; `nothing` is the value of `applied` without a correction."""
     if value is None or std is None or not math.isfinite(value + std):
         value = std = None
     if applied != nothing:
@@ -203,17 +203,21 @@ def _finding(value: float | None, std: float | None, applied: float, nothing: fl
     return Finding(value, std, applied, why)
 
 
-LENGTH_M, SHARE = 10.0, 0.9
-"""References are compared by the residual that this share of windows of this driven distance stays below."""
+LENGTH_M = 10.0
+"""Length of the windows in which references are compared [m]."""
+
+SHARE = 0.9
+"""Quantile of the residuals in these windows, by which references are compared."""
 
 POOR_M = 1.0
-"""A reference whose residual is less is kept: GNSS gives positions on the globe, and does not drift."""
+"""Residual below which the chosen reference is kept [m]. GNSS gives positions on the globe and does not drift."""
 
 BETTER_RESIDUAL_RATIO = 0.5
-"""Another reference is taken where its residual is less than this part of the chosen one's."""
+"""Ratio of the residuals of another and of the chosen reference below which the other one may be taken."""
 
 LEAST_SHARE_COVERED = 0.7
-"""... and where it covers this part of the distance that the chosen one covers."""
+"""Smallest ratio of the distance that another reference covers to the distance that the chosen one covers. With less,
+the other reference is not taken."""
 
 
 class Agreement(NamedTuple):
@@ -221,7 +225,7 @@ class Agreement(NamedTuple):
 
     Attributes
     ----------
-    residual_m : of displacements over `LENGTH_M`, inf where they cannot be compared
+    residual_m : `SHARE` quantile of the residuals of displacements over `LENGTH_M`, inf where there is none
     distance_m : driven distance that windows cover
     """
 

@@ -1,18 +1,18 @@
 """Which side is which, in which sense a heading turns: hypotheses compared by their likelihood.
 
 Displacements of windows are linear in two integrals along the measured heading, p = Z_v ∫v e^{j psi} + Z_u ∫u e^{j psi}
-with v the mean of the sides' speeds and u half their difference, its changes in ∫u and ∫v. Sides that are swapped or
-reversed exchange v and u or change their signs; a heading or a position of the other handedness turns psi round. One
-robust fit for either handedness gives Z and the turn's coefficients with covariance; every hypothesis gives what they
-should be: |Z_v| = 1 up to a common factor, Z_u small, a positive turn for a faster left side. Its cost is the squared
-Mahalanobis distance from there.
+where v is the mean of the sides' speeds and u half their difference. Heading changes are linear in ∫u and ∫v. Sides
+that are swapped or reversed exchange v and u or change their signs. A heading or a position of the other handedness
+changes the sign of psi. One robust fit for each handedness gives Z and the turn's coefficients with covariance. Every
+hypothesis states their expected values: |Z_v| = 1 up to a common factor, Z_u small, a positive turn for a faster left
+side. The cost of a hypothesis is the squared Mahalanobis distance from them.
 
-Two symmetries are exact: position and heading mirrored together is sides swapped; a heading turned by 180 deg is sides
-swapped and both reversed. There the fewest faults decide; a gyro of the other sense and a robot that hardly ever drives
-forward count as one each.
+Two pairs of hypotheses give the same motion: position and heading mirrored, and sides swapped; a heading turned by 180
+deg, and sides swapped and both reversed. Of each pair the hypothesis with fewer faults is chosen. A gyro of the other
+sense and a robot that hardly ever drives forward count as one fault each.
 
-The fit is not that of `icrtool.alignment.estimator`, which needs named sides and one solve for each hypothesis: this
-one is linear and gives all 32 of them from two solves.
+`icrtool.alignment.estimator` is not used here, because it needs named sides and one solve for each hypothesis. This fit
+is linear: two solves give all 32 hypotheses.
 """
 
 from __future__ import annotations
@@ -40,25 +40,28 @@ from icrtool.records.notes import Note, note
 from icrtool.records.tables import RobotLog
 
 EXPECTED_STD = np.array([0.3, 0.3, 0.5, 0.5, 0.3, 0.2])
-"""How far robots lie from Z_v = 1, Z_u = 0 (complex: two each), turn = 1 (largest coefficient), asymmetry = 0."""
+"""Standard deviations of robots from Z_v = 1, Z_u = 0 (complex: two each), turn = 1 (largest coefficient), asymmetry
+0."""
 
 DECISIVE = 25.0
-"""Twice the log-likelihood, five standard deviations: less does not overrule that everything is as it is named."""
+"""Twice the gain in log-likelihood from which on a hypothesis is preferred to the names in the log: 5 sigma."""
 
 VAGUE_PRIOR_STD = 10.0
-"""Hardly any prior, of parameters near one."""
+"""Prior standard deviation of the fit's parameters, which are near 1. It has hardly any effect."""
 
 FAULTS = {"swapped": 1.0, "one side reversed": 1.0, "both reversed": 1.0, "heading mirrored": 1.0,
           "position mirrored": 1.5, "pose mirrored": 0.75, "turned about": 0.5, "gyro upside down": 1.0,
           "drives backwards": 1.0}  # fmt: skip
-"""Position and heading of one pose that are both mirrored are one fault; that two joints or two topics carry each
-other's names is rarer."""
+"""Number of faults that each deviation from the names counts as. A pose with mirrored position and heading is one
+common fault; two joints or topics with exchanged names are rarer."""
 
 ABOUT_RAD = math.radians(135.0)
 BACKWARDS_SHARE = 0.8
-"""People drive robots forward: one whose wheels go backwards on this share of the distance is more likely turned."""
+"""Share of the distance with wheels going backwards from which on a hypothesis has a fault. Robots are driven
+forward."""
+
 CHORD_IN_POSITION_STD = 4.0
-"""Without a heading, distances are compared where the robot moves clearly."""
+"""Smallest chord that is compared without a heading, in standard deviations of the position."""
 
 
 class Convention(NamedTuple):
@@ -66,7 +69,7 @@ class Convention(NamedTuple):
 
     Attributes
     ----------
-    swapped : sides are exchanged; sign_left, sign_right : of the named sides, before they are exchanged
+    swapped : sides are exchanged; sign_left, sign_right : signs of the named sides, before they are exchanged
     heading, position : +1, or -1 where mirrored
     """
 
@@ -77,7 +80,7 @@ class Convention(NamedTuple):
     position: int
 
     def faults(self, offset: float, track: Track, gyro_sense: int) -> float:
-        """Return how many things would be wrong; `gyro_sense` as in `decide_conventions`."""
+        """Return the number of faults, weighted by `FAULTS`; `gyro_sense` as in `decide_conventions`."""
         count = FAULTS["swapped"] * self.swapped
         signs = self.sign_left + self.sign_right
         count += FAULTS["one side reversed"] * (signs == 0) + FAULTS["both reversed"] * (signs == -2)
@@ -85,7 +88,7 @@ class Convention(NamedTuple):
             count += FAULTS["pose mirrored"]
         else:
             count += FAULTS["heading mirrored"] * (self.heading < 0) + FAULTS["position mirrored"] * (self.position < 0)
-            # an ENU yaw read as a NED one, or the reverse, is turned by a quarter as well
+            # an ENU yaw that is read as a NED yaw, or the reverse, is also turned by 90 deg
             if self.heading < 0 and not track.same_clock:
                 offset = math.remainder(offset - math.pi / 2, 2 * math.pi)
         count += FAULTS["turned about"] * (abs(offset) > ABOUT_RAD)
@@ -100,7 +103,7 @@ class Decision(NamedTuple):
 
     Attributes
     ----------
-    as_likely : another convention with the same likelihood and no more than half a fault more, None without one
+    as_likely : another convention with the same likelihood and at most half a fault more; None without one
     """
 
     convention: Convention
@@ -111,7 +114,7 @@ AS_NAMED = Convention(swapped=False, sign_left=1, sign_right=1, heading=1, posit
 
 
 class _Shown(NamedTuple):
-    """What a handedness shows: Z (re v, im v, re u, im u), turn by u and by v, covariances, residuals."""
+    """Fit for one handedness: Z (re v, im v, re u, im u), turn by u and by v, covariances, residuals."""
 
     z: Floats
     z_covariance: Floats
@@ -136,7 +139,7 @@ def decide_conventions(
     track = windows.track
     laid = windows.laid, windows.over(track.at_places(track.half_difference * track.nose))
     shown = {1: _show(windows, laid, 1), -1: _show(windows, (np.conj(laid[0]), np.conj(laid[1])), -1)}
-    # twice the negative log-likelihood of either handedness, both in the noise of the better one
+    # twice the negative log-likelihood of each handedness, both with the noise of the better one
     scale = min(mad_std(one.residuals, 0.0) for one in shown.values())
     scale = max(scale, 0.5 * track.place_std_m / windows.length_m[0])
     losses = {hand: soft_l1_loss(one.residuals / scale) / STARTS_A_WINDOW for hand, one in shown.items()}
@@ -159,7 +162,7 @@ def decide_conventions(
 def senses_by_distance(track: Track) -> Convention:
     """Return whether one side counts backwards, by distances alone: for a drive without a heading.
 
-    Of two such sides, that one is reversed with which the robot drives forward.
+    Either side may be the reversed one; the choice is the one with which the robot drives forward.
     """
     _, step, left, right = cut_chords(track)
     chord = np.abs(step)
@@ -176,7 +179,7 @@ def senses_by_distance(track: Track) -> Convention:
 
 
 TIE = 9.0
-"""Hypotheses this near the best are as good."""
+"""Difference in cost from the best hypothesis below which another one is equally likely."""
 
 
 def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -> _Shown:
@@ -204,11 +207,11 @@ def _show(windows: DriveWindows, laid: tuple[Complexes, Complexes], hand: int) -
 
 
 def _cost(one: Convention, shown: _Shown) -> tuple[float, float]:
-    """Return the squared Mahalanobis distance of what was shown from what a convention expects, and its offset."""
+    """Return the squared Mahalanobis distance of the fit from a convention's expected values, and its offset."""
     sides = np.diag([float(one.sign_left), float(one.sign_right)])
     if one.swapped:
         sides = sides[::-1]
-    # (v, u) of the named sides by those of the true ones: p = Z (v, u)_named = Z back (v, u)_true
+    # `back` maps (v, u) of the true sides to (v, u) of the named sides: p = Z (v, u)_named = Z back (v, u)_true
     halves = np.array([[0.5, 0.5], [0.5, -0.5]])
     back = 2.0 * halves @ sides.T @ halves
     lift = np.kron(back.T, np.eye(2))
@@ -265,7 +268,7 @@ def gyro_sense(log: RobotLog, track: Track) -> int:
 
 
 def apply_convention(log: RobotLog, convention: Convention) -> RobotLog:
-    """Return the log with sides, heading and position as the convention has them; the same log as named."""
+    """Return the log with the sides, heading and position of a convention; the same log if all names are right."""
     if convention == AS_NAMED:
         return log
     wheels, heading, gnss = log.wheels, log.heading, log.gnss

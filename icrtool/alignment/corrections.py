@@ -1,7 +1,7 @@
 """Align the streams of a log: conventions, wheel scale, heading offset, delays, from one estimate.
 
-What is significant and large enough to matter is corrected and reported with its standard deviation; the rest is
-reported. Preset ``paper`` corrects nothing.
+Errors that are significant and large enough to have an effect are corrected and reported with their standard
+deviations. Other findings are only reported. Preset ``paper`` corrects nothing.
 """
 
 from __future__ import annotations
@@ -55,8 +55,10 @@ from icrtool.records.tables import RobotLog
 
 CORRECTION_SIGMAS = 2.5
 SMALLEST_LEAD_S, LARGEST_STD_S = 0.2, 0.1
-"""A robot follows its wheels by up to `RESPONSE_S`, which is no clock; the standard deviation of a delay holds that. A
-stream that leads by little is more often a response that the model lacks than a clock."""
+"""Smallest lead that is corrected, and largest standard deviation of a corrected delay [s].
+
+A robot follows its wheels with a delay of up to `RESPONSE_S`, which is no error of a clock; the standard deviation of a
+delay includes it. A small lead more often comes from such a response than from a clock."""
 
 
 class Delay(NamedTuple):
@@ -75,13 +77,13 @@ UNKNOWN = Delay(math.nan, math.nan)
 
 
 class StreamDelays(NamedTuple):
-    """What was found, and what is corrected: what was clear, or is configured.
+    """Delays that were found, and delays that are corrected because they are clear or configured.
 
     Attributes
     ----------
-    heading, gnss : as measured; apart : of the position against the heading
+    heading, gnss : as measured; apart : delay of the position against the heading
     together : position and heading are fields of the same messages
-    applied_heading_s, applied_gnss_s : corrected
+    applied_heading_s, applied_gnss_s : delays that are corrected [s]
     """
 
     heading: Delay
@@ -93,10 +95,11 @@ class StreamDelays(NamedTuple):
 
     @property
     def clock_std_s(self) -> float:
-        """What remains unknown of the time between position and heading, where nothing or some of it was corrected [s].
+        """Standard deviation of the time between position and heading after the correction [s].
 
-        Clocks agree as often as not. Where they were taken to agree, the deviation is that of the other case, times its
-        probability (Bayes factor of Dickey 1971: densities at zero after and before the drive).
+        Before a drive, clocks agree with probability 0.5. Where they were assumed to agree, the deviation is the
+        deviation of the other case times its probability (Bayes factor of Dickey 1971: densities at zero after and
+        before the drive).
         """
         value, std = self.apart
         if self.together or not math.isfinite(std):
@@ -108,7 +111,7 @@ class StreamDelays(NamedTuple):
 
 
 def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tuple[StreamDelays, list[Note]]:
-    """Return the delays of heading and positions against the wheels, those that are corrected, and what to report."""
+    """Return the delays of heading and positions against the wheels, with corrected delays, and the findings."""
     heading = position = apart = UNKNOWN
     if fit is not None:
         found = (Delay(*fit.estimate(name)) for name in ("heading_delay", "position_delay"))
@@ -127,7 +130,7 @@ def find_delays(log: RobotLog, config: Config, fit: AlignmentFit | None) -> tupl
 
 
 def _clear_delays(heading: Delay, position: Delay, apart: Delay, *, together: bool) -> tuple[float, float]:
-    """Return the delays of heading and position to correct: of the ways in which streams lag, the likeliest.
+    """Return the delays of heading and position to correct: the most likely combination.
 
     Twice the negative log-likelihood, with a penalty for each delay that is not zero (`CORRECTION_SIGMAS` squared).
     """
@@ -155,7 +158,7 @@ def _is_large(delay_s: float) -> bool:
 
 
 def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bool], *, together: bool) -> list[Note]:
-    """Return a finding for each stream, heading and position, that was moved and is free to be."""
+    """Return a finding for each stream, heading or position, that was moved without being configured."""
     subjects = [("the heading", "lags", "frames.heading_delay_s"), ("the position", "lags", "frames.reference_delay_s")]
     alike = not together and applied[0] == applied[1] and free[0]
     also = "; the position is corrected alike, as nothing shows that its delay differs" if alike else ""
@@ -172,16 +175,17 @@ def _delay_notes(applied: tuple[float, float], std_s: list[float], free: list[bo
 
 
 class AlignedStreams(NamedTuple):
-    """A log whose streams fit together, and what was done for that.
+    """A log whose streams fit together, and the corrections that were made.
 
     Attributes
     ----------
-    log : corrected; the heading's offset stands in `heading`, which the filter applies
-    wheels, heading : what is known of them; scales : what the speeds of the left and of the right side were multiplied
-        with, beside the configured scales; correlation_s : of the noise of a stated heading, where it was raised
-    track : what the estimate was made of; fit : the estimate, None where the drive is too short
+    log : corrected, but for the heading's offset, which is in `heading` and which the filter applies
+    wheels, heading : facts about them
+    scales : factors of the left and of the right speeds, in addition to the configured scales
+    correlation_s : correlation time of the noise of a stated heading, where the noise was raised
+    track : data of the estimate; fit : the estimate, None where the drive is too short
     derived : the heading where it was estimated, else None
-    notes : what was found
+    notes : the findings
     """
 
     log: RobotLog
@@ -198,7 +202,7 @@ class AlignedStreams(NamedTuple):
     def steps(self) -> tuple[FixSteps, FixSteps]:
         """Return steps of position and of heading [rad] between the fixes, beyond the motion of the wheels.
 
-        Without an estimate there are none of the heading.
+        Without an estimate there are no steps of the heading.
         """
         track = self.track
         if self.fit is None:
@@ -289,7 +293,7 @@ def _name_streams(
     named = apply_convention(log, decision.convention)
     if named is not log:
         if derived is not None:
-            # it was made with wheels whose sides are exchanged, or run backwards
+            # the heading was estimated with wheels whose sides were exchanged or reversed
             derived = derive_heading(named, width_m)
             named = derived.apply(named)
         windows = windows_of_log(named, width_m, None if derived is None else derived.smoothed)

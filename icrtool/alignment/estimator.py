@@ -1,17 +1,18 @@
-"""One estimate of what relates wheels, heading and positions: scales, ICRs, heading offset, delays.
+"""One estimate of the relations between wheels, heading and positions: scales, ICRs, heading offset, delays.
 
-With the heading measured along the path, all of it is linear except the heading offset and the delays. Windows of
-driven distance from fix i to fix j, and windows of time of the heading itself:
+With the heading measured along the path, the equations are linear except in the heading offset and the delays. They
+compare windows of driven distance from fix i to fix j, and windows of time of the heading itself:
 
     p_j - p_i = e^{j d} ∫(a v + m u + n |u| + j (c + l v) psi') e^{j psi},                           u = (V_l - V_r)/2
     psi(t + T) - psi(t) = k ∫w + q ∫v/b + g T,                                                       w = (V_l - V_r)/b
 
 with psi taken tau_h later than stamped, and p tau_p earlier. Then a is the wheel scale, W = a b/k, and in general
-y_r = (∂v_x/∂V_l)/(∂ω/∂V_l), y_l = (∂v_x/∂V_r)/(∂ω/∂V_r), x = -c - l v (Pentzer 2014, Eqs. 8-12). The motion sideways
-is that of the measured turn psi': the wheels' turn leads it while the robot begins to turn, which looks like a delay.
+y_r = (∂v_x/∂V_l)/(∂ω/∂V_l), y_l = (∂v_x/∂V_r)/(∂ω/∂V_r), x = -c - l v (Pentzer 2014, Eqs. 8-12). The sideways motion is
+computed with the measured turn psi', not with the wheels' turn: the latter leads while the robot begins to turn, which
+has the same effect as a delay.
 
-Not separable: a sideways crab from the offset; the antenna's place from the ICRs (forward from x_icr, right from the
-middle of y); sideways slip l from tau_p at constant speed. Priors decide.
+A drive does not separate a sideways crab from the offset, the antenna's place from the ICRs (forward from x_icr, right
+from the middle of y), or, at constant speed, sideways slip l from tau_p. There the priors decide.
 """
 
 from __future__ import annotations
@@ -45,60 +46,69 @@ A, M, C, L, K, Q, G, D, TP, TH, N = range(11)
 
 ESTIMATE_PRIOR_MEAN = np.array([1.0, 0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 ESTIMATE_PRIOR_STD = np.array([0.5, 0.1, 0.5, 0.2, 0.6, 0.05, 3e-4, math.inf, 0.15, 0.5, 0.1])
-"""They keep apart what a drive does not, and hardly matter where it does. Robots are symmetric: their ICRs lie about as
-far to either side (`MIDDLE_STD_M`), and x_icr within half of b (the third is in b). Delays of position and
-heading of one robot usually agree to 0.15 s. An absolute heading drifts by no more than a degree in a minute: without
-that, a drive at constant speed does not separate the drift from unequal wheels."""
+"""Prior standard deviations, in the order of `ESTIMATE_NAMES`. They decide where a drive does not separate parameters,
+and have little effect otherwise.
+
+Robots are symmetric: the middle of the ICRs is near 0 (`MIDDLE_STD_M`), and x_icr is within half of b (the third value
+is in units of b). Delays of position and heading of one robot usually agree to 0.15 s. An absolute heading drifts by at
+most a degree in a minute; without this prior, a drive at constant speed does not separate the drift from unequal
+wheels."""
 
 MIDDLE_STD_M = 0.1
-"""The middle of the ICRs lies this near to the antenna, to either side."""
+"""Prior standard deviation of the sideways distance between the middle of the ICRs and the antenna [m]."""
 
 SAME_CLOCK_STD_S = 1e-3
-"""Fields of the same messages lag alike."""
+"""Prior standard deviation of the delay between position and heading in the same messages [s]."""
 
 DELAY_STEP_S, HEADING_STEP_S = 0.02, 0.1
-"""Delays are differentiated over the first step to either side, noisy headings over the second."""
+"""Steps of central differences [s]: for derivatives by delays, and for derivatives of noisy headings."""
 
 SMOOTH_S = 0.2
-"""Noise of the heading is smoothed over this time for the motion sideways, of which it would show too little."""
+"""Half the time over which the heading is averaged for the sideways motion [s]. Its noise would reduce this motion."""
 
 OVERLAP = 1.0
-"""Windows overlap, but their ends are different fixes; the spread between groups shows what they have in common."""
+"""Overlap of the windows that the covariance assumes: none, because their ends are different fixes. The spread between
+groups of windows shows common errors."""
 
 RESPONSE_STD_S = RESPONSE_S / math.sqrt(12.0)
-"""No drive separates the response from a delay of the streams."""
+"""Standard deviation of a robot's response to its wheels [s]. No drive separates it from a delay of the streams."""
 
 CLOCK_S_PER_M = 0.1
-"""A body follows a change of speed later than a turn, which looks as if its position lagged its heading: in parts of b,
-0.1 s/m rms on 19 rigid-body drives without any delay (0.03 s rms where b is 0.5 to 0.8 m, 0.11 s where it is 1.1 m),
-0.04 s rms on five recorded ones of 1.1 m."""
+"""Apparent lag of the position behind the heading, per metre of track width [s/m]. It arises because a body follows a
+change of speed later than a turn.
+
+On 19 rigid-body drives without any delay it is 0.1 s/m rms (0.03 s rms where b is 0.5 to 0.8 m, 0.11 s where b is 1.1
+m), on five recorded drives with b = 1.1 m 0.04 s rms."""
 
 SCALE_STD = 0.003
-"""Slip that varies with speed and turns looks like a scale: by so much rms on the same drives."""
+"""Standard deviation of the scale by slip that varies with speed and turns, rms on the same drives."""
 
 SLIPPING = 0.08
-"""Wheels whose distance differs from that of the positions by so much, from one window to the next, slip: they show
-neither a scale nor a delay. On firm ground it is 1 to 3 %, on simulated ice 9 to 18 %."""
+"""Relative difference between the distances of wheels and positions, from window to window, above which wheels slip.
+They then show neither a scale nor a delay. On firm ground it is 1 to 3 %, on simulated ice 9 to 18 %."""
 
-TURNS_SLIPPING, LEAST_TURN_RAD = 0.14, 0.2
-"""The same for turns within a second, a share of their size: a body that slides follows its wheels by half a second
-later, which is no clock. On firm ground 4 to 13 %, on fast simulated ice 15 to 22 %. Smaller turns than the second
-are mostly noise."""
+TURNS_SLIPPING = 0.14
+"""Relative difference between the turns of wheels and heading within a second above which wheels slip. A body that
+slides follows its wheels half a second later, which is no error of a clock. On firm ground the difference is 4 to 13 %,
+on fast simulated ice 15 to 22 %."""
+
+LEAST_TURN_RAD = 0.2
+"""Smallest usual turn within a second to which the difference is related [rad]. Smaller turns are mostly noise."""
 
 ATTITUDE_STD_RAD, ATTITUDE_TIME_S = math.radians(1.0), 30.0
-"""An attitude sensor errs slowly by this much, over this time (magnetic surroundings)."""
+"""Size [rad] and correlation time [s] of the slow error of an attitude sensor, from magnetic surroundings."""
 
 MOUNTING_STD_RAD = math.radians(3.0)
-"""A sensor whose offset no drive shows points ahead to within this."""
+"""Standard deviation of a sensor's direction from straight ahead, where no drive shows its offset [rad]."""
 
 MOST_NEWTON_STEPS = 15
 
 EVIDENCE_SIGMAS = 4.0
-"""What contradicts that sensors are mounted along the robot, sides alike or wheels measured is this sure: standard
-deviations of few stretches of distance are uncertain themselves."""
+"""Number of standard deviations needed against an assumption: sensors mounted straight, equal sides, measured wheels.
+It is large, because standard deviations from few stretches of distance are uncertain themselves."""
 
 FIVE_TERMS = MODELS[FIVE]
-"""The motion model of the displacements and turns, but for drag and drift."""
+"""Motion model of the displacements and turns, without drag and drift."""
 
 
 class ResidualsByEstimate(NamedTuple):
@@ -123,9 +133,9 @@ class AlignmentFit(NamedTuple):
     Attributes
     ----------
     fit : the robust fit; covariance : of its parameters
-    width_m : b that w was formed with
-    windows : that it was made of; model : what it expects of them
-    turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is that at this speed
+    width_m : track width b, with which w was formed
+    windows : data of the fit; model : the expected motion in them
+    turning_speed_mps : mean speed, weighted by the square of the turn rate; x_icr is stated at this speed
     """
 
     fit: RobustFit
@@ -136,7 +146,7 @@ class AlignmentFit(NamedTuple):
     turning_speed_mps: float
 
     def estimate(self, name: str) -> tuple[float, float]:
-        """Return a parameter and its standard deviation; ``position_delay`` is that against the wheels."""
+        """Return a parameter and its standard deviation; ``position_delay`` is the delay against the wheels."""
         if name == "position_delay":
             both = self.covariance[np.ix_([TP, TH], [TP, TH])]
             return float(self.fit.x[TP] + self.fit.x[TH]), math.sqrt(max(float(both.sum()), 0.0))
@@ -160,14 +170,14 @@ class AlignmentFit(NamedTuple):
 
     @property
     def turn_wander_rad(self) -> float:
-        """How far the heading wanders from the wheels' turn in a second [rad] (rms of short windows)."""
+        """Rms wander of the heading from the wheels' turn in a second [rad], from short windows."""
         u = len(self.windows.turn_begin)
         length = self.windows.turn_end - self.windows.turn_begin
         return float(np.sqrt(np.mean(self.fit.residuals[-u:] ** 2 / length)))
 
     @property
     def turn_slip(self) -> float:
-        """Robust scatter of the turns within a second about those of the wheels, in parts of the usual turn."""
+        """Robust scatter of the turns within a second about the wheels' turns, as a share of the usual turn."""
         usual = math.sqrt(float(np.mean(self.windows.heading_changes**2)))
         return float(self.fit.scale[-1]) / max(usual, LEAST_TURN_RAD)
 
@@ -179,14 +189,14 @@ class AlignmentFit(NamedTuple):
     def geometry(self) -> tuple[TrackGeometry, Floats]:
         """Return ICRs about the antenna, multiplier and side scales, and their covariance (6, 6)."""
         x, b, speed = self.fit.x, self.width_m, self.turning_speed_mps
-        # sideways slip l v w of that speed displaces the centre as c does
+        # at this speed, sideways slip l v w has the same effect as c
         aside = x[C] + x[L] * speed
         by = np.zeros((len(FIVE_TERMS.terms), len(x)))
         by[[0, 1, 2, 3], [A, M, K, Q]] = 1.0
         by[4, [K, C, L]] = np.array([aside, x[K], x[K] * speed]) * 2.0 / b
         parameters = np.array([x[A], x[M], x[K], x[Q], x[K] * aside * 2.0 / b])
         values, covariance = FittedModel(FIVE_TERMS, parameters, by @ self.covariance @ by.T).geometry(b)
-        # at one speed, positions that lag look like an antenna further back
+        # at one speed, positions that lag have the same effect as an antenna further back
         covariance[2, 2] += (speed * _clock_std_s(self.windows.track, b)) ** 2
         return values, covariance
 
@@ -204,7 +214,7 @@ def residuals_by_estimate(found: AlignmentFit) -> ResidualsByEstimate:
 
 
 def _clock_std_s(track: Track, width_m: float) -> float:
-    """Return what no drive shows of the time between position and heading, or of a robot's response."""
+    """Return the standard deviation of the time between position and heading that no drive shows [s]."""
     return RESPONSE_STD_S if track.same_clock else max(CLOCK_S_PER_M * width_m, RESPONSE_STD_S)
 
 
@@ -225,7 +235,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
         return None
     track, model = windows.track, MotionOfWindows(windows, width_m)
     start = ESTIMATE_PRIOR_MEAN.copy()
-    # the direction of the displacements from wheels laid along the heading
+    # direction of the displacements relative to the wheels' motion along the heading
     unit = (windows.seen * np.conj(windows.laid))[np.abs(windows.laid) > windows.length_m / 3]
     spins = len(unit) < FEWEST_OVERLAPPING
     if not spins:
@@ -234,7 +244,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     kind = np.concatenate([np.zeros(w, np.int64), np.ones(w, np.int64), np.full(u, 2)])
     group = np.concatenate([windows.group, windows.group, windows.turn_group])
     prior_std = ESTIMATE_PRIOR_STD.copy()
-    # spins show the distance of the ICRs' middle from the antenna, and not its direction
+    # spins show the distance of the ICRs' middle from the antenna, but not its direction
     prior_std[D] = MOUNTING_STD_RAD if spins else prior_std[D]
     prior_std[TP] = SAME_CLOCK_STD_S if track.same_clock else prior_std[TP]
     prior_std[M] = MIDDLE_STD_M / (1.5 * width_m)
@@ -253,7 +263,7 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
     except np.linalg.LinAlgError:
         return None
     if not np.isfinite(covariance).all():
-        # exact data on one circle: nothing separates the parameters
+        # exact data on one circle do not separate the parameters
         return None
     covariance[TH, TH] += RESPONSE_STD_S**2
     covariance[A, A] += SCALE_STD**2
@@ -266,17 +276,17 @@ def estimate_alignment(windows: DriveWindows, width_m: float) -> AlignmentFit | 
 
 
 class MotionOfWindows:
-    """The motion that parameters expect: residuals of the windows with their Jacobian, place and turn to each fix."""
+    """Motion for given parameters: residuals of the windows with their Jacobian, place and turn until each fix."""
 
     def __init__(self, windows: DriveWindows, width_m: float) -> None:
         self.track, self.windows, self.b = windows.track, windows, width_m
         track = windows.track
         self.v, self.u = track.mean_speed, track.half_difference
-        # places are needed where a window begins or ends: at few of the fixes of a long drive
+        # places are needed only at the begins and ends of windows, which are few of the fixes of a long drive
         self.edge_t = track.place_t[np.stack([windows.begin, windows.end])]
         self.level = np.exp(-0.5j * track.heading_at(self.edge_t).sum(axis=0))
         self.turn_v, self.turn_w = track.cumulate(self.v), track.cumulate(2 * self.u / width_m)
-        # the mean of the heading over `SMOOTH_S` to either side: noise is no turn
+        # mean of the heading over `SMOOTH_S` to either side, so that noise is not taken for a turn
         t, area = track.heading_t, trapezoids(track.heading_t, track.heading)
         reach = np.minimum(np.minimum(t - t[0], t[-1] - t), SMOOTH_S)
         mean = (np.interp(t + reach, t, area) - np.interp(t - reach, t, area)) / np.maximum(2.0 * reach, 1e-9)
@@ -292,7 +302,7 @@ class MotionOfWindows:
         part = passed - row
 
         def laid(speed: Floats) -> Complexes:
-            """Return a speed (n,) laid along the heading in each window (w,); found once where all of them end."""
+            """Return the integral of a speed (n,) along the heading over each window (w,)."""
             total = track.cumulate(np.asarray(speed * nose))
             begin, end = total[row] + part * (total[row + 1] - total[row])
             return np.asarray(end - begin)
@@ -329,10 +339,10 @@ class MotionOfWindows:
         )
 
     def _motion(self, x: Floats) -> tuple[Complexes, Floats, Floats, Floats]:
-        """Return the heading as a unit vector, its rate [rad/s], speeds ahead and aside for each of that rate (n,)."""
+        """Return the heading as a unit vector, its rate [rad/s], and the terms of the speeds ahead and aside (n,)."""
         track = self.track
         ends = np.append(track.t, track.t[-1] + track.held[-1])
-        # a wheel speed acts along the heading of a later time: a response delays both alike
+        # a wheel speed acts along the heading of a later time, because a response delays both equally
         heading = track.heading_at(ends + x[TH]) + x[D]
         smooth = np.interp(ends + x[TH], track.heading_t, self.smooth_heading)
         rate = np.where(track.held > 0.0, np.diff(smooth) / np.maximum(track.held, 1e-9), 0.0)

@@ -1,8 +1,8 @@
 """Classes of the fixes: fixed, float or other by what they state and how they move; noise by class.
 
 A receiver that loses RTK drifts away by decimetres and jumps back when it is fixed again. Its float errors last for
-tens of seconds: treated as independent they would mislead the filter. Some drivers still state a centimetre: such fixes
-are found by their noise, best beside a jump, or between a jump and its return.
+tens of seconds. If they were treated as independent, the filter would follow them. Some drivers still state a
+centimetre. Such fixes are found by their noise, most clearly before or after a jump, or between a jump and its return.
 """
 
 from __future__ import annotations
@@ -34,19 +34,20 @@ CLASSES = {REFERENCE: "reference", OTHER_FIX: "other", FLOAT_FIX: "float", FIXED
 """Classes by name. A metric pose (lidar, total station, motion capture) is a reference, and has one class."""
 
 FIXED_STD_M = 0.1
-"""What states more than this is no fixed solution; nmea_navsat_driver states 0.02 m times HDOP of one, 4 m of float."""
+"""Largest stated standard deviation of a fixed solution [m]. nmea_navsat_driver states 0.02 m times HDOP for a fixed
+solution and 4 m for float."""
 
 SURELY_FIXED_STD_M = 0.05
-"""... and what states less is one, where no status is given."""
+"""Stated standard deviation below which a fix without a status is a fixed solution [m]."""
 
 NORM_SHARE = 0.5
-"""Where at least this share of the fixes is fixed, the others are RTK losses."""
+"""Share of fixed solutions from which on they are the norm. The other fixes are then RTK losses."""
 
 CLASS_STD_M = {OTHER_FIX: 1.0, FLOAT_FIX: 0.4}
-"""Least standard deviation of fixes that are not fixed, in a log where fixed is the norm."""
+"""Smallest standard deviation of fixes that are not fixed, in a log where fixed is the norm [m]."""
 
 CORRELATION_S = 10.0
-"""How long such a fix errs alike."""
+"""Correlation time of the errors of such fixes [s]."""
 
 SHORTEST_LOSS_S = 2.0
 
@@ -56,7 +57,7 @@ class GnssQuality(NamedTuple):
 
     Attributes
     ----------
-    fixes : with their classes, and the variances that they deserve
+    fixes : with their classes and the variances to use
     statistics : of the classes
     losses_ns : half-open spans without RTK in a log where fixed is the norm, (k, 2)
     """
@@ -70,10 +71,10 @@ class GnssQuality(NamedTuple):
 def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: float = math.nan) -> GnssQuality:
     """Return the classes of the fixes, and the noise of each.
 
-    The order of evidence: what the message states (status, flags, solution type), the variance it states, then how the
-    fixes move against the wheels: a stretch that is noisier than the rest, or lies between two jumps that take each
-    other back, is no fixed solution. Where fixed is the norm, the others get the variance of their class, times the
-    number of samples that err alike. Preset ``paper`` takes every fix as it is.
+    The order of evidence: the status, flags or solution type in the message; the stated variance; the motion of the
+    fixes relative to the wheels. A stretch that is noisier than the rest, or lies between two jumps that cancel each
+    other, is not a fixed solution. If fixed is the norm, the other fixes get the variance of their class, times the
+    number of samples with a common error. Preset ``paper`` takes every fix as it is.
 
     Parameters
     ----------
@@ -111,7 +112,7 @@ def grade_fixes(log: RobotLog, config: Config, steps: FixSteps, measured_m: floa
 
 
 def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Bools]:
-    """Return the class of each fix (m,), and which are reported as fixed and are not (m,)."""
+    """Return the class of each fix (m,), and which fixes are wrongly reported as fixed (m,)."""
     gnss, none = log.gnss, np.zeros(len(stated), np.bool_)
     if log.datum is None:
         return np.full(len(stated), REFERENCE, np.uint8), none
@@ -124,20 +125,20 @@ def _classes(log: RobotLog, stated: Floats, steps: FixSteps) -> tuple[Bytes, Boo
 
 
 def _of_class(variance: Floats, kinds: Bytes, stamps: Ints) -> Floats:
-    """Return variances (m, 2) of fixes that are not fixed: at least their class's, and shared by all that err alike."""
+    """Return variances (m, 2) of fixes that are not fixed: at least their class's, times the number with one error."""
     least = np.select([kinds == code for code in CLASS_STD_M], list(CLASS_STD_M.values()), 0.0)[:, None]
     interval = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else 0.0
     alike = max(1.0, 2.0 * CORRELATION_S / interval) if interval > 0 else 1.0
     own = np.maximum(np.where(np.isfinite(variance), variance, 0.0), least**2)
-    # Beyond the largest sane value the filter would take a variance for unknown, and the fix for a good one.
+    # Above the largest accepted value the filter would treat the variance as unknown and the fix as a good one.
     grown: Floats = np.minimum(alike * own, (LARGEST_SANE_GNSS_STD_M / 2) ** 2)
     return grown
 
 
 def _losses(stamps: Ints, fixed: Bools) -> Ints:
-    """Return the spans from the last fixed fix to the next one, with others between them, that are long enough.
+    """Return the long enough spans without a fixed solution, from the last fixed fix before to the next one.
 
-    Others before the first and after the last fixed one make a span with the log's end.
+    Fixes that are not fixed at the begin or the end of the log also make a span.
     """
     rows = np.flatnonzero(fixed)
     edge = np.concatenate([[-1], rows, [len(stamps)]])
@@ -149,7 +150,7 @@ def _losses(stamps: Ints, fixed: Bools) -> Ints:
 
 
 def _notes(fixes: Fixes, stated: Floats, given: Floats, raised: dict[str, float], *, changes: bool) -> list[Note]:
-    """Return findings on fixes that are not fixed, and on classes whose noise was raised to what they scatter by.
+    """Return findings on fixes that are not fixed, and on classes whose noise was raised to their scatter.
 
     Parameters
     ----------
@@ -182,24 +183,25 @@ def _notes(fixes: Fixes, stated: Floats, given: Floats, raised: dict[str, float]
 
 
 USUAL_M2 = 2 * 0.005**2
-"""Stretches are not compared below this variance, both axes."""
+"""Smallest variance of a stretch for comparisons, both axes together [m^2]."""
 
 STRETCH_VARIANCE = 9.0
-"""A stretch whose white noise has this many times the usual variance is float by itself, unless its messages state
-that it is fixed. Usual is what the fixes show while the robot moves: jitter of the stamps is noise then, and none where
-it parks.
-"""
+"""Ratio of a stretch's white variance to the usual one from which on it is float, unless its messages state that it is
+fixed. The usual variance is measured while the robot moves, since jitter of the stamps then adds noise."""
 
 BESIDE_JUMP = 5
 SIDES_VARIANCE = 1.7
-"""Beside a jump, the side whose noise over this many stretches has this many times the other's variance is float."""
+"""Number of stretches before and after a jump that are compared, and the ratio of their variances. The noisier side is
+float if the ratio is larger."""
 
 LONGEST_EXCURSION_S = 60.0
 TAKEN_BACK = 0.25
-"""A jump that another takes back, up to this part, within this time: the fixes between were off."""
+"""A second jump within this time cancels the first one, if the remaining part is at most this share. The fixes between
+them were wrong."""
 
 MOST_RTK_JUMPS = 500
-"""With more of them the position reference is something else than RTK that is lost now and then."""
+"""Largest number of jumps of a receiver that sometimes loses RTK. With more, the reference has another kind of
+error."""
 
 
 def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Bools) -> Bools:
@@ -209,7 +211,8 @@ def find_misreported(stamps: Ints, steps: FixSteps, claimed: Bools, flagged: Boo
     ----------
     claimed : bool (m,), reported as fixed; flagged : bool (m,), by a flag of the message itself and not by its variance
 
-    A jump alone does not show which of its sides is wrong: noise does, or a return. Else the class stays.
+    A jump alone does not show which of its sides is wrong. Noise or a second jump back shows it. Otherwise the class is
+    unchanged.
     """
     misreported = np.zeros(len(claimed), np.bool_)
     level, moves = steps.stretches(claimed)
@@ -249,13 +252,13 @@ def _moving_mean(level: Floats, width: int) -> Floats:
 
 
 def _noisy_side(beside: Floats, nearby: Floats, moves: Bools, at: int) -> slice:
-    """Return the stretches that are float beside a jump in stretch `at`; none where noise does not show its side."""
+    """Return the float stretches before or after a jump in stretch `at`; none where noise does not show the side."""
     before, after = at - 1 - BESIDE_JUMP // 2, at + 1 + BESIDE_JUMP // 2
     if before < 0 or after >= len(beside) or not np.isfinite(beside[[before, after]]).all():
         return slice(0, 0)
     half = BESIDE_JUMP // 2
     if moves[before - half : before + half + 1].any() != moves[after - half : after + half + 1].any():
-        return slice(0, 0)  # where the robot parks the fixes are quieter, whatever they are
+        return slice(0, 0)  # fixes of any class are quieter where the robot parks
     left, right = max(float(beside[before]), USUAL_M2), max(float(beside[after]), USUAL_M2)
     if max(left, right) < SIDES_VARIANCE * min(left, right):
         return slice(0, 0)

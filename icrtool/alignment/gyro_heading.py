@@ -1,11 +1,11 @@
 """Heading from turn rates, courses over ground and absolute headings, in a Kalman filter and smoother.
 
-Each source has an error model whose sizes the likelihood of the log chooses: a turn rate has a random walk of its
-integral and of its bias; a course over ground has the noise of the fixes and an ICR that varies from window to
-window; an absolute heading (attitude sensor, bearing between two antennas) has a constant offset, an error that
-wanders slowly, white noise and a delay. While the robot stands, the rate is its own bias. Constants (offset, scale,
-delays, ICR) come from the whole log; what varies in time has a causal estimate (the past alone, constants excepted)
-and a smoothed one.
+Each source has an error model. Its sizes are chosen by the likelihood of the log. A turn rate has a random walk of its
+integral and of its bias. A course over ground has the noise of the fixes and an ICR that varies from window to window.
+An absolute heading (attitude sensor, bearing between two antennas) has a constant offset, a slowly varying error, white
+noise and a delay. While the robot stands, the measured rate is the bias. Constants (offset, scale, delays, ICR) come
+from the whole log. Quantities that vary in time have a causal estimate (from the past alone, constants excepted) and a
+smoothed estimate.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from icrtool.kernels.track import Track
 
 ANGLE, BIAS, SCALE, X, DELAY = range(5)
 OFFSET, WANDER, LAG = 5, 6, 7
-"""States of the first absolute heading; those of the next one follow."""
+"""Rows of the states of the first absolute heading. The states of the next one follow."""
 GYRO_STATES, STATES_OF_A_SOURCE = 5, 3
 COURSE, STANDSTILL, NOTHING, ABSOLUTE = range(4)
 
@@ -51,7 +51,7 @@ ANY_DIRECTION_STD = math.pi / math.sqrt(3.0)
 """Standard deviation [rad] of a direction that may be any, as before the robot drives."""
 
 LONGEST_GYRO_STEP_S = 1.0
-"""A gap between events is cut into steps of at most this, so that the uncertainty grows within it."""
+"""Longest step between events [s]. A longer gap is cut into steps, so that the uncertainty grows within it."""
 
 LEAST_COURSE_STD_RAD = math.radians(0.05)
 ROUNDS, LONG_DELAY_S, LARGE_BIAS_RAD = 3, 0.15, math.radians(1.0)
@@ -59,7 +59,7 @@ MOST_SWEEPS = 3
 """A delay of the fixes up to this, and a bias that turns a window by this, are linear; larger ones take rounds."""
 
 MOST_EVENTS = 2000
-"""The likelihood looks at so many events."""
+"""Largest number of events that the likelihood is computed from."""
 
 GYRO_NOISES = {
     "angle": np.radians([0.01, 0.02, 0.05, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0]),
@@ -67,22 +67,23 @@ GYRO_NOISES = {
     "fixes": np.array([0.7, 1.0, 1.4, 2.0, 3.0, 5.0]),
     "slip": np.array([0.003, 0.01, 0.02, 0.04, 0.08, 0.16]),
 }
-"""Random walks of the integrated rate [rad/sqrt(s)] and of its bias [rad/s/sqrt(s)]; noise of the fixes in the stated
-one; standard deviation of the ICR from window to window [m]."""
+"""Values to search for each noise: random walks of the integrated rate [rad/sqrt(s)] and of its bias [rad/s/sqrt(s)];
+ratio of the fixes' noise to the stated one; standard deviation of the ICR from window to window [m]."""
 
 NOISES_OF_A_SOURCE = {
     "white": np.array([0.25, 0.5, 1.0, 2.0, 4.0]),
     "rate": np.radians([0.01, 0.03, 0.1, 0.2, 0.4, 1.0]),
     "size": np.radians([0.03, 0.1, 0.3, 0.6, 1.2, 2.5, 5.0]),
 }
-"""White noise in the stated one; growth [rad/sqrt(s)] and standard deviation [rad] of the error that wanders."""
+"""Values to search for each noise of an absolute heading: ratio of the white noise to the stated one; growth
+[rad/sqrt(s)] and standard deviation [rad] of the slowly varying error."""
 
 
 USUAL_NOISES = {name: float(grid[len(grid) // 2]) for name, grid in GYRO_NOISES.items()}
-"""Where the search for the noises begins."""
+"""Noises at which the search begins."""
 
 WANDERS = "0 size"
-"""Of these, the standard deviation of the wandering error of the first absolute heading."""
+"""Name of the noise that is the standard deviation of the first absolute heading's slowly varying error."""
 
 
 class AbsoluteHeading(NamedTuple):
@@ -92,8 +93,8 @@ class AbsoluteHeading(NamedTuple):
     ----------
     t : (m,) [s]; heading : (m,) [rad]; std : (m,) of their white noise [rad]
     rate : (m,) turn rate, which a delay of the heading multiplies [rad/s]
-    offset_std : of the offset, about zero [rad]; aligned_std : the same where no offset is significant
-    topic : where it was read; part : what it is, for the user
+    offset_std : prior of the offset, about zero [rad]; aligned_std : its prior where no offset is significant
+    topic : where it was read; part : words for the user
     """
 
     t: Floats
@@ -115,7 +116,7 @@ class HeadingEstimate:
     causal, causal_std : (n,) from the past alone, constants excepted; smoothed, smoothed_std : (n,) from all
     constants, constants_std : (k,) heading and bias at the end, scale error, x [m], delay [s]; then offset, wandering
         error at the end, delay of each absolute heading
-    noises : what the likelihood chose; those of an absolute heading have its number in front
+    noises : chosen by the likelihood; names of an absolute heading's noises begin with its number
     """
 
     t: Floats
@@ -139,7 +140,7 @@ class HeadingEstimate:
 
     @property
     def median_causal_std(self) -> float:
-        """Median standard deviation of the causal heading once it is known [rad]: of what the filter is given."""
+        """Median standard deviation of the causal heading once it is known [rad]. The filter uses this heading."""
         known = self.causal_std <= max(ANY_DIRECTION_STD, float(self.causal_std.min()))
         return float(np.median(self.causal_std[known]))
 
@@ -164,7 +165,7 @@ def estimate_heading(
             return None
         problem = _Problem(courses, still, turn, ())
         if attempt:
-            # the sizes of the turn rate's and the courses' errors are seen without what is compared with them
+            # the noises of turn rate and courses are chosen without the absolute headings
             noises = problem.choose(GYRO_NOISES, noises)
         better = problem.guess(noises)._replace(middle=fit_middle(courses, guess))
         turned = float(np.abs(better.bias - guess.bias).max() * np.median(courses.end - courses.begin))
@@ -182,7 +183,7 @@ def estimate_heading(
     if absolute and math.isfinite(absolute[0].aligned_std):
         offset, std = problem.offset(noises)
         if abs(offset) <= EVIDENCE_SIGMAS * std:
-            # not significant: that of a sensor mounted along the robot
+            # an offset that is not significant: the sensor is taken to be mounted along the robot
             problem.absolute = [absolute[0]._replace(offset_std=absolute[0].aligned_std), *absolute[1:]]
     return problem.solve(noises)
 
@@ -200,7 +201,7 @@ def _standing(track: Track, turn: TurnRate) -> tuple[Floats, Floats]:
 
 
 class _Problem:
-    """The events of a log, in order, and what is not known of their noise."""
+    """The events of a log, in order of time, as functions of their unknown noises."""
 
     def __init__(
         self, courses: Courses, still: tuple[Floats, Floats], turn: TurnRate, absolute: Sequence[AbsoluteHeading]
@@ -243,7 +244,7 @@ class _Problem:
         self.stated = HeadingEvents(elapsed, turned, holes, z[order], h, variance, angle=h[:, ANGLE] > 0.0)
 
     def events(self, noises: dict[str, float], alike: float = 1.0, count: int | None = None) -> HeadingEvents:
-        """Return the events, or so many of them, with the variances of some noises."""
+        """Return the events, or the first `count` of them, with the variances of some noises."""
         stated, kind = self.stated.cut(count), self.kind[:count]
         of_course = noises["fixes"] ** 2 * stated.r + (noises["slip"] * stated.h[:, X]) ** 2 + LEAST_COURSE_STD_RAD**2
         white = np.ones(ABSOLUTE + len(self.absolute))
@@ -271,7 +272,7 @@ class _Problem:
         return HeadingModel(x, np.diag(std**2), q, decay, np.zeros(len(std), np.bool_))
 
     def guess(self, noises: dict[str, float]) -> Guess:
-        """Return where to measure the courses next."""
+        """Return the errors at which the courses are linearised next."""
         events, model = self.events(noises), self.model(noises)
         states, covariances = smooth_headings(events, model, filter_headings(events, model))
         bias = np.interp(self.turn.t, self.t, states[:, BIAS])
@@ -279,7 +280,7 @@ class _Problem:
         return Guess(bias, float(bias_std), float(scale_std), float(states[-1, X]), float(states[-1, DELAY]))
 
     def choose(self, grids: dict[str, Floats], noises: dict[str, float]) -> dict[str, float]:
-        """Return the noises with those of the grids that have the largest likelihood, one after the other."""
+        """Return the noises; each in `grids` is set, one after the other, to its value of largest likelihood."""
         noises = {name: float(values[len(values) // 2]) for name, values in grids.items()} | noises
 
         @functools.cache
@@ -297,10 +298,10 @@ class _Problem:
         return noises
 
     def _forward(self, noises: dict[str, float]) -> tuple[HeadingEvents, HeadingModel, HeadingPasses]:
-        """Run the filter with some noises; courses that err alike count less."""
+        """Run the filter with some noises; courses with a common error have less weight."""
         events, model = self.events(noises), self.model(noises)
         passes = filter_headings(events, model)
-        # by how much courses of windows that follow one another err alike, by slip that the model lacks
+        # correlation of the errors of successive courses, from slip that the model lacks
         course = self.kind == COURSE
         z = np.clip(passes.innovation[course] / np.sqrt(passes.variance[course]), -SETTLED_SIGMAS, SETTLED_SIGMAS)
         # the first ones find the states
@@ -319,7 +320,7 @@ class _Problem:
         """Return the estimate with some noises."""
         events, model, passes = self._forward(noises)
         states, covariances = smooth_headings(events, model, passes)
-        del passes  # of a long log, as large as what the pass below makes
+        del passes  # for a long log as large as the result of the pass below
         fixed = np.ones(len(model.x), np.bool_)
         fixed[[ANGLE, BIAS]] = False
         fixed[GYRO_STATES + WANDER - OFFSET :: STATES_OF_A_SOURCE] = False
@@ -329,7 +330,7 @@ class _Problem:
         del covariances
         passes = filter_headings(events, model._replace(x=start[0], P=start[1], fixed=fixed))
         causal, of_causal = passes.x, passes.P
-        del passes, events  # as large as what is carried on from there to each sample
+        del passes, events  # as large as the arrays at each sample below
         t, turn, G = self.t, self.turn, self.G
         # at samples of the rate: carried on from the last event, or between events
         interval_s = float(np.median(np.diff(turn.t), overwrite_input=True))

@@ -1,4 +1,4 @@
-"""The heading compared with the course over ground: its offset, the cause of it, what is applied, what is refused."""
+"""The heading compared with the course over ground: its offset, the cause, the correction, and refused headings."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from icrtool.records.samples import Datum
 from icrtool.records.tables import RobotLog
 
 LIKE_RAD = math.radians(1.0)
-"""An offset is named after what it equals to within this: compasses in robots are no better. One that is not known
-that well has no name."""
+"""Largest difference between an offset and its possible cause [rad]. Compasses in robots are no more accurate. An
+offset with a larger standard deviation gets no cause."""
 
 SMALLEST_NAME_RAD = math.radians(0.5)
 UTM_LATITUDES_DEG = (-80.0, 84.0)
@@ -36,7 +36,7 @@ TURN_WORDS = {
 
 
 class OffsetName(NamedTuple):
-    """What an offset may come from.
+    """A possible cause of an offset.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ def name_offset(offset_rad: float, sigma_rad: float, datum: Datum | None, stamp_
             away = abs(math.remainder(offset_rad - math.radians(turn) + north, 2 * math.pi))
             texts = [text for text in (turn_text, north_text) if text]
             if away <= max(LIKE_RAD, 2.0 * sigma_rad) and texts:
-                # The fewer causes, the likelier; then the nearer.
+                # Fewer causes are more likely; of equally many, the closest ones.
                 found.append((len(texts), away, " and ".join(texts)))
     return OffsetName(min(found)[2] if found else "", declination, convergence)
 
@@ -106,7 +106,7 @@ def _declination_deg(datum: Datum, stamp_ns: int) -> float | None:
         model = GeoMag(base_year=day)
         return float(model.calculate(datum.latitude_deg, datum.longitude_deg, datum.height_m / 1e3, year).d)
     except ValueError:
-        # Stamps that count from the robot's start are 1970: there is no model of that year, and no date either.
+        # Stamps that count from the robot's start give 1970: no date, and no model covers it.
         return None
 
 
@@ -119,21 +119,27 @@ OTHER_CONVENTION = note(
 )
 
 OF_THE_SENSE = {"heading_convention_contradicts", "heading_convention_corrected"}
-"""Codes of findings about the sense of a heading, which its offset is stated with."""
+"""Codes of findings about the sense of a heading. The offset is stated in the same finding."""
 
 EXPLAINED = 0.8
-"""Mean resultant length of angles above which they are one direction; share of those that turn about."""
+"""Mean resultant length of angles above which they have one direction, and share of windows in reverse that turn
+about."""
 
 UNEXPLAINED_RAD = math.radians(40.0)
-"""A heading that scatters by more about the motion of wheels and fixes is refused: noise with half of that is used."""
+"""Scatter about the motion of wheels and fixes above which a heading is refused [rad]. With half of it, it is used."""
 
-STUCK_S, STUCK_TURN_M, STUCK_SHARE = 5.0, 0.3, 0.1
-"""A heading that is constant for so long, while one side gains so much on the other, over this share of the distance,
-is stuck."""
+STUCK_S = 5.0
+"""Time for which a stuck heading is constant, at least [s]."""
+
+STUCK_TURN_M = 0.3
+"""Difference of the sides' distances in this time above which the robot turns [m]."""
+
+STUCK_SHARE = 0.1
+"""Share of the distance with a constant heading in turns above which the heading is stuck."""
 
 TURN_M, TURN_SHARE = 1.0, 0.1
-"""A side that gains less than this share of the distance, over so much of it, shows no turn: wheels of unequal size do
-so on a straight row."""
+"""Distance over which a turn is looked for [m], and smallest difference of the sides as a share of it. Wheels of
+unequal size make a smaller difference on a straight path."""
 
 
 class CourseComparison(NamedTuple):
@@ -141,7 +147,7 @@ class CourseComparison(NamedTuple):
 
     Attributes
     ----------
-    windows : how many
+    windows : number of windows
     agreement : mean resultant length of heading minus course over ground: 1 where they agree, about 0 at random, NaN
         without windows; mirrored_agreement : the same for a heading of the other handedness
     turns_about : the heading turns about where the robot drives backwards: it is itself a course over ground
@@ -166,7 +172,7 @@ def compare_with_course(windows: DriveWindows) -> CourseComparison:
     moved = (np.abs(seen) > third_m) & (np.abs(laid) > third_m)
     if not moved.any():
         return NOT_COMPARED
-    # a heading of the other handedness lays the same distance on the other side of north
+    # with a heading of the other handedness the displacement is mirrored about north
     angle, turned_over = (np.exp(1j * np.angle(one * np.conj(seen)))[moved] for one in (laid, np.conj(laid)))
     backwards = (gone < 0.0)[moved]
     ahead, back = angle[~backwards], angle[backwards]
@@ -184,18 +190,18 @@ def align_heading(
     log: RobotLog, config: Config, fit: AlignmentFit | None, course: CourseComparison, convention: Convention,
     derived: DerivedHeading | None,
 ) -> tuple[HeadingFacts, float, list[Note]]:  # fmt: skip
-    """Return offset and noise of the heading, and what is applied.
+    """Return offset and noise of the heading, and the correction.
 
     Parameters
     ----------
-    fit : of the heading that a sensor states, None without one or where the drive is too short; after it the same
-        heading beside the course over ground
-    convention : that the streams were found to have
-    derived : the heading where it was estimated, which holds every correction
+    fit : alignment with a sensor's heading, None without one or where the drive is too short; the next parameter is the
+        comparison of this heading with the course over ground
+    convention : the chosen convention of the streams
+    derived : the heading where it was estimated, with every correction
 
     Returns
     -------
-    what run.json states; how long the noise of a stated heading is correlated, where it was raised [s]; what to report
+    facts for run.json; correlation time of a stated heading's noise where it was raised [s]; findings
     """
     corrects, mirrored = config.filter.rules.corrects, convention.heading < 0
     offset, std, scatter, applied, correlation_s = math.nan, math.nan, math.nan, 0.0, 0.0
@@ -247,11 +253,11 @@ def align_heading(
 def _correction(
     log: RobotLog, config: Config, fit: AlignmentFit, convention: Convention, found: tuple[float, float], fixed: float
 ) -> tuple[float, OffsetName, list[Note]]:
-    """Return what is subtracted from a stated heading [rad], what its offset comes from, and what to report.
+    """Return the angle to subtract from a stated heading [rad], the cause of its offset, and findings.
 
     Parameters
     ----------
-    found : offset and its standard deviation [rad]; fixed : what is subtracted by the configuration
+    found : offset and its standard deviation [rad]; fixed : configured angle to subtract [rad]
     """
     offset, std = found
     mirrored, corrects = convention.heading < 0, config.filter.rules.corrects
@@ -279,7 +285,7 @@ def _correction(
 
 
 def _offset_in_words(log: RobotLog, offset: float, std: float, *, mirrored: bool) -> tuple[str, OffsetName]:
-    """Return an offset with its deviation and its cause; that of a yaw, where the yaw is of the other convention."""
+    """Return an offset with its deviation, and its cause; `mirrored`: the offset of a yaw of the other convention."""
     rest = offset + math.pi / 2 if mirrored else offset
     name = name_offset(rest, std, log.datum, int(log.wheels.stamp_ns[0])) if _significant(rest, std) else NO_NAME
     cause = f" ({name.text})" if name.text else ""
@@ -296,9 +302,9 @@ def _significant(offset: float, std: float) -> bool:
 
 
 def refuse_unexplained(log: RobotLog, fit: AlignmentFit | None, course: CourseComparison) -> None:
-    """Raise where no convention and no offset makes the heading follow the motion of wheels and fixes.
+    """Raise where the heading follows the motion of wheels and fixes with no convention and no offset.
 
-    A heading of the other convention that the configuration keeps scatters, too, and is used with its warning.
+    A heading of the other convention that the configuration keeps also scatters. It is used, with a warning.
     """
     if fit is not None and fit.heading_scatter > UNEXPLAINED_RAD and not course.mirrored_agreement > EXPLAINED:
         spread = min(math.degrees(fit.heading_scatter), 180.0)
@@ -320,7 +326,7 @@ def refuse_stuck(log: RobotLog) -> None:
     left, right = wheels.v_left_mps[:-1] * interval, wheels.v_right_mps[:-1] * interval
     gone = np.concatenate([[0.0], np.cumsum(np.abs(left) + np.abs(right)) / 2])
     ahead = np.concatenate([[0.0], np.cumsum(left - right)])
-    # without what it gains where it gains too little of the distance to be a turn
+    # differences of the sides that are too small a share of the distance for a turn are left out
     later = np.minimum(np.searchsorted(gone, gone + TURN_M), len(gone) - 1)
     turns = np.abs(ahead[later] - ahead) >= TURN_SHARE * (gone[later] - gone)
     ahead = np.concatenate([[0.0], np.cumsum(np.where(turns[:-1], np.diff(ahead), 0.0))])

@@ -1,4 +1,4 @@
-"""The heading of a log: as a sensor states it, or estimated from turn rates, positions, antennas and that sensor."""
+"""The heading of a log: as a sensor states it, or estimated from turn rates, positions, antennas and this sensor."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ from icrtool.records.samples import (
 from icrtool.records.tables import RobotLog
 
 ATTITUDE_CELL_S, PAIR_CELL_S = 1.0, 0.5
-"""Headings are averaged over this time, the turn in it corrected for."""
+"""Times over which headings of an attitude sensor and of a pair of antennas are averaged, corrected for the turn
+[s]."""
 
 SHORTEST_BASELINE_M = 0.2
 LEAST_ATTITUDE_STD_RAD = math.radians(0.01)
@@ -66,9 +67,9 @@ def antenna_bearing(log: RobotLog, turn: TurnRate) -> AbsoluteHeading | None:
 
 
 def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> AbsoluteHeading:
-    """Return means over cells of time, at each cell's last sample; `std` is that of a sample of unit noise.
+    """Return means over cells of time, at each cell's last sample; `std` is relative to the noise of a sample.
 
-    The turn rate carries the samples of a cell to its end: the mean uses nothing later.
+    The turn rate moves the samples of a cell to the cell's end, so that the mean is causal.
     """
     inside = (t >= turn.t[0]) & (t <= turn.t[-1])
     t, angle = t[inside], angle[inside]
@@ -84,17 +85,25 @@ def _averaged(t: Floats, angle: Floats, turn: TurnRate, cell_s: float) -> Absolu
 
 
 LARGEST_START_STD_RAD = math.radians(5.0)
-"""Headings less certain than this are not given to the filter."""
+"""Largest standard deviation of headings that are given to the filter at its start [rad]."""
 
 LARGEST_DRIFT = math.radians(10.0)
-"""A gyro whose integral wanders by so much [rad/sqrt(s)] is dead, or in another unit: the wheels may be better."""
+"""Random walk of a gyro's integral from which on it is dead or in another unit [rad/sqrt(s)]. Wheels may then be
+better."""
 
-TURNS_COMPARED_S, LEFT_SHARE, LEAST_GAIN, LARGEST_GAIN = 1.0, 0.3, 0.15, 1.3
-"""A gyro whose turns within a second are those of the wheels but for this share, with such a gain, turns with the
-robot: what contradicts it contradicts the wheels as much, and it is the fixes that err."""
+TURNS_COMPARED_S = 1.0
+"""Time over which the turns of gyro and wheels are compared [s]."""
+
+LEFT_SHARE = 0.3
+"""Largest scatter of the gyro's turns about the wheels' turns, as a share of the rms turn, at which both agree. A
+conflict with the course over ground is then attributed to the fixes."""
+
+LEAST_GAIN, LARGEST_GAIN = 0.15, 1.3
+"""Smallest and largest ratio of the gyro's turns to the wheels' turns at which both agree."""
 
 NOISY_SCATTER_RAD = math.radians(6.0)
-"""Scatter about the course over ground above which a heading is no attitude sensor's: it drifts, or is noise."""
+"""Scatter about the course over ground above which a heading drifts or is noise [rad]. Attitude sensors scatter
+less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +112,9 @@ class DerivedHeading:
 
     Attributes
     ----------
-    source : what it was made of, as in `HeadingFacts`; topic : of its parts
-    estimate : causal and smoothed; causal, smoothed : the same as samples, the causal ones for the filter
-    gyro : the turn rate that was used, None where it is the wheels'
+    source : its kind, as in `HeadingFacts`; topic : topics of its parts
+    estimate : causal and smoothed heading; causal, smoothed : both as samples; the filter uses the causal ones
+    gyro : the turn rate that was used, None if the wheels' turn rate was used
     attitude : the attitude sensor's own heading, corrected by the offset of the estimate; None where none was used
     why : its parts and standard deviation, for the user
     """
@@ -129,12 +138,12 @@ class DerivedHeading:
 
 
 def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
-    """Estimate the heading of a log without one, from the best of what it holds.
+    """Estimate the heading of a log without one, from its best sources.
 
     Raises
     ------
     DataError
-        Too little distance, or none: a robot on a stand.
+        Too little distance, or a robot on a stand.
     """
     if min(len(log.wheels.stamp_ns), len(log.gnss.stamp_ns)) < 2:
         refuse_standing(log)
@@ -168,8 +177,8 @@ def derive_heading(log: RobotLog, width_m: float) -> DerivedHeading:
 def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
     """Estimate the heading from gyro, course over ground and the heading that the log states.
 
-    None without a gyro, where the gyro is dead, where the stated heading alone is as good, and where it is the position
-    reference's own.
+    None without a gyro, with a dead gyro, where the stated heading alone is equally good, and where the stated heading
+    comes from the position reference.
 
     Parameters
     ----------
@@ -184,7 +193,7 @@ def fuse_heading(log: RobotLog, track: Track) -> DerivedHeading | None:
 
 
 def _follows_wheels(derived: DerivedHeading, track: Track, width_m: float, log: RobotLog) -> bool:
-    """Return whether a gyro turns as the wheels of a robot that may slip do, in windows of time."""
+    """Return whether the turns of a gyro agree with the turns of wheels that may slip, in windows of time."""
     if derived.gyro is None:
         return False
     t = (derived.gyro.stamp_ns - int(log.wheels.stamp_ns[0])) / 1e9
@@ -202,7 +211,7 @@ def _with_gyro(log: RobotLog, track: Track, stated: HeadingSamples | None) -> De
     best, least, changes, epoch = None, math.inf, course_changes(track), int(log.wheels.stamp_ns[0])
     for gyro in log.gyros:
         rates = gyro_rates(track, changes, gyro, epoch)
-        # beside a stated heading, which bends to either sense of a turn rate, as the sensor is usually mounted
+        # with a stated heading, which would fit to either sense of a turn rate, only the usual mounting is tried
         for row, (turn, axis) in enumerate(rates if stated is None else rates[:1]):
             found = _derived(log, track, turn, gyro.topic if axis == "z up" else f"{gyro.topic} ({axis})", stated)
             std = math.inf if found is None else found.estimate.median_std
@@ -220,11 +229,11 @@ def _derived(
 
     Parameters
     ----------
-    gyro_topic : of the turn rate; None: it is the wheels', for the reason `instead`
+    gyro_topic : topic of the turn rate; None: it is the wheels' turn rate, for the reason `instead`
     """
     epoch, absolute = int(log.wheels.stamp_ns[0]), list[AbsoluteHeading]()
     if stated is not None:
-        # with the white noise that it shows beside the turn rate
+        # with the white noise that it shows relative to the turn rate
         one = _averaged(track.heading_t, track.heading, turn, ATTITUDE_CELL_S)
         step = np.diff(one.heading - np.interp(one.t, turn.t, turn.integrated))
         noise = mad_std(wrapped(step - np.median(step))) / math.sqrt(2.0) if len(step) else 0.0
@@ -250,7 +259,7 @@ def _derived(
         attitude = HeadingSamples(stated.stamp_ns - lag, stated.heading_rad - estimate.offset[0], thin(stated.var_rad2))
     stamps, turn_stamps = (epoch + np.round(t * 1e9).astype(np.int64) for t in (estimate.t, turn.t))
     causal, smoothed = wrapped(estimate.causal), wrapped(estimate.smoothed)
-    # the causal one from where it is known
+    # the causal heading begins where it is known
     std = estimate.causal_std
     known = slice(int(np.argmax(std < max(LARGEST_START_STD_RAD, 2.0 * float(np.median(std))))), None)
     return DerivedHeading(
@@ -266,9 +275,9 @@ def _derived(
 
 
 def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog | None:
-    """Return a log whose heading is a turn rate only, where it drifts and its rate gives a better one; else None.
+    """Return a log with only the turn rate of its heading, where the heading drifts and the rate is better; else None.
 
-    An orientation without a magnetometer is an integrated gyro: its offset wanders with the bias.
+    An orientation without a magnetometer is an integrated gyro. Its offset drifts with the bias.
 
     Parameters
     ----------
@@ -297,7 +306,7 @@ def as_turn_rate(log: RobotLog, scatter_rad: float, width_m: float) -> RobotLog 
 
 
 def without_heading(log: RobotLog, why: str) -> RobotLog:
-    """Return the log without its heading, so that one is estimated; `why` is reported."""
+    """Return the log without its heading, so that a heading is estimated; `why` is reported."""
     streams = tuple(one for one in log.streams if one.role != "heading")
     return replace(
         log, heading=NO_HEADINGS, streams=streams, notes=(*log.notes, note("heading_left_out", why, log.name))

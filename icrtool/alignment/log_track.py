@@ -1,4 +1,4 @@
-"""The track of a log: whether its streams can be used together, and windows of driven distance that are compared."""
+"""The track of a log: checks that its streams can be used together, and windows of driven distance to compare."""
 
 from __future__ import annotations
 
@@ -24,32 +24,38 @@ from icrtool.records.tables import RobotLog
 
 ALIGNMENT_WINDOW_M, LONGEST_WINDOW_M = 2.0, 10.0
 WINDOW_IN_WIDTHS = 4.0
-"""Windows of small robots are so many track widths long: slip is a share of the distance, and hides them over 2 m."""
+"""Length of the windows of small robots, in track widths. Slip is a share of the distance; over 2 m it hides their
+ICRs."""
 
 WINDOW_IN_POSITION_STD = 12.0
-"""A window is so long that noise of the fixes turns its displacement by no more than 7 deg."""
+"""Smallest length of a window, in standard deviations of a position. Noise of the fixes then turns the displacement of
+a window by at most 7 deg."""
 
 WINDOW_IN_VALUES = 12.0
-"""A value that is held while the robot accelerates moves the end of a window by a part of its own distance."""
+"""Smallest length of a window, in distances for which a wheel value is held. A value that is held while the robot
+accelerates moves the end of a window by a part of this distance."""
 
 STARTS_A_WINDOW, FEWEST_ALIGNMENT_WINDOWS = 8, 8
 FEWEST_OVERLAPPING = 2 * STARTS_A_WINDOW
-"""Fewer windows that follow one another show nothing, nor do less than two that overlap."""
+"""Smallest number of overlapping windows that are used: as many as start within two windows."""
 
 LONGEST_ALIGNMENT_WINDOW_S = 30.0
-"""A window that takes longer holds an outage or a stop."""
+"""Longest duration of a window [s]. A longer one holds an outage or a stop."""
 
-TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS, TURN_WINDOW_EVERY_S = 1.0, 2.0, 0.5
-"""Heading changes are compared over this time, and at least so many intervals; windows start at every step."""
+TURN_WINDOW_S, TURN_WINDOW_IN_INTERVALS = 1.0, 2.0
+"""Shortest window of heading changes: in seconds, and in intervals between samples."""
+
+TURN_WINDOW_EVERY_S = 0.5
+"""Time between the starts of two windows of heading changes [s]."""
 
 CHORD_S, LEAST_CHORD_M = 2.0, 0.3
-"""Without a heading, distances are compared over this time, and where the chord is so long [m]."""
+"""Time over which distances are compared without a heading [s], and the shortest chord that is compared [m]."""
 
 STANDS_S = 5.0
-"""A heading further than this from a turn of the wheels is one of a robot that stands."""
+"""Time from a turn of the wheels beyond which the robot stands when a heading is measured [s]."""
 
 MOST_WHEEL_SAMPLES = 25_000
-"""The samples of a longer drive are joined to about so many: 1 h at 7 Hz, where windows last seconds."""
+"""Approximate number of samples to which the wheel samples of a longer drive are joined: 1 h at 7 Hz."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ class DriveWindows(Windows):
     Attributes
     ----------
     turn_begin, turn_end : (u,) [s] windows of heading changes
-    group, turn_group : (w,), (u,) stretches of distance that are independent of one another
+    group, turn_group : (w,), (u,) numbers of stretches of distance that are independent of one another
     """
 
     turn_begin: Floats
@@ -80,7 +86,7 @@ class DriveWindows(Windows):
 
 
 def track_of_log(log: RobotLog, heading: HeadingSamples | None = None) -> Track:
-    """Return a log as arrays; `heading` in place of its own."""
+    """Return a log as arrays; `heading` replaces the log's own."""
     stated = log.heading if heading is None else heading
     return track_of_streams(
         log.wheels, log.gnss, stated, same_clock=log.heading_is_of_position, slipping_ns=log.slipping_ns
@@ -103,7 +109,7 @@ def track_of_streams(
     turns = np.abs(left) + np.abs(right) > 2.0 * TURNING_MPS
     angle = unwrapped(heading.heading_rad)
     if len(heading_t) > MOST_WHEEL_SAMPLES:
-        # neighbours averaged: a delay then moves no single noise
+        # neighbours are averaged, so that a delay does not depend on the noise of single samples
         begin, behind = runs_of(turns)
         first = _thinned(in_spans(heading_t, wheel_t[begin] - STANDS_S, wheel_t[behind - 1] + STANDS_S))
         count = np.diff(first, append=len(heading_t))
@@ -114,7 +120,7 @@ def track_of_streams(
         none, none, none, place_std_m=fix_std_m(gnss), same_clock=same_clock,
     )  # fmt: skip
     if len(wheel_t) > MOST_WHEEL_SAMPLES:
-        # gaps stay samples of their own
+        # gaps are not joined with other samples
         begins = (held == 0.0) | np.append(True, held[:-1] == 0.0)
         begins[_thinned(turns)] = begins[-1] = True
         track = track.joined(np.flatnonzero(begins))
@@ -122,9 +128,9 @@ def track_of_streams(
 
 
 def _thinned(busy: Bools) -> Ints:
-    """Return rows at which to join the samples of a long drive (n,): evenly, or only where it stands if that is enough.
+    """Return rows at which to join the samples of a long drive (n,): evenly, or only in its stops if that is enough.
 
-    A robot that is parked for days leaves the samples of its drives as they are.
+    If a robot is parked for days, the samples of its drives are therefore not joined.
     """
     every = -(-len(busy) // MOST_WHEEL_SAMPLES)
     moving = np.flatnonzero(busy | np.append(False, busy[:-1]))
@@ -133,13 +139,13 @@ def _thinned(busy: Bools) -> Ints:
 
 
 def fix_std_m(gnss: PositionFixes | Fixes) -> float:
-    """Return the noise of the fixes, an axis [m]: what they state, or what they show where that is clearly more.
+    """Return the noise of the fixes, an axis [m]: the stated noise, or the measured one where it is clearly larger.
 
     Notes
     -----
-    They show it without wheels and heading, before it is known what those mean: three white errors make a second
-    difference of six times the variance. What the robot does between two fixes adds little where they are frequent, and
-    much where they are not: `FixSteps.white_std_m` leaves it out.
+    The noise is measured without wheels and heading, whose meaning is not known yet: the second difference of white
+    errors has six times their variance. The robot's motion between fixes adds little where fixes are frequent, and much
+    where they are rare; `FixSteps.white_std_m` leaves the motion out.
     """
     variance = (gnss.var_north_m2 + gnss.var_east_m2) / 2
     known = variance[np.isfinite(variance) & (variance > 0)]
@@ -152,22 +158,23 @@ def fix_std_m(gnss: PositionFixes | Fixes) -> float:
 
 
 def windows_of_log(log: RobotLog, width_m: float, heading: HeadingSamples | None = None) -> DriveWindows:
-    """Return the windows of the alignment, for a robot of track width b [m]; `heading` in place of the log's."""
+    """Return the windows of the alignment, for a robot of track width b [m]; `heading` replaces the log's own."""
     return cut_drive_windows(track_of_log(log, heading), min(ALIGNMENT_WINDOW_M, WINDOW_IN_WIDTHS * width_m))
 
 
 def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, length_m: float = 0.0) -> DriveWindows:
     """Cut a drive into overlapping windows of wheel distance between fixes, and of time between headings.
 
-    All arrays are as long as the samples allow, whatever the speeds: a damaged speed fills no memory.
+    The length of the arrays depends on the number of samples and not on the speeds, so that a damaged speed needs no
+    more memory.
 
     Parameters
     ----------
-    least_m : windows are at least so long, and as long as the noise of the fixes and held wheel values ask for
-    length_m : of a window, in place of that
+    least_m : shortest window; noise of the fixes and held wheel values make windows longer
+    length_m : length of the windows in place of that; 0: not given
     """
     travel, noise = track.travel, WINDOW_IN_POSITION_STD * min(track.place_std_m, 10.0)
-    # the distance on which a wheel value lasts while the robot moves, however often it is repeated
+    # distance for which a wheel value is held while the robot moves, with its repetitions
     moving = np.diff(travel) > 0
     changes = [np.count_nonzero((np.diff(speed) != 0) & moving) for speed in (track.v_left, track.v_right)]
     lasts_m = float(travel[-1]) / max(sum(changes) / 2, 1.0)
@@ -193,7 +200,7 @@ def cut_drive_windows(track: Track, least_m: float = ALIGNMENT_WINDOW_M, *, leng
         whole &= np.searchsorted(sampled, turn_end) > np.searchsorted(sampled, turn_begin) + 1
         whole &= np.interp(turn_end, track.t, travel) > np.interp(turn_begin, track.t, travel)
         turn_begin, turn_end = turn_begin[whole], turn_end[whole]
-    # what counts as one independent observation: 10 windows, where there are 40 of them
+    # windows that count as one independent observation: 10 windows, where there are 40 of them
     size = min(max(float(travel[-1]) / 40.0, 2.0 * length), 10.0 * length)
     turn_travel = np.interp(turn_begin, track.t, travel)
     return DriveWindows(
@@ -216,10 +223,11 @@ def cut_chords(track: Track) -> tuple[Floats, Complexes, Floats, Floats]:
 
 
 IMPOSSIBLE_MPS = 1e6
-"""A wheel speed from here on is a broken value: its distance is more than can be cut into windows."""
+"""Wheel speed from which on a value is damaged [m/s]. Its distance could not be cut into windows."""
 
 IMPOSSIBLE_M = 1e9
-"""A position this far from the origin is a broken value: metric coordinates of any country are below 1e8 m."""
+"""Distance from the origin from which on a position is damaged [m]. Metric coordinates of all countries are below 1e8
+m."""
 
 
 def check_streams(log: RobotLog) -> None:
@@ -229,8 +237,7 @@ def check_streams(log: RobotLog) -> None:
     ------
     DataError
         Fewer than two samples of a stream, none at the same time, stamps that go back, or a value that is not a finite
-        number. Logs that were read hold no such rows (`icrtool.read_log` sorts, and leaves out), tables made by a
-        program may.
+        number. `icrtool.read_log` sorts rows and leaves damaged ones out; a table made by a program may hold them.
     """
     wheels, gnss, heading = log.wheels, log.gnss, log.heading
     if not len(heading.stamp_ns):

@@ -1,12 +1,12 @@
-"""Motion of the reference compared with that of the wheels, in windows of time; steps of it that are jumps.
+"""Motion of the reference compared with the motion of the wheels, in windows of time; steps of it that are jumps.
 
-The motion of the wheels is that of the alignment's estimate. Place and turn are compared apart from each other: wheel
-speeds are integrated along the measured heading for the place, and by themselves for the turn.
+The motion of the wheels is computed with the alignment's estimate. Place and turn are compared separately: for the
+place, wheel speeds are integrated along the measured heading; for the turn, they are integrated alone.
 
-A step beyond the motion of the wheels is the robot's slip or an error of the reference. A gyro separates them where the
-heading steps: it turns with the robot, so a heading that leaves wheels and gyro behind jumps, with the position of the
-same pose. Otherwise only what no robot can do, and what receivers state of their solution, is a jump. What neither
-shows stays undecided, and is the robot's.
+A step that exceeds the motion of the wheels is slip of the robot or an error of the reference. A gyro separates the two
+where the heading steps: if heading and position of a pose step while wheels and gyro do not turn, the reference jumps.
+Otherwise a step is a jump only if no robot can make it, or if the receiver reports a change of its solution. Other
+steps remain undecided and count as motion of the robot.
 """
 
 from __future__ import annotations
@@ -27,41 +27,43 @@ from icrtool.motion.recording import fit_gyro_line
 from icrtool.records.measurements import RESPONSE_S, ReferenceJump, SensorData
 
 KNOT_S = 0.1
-"""Fixes closer together than this are thinned: they show little more, and their noise much."""
+"""Shortest time between two fixes that are compared [s]. Closer fixes add much noise and little information."""
 
 SPEED_S = 0.1
-"""The speed at a knot is the mean of this much time about it."""
+"""Time over which the speed at a knot is averaged [s]."""
 
 LONGEST_SAMPLE_HOLE_S = 0.6
-"""Longer without a sample: a hole, which no window spans."""
+"""Longest time between two samples without a hole [s]. No window spans a hole."""
 
 LONGEST_HELD_IN_USUAL = 2.0
-"""A value held for longer than this many times the usual was constant."""
+"""Ratio to the usual time for which a value is held above which the speed really was constant."""
 
 MOTION_WINDOW_M = 1.0
-"""The motion is estimated over shorter windows than the alignment: events disturb fewer of them."""
+"""Shortest window for the estimate of the motion [m]. It is shorter than in the alignment, so that events disturb fewer
+windows."""
 
 LEAST_TURN_GAIN = 1e-3
 
 WINDOWS_S = (0.5, 1.0, 2.0)
 LONGEST_MOTION_WINDOW_S = 16.0
-"""Windows are doubled to this where the fixes are too noisy for shorter ones."""
+"""Longest window [s]. Windows are doubled up to this time where the fixes are too noisy for shorter ones."""
 
 FEWEST_INTERVALS = 2
-"""An event is seen in at least so many intervals between fixes: one alone may be a jump."""
+"""Smallest number of intervals between fixes in an event. A single interval may be a jump."""
 
 LEAST_DISTANCE2 = 36.0
-"""Squared Mahalanobis distance of a window in which an event is seen."""
+"""Squared Mahalanobis distance from which on a window shows an event."""
 
 LEAST_MODEL_ERROR = 0.03
 FIRST_QUANTILE, LATER_QUANTILE = 0.7, 0.95
-"""The model's error is what this share of the windows stays within: the first time events are still among them."""
+"""Shares of the windows from which the model's error is computed: the first time, and later. The first time the windows
+still include events."""
 
 NORMAL_QUANTILE = {FIRST_QUANTILE: 1.0364, LATER_QUANTILE: 1.9600}
-"""Of the absolute value of a standard normal."""
+"""Quantiles of the absolute value of a standard normal variable."""
 
 MOVING_SHARE = 0.2
-"""Windows in which the wheels do less than this part of the usual show nothing of the model's error."""
+"""Smallest motion of the wheels in a window that shows the model's error, as a share of the usual motion."""
 
 
 class Knots(NamedTuple):
@@ -69,15 +71,15 @@ class Knots(NamedTuple):
 
     Attributes
     ----------
-    track : with these fixes alone, since `epoch_ns`; its distance is that of the wheels
+    track : with these fixes alone, since `epoch_ns`; its distance is the wheels' distance
     variance : (m,) of a place, one axis [m^2]
-    heading : (m,) [rad], unwrapped; turn_variance : of one value of it [rad^2]
+    heading : (m,) [rad], unwrapped; turn_variance : variance of one heading [rad^2]
     velocity : complex (m,), the mean of the sides along the heading [m/s]; apart : (m,) left minus right [m/s]
     held_m2 : (m,) variance that values held from sample to sample add to a side's distance
-    holes : (m,) number of steps so far that lie in a hole of any stream, even in part; wheel_holes : of the wheels
+    holes : (m,) number of earlier steps that touch a hole of any stream; wheel_holes : of the wheels
     fix_class : (m,) classes of the fixes
     turn_follows_place : the headings are estimated from the positions, and jump with them
-    gyro : (m,) turn of the gyro [rad], in sense and scale of the headings; None without one that turns with them
+    gyro : (m,) turn of the gyro [rad], in sense and scale of the headings; None without a gyro that agrees with them
     """
 
     epoch_ns: int
@@ -116,12 +118,12 @@ class Motion(NamedTuple):
 
 
 class ComparedWindows(NamedTuple):
-    """What the reference did beyond the model, in windows between two knots.
+    """Motion of the reference minus the model's, in windows between two knots.
 
     Attributes
     ----------
     begin, end : (w,) rows of the knots
-    ahead, aside, turned : (w,) reference minus model [m]; a turn is metres at half the ICR separation
+    ahead, aside, turned : (w,) reference minus model [m]; turns are multiplied by half the ICR separation
     model_ahead, model_turned : (w,) by the wheels, likewise
     made : (w,) motion of the reference itself, the larger of displacement and turn [m]
     path_m : (w,) motion of the wheels [m], scale included
@@ -192,7 +194,7 @@ def lay_knots(sensors: SensorData) -> Knots | None:
     return Knots(
         epoch_ns=int(wheels.stamp_ns[0]), track=track,
         variance=np.maximum((fixes.var_north_m2 + fixes.var_east_m2)[rows] / 2, USUAL_POSITION_STD_M**2),
-        # at most this is noise
+        # the noise is at most this
         heading=heading, turn_variance=mad_std(np.diff(heading, 2), 0.0) ** 2 / 6,
         velocity=(v_left + v_right) / 2 * np.exp(1j * heading), apart=v_left - v_right,
         held_m2=np.interp(t, track.t, _held_variance(track.t, left, right)),
@@ -212,8 +214,8 @@ def _in_hole(sampled: Floats, t: Floats) -> Bools:
 def compare_by_duration(knots: Knots, motion: Motion) -> list[tuple[float, ComparedWindows]]:
     """Return the durations of the windows [s], the longest first, and the windows of each.
 
-    Durations are doubled until the usual distance stands out of the noise of the fixes. A window lasts so long, or one
-    fix more, and spans no hole.
+    Durations are doubled until the usual distance clearly exceeds the noise of the fixes. A window lasts for its
+    duration, or one fix longer, and spans no hole.
     """
     path, dt = np.diff(knots.track.distance), np.diff(knots.t)
     moving, durations = path > MOVES_MPS * dt, list(WINDOWS_S)
@@ -233,7 +235,7 @@ def compare_by_duration(knots: Knots, motion: Motion) -> list[tuple[float, Compa
 
 
 def fit_motion(knots: Knots, width_m: float, quiet: Bools) -> Motion | None:
-    """Return the motion that the alignment's estimate expects of the wheels; None where there is too little distance.
+    """Return the motion by the wheels with the alignment's estimate; None where there is too little distance.
 
     Parameters
     ----------
@@ -288,7 +290,7 @@ def _held_variance(t: Floats, v_left: Floats, v_right: Floats) -> Floats:
     change = np.hypot(np.diff(v_left), np.diff(v_right))
     changed = np.flatnonzero(change > 0) + 1
     held = np.diff(t[np.concatenate([[0], changed])])
-    # a robot that stood still held nothing
+    # values of a standing robot do not count as held
     held = np.minimum(held, LONGEST_HELD_IN_USUAL * float(np.median(held)) if len(held) else 0.0)
     variance = np.zeros(len(t))
     variance[changed] = (change[changed - 1] * held) ** 2 / 12
@@ -298,7 +300,7 @@ def _held_variance(t: Floats, v_left: Floats, v_right: Floats) -> Floats:
 def model_error(windows: ComparedWindows, quiet: Bools, quantile: float) -> Floats:
     """Return the standard deviation of the model's error (3,), a share of the wheels' motion.
 
-    Sensor noise s and model error k p leave a share q of the residuals r within n standard deviations where k is the
+    With sensor noise s and model error k p, a share q of the residuals r is within n standard deviations if k is the
     q-quantile of sqrt(r^2 / n^2 - s^2) / p.
     """
     disturbed = np.concatenate([[0], np.cumsum(~quiet)])
@@ -312,14 +314,15 @@ def model_error(windows: ComparedWindows, quiet: Bools, quantile: float) -> Floa
 
 
 JUMP_SPEED_SHARE, JUMP_MPS = 2.0, 0.3
-"""A step beyond the noise, and beyond what wheels and a slow slide can do, may be a jump."""
+"""Motion that the robot may make beyond noise: a multiple of the wheels' distance, plus a slow slide [m/s]. A larger
+step may be a jump."""
 
 SLIDE_MPS = 2.0
-"""A robot slides by up to this much faster than its wheels ever are: it needs 1 s of free slide at 0.2 g, and a robot
-that brakes on ice keeps its speed."""
+"""Largest excess of a sliding robot's speed over the largest wheel speed [m/s]. It needs 1 s of free slide at 0.2 g; a
+robot that brakes on ice keeps its speed."""
 
 STAMP_STD_S = 0.1
-"""Stamps of poses jitter: by 0.1 s rms, and three times as much now and then, on recorded lidar poses."""
+"""Standard deviation of the stamps of poses [s], measured on recorded lidar poses. Single stamps are wrong by 0.3 s."""
 
 
 def without_jumps(knots: Knots, width_m: float) -> tuple[Knots, Ints]:
@@ -363,9 +366,9 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     windows = compare(knots, motion, first, last, 0.0)
     duration = knots.t[last] - knots.t[first]
     speed = np.diff(knots.track.distance) / np.diff(knots.t)
-    # how fast the wheels drive the robot at most, but for single samples
+    # largest speed of the wheels, without single samples
     slide = (SLIDE_MPS + motion.scale * float(np.quantile(speed, 0.99))) * duration
-    # what the wheels do in the time by which stamps are wrong, before and after each step
+    # motion of the wheels in the time by which stamps may be wrong, before and after each step
     reach = (knots.t[last] + 3 * STAMP_STD_S, knots.t[first] - 3 * STAMP_STD_S)
     jitter, spin = (
         np.abs(np.interp(reach[0], knots.t, along) - np.interp(reach[1], knots.t, along) - (along[last] - along[first]))
@@ -381,7 +384,7 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
     if knots.gyro is None:
         alone[:] = False
     else:
-        # a gyro turns as the wheels do, nearer to them than to the reference
+        # the gyro's turn is closer to the wheels' turn than to the reference's
         by_gyro = motion.lever_m * (knots.gyro[last] - knots.gyro[first])
         slipped = np.abs(by_gyro - windows.model_turned)
         alone &= slipped < np.minimum(JUMP_MPS * duration, np.abs(windows.turned) / 2)
@@ -393,7 +396,7 @@ def decide_jumps(knots: Knots, motion: Motion, first: Ints) -> tuple[ReferenceJu
         "turns faster than any robot": turned > slide,
     }
     why = np.select(list(causes.values()), list(causes), "")
-    # Where the wheels are not known, a step without a cause is how the robot drove.
+    # Where the wheels are not known, a step without a cause counts as motion of the robot.
     shown &= (why != "") | (knots.wheel_holes[first] == knots.wheel_holes[last])
     level = np.exp(0.5j * (knots.heading[first] + knots.heading[last]))
     by = (windows.ahead + 1j * windows.aside) * level

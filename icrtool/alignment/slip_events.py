@@ -1,10 +1,11 @@
-"""Where wheels and reference disagree beyond what motion model and noise of the sensors allow: slip events, and jumps.
+"""Slip events and jumps: wheels and reference disagree by more than the motion model and the sensors' noise explain.
 
-Pentzer 2014, Sections 2 and 7: ICRs that grow without bound mean pure slip or a robot that is stuck. Here it is found
+Pentzer 2014, Sections 2 and 7: ICRs that grow without bound mean pure slip or a robot that is stuck. Here slip is found
 from the aligned measurements, before any filter, by a test over windows of half a second and more.
 
-A step between two fixes shows little, and a sum of them much: the log likelihood ratio of "this share of each side's
-motion is missing" over "none is" grows through an event and falls outside it (Page 1954). That gives begin and end.
+A single step between two fixes is not significant, but a sum of steps is. The log likelihood ratio of "this share of
+each side's motion is missing" to "none is missing" grows in an event and falls outside it (Page 1954). This gives begin
+and end.
 """
 
 from __future__ import annotations
@@ -37,59 +38,65 @@ from icrtool.kernels.arrays import Bools, Floats
 from icrtool.records.measurements import RESPONSE_S, ReferenceJump, SensorData, SlipEvent, SlipKind
 
 LEAST_SHARE = 0.3
-"""... and the least share of the wheels' motion that the robot does not make, or makes sideways."""
+"""Smallest severity of a slip event: the share of the wheels' motion that the robot does not make, or makes
+sideways."""
 
 LEAST_OF_SIDE = 0.12
-"""... where the robot drives and one side keeps to its wheels. In a spin a side slips by its own share."""
+"""Smallest severity where the robot drives and only one side disagrees with its wheels. It is smaller than
+`LEAST_SHARE`, because an error of the reference rarely looks like this. In a spin both sides slip."""
 
 IMMOBILISED_SHARE = 0.2
-"""Robot that moves and turns less than this share of what its wheels do: immobilised."""
+"""Ratio of the robot's motion to the motion of its wheels below which the robot is immobilised."""
 
 KEEPING_SHARE = 1 / 3
-"""A side that disagrees by less than this part of what the other does keeps to its wheels."""
+"""Ratio of the disagreements of the two sides below which one side follows its wheels."""
 
 STEADY_SHARE = 0.8
-"""... and what the other lacks has the same sign, but for this."""
+"""Smallest ratio of the other side's total disagreement to the sum of its sizes step by step. A steady disagreement
+with one sign has a ratio near 1."""
 
 LONGEST_STAMP_ERROR_S = 1.0
-"""For longer no reference lags by a wrong stamp."""
+"""Longest time for which a wrong stamp makes a reference lag [s]."""
 
 MOST_FALSE = 0.25
-"""Most windows that show what slip cannot do, for each that shows slip as clearly."""
+"""Largest ratio of windows that slip cannot explain to windows that show slip equally clearly."""
 
-RETURN_S, RETURNED_SHARE, RETURN_SIGMAS = 5.0, 0.5, 5.0
-"""A reference that comes back by this share within this time was wrong; what is missed must stand out of its noise."""
+RETURN_S, RETURNED_SHARE = 5.0, 0.5
+"""Time [s], and share of the missing motion that a reference must recover in it. Then the reference was wrong."""
+
+RETURN_SIGMAS = 5.0
+"""Ratio of the missing motion to its noise from which on such a return is looked for."""
 
 SHORTEST_EVENT_S = 0.5
 FEWEST_EVENT_STEPS = 2
 
 MOST_EVIDENCE = 4.0
-"""One step counts no more than this for an event or against it: a jump is not one."""
+"""Largest evidence of one step for or against an event. A jump is therefore not an event."""
 
 LOST_EVIDENCE = 8.0
-"""An event has ended where this much of its evidence is lost again."""
+"""Decrease of the summed evidence after which an event has ended."""
 
 CLEAR_STEP = 2.0
-"""A step whose missing motion is so many standard deviations shows where in it an event begins."""
+"""Missing motion of a step, in standard deviations, from which on it shows where in the step an event begins."""
 
 CHUNK = 64
-"""Steps that are evaluated together while an event grows."""
+"""Number of steps that are evaluated together while an event grows."""
 
 
 class Disagreements(NamedTuple):
-    """Where the reference does not do what the wheels do: by the robot, or by an error of its own; in order of time."""
+    """Disagreements of reference and wheels, in order of time: slip of the robot, or errors of the reference."""
 
     events: tuple[SlipEvent, ...] = ()
     jumps: tuple[ReferenceJump, ...] = ()
 
 
 def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
-    """Find the spans in which the robot did not do what its wheels did, and those in which the reference jumps.
+    """Find the spans in which the robot did not follow its wheels, and the spans in which the reference jumps.
 
     Parameters
     ----------
     sensors : aligned: sides, signs, scale, conventions and delays corrected
-    width_m : distance b between the track centre lines, or what stands for it
+    width_m : distance b between the track centre lines, or a value used in place of it
 
     Returns
     -------
@@ -103,9 +110,10 @@ def find_disagreements(sensors: SensorData, width_m: float) -> Disagreements:
     at changes of speed, and the model's own error, a share of the distance, which is estimated from the log. The
     squared Mahalanobis distance is chi-squared with 3 degrees of freedom.
 
-    A reference that is worse than it states makes the robot do too much as often as too little. Windows in which a side
-    does more than its wheels, which no slip can cause, are counted: where there are many, the others are not used
-    (target-decoy estimate of the false discovery rate, Benjamini and Hochberg 1995, Elias and Gygi 2007).
+    A reference with more noise than stated shows too much motion in half of the windows, and too little in the other
+    half. Slip cannot make a side move further than its wheels. Windows in which a side does are counted; if there are
+    many, the other windows are not used (target-decoy estimate of the false discovery rate, Benjamini and Hochberg
+    1995, Elias and Gygi 2007).
 
     Steps from fix to fix that may be jumps (`icrtool.alignment.reference_motion`) are in no window.
     """
@@ -139,7 +147,7 @@ def _find_events(
     Parameters
     ----------
     compared : of `compare_by_duration`
-    quiet : (m,) knots that the model's error is taken from; it is this quantile of what they show
+    quiet : (m,) knots from which the model's error is estimated; the next parameter is the quantile for it
     """
     windows, distance2, false_rate, error = _weigh(compared, quiet, quantile)
     row, outside = np.arange(len(knots.t)), np.ones(len(knots.t), np.bool_)
@@ -180,12 +188,12 @@ def _find_events(
 def _weigh(
     compared: list[tuple[float, ComparedWindows]], quiet: Bools, quantile: float
 ) -> tuple[ComparedWindows, Floats, Floats, Floats]:
-    """Return the windows (w,) of all durations that disagree with the model, and how surely.
+    """Return the windows (w,) of all durations that disagree with the model, with their significance.
 
     Returns
     -------
-    the windows; their squared Mahalanobis distance (w,); the share of errors (w,) that is expected among windows as
-    clear as each, inf where slip cannot be the cause; the model's error (3,) over the shortest of all windows
+    the windows; their squared Mahalanobis distance (w,); the expected share of false windows (w,) among windows with at
+    least this distance, inf where slip cannot be the cause; the model's error (3,) over the shortest of all windows
     """
     shown: list[tuple[ComparedWindows, Floats]] = []
     error = np.full(3, LEAST_MODEL_ERROR)
@@ -201,7 +209,7 @@ def _weigh(
         shown.append((moving.rows(shows), square[shows]))
     windows = ComparedWindows._make(map(np.concatenate, zip(*(one for one, _ in shown), strict=True)))
     square, beyond = np.concatenate([one for _, one in shown]), _exceeds(windows)
-    # what stands still is rarer than any slip, and so is its opposite: twice the motion of the wheels
+    # a robot that stands still is rarer than slip, and so is its opposite: twice the motion of the wheels
     doubled = np.hypot(windows.ahead - windows.model_ahead, windows.aside)
     doubled = np.maximum(doubled, np.abs(windows.turned - windows.model_turned))
     still, twice = (far < IMMOBILISED_SHARE * windows.path_m for far in (windows.made, doubled))
@@ -211,9 +219,10 @@ def _weigh(
 
 
 def _exceeds(windows: ComparedWindows) -> Bools:
-    """Return which windows show more motion than the wheels', of a side and of distance or turn, or the opposite.
+    """Return which windows show more motion than the wheels, of a side and of distance or turn, or the opposite motion.
 
-    A side without grip turns the robot more than both sides would; a robot in a rut drags the slower side along.
+    A single side is not enough: a side without grip makes the robot turn more than both sides would, and a robot in a
+    rut drags the slower side along.
     """
     least = LEAST_SHARE * windows.path_m
 
@@ -227,15 +236,15 @@ def _exceeds(windows: ComparedWindows) -> Bools:
 
 
 def _of_one_side(windows: ComparedWindows) -> Bools:
-    """Return in which windows one side keeps to its wheels: the other has no grip, and may be dragged along."""
+    """Return in which windows one side follows its wheels. The other side has no grip and may be dragged along."""
     sides = np.abs(windows.of_sides)
     return np.asarray(sides.min(axis=0) < KEEPING_SHARE * sides.max(axis=0))
 
 
 def _false_rate(windows: ComparedWindows, distance2: Floats, targets: Bools, decoys: Bools) -> Floats:
-    """Return, for each window, the decoys over the targets among those as clear as it or clearer (w,).
+    """Return for each window the ratio of decoys to targets among windows with at least its distance (w,).
 
-    Windows that overlap are one run, as clear as the clearest of them.
+    Windows that overlap count as one, with the largest of their distances.
     """
     beyond = []
     for kind in (decoys, targets):
@@ -248,11 +257,11 @@ def _false_rate(windows: ComparedWindows, distance2: Floats, targets: Bools, dec
 
 
 def _is_slip(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
-    """Return whether an event is severe enough, and no error of the reference.
+    """Return whether an event is severe enough, and not an error of the reference.
 
-    No error of a position or of a heading makes one side do what its wheels do, and the other lack a steady part of it,
-    except that of a stamp while the robot turns about a side: it is short, or comes and goes. Of a side without grip
-    the severity counts as the root mean square over both sides.
+    An error of a position or of a heading rarely agrees with the wheels of one side while the other side lacks a steady
+    part. Only a wrong stamp has this effect, while the robot turns about one side; it is short, or comes and goes. If
+    only one side has no grip, the severity is the root mean square over both sides.
     """
     inside = steps.rows(slice(extent.first, extent.last))
     sides, noise2 = inside.of_sides, inside.sensor[:, 0] + inside.sensor[:, 2]
@@ -265,9 +274,9 @@ def _is_slip(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
 
 
 def _returns(knots: Knots, steps: ComparedWindows, extent: Extent) -> bool:
-    """Return whether the reference makes up, shortly before or after, for the motion that is missing in the event.
+    """Return whether the reference recovers the motion that is missing in the event, shortly before or after it.
 
-    A reference that is wrong for a while comes back; distance and turn lost by slip do not.
+    A reference that is wrong for some time comes back. Distance and turn that are lost by slip do not.
     """
     middle = (knots.heading[1:] + knots.heading[:-1]) / 2
     low, high = np.searchsorted(knots.t, [extent.begin_s - RETURN_S, extent.end_s + RETURN_S])
@@ -288,9 +297,9 @@ class Extent(NamedTuple):
 
     Attributes
     ----------
-    first, last : rows of the knots about it
-    begin_s, end_s : within a step of those
-    kind : immobilised; else slip, skid or spin: the largest part of what is missed
+    first, last : rows of the knots around it
+    begin_s, end_s : times within one step of these knots
+    kind : immobilised; else slip, skid or spin, by the largest part of the missing motion
     severity : share of the motion of both sides that is missed, or made sideways if that is more; at most 1
     distance_m : the robot's path through the event
     """
@@ -305,9 +314,10 @@ class Extent(NamedTuple):
 
 
 def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools, core: slice) -> Extent | None:
-    """Return the event about a window that shows one; None where none of its own is left.
+    """Return the event around a window that shows one; None where other events have taken all its steps.
 
-    First the part of the window with the largest sum of evidence, then outwards as long as the evidence grows.
+    The event begins as the part of the window with the largest sum of evidence. It is extended in both directions as
+    long as the evidence grows.
 
     Parameters
     ----------
@@ -335,7 +345,7 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
         shares = _missed_shares(steps.rows(span))
 
     def time_in(row: int, default: float) -> float:
-        """Return how much of a step lies in the event [s]; a default part where its fixes are too noisy to show it."""
+        """Return the part of a step that lies in the event [s]; a default where the fixes are too noisy to show it."""
         if not 0 <= row < len(usable) or not usable[row]:
             return 0.0
         one = steps.rows(slice(row, row + 1))
@@ -349,20 +359,21 @@ def _find_extent(t: Floats, steps: ComparedWindows, error: Floats, usable: Bools
     end_s = float(t[span.stop - 1]) + time_in(span.stop - 1, 1.0) + time_in(span.stop, 0.0)
     if end_s - begin_s < SHORTEST_EVENT_S or span.stop - span.start < FEWEST_EVENT_STEPS:
         return None
-    # rounding is evidence, too, where the wheels stand: a share of no motion is none
+    # where the wheels stand there is no motion to miss, and rounding must not count as evidence
     if not steps.path_m[span].any():
         return None
     return _measured(steps.rows(span), span, shares, begin_s, end_s)
 
 
 NO_VARIANCE = float(np.finfo(np.float64).tiny)
-"""Least variance [m^2]: while the robot parks, sensors without noise leave none, and nothing is expected."""
+"""Smallest variance to divide by [m^2]. While the robot parks, sensors without noise have variance 0."""
 
 
 def _missed_shares(steps: ComparedWindows) -> Floats:
-    """Return the shares that the left and the right side miss of their motion, and that the robot moves aside (3,).
+    """Return the shares of their motion that the left and the right side miss, and the share that is sideways (3,).
 
-    Sums, and no least squares over steps: the noise of the fixes cancels except that of the first and the last.
+    The shares come from sums, not from least squares over steps: in sums only the noise of the first and of the last
+    fix remains.
     """
     moved = np.concatenate([steps.model_sides, [steps.path_m]])
     missed = -np.concatenate([steps.of_sides, [steps.aside]])
@@ -408,7 +419,7 @@ def _evidence(steps: ComparedWindows, error: Floats, shares: Floats) -> Floats:
 
 
 def _growth(steps: ComparedWindows, error: Floats, shares: Floats, usable: Bools, rows: range) -> int:
-    """Return how many of the rows belong to the event: up to the largest sum of evidence before it is lost again."""
+    """Return the number of rows that belong to the event: up to the largest sum of evidence before it decreases."""
     total, best, count, done = 0.0, 0.0, 0, 0
     while done < len(rows):
         chunk = rows[done : done + CHUNK]

@@ -1,15 +1,15 @@
-"""Turn rates, and the courses over ground that they are compared with: directions in which fixes moved.
+"""Turn rates, and courses over ground to compare them with: directions in which fixes moved.
 
 Over windows of driven distance the fixes p_i are regressed on the wheels' speed laid along the integrated turn rate,
 S_i = ∫ v e^{jG}, both about their means: the angle of sum p_i S_i* is the heading at the window's end, G being 0
 there.
-What turns it further is linear, each divided by sum |S_i|^2:
+Three further effects on the angle are linear; each is divided by sum |S_i|^2:
 
     an error δpsi(t) of the heading           Re(sum ∫ δpsi v e^{jG} S_i*)
     an ICR ahead of the antenna               x Im(sum -e^{jG_i} S_i*)
     positions that lag by tau                 tau Im(sum -v_i e^{jG_i} S_i*)
 
-Wheels that run backwards turn S round.
+Wheels that run backwards change the sign of S.
 """
 
 from __future__ import annotations
@@ -30,19 +30,21 @@ from icrtool.records.samples import GyroAxes
 
 COURSE_WINDOW_M, COURSE_IN_POSITION_STD, SHORTEST_IN_POSITION_STD = 1.0, 12.0, 6.0
 ENOUGH_COURSES = 24.0
-"""Windows are as long as the noise of the fixes asks for; on a short drive shorter, so that there are so many."""
+"""Number of windows for which windows are shortened on a short drive. Otherwise the noise of the fixes sets the
+length."""
 
 LARGEST_TURN_ERROR_RAD = 2.0
-"""A window is used where what is not known of bias and scale of the turn rate turns its window by less than this."""
+"""Largest turn of a window by the unknown bias and scale of the turn rate [rad]. With a larger one it is not used."""
 
 FIXES_A_WINDOW = 5
-"""Windows share no fix, so that their errors are independent; with fewer fixes, most of the distance would be lost."""
+"""Smallest usual number of fixes in a window. Windows share no fix, so that their errors are independent; with fewer
+fixes most of the distance between windows would be lost."""
 
 MIDDLE_NOISE = 0.01
-"""Turns that change the sides' speeds by less than this show no middle, however exact the courses are."""
+"""Relative change of the sides' speeds by a turn below which it does not show the middle, even with exact courses."""
 
 LONGEST_STRETCH_S = 60.0
-"""Displacements that take longer, or are further apart, are not compared without a turn rate."""
+"""Longest duration of two displacements, and longest time between them, to compare them without a turn rate [s]."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class TurnRate:
     t : (n,) [s]; rate : (n,) [rad/s]
     holes : (m, 2) begins and ends of stretches [s] in which it was not measured
     scale_std, bias_std : deviations of its scale and bias before the log
-    hole_std : of the rate within a hole [rad/s]; delay_std_s : of its stamps, None: half an interval
+    hole_std : deviation of the rate within a hole [rad/s]; delay_std_s : of its stamps, None: half an interval
     """
 
     t: Floats
@@ -79,14 +81,14 @@ class TurnRate:
 
 
 class Guess(NamedTuple):
-    """Where courses are linear in the errors that turn them.
+    """Errors at which courses are linearised.
 
     Attributes
     ----------
     bias : (n,) of the turn rate at its samples [rad/s]
     x : ICR ahead of the antenna [m]; delay_s : of the positions
-    middle : how much the antenna's speed grows with half the speed difference of the sides (left - right)
-    bias_std, scale_std : what is not known of bias [rad/s] and scale
+    middle : derivative of the antenna's speed by half the speed difference of the sides (left - right)
+    bias_std, scale_std : standard deviations of bias [rad/s] and scale
     """
 
     bias: Floats
@@ -106,7 +108,8 @@ class Courses(NamedTuple):
     of_x, of_delay, of_bias, of_scale : its derivatives by x_icr, by the delay of the positions, and by bias and scale
         error of the turn rate
     std : by the noise of the fixes [rad]
-    length : displacement by the fixes over that by the wheels; of_middle : its derivative by `Guess.middle`
+    length : ratio of the displacement by the fixes to the displacement by the wheels; of_middle : its derivative by
+        `Guess.middle`
     """
 
     begin: Floats
@@ -186,9 +189,9 @@ def fit_middle(courses: Courses, guess: Guess) -> float:
 
 
 def course_changes(track: Track) -> tuple[Floats, Floats, Floats]:
-    """Return middles (m,) [s] of windows and of those that follow, and how far the course over ground turns [rad].
+    """Return mid-times (m,) [s] of windows and of the next ones, and the turn of the course over ground between [rad].
 
-    Only displacements and the sense of the wheels' turning: nothing is known of the heading yet.
+    Only displacements and the sense of the wheels' turning are used, because the heading is not known yet.
     """
     along = track.cumulate(track.mean_speed)
     length, t, place, begin, end = _cut_courses(track, float(track.t[0]), float(track.t[-1]))
@@ -217,7 +220,7 @@ def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Fl
     if len(rows) > 2:
         bend = np.abs(place[1:-1] - (place[:-2] + place[2:]) / 2)
         far = bend > JUMP_SIGMAS * max(mad_std(bend, 0.0), track.place_std_m)
-        # the neighbours of a spike bend by half as much
+        # the path also bends at the neighbours of a spike, by half of the angle
         spike = far & (bend >= np.maximum(np.append(bend[1:], 0.0), np.append(0.0, bend[:-1])))
         kept = np.concatenate([[True], ~spike, [True]])
         t, place = t[kept], place[kept]
@@ -230,27 +233,28 @@ def _cut_courses(track: Track, first_s: float, last_s: float) -> tuple[float, Fl
 
 
 WHEEL_TURN, WHEEL_SCALE_STD = 0.6, 0.5
-"""Skid-steer robots turn about this much of what their wheels would without slip."""
+"""Prior mean and standard deviation of the ratio of a skid-steer robot's turn to its wheels' turn without slip."""
 
 Z_UP = np.array([0.0, 0.0, -1.0])
 """The downward vertical in a sensor whose z axis points up."""
 
 ALONG_AN_AXIS = 0.95
-"""A sensor whose axis is this near to the vertical (cosine) is mounted along it."""
+"""Cosine of the angle between a sensor's axis and the vertical above which the axis is taken to be vertical."""
 
 BETTER_SCATTER_RATIO = 0.9
-"""Another axis than z up is used where turns of the course over ground scatter about it by no more than this share, or
-where that is the share of the heading's standard deviation with it."""
+"""Largest ratio of another axis's scatter to the scatter with z up at which the other axis is used. The scatter is of
+the turns of the course over ground, or the standard deviation of the heading."""
 
 LARGEST_CHANGE_RAD = 2.5
 SHORTEST_HOLE_S = 0.1
-"""Shorter ones are none in a turn rate."""
+"""Shortest interval that is a hole in a turn rate [s]."""
 
 AXIS_PRIOR_STD = np.array([0.3, 0.3, 0.3, math.radians(1.0)])
-"""A drive on level ground shows little of the axes across the vertical; the last is of the gyro's bias [rad/s]."""
+"""Prior standard deviations of the vertical's three components, and of the gyro's bias [rad/s]. A drive on level ground
+shows little of the horizontal axes."""
 
 LEAST_AXIS = 0.3
-"""A gyro that shows less than this share of the changes of the course over ground shows no axis."""
+"""Smallest share of the course's changes that a gyro must show. A gyro with less shows no axis."""
 
 
 def wheel_rate(track: Track, width_m: float) -> TurnRate:
@@ -264,12 +268,12 @@ def wheel_rate(track: Track, width_m: float) -> TurnRate:
 def gyro_rates(
     track: Track, changes: tuple[Floats, Floats, Floats], gyro: GyroAxes, epoch_ns: int
 ) -> list[tuple[TurnRate, str]]:
-    """Return what a gyro's turn rate about the vertical may be, each with how it is then mounted.
+    """Return candidates of a gyro's turn rate about the vertical, each with the mounting that it assumes.
 
-    One where the changes of the course over ground, regressed on the turns about all three axes of the sensor, show the
-    vertical, or where it turned most about its z axis, which then points up. Else, after that, both senses of the axis
-    about which it turned most: how well a heading by each agrees with the courses decides. None where the gyro does not
-    cover courses.
+    There is one candidate if the changes of the course over ground, regressed on the turns about the sensor's three
+    axes, show the vertical, or if the sensor turned most about its z axis, which then points up. Otherwise both senses
+    of the axis with most turn follow; the agreement of the resulting headings with the courses decides. The list is
+    empty where the gyro does not cover courses.
     """
     t = (gyro.stamp_ns - epoch_ns) / 1e9
     begin, end, change = changes
@@ -290,7 +294,7 @@ def gyro_rates(
 
 
 def _named(axis: Floats) -> tuple[Floats, str]:
-    """Return the downward vertical in a sensor (3,), along an axis of it where it is near to one, and its name."""
+    """Return the downward vertical in a sensor (3,), set to one of its axes if close to it, and its name."""
     main = int(np.argmax(np.abs(axis)))
     if abs(axis[main]) <= ALONG_AN_AXIS:
         return axis, "tilted"
@@ -315,7 +319,7 @@ def _axis_by_courses(turned: Floats, seconds: Floats, change: Floats) -> tuple[F
 
 
 def _main_axis(turned: Floats, seconds: Floats, change: Floats) -> Floats | None:
-    """Return the direction (3,), of either sense, of the axis about which a sensor turned most, a bias aside.
+    """Return the direction (3,), of either sense, of the axis about which a sensor turned most, without its bias.
 
     None where that is its z axis, or where it hardly turned; parameters as in `_axis_by_courses`.
     """

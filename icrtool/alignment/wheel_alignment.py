@@ -1,8 +1,8 @@
-"""What is known of the wheels: scales of the sides; dead, copied, held and fused encoders.
+"""Facts about the wheels: scales of the sides; dead, copied, held and fused encoders.
 
-Wheels that another filter made are low-passed, or turn by a heading from elsewhere. Wheels that slip lose or gain turn
-for good: how far their turn is from the heading's grows like a random walk. What a filter smooths, delays or pulls back
-to an absolute heading stays near it, however long it drives.
+Wheel speeds from another filter are low-passed, or contain a turn rate from another sensor. If wheels slip, the
+difference between their turn and the heading's grows like a random walk. If a filter smooths or delays the turn, or
+corrects it by an absolute heading, the difference stays bounded for any duration.
 """
 
 from __future__ import annotations
@@ -31,33 +31,37 @@ from icrtool.records.tables import RobotLog
 SMALLEST_TURN_RAD = math.radians(20.0)
 
 NEVER_MOVES_SHARE, DEAD_M = 0.02, 10.0
-"""A side slower than this share of the other's speed over this distance has a dead encoder: no robot turns about one
-side for so long."""
+"""Ratio of the sides' speeds below which, over this distance [m], the slower side has a dead encoder. No robot turns
+about one side for this distance."""
 
 HELD_SHARE = 0.65
-"""Share of wheel samples that repeat the one before, while moving, from which on the values count as held."""
+"""Share of wheel samples that repeat the sample before, while moving, from which on the values count as held."""
 
-LARGEST_SCALE_STD, USUAL_SCALE_STD = 0.1, 0.04
-"""Wheels roll exactly at their radius, or at it to 4 %: as likely before a drive, and the likelier one is taken after
-it, where the drive shows a scale. The correction is what remains of it beside that prior."""
+LARGEST_SCALE_STD = 0.1
+"""Largest standard deviation of a scale that is corrected or reported."""
+
+USUAL_SCALE_STD = 0.04
+"""Prior of a wheel scale: with probability 0.5 exactly 1, otherwise normal about 1 with this standard deviation. After
+the drive the more likely case is taken. In the second case the correction is the posterior mean."""
 
 SMALLEST_SIDE_DIFFERENCE = 0.005
-"""Sides are scaled apart where they differ by more than this. The robot then veers where both report one speed."""
+"""Smallest relative difference of the sides that is corrected. With it the robot veers where both report one speed."""
 
 LARGEST_SCALE_CORRECTION = 0.15
+"""Largest correction of a scale that tyres and soil explain."""
+
 FACTOR_TWO_TOLERANCE = 2.0 * USUAL_SCALE_STD
-"""A scale is corrected up to what tyres and soil explain, or where it is a factor two (diameter for radius) beside what
-wheels usually roll at."""
+"""Largest relative difference of a scale from 2 or 1/2 (diameter for radius) at which it is also corrected."""
 
 LONGEST_BRIDGE_S = 5.0
-"""In a longer gap the robot may have stopped and turned: what the counts show at its ends is no path."""
+"""Longest gap that is bridged [s]. In a longer gap the robot may have stopped and turned."""
 
 CONTRADICTED_SIGMAS, CONTRADICTED_SHARE = 3.0, 0.5
-"""Wheels and fixes contradict each other in a gap where their distances differ by more than this many standard
-deviations and this part of the wheels' distance: speed and turn vary within a gap."""
+"""Difference of the distances of wheels and fixes in a gap above which they contradict each other: in standard
+deviations, and as a share of the wheels' distance, because speed and turn vary within a gap. Both must be exceeded."""
 
 FUSED_CORRELATION = 0.9995
-"""A turn rate of the wheels that follows the gyro this closely was made of it."""
+"""Correlation of the turn rates of wheels and gyro above which the former was computed from the latter."""
 
 
 def configured_scales(config: Config) -> tuple[float, float]:
@@ -75,10 +79,10 @@ def scaled(log: RobotLog, left: float, right: float) -> RobotLog:
 
 
 def _contradicted(wheels: WheelSamples, fixes: Fixes) -> Bools:
-    """Return in which intervals (n - 1,) the fixes move further than the wheels, or much less, and beyond their noise.
+    """Return in which intervals (n - 1,) the fixes move further than the wheels, or much less, beyond their noise.
 
-    What a robot drives in a gap at constant speed it may drive along an arc, so that a chord may be shorter than the
-    distance; the wheels then turn by as much as the sides differ.
+    In a gap the robot may drive along an arc, so that the chord is shorter than the distance. The difference of the
+    sides gives the turn of this arc.
     """
     stamps = wheels.stamp_ns
     if len(fixes.stamp_ns) < 2:
@@ -97,12 +101,12 @@ def _contradicted(wheels: WheelSamples, fixes: Fixes) -> Bools:
 
 
 def bridged(wheels: WheelSamples, gap_s: float, fixes: Fixes) -> tuple[WheelSamples, Note | None]:
-    """Return wheels that report positions with samples in their gaps, and what to report.
+    """Return wheels that report positions with samples in their gaps, and a finding.
 
     Parameters
     ----------
-    gap_s : a longer interval between samples is a gap
-    fixes : gaps in which they contradict the positions of the wheels stay gaps
+    gap_s : longest interval between samples that is no gap [s]
+    fixes : a gap in which the fixes contradict the wheel positions is not filled
 
     Notes
     -----
@@ -136,7 +140,7 @@ def dead_or_copied(log: RobotLog) -> list[Note]:
     interval = unbroken(np.diff(seconds, append=seconds[-1:]))
     for side, still, moving in (("left", left, right), ("right", right, left)):
         still_m, gone = np.cumsum(still * interval), np.cumsum(np.abs(moving) * interval)
-        # where the one side hardly moves while the other goes furthest, compared every metre of that
+        # the longest distance of one side over which the other hardly moves, compared at every metre
         rows = np.append(rows_at_steps(gone, 1.0), len(gone) - 1)
         moves = np.flatnonzero(np.abs(np.diff(still_m[rows])) > NEVER_MOVES_SHARE * np.diff(gone[rows]))
         begins, ends = rows[np.append(0, moves + 1)], rows[np.append(moves, len(rows) - 1)]
@@ -156,12 +160,12 @@ def dead_or_copied(log: RobotLog) -> list[Note]:
 def align_wheels(
     log: RobotLog, config: Config, fit: AlignmentFit | None, configured: tuple[float, float], *, sound: bool
 ) -> tuple[WheelFacts, tuple[float, float], list[Note]]:
-    """Return what is known of the wheels, what the sides are multiplied with, left and right, and what to report.
+    """Return the facts about the wheels, the factors of the left and the right speeds, and findings.
 
     Parameters
     ----------
-    log : with the configured scales (left, right), which the factors come on top of
-    fit : of it, None where the drive is too short
+    log : with the configured scales (left, right) already applied; the factors are in addition to them
+    fit : alignment of the log, None where the drive is too short
     sound : no side is dead or a copy of the other
     """
     wheels, notes, applied = log.wheels, list[Note](), (1.0, 1.0)
@@ -203,8 +207,8 @@ def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
 
     Notes
     -----
-    The deviation is of a jackknife over stretches of distance (Efron and Stein 1981). NaN without two stretches that
-    turn.
+    The deviation comes from a jackknife over stretches of distance (Efron and Stein 1981). NaN without two stretches
+    that turn.
     """
     of = residuals_by_estimate(fit)
     groups, row = np.unique(fit.windows.turn_group, return_inverse=True)
@@ -218,12 +222,12 @@ def turn_variance_left(fit: AlignmentFit) -> tuple[float, float]:
 
 
 def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tuple[float, float], list[Note]]:
-    """Return the factors to apply to the speeds of the left and of the right side, and what to report.
+    """Return the factors to apply to the speeds of the left and of the right side, and findings.
 
     Notes
     -----
-    The difference of the sides is the asymmetry of the turn rate over its gain: a robot that veers where both sides
-    report one speed. Both factors keep the scale as their mean.
+    The difference of the sides is the ratio of the turn rate's asymmetry to its gain. With such a difference a robot
+    veers where both sides report one speed. The mean of the two factors is the scale.
     """
     if fit.slips:
         apart = f"their distance differs by {100 * fit.scatter[0]:.0f} % from the robot's"
@@ -234,7 +238,7 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
     factor, notes = 1.0, list[Note]()
     scale, std = fit.estimate("scale")
     error, kept = abs(scale - 1.0), USUAL_SCALE_STD**2 / (USUAL_SCALE_STD**2 + std**2)
-    # twice the log-likelihood of a scale of its own, less that of none
+    # twice the log-likelihood with a free scale, minus twice the log-likelihood with scale 1
     if std <= LARGEST_SCALE_STD and (error / std) ** 2 * kept + math.log1p(-kept) > 0.0:
         if small := error <= LARGEST_SCALE_CORRECTION:
             scale = 1.0 + (scale - 1.0) * kept
@@ -262,7 +266,7 @@ def _find_scales(fit: AlignmentFit, config: Config, *, sound: bool) -> tuple[tup
 
 
 def _fused_note(log: RobotLog) -> list[Note]:
-    """Warn of wheels that are another filter's output: their turn rate is the gyro's."""
+    """Return a warning for wheels that are another filter's output: their turn rate is the gyro's."""
     stream = next((one for one in log.streams if one.is_twist), None)
     if stream is None or log.gyro is None:
         return []
@@ -276,7 +280,7 @@ def _fused_note(log: RobotLog) -> list[Note]:
 
 
 STARTS_A_SPAN, FEWEST_SPANS = 4, 6
-"""Windows of turns start so often in one, and so many whole ones are needed."""
+"""Number of windows of turns that start within one window, and smallest number of windows without overlap."""
 
 
 class Turns(NamedTuple):
@@ -285,7 +289,7 @@ class Turns(NamedTuple):
     Attributes
     ----------
     ratio, ratio_std : turn of the heading per turn of the wheels
-    left_rad : robust scatter of the heading's turn beyond that; turn_rad : rms turn of the heading
+    left_rad : robust scatter of the heading's turn about this ratio; turn_rad : rms turn of the heading
     """
 
     ratio: float
@@ -295,12 +299,12 @@ class Turns(NamedTuple):
 
 
 def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Sequence[float]) -> list[Turns]:
-    """Compare the turns of heading and wheels over windows of some lengths; empty where there are too few of one.
+    """Compare the turns of heading and wheels over windows of some lengths; empty where one length has too few windows.
 
     Parameters
     ----------
     width_m : the track width b
-    delay_s : by which the heading lags the wheels
+    delay_s : lag of the heading behind the wheels
     """
     t, travel, found = track.t, track.travel, list[Turns]()
     turned = track.cumulate(2.0 * track.half_difference / width_m)
@@ -325,27 +329,29 @@ def compare_turns(track: Track, width_m: float, delay_s: float, windows_s: Seque
 
 
 NOISE_S, SHORT_S, MIDDLE_S, LONGEST_S = 0.3, 1.0, 5.0, 40.0
-"""Turns are compared over these times; in the first there is hardly more than noise."""
+"""Times over which turns are compared [s]. Turns over the first one are mostly noise."""
 
 SHORTEST_LONG_S, LONG_WINDOWS = 15.0, 8.0
-"""The long windows last at least so long, and a drive has so many of them."""
+"""Shortest duration of the long windows [s], and number of long windows in a drive."""
 
 SMALLEST_CHANGE = 0.1
-"""The ratio of turn to wheels' turn changes from short to long windows where it differs by more than both."""
+"""Smallest significant change of the ratio of turn to wheels' turn from short to long windows."""
 
 AS_THE_ROBOT = 0.1
-"""A ratio over long windows this near to 1 is that of something that knows the heading: wheels in turns slip more."""
+"""Largest difference from 1 of the ratio over long windows at which the wheels' turn was computed with the heading. The
+ratio of wheels that slip in turns differs more."""
 
 LARGE_SHARE, LARGE_RAD = 0.25, math.radians(3.0)
-"""Wheels are off the heading's turn by a filter's doing where by more than this part of the turn in a second, and by
-more than attitude sensors err."""
+"""Smallest difference of the wheels' turn from the heading's in a second that shows a filter: as a share of the turn,
+and in rad, which is more than the error of attitude sensors."""
 
 BOUNDED = 1.5
-"""What a random walk adds grows by 2 from 5 to 20 s and by 2.8 to 40 s."""
+"""Largest growth of the difference of the turns, from 5 s to long windows, that counts as bounded. The difference by a
+random walk grows by a factor of 2 from 5 to 20 s and of 2.8 from 5 to 40 s."""
 
 
 def find_filtering(fit: AlignmentFit) -> str:
-    """Return how the wheels of a drive show that they are filtered or fused; empty where they do not."""
+    """Return the evidence that the wheels of a drive are filtered or fused; empty without any."""
     track, delay = fit.windows.track, fit.estimate("heading_delay")[0]
     long_s = min(LONGEST_S, float(track.t[-1]) / LONG_WINDOWS)
     if long_s < SHORTEST_LONG_S:

@@ -1,6 +1,6 @@
-"""Wheel speeds in m/s of what a log sends: metres per unit by the configuration, else by the position reference.
+"""Wheel speeds in m/s from the values of a log: metres per unit by the configuration, else by the position reference.
 
-A robot that stands, or is on a stand, shows none: it is refused here.
+A robot that does not move, for example on a stand, shows no unit and is refused here.
 """
 
 from __future__ import annotations
@@ -30,33 +30,37 @@ from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted
 
 STRAIGHT, BENT, LARGEST_BEND_RAD = 0.1, 1.0, 1.2
-"""The distance by the position reference is compared with that of the wheels over spans of time: straight
-ones, in which the sides' distances differ by less than a tenth, else bent ones up to this change of direction."""
+"""Spans in which the distances of wheels and position reference are compared: largest relative difference of the sides
+in straight spans and in bent spans, and largest change of direction in bent spans [rad]. Bent spans are used if there
+are too few straight ones."""
 
 FASTEST_MPS = 100.0
-"""No robot on wheels or tracks is faster: a number over it is damage, and would make a distance of any length."""
+"""Largest possible wheel speed [m/s]. A larger number is damaged, and would give any distance."""
 
 SPIKE_MPS, SPIKE_RATIO, USUAL_SHARE = 3.0, 10.0, 0.995
-"""A single sample faster than this, and that much faster than almost all and than its neighbours, is no driving."""
+"""Smallest speed of a spike [m/s], its ratio to its neighbours and to the usual speed, and the quantile of the speeds
+that is the usual one. Such a single sample is not a motion of the robot."""
 
 GAP_IN_USUAL, FASTER = 2.5, 1.5
 """Positions that change in a gap, this many usual intervals long, this many times faster than in almost all other
 intervals began again: the base restarted."""
 
 PARKED_M, PARKED_SIGMAS, TURNING_SHARE = 0.5, 3.0, 0.2
-"""A robot stands where 95 % of its positions lie within this, or within so many of their standard deviations, while its
-wheels turn for this share of the time."""
+"""Radius within which 95 % of a standing robot's positions lie, in metres and in their standard deviations, and
+smallest share of the time in which its wheels turn."""
 
 UNIT_TOLERANCE = 0.35
-"""A unit is recognised when the reference confirms its size within this share (slip and soil change it by less)."""
+"""Largest relative difference from the size by the reference at which a unit is recognised. Slip and soil change the
+size by less."""
 
 
 OTHER_UNIT_TOLERANCE = 0.1
-"""A unit other than that of the message type is recognised within this share: slip of 90 % would look like rpm."""
+"""The same difference for another unit than the message type's. It is smaller: slip of 90 % would look like rpm."""
 
 
 STANDS_SHARE, STILL = 0.8, 0.2
-"""The robot does not move where in this share of the windows its displacement is below this part of the wheels'."""
+"""Share of the windows with a small displacement, and the largest ratio of a small displacement to the wheels', at
+which the robot does not move."""
 
 
 class Scale(NamedTuple):
@@ -69,8 +73,8 @@ class Scale(NamedTuple):
 def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
     """Return the log with wheel speeds in m/s; the same log where its speeds are ready to use.
 
-    What no wheel can have done is left out. What was used, and what had to be estimated, stands in the stream's
-    ``why`` and in the findings.
+    Speeds that no wheel can have are left out. The unit that was used or estimated is stated in the stream's ``why``
+    and in the findings.
 
     Raises
     ------
@@ -123,17 +127,17 @@ def with_wheel_speeds(log: RobotLog, config: Config) -> RobotLog:
 
 
 def refuse_standing(log: RobotLog, windows: DriveWindows | None = None) -> None:
-    """Raise where the wheels turn and the robot does not move: it is on a stand, or held.
+    """Raise where the wheels turn and the robot does not move, because it is on a stand or held.
 
     Parameters
     ----------
-    windows : of the log; without them the positions decide, which stay within their noise: for logs that show no
-        heading or no unit, which a robot on a stand shows neither. One that spins on the spot may
+    windows : of the log. Without them the robot stands if its positions stay within their noise; this is for logs that
+        show no heading or no unit, like logs of a robot on a stand. A robot that spins on the spot may show them
 
     Raises
     ------
     DataError
-        It stands.
+        The robot does not move.
     """
     gone = ""
     if windows is not None:
@@ -182,7 +186,7 @@ def _restarts(stamps: Ints, left: Floats, right: Floats) -> Bools:
 
 
 def _spikes(speed: Floats) -> Bools:
-    """Mark single samples (n,) far faster than those before and after them, and than almost all others."""
+    """Mark single samples (n,) far faster than the samples before and after them, and than almost all others."""
     size = np.abs(speed)
     if len(size) < 2:
         return np.zeros(len(size), np.bool_)
@@ -193,13 +197,13 @@ def _spikes(speed: Floats) -> Bools:
 
 
 def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFixes) -> Scale | None:
-    """Compare distances by reference and wheels over `CHORD_S`; None where too few spans show one.
+    """Compare distances by reference and wheels over `CHORD_S`; None where there are too few spans.
 
     Notes
     -----
-    Straight spans where there are enough, else bent ones, whose chords are made arcs by the directions of the chords
-    before and after. Senses of the wheels do not matter. The estimate of `icrtool.alignment.estimator` needs m/s and a
-    heading, which are found after this.
+    Straight spans are used where there are enough, else bent ones. The chords of bent spans are converted to arcs with
+    the directions of the chords before and after. The signs of the wheel speeds have no effect.
+    `icrtool.alignment.estimator` cannot be used, because it needs m/s and a heading, which are found later.
     """
     if min(len(stamps), len(gnss.stamp_ns)) < 2:
         return None
@@ -226,7 +230,7 @@ def reference_scale(stamps: Ints, left: Floats, right: Floats, gnss: PositionFix
 def _metres_per_unit(
     wheels: WheelSamples, gnss: PositionFixes, config: Config, topic: str
 ) -> tuple[float, str, list[Note]]:
-    """Return metres per unit, how it is known in words, and what had to be estimated because a key is missing."""
+    """Return metres per unit, its source in words, and findings where it had to be estimated."""
     radius, counts = config.robot.wheel_radius_m, config.robot.encoder_counts_per_rev
     known: dict[WheelUnit, float] = {"m": 1.0}
     if radius is not None:

@@ -1,9 +1,10 @@
 """How the error of a motion model grows along a path, and its forecast for a path that is driven without GNSS.
 
-The position error of a drive without GNSS has two parts. The parameters have a covariance; what it makes of the path
-follows from their derivatives. What the model leaves out is described by a few sources of error with a variance each:
-the heading at the start, a turn rate off by a constant, turns off by a share, a turn rate that wanders, a speed off by
-a share, a speed that wanders. `icrtool.calibration.held_out` measures them.
+The position error of a drive without GNSS has two parts. The first part comes from the covariance of the parameters; it
+is carried to the path by derivatives. The second part is what the model leaves out. Six sources of error describe it,
+each with a variance: the heading at the start, a constant error of the turn rate, a proportional error of the turns, a
+random walk of the turn rate, a proportional error of the speed, a random walk of the speed.
+`icrtool.calibration.held_out` measures the variances.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ ANGLES, BISECTIONS = 24, 26
 SOURCES = ErrorSources.__struct_fields__.index("p95_factor")
 
 STEP_M = 0.1
-"""A planned path is driven in steps of this length."""
+"""Length of the steps in which a planned path is driven [m]."""
 
 SPEED_MPS = 0.5
-"""Speed of a plan that gives none."""
+"""Speed of a plan that states no speed [m/s]."""
 
 SLOWEST_PLAN_MPS = 0.02
 
@@ -69,7 +70,7 @@ class Spread(NamedTuple):
 
 
 class PathErrors(NamedTuple):
-    """What a model makes of windows: moved (w,) forward + j right [m], turned (w,) [rad], and moments of its errors.
+    """Motion in windows by a model: moved (w,) forward + j right [m], turned (w,) [rad], and moments of its errors.
 
     `of_parameters` has one column, `of_sources` one for each source.
     """
@@ -92,7 +93,7 @@ def path_errors(windows: Windows, fitted: FittedModel, width_m: float, own: LogC
     motion = wheel_motion(steps.v_left, steps.v_right, width_m, gyro)
     fixed, axes, columns = model_columns(fitted.model, fitted.complete(motion))
     fixed[OMEGA] += own.gyro_bias_radps
-    # the sources act all along the path, not at the ends of windows alone
+    # the sources act along the whole path, not only at the ends of the windows
     of_start, of_end = (steps.place_t[rows] + own.wheels_later_s for rows in (windows.begin, windows.end))
     at = np.unique(np.concatenate([of_start, of_end, steps.t]))
     path = path_at(steps, lambda some: (fixed[:, some], axes, columns[:, some]), fitted.parameters, at)
@@ -176,7 +177,7 @@ def _directions(spread: Spread) -> Floats:
 
 
 def fit_variances(length: Floats, sources: Spread, known: Spread, turned: Floats, missed: Complexes) -> Floats:
-    """Return the variances (`SOURCES`,) that make the squared errors of windows, beside those of the parameters."""
+    """Return the variances (`SOURCES`,) that explain the squared errors of windows, less the part of the parameters."""
     matrix, y = np.zeros((SOURCES, SOURCES)), np.zeros(SOURCES)
     kinds = (
         (sources.heading, known.heading, turned**2),
@@ -241,7 +242,7 @@ def forecast_plan(
     ----------
     east_m, north_m : (p,) points of the path, driven in their order
     speed_mps : (p,) speed from each point on, negative in reverse; default `SPEED_MPS`
-    with_gyro : by the calibration's model with a gyro
+    with_gyro : use the calibration's model with a gyro
 
     Raises
     ------
@@ -263,7 +264,7 @@ def forecast_plan(
         why = f"a speed that is zero, no number, or beyond {FASTEST_MPS:g} m/s"
         raise DataError("plan", why, "give speed_mps in m/s, negative in reverse")
     speed = np.sign(speed) * np.maximum(np.abs(speed), SLOWEST_PLAN_MPS)
-    # a corner of the plan is turned over the steps around it, not on the spot: means over a track width
+    # a corner of the plan is driven as a curve over one track width, not on the spot: speeds are averaged over it
     width = max(round(calibration.width_m / STEP_M), 1)
     padded = np.pad(unwrapped(np.angle(step * np.sign(speed))), (width // 2, width - 1 - width // 2), mode="edge")
     direction = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
@@ -288,7 +289,7 @@ def wheel_speeds(fitted: FittedModel, width_m: float, speed: Floats, turn: Float
 
     Notes
     -----
-    The model's matrix from (v, w) to (v_x, omega), its terms that are not linear taken at the last step.
+    The model's matrix from (v, w) to (v_x, omega) is inverted. Nonlinear terms are evaluated at the last iteration.
     """
 
     def ahead_and_turn(v: Floats, w: Floats) -> Floats:

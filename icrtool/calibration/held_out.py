@@ -1,11 +1,11 @@
 """The motion models on recordings, or distance of one, that they were not fitted to.
 
 Of many recordings each is left out in turn (Stone 1974). In a single one each trial is predicted without the windows
-that share distance with it (Burman, Chow and Nolan 1994; on recorded drives 5 or 10 m more between them changed no
-error).
+that share distance with it (Burman, Chow and Nolan 1994). On recorded drives a further distance of 5 or 10 m between
+trial and windows changed no error.
 
-Held-out windows of several lengths also show how the errors of a model grow (`icrtool.calibration.error_growth`), with
-quantiles scaled so that they hold there, and the errors of what a controller can express of it.
+Held-out windows of several lengths also show how the errors of a model grow (`icrtool.calibration.error_growth`). The
+quantiles are scaled to hold in these windows. The errors of the controller's model are measured there, too.
 """
 
 from __future__ import annotations
@@ -44,35 +44,43 @@ HELD_OUT_HORIZONS_M = (5.0, 10.0, 20.0)
 
 SHORTEST_BLOCK_M, FEWEST_FOLD_BLOCKS, MOST_FOLD_BLOCKS = 25.0, 3, 5
 
-STRIP_M, MOST_STRIPS = 5.0, 2
-"""Trials from one strip of distance to another are predicted by one fit: strips at least so long, so many a block."""
+STRIP_M = 5.0
+"""Shortest strip of distance [m]. One fit predicts all trials from one strip to another, to save time."""
+
+MOST_STRIPS = 2
+"""Largest number of strips in a block."""
 
 HELD_OUT = (NO_SLIP, CONTROLLER, RECOMMENDED)
-"""The rows of a held-out table; each may come again with a gyro, ``_gyro`` behind its name."""
+"""The rows of a held-out table. A row with a gyro has the same name with ``_gyro`` at the end."""
 
 GYRO_SUFFIX = "_gyro"
 
 TOO_SHORT = "too short to fit on one part and test on another"
 
 TWIST_OVER_M = 1.0
-"""Errors of velocities are those of their means over windows of this length."""
+"""Length of the windows over which velocities are averaged for their errors [m]."""
 
 LENGTHS_M = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-ALWAYS_TO_M, FEWEST_STRETCHES = 20.0, 10
-"""Held-out windows of these lengths are compared; longer ones where the drives hold so many stretches of them."""
+ALWAYS_TO_M = 20.0
+"""Largest length of held-out windows that is always compared [m]."""
+
+FEWEST_STRETCHES = 10
+"""Number of separate stretches of a longer length that the drives must hold. Otherwise this length is not compared."""
 
 SCALED_FROM_M = 5.0
-"""Errors of shorter windows are more the reference's noise than the model's; they do not scale the quantiles."""
+"""Shortest windows that scale the quantiles [m]. In shorter windows the reference's noise exceeds the model's error."""
 
 FEWEST_HELD_OUT_WINDOWS = 20
 
 NORMAL_STRETCHES = 10
-"""That the errors are normal counts as much as so many independent stretches: quantiles of as many are as uncertain as
-those of robots differ. A few windows never show that errors are smaller than normal."""
+"""Weight of the assumption of normal errors, as a number of independent stretches.
+
+The measured quantile of n stretches has the weight n / (n + 10). With 10 stretches its uncertainty equals the spread of
+this quantile between robots."""
 
 SMALLEST_VARIANCE = 1e-6
 FEWEST_TESTED = 10
-"""A controller is given errors from so many windows at least."""
+"""Number of held-out windows below which the errors of a controller are not stated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +110,7 @@ class HeldOutRow:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Fits of the motion models to recordings, and what each predicts without a fold.
+    """Fits of the motion models to recordings, and their predictions without each fold.
 
     Attributes
     ----------
@@ -136,7 +144,7 @@ class HeldOut:
 
     @cached_property
     def error_windows(self) -> tuple[tuple[int, Windows], ...]:
-        """Windows of `LENGTHS_M` and `TWIST_OVER_M`, with the number of their recording; short ones have none."""
+        """Windows of `LENGTHS_M` and `TWIST_OVER_M`, with the number of their recording; a short recording has none."""
         pooled, found = totals_of(*self.recordings), []
         for i, recording in enumerate(self.recordings):
             with suppress(DataError):
@@ -171,12 +179,12 @@ class HeldOut:
         return controller_model(found[0], recording.lever, recording.width_m), found[1]
 
     def errors(self, name: str, i: int, trials: Trials) -> TrialErrors:
-        """Return the errors of a row in trials of recording i, each predicted without what it touches."""
+        """Return the errors of a row in trials of recording i, each predicted without the fold that it touches."""
         steps = self.fits[RECOMMENDED].pool.windows[i].track
         return errors_without(self.recordings[i], trials, self.folds, i, partial(self.without, name), steps)
 
     def path(self, name: str, i: int, start: int, end: int) -> OpenLoopPath | None:
-        """Return the path of a row from one state of recording i to another, predicted without what it touches."""
+        """Return the path of a row from one state of recording i to another, without the fold that it touches."""
         recording = self.recordings[i]
         ends = (recording.track.distance[row : row + 1] for row in (start, end))
         ((fold, _),) = left_out(self.folds, i, *ends)
@@ -214,7 +222,7 @@ def plan_folds(recordings: Sequence[Recording]) -> tuple[Fold, ...]:
 
 
 def left_out(folds: Sequence[Fold], recording: int, start_m: Floats, end_m: Floats) -> Iterator[tuple[Fold, Ints]]:
-    """Yield what is left out to predict trials of a recording, and the rows of the trials that it is left out for.
+    """Yield each fold that trials of a recording need left out, and the rows of these trials.
 
     Parameters
     ----------
@@ -244,7 +252,7 @@ def errors_without(
     recording: Recording, trials: Trials, folds: Sequence[Fold], i: int, without: Callable[[Fold], Prediction | None],
     steps: Track | None = None,
 ) -> TrialErrors:  # fmt: skip
-    """Return the errors of trials of recording i, each predicted without its fold; NaN where that is none.
+    """Return the errors of trials of recording i, each predicted without its fold; NaN where no model is given.
 
     Parameters
     ----------
@@ -253,7 +261,7 @@ def errors_without(
     """
     track, distance = recording.track, recording.track.distance
     errors = TrialErrors.none(trials.ends.shape)
-    # a horizon after the other, as the ends lie in memory
+    # one horizon after the other, in the order in which the ends lie in memory
     column, row = np.nonzero(trials.ends.T >= 0)
     start, end = trials.starts[row], trials.ends[row, column]
     for fold, some in left_out(folds, i, distance[start], distance[end]):
@@ -279,7 +287,7 @@ def fit_models(recordings: Sequence[Recording], names: Sequence[str] = tuple(MOD
     pool = Pool([cut_windows(one, pooled=pooled) for one in recordings], [one.width_m for one in recordings])
     fits = {name: pool.fit(MODELS[name]) for name in names}
     if FIVE in fits:
-        # the clocks are those of one robot: many logs show them no better than one
+        # all logs have the clocks of one robot: many logs show a constant delay no better than one log
         off = float(np.sqrt(np.mean([one.x_clock_std_m**2 for one in recordings])))
         fits[FIVE] = fits[FIVE].with_clock_error(off)
     if all(one.track.gyro is not None for one in recordings):
@@ -297,13 +305,13 @@ def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HELD
     Raises
     ------
     DataError
-        Too short a drive, or too little left beside a fold.
+        Too short a drive, or too few windows outside a fold.
     """
     folds = plan_folds(recordings)
     fits = fit_models(recordings)
     for fold in folds:
         if np.count_nonzero(fits[RECOMMENDED].pool.clear_of(fold)) < FEWEST_RESIDUALS:
-            raise DataError(fold.name, "too few windows beside it", TOO_SHORT)
+            raise DataError(fold.name, "too few windows outside it", TOO_SHORT)
     pooled = totals_of(*recordings)
     trials = tuple(cut_trials(one, horizons_m, pooled) for one in recordings)
     return HeldOut(tuple(recordings), tuple(horizons_m), folds, trials, fits)
@@ -312,7 +320,7 @@ def hold_out(recordings: Sequence[Recording], horizons_m: Sequence[float] = HELD
 def _left_out_windows(
     table: HeldOut, name: str, lengths_m: Sequence[float]
 ) -> Iterator[tuple[int, Windows, Prediction]]:
-    """Yield recording, windows of it with the steps around them, and what is predicted without them."""
+    """Yield the number of a recording, windows of it with the steps around them, and the model fitted without them."""
     for i, windows in table.error_windows:
         these = np.flatnonzero(np.isin(windows.length_m, lengths_m))
         start_m, end_m = (windows.track.distance[rows[these]] for rows in (windows.begin, windows.end))
@@ -325,7 +333,7 @@ def _left_out_windows(
 
 
 def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
-    """Return the sources of error of a row of a held-out table, from windows of what it was not fitted to.
+    """Return the sources of error of a row of a held-out table, from windows that the row was not fitted to.
 
     Returns
     -------
@@ -333,9 +341,10 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
 
     Notes
     -----
-    Non-negative least squares of the squared errors, each length and direction with the same weight; the factors are
-    those of split conformal prediction (Vovk et al. 2005), a window of 10 m counted as independent, shrunk towards one
-    in their logarithm (James and Stein 1961): one short drive shows its largest error, not a quantile.
+    The variances are non-negative least squares of the squared errors; each length and direction has the same weight.
+    The factors come from split conformal prediction (Vovk et al. 2005), where windows of 10 m count as independent.
+    Their logarithm is shrunk towards zero (James and Stein 1961), because a short drive shows its largest error and no
+    quantile.
     """
     found: list[tuple[Floats, error_growth.PathErrors, Floats, Complexes]] = []
     tested = [np.empty((0, 3))]
@@ -364,13 +373,13 @@ def measure_error_sources(table: HeldOut, name: str) -> ErrorSources | None:
     level = min(95.0 * (1.0 + 1.0 / count), 100.0)
     share = np.percentile(error / np.maximum(error_growth.radius(spread, 0.95)[far], 1e-9), level)
     mean = error.mean() / max(float(error_growth.mean_error(spread)[far].mean()), 1e-9)
-    # measured over normal: the fewer stretches show it, the nearer to normal
+    # ratio of measured to normal error: with fewer stretches it is drawn closer to 1
     factors = np.maximum([share, mean], [1.0, 1e-9]) ** (count / (count + NORMAL_STRETCHES))
     return ErrorSources(*(*variances.tolist(), *factors.tolist(), measured_to_m))
 
 
 def measure_controller_errors(table: HeldOut) -> ControllerErrors | None:
-    """Return the errors of what a controller can express, fitted without each fold, in that fold.
+    """Return the errors of the controller's model in each fold, fitted without this fold.
 
     Returns
     -------
@@ -397,7 +406,7 @@ def _variances(errors: Floats) -> tuple[float, float, float]:
 
 
 def _shares(missed: Floats, first: Floats, second: Floats) -> tuple[float, float]:
-    """Return a, b >= 0 with missed^2 about a first^2 + b second^2, by least squares."""
+    """Return a, b >= 0 such that a first^2 + b second^2 fits missed^2 by least squares."""
     columns = np.column_stack([first**2, second**2])
     a, b = np.maximum(error_growth.nonnegative(columns.T @ columns, columns.T @ missed**2), SMALLEST_VARIANCE).tolist()
     return a, b

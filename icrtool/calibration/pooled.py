@@ -42,8 +42,7 @@ def recording_of(run: Run, heading: MeasuredHeading | None = None, *, width_m: f
 
     Parameters
     ----------
-    heading : a measured heading of the run, such as its gyro's; its turn rate is used where it turns as the reference
-        does
+    heading : a measured heading of the run, such as its gyro's; its turn rate is used if it agrees with the reference
     width_m : track width b to use; default the run's
 
     Raises
@@ -81,11 +80,11 @@ def known_antenna_m(run: Run) -> tuple[float | None, float | None]:
 
 
 def with_turn_rate(plain: Recording, heading: MeasuredHeading, delay_s: float | Literal["auto"] = "auto") -> Recording:
-    """Return a recording with the turn rate of a measured heading, or as it was where that does not turn with it.
+    """Return a recording with the turn rate of a measured heading; unchanged if that heading does not turn with it.
 
     Parameters
     ----------
-    delay_s : by which it lags the wheels; ``auto``: as the turns of the reference show
+    delay_s : lag of the heading behind the wheels [s]; ``auto``: estimated from the turns of the reference
     """
     if not np.isfinite(heading.angle_rad).all():
         return plain
@@ -120,7 +119,7 @@ def gyro_line(recording: Recording) -> PastLines:
 
 
 def _gyro_line(recording: Recording, rate: Floats) -> GyroLine:
-    """Return the line by which a turn rate (n,) makes the turns of a recording's reference."""
+    """Return the line that maps a turn rate (n,) to the turns of a recording's reference."""
     track = recording.track
     return fit_gyro_line(track.t, rate, track.cumulate(rate), track.t, track.heading)
 
@@ -152,8 +151,8 @@ def calibrate_recordings(
     Parameters
     ----------
     recordings : one or many, of one robot
-    robot : as its calibration holds it; default: of no name
-    findings : what to know before use
+    robot : the robot that the calibration states; default: without a name
+    findings : notes that a user needs before use
 
     Raises
     ------
@@ -179,7 +178,7 @@ def calibrate_recordings(
 def calibration_from(
     table: held_out.HeldOut, robot: documents.CalibratedRobot | None = None, findings: tuple[Note, ...] = ()
 ) -> Calibration:
-    """Return the calibration of the recordings that a held-out table is of."""
+    """Return the calibration from the recordings of a held-out table."""
     recordings, best = table.recordings, table.fits[RECOMMENDED]
     logs = []
     for i, one in enumerate(recordings):
@@ -230,7 +229,7 @@ def calibration_from(
 
 
 FEWEST_POOLED = 3
-"""Fewer logs show no spread between drives."""
+"""Number of logs from which on the spread between drives is estimated."""
 
 
 def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: float) -> float | None:
@@ -238,7 +237,8 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
 
     Notes
     -----
-    The variance that the logs show beyond their own (`between_variance`), pooled with the one that other robots have.
+    The variance of the logs beyond their own uncertainty (`between_variance`), pooled with the variance of other
+    robots.
     """
     if len(table.recordings) < FEWEST_POOLED:
         return None
@@ -252,7 +252,7 @@ def multiplier_between_std(table: held_out.HeldOut, width_m: float, multiplier: 
 
 
 def predictor(calibration: Calibration, recording: Recording, *, with_gyro: bool = False) -> ErrorsOf:
-    """Return what gives the errors of a calibration in any trials of a recording; see `calibrated`."""
+    """Return the function that gives the errors of a calibration in trials of a recording; see `calibrated`."""
     found = calibrated(calibration, recording, with_gyro=with_gyro)
     folds = [Fold("", 0, 0, -np.inf, np.inf)]
     return lambda trials: held_out.errors_without(recording, trials, folds, 0, lambda _: found)
@@ -286,8 +286,11 @@ def calibrated(calibration: Calibration, recording: Recording, *, with_gyro: boo
     return fitted, own_constants(cut_windows(recording), fitted, recording.width_m)
 
 
-SAME_SHARE, SAME_SPEED = 0.98, 1e-6
-"""A log is a part of another that has so much of its rows, with speeds that differ by no more than this share."""
+SAME_SHARE = 0.98
+"""Share of a log's rows that another log must also have. Then the first log is a part of the other one."""
+
+SAME_SPEED = 1e-6
+"""Largest relative difference of two wheel speeds that count as the same."""
 
 
 def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Calibration:
@@ -306,7 +309,7 @@ def calibrate(runs: Run | Sequence[Run], *, allow_unusable: bool = False) -> Cal
     DataError
         No run is left, or too short a drive.
     """
-    # A path is refused as what it is, not as a sequence of letters.
+    # A string is a sequence, too: a path is refused with its own message.
     several = [runs] if isinstance(runs, (Run, str, PathLike)) else runs
     return calibrate_runs(several, allow_unusable=allow_unusable).calibration
 
@@ -349,7 +352,7 @@ class _Taken(NamedTuple):
     Attributes
     ----------
     positions : complex (m,), of its fixes, north + i east [m]
-    notes : of its use beside others
+    notes : of its use together with other runs
     """
 
     recording: Recording
@@ -359,10 +362,10 @@ class _Taken(NamedTuple):
 
 
 def _is_part(one: _Taken, of: _Taken) -> bool:
-    """Return whether a log, as one that was cut off, holds nothing but a part of a longer one.
+    """Return whether a log is only a part of a longer log, for example because its recording was cut off.
 
-    It has the other's stamps, and where both have them the same wheel speeds and positions. At its ends speeds that
-    were made from positions of the wheels may differ.
+    The part has the stamps of the longer log. At equal stamps both have equal wheel speeds and positions. Wheel speeds
+    that were computed from wheel positions may differ at the ends of the part.
     """
     part, whole = one.recording, of.recording
     stamps, theirs = (np.rint(1e9 * log.track.t).astype(np.int64) + log.begin_ns for log in (part, whole))

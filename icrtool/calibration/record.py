@@ -1,6 +1,6 @@
 """A calibration: the motion model recommended for a robot, its parameters with covariance, and how it was tested.
 
-Frames and signs are those of `icrtool`: x forward, y right, turn rate clockwise. Parameters refer to wheel speeds at
+Frames and signs follow `icrtool`: x forward, y right, turn rate clockwise. Parameters refer to wheel speeds at
 the configured wheel radius.
 """
 
@@ -67,7 +67,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     held_out : scores by model, horizon and log, each predicted without that log, or block of a single one
     held_out_pooled : scores of all these trials together
     geometry, geometry_std : ICRs [m], multiplier and radius factors, from one fit
-    controller : what a controller is given, and the errors of that, where the drive is long enough to measure them
+    controller : numbers for a controller, and their errors where the drive is long enough to measure them
     error_sources : variances of what the model leaves out, for wheels alone; None where the drive is too short
     notes : what to know before use; `warnings` : their sentences
     created : date and time, UTC, ISO 8601
@@ -76,7 +76,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
     Raises
     ------
     LookupError, ValueError
-        Its terms or numbers are not those of a motion model.
+        Its terms or numbers do not form a motion model.
     """
 
     name: str | UnsetType = UNSET
@@ -199,7 +199,7 @@ class Calibration(documents.CalibrationDocument, frozen=True, kw_only=True):
         return bool(sha256) and any(log.sha256 == sha256 for log in self.logs)
 
     def write(self, path: str | Path) -> Path:
-        """Write the calibration file, whole or not at all; into `path` where that is a folder.
+        """Write the calibration file, whole or not at all; into `path` where `path` is a folder.
 
         Returns
         -------
@@ -236,7 +236,7 @@ def stored_calibration(document: documents.CalibrationDocument) -> Calibration:
     Raises
     ------
     LookupError, ValueError
-        Its terms or numbers are not those of a motion model.
+        Its terms or numbers do not form a motion model.
     """
     return Calibration(**msgspec.structs.asdict(document))
 
@@ -245,9 +245,9 @@ def fitted_document(
     fitted: FittedModel, geometry: TrackGeometry, covariance: Floats, robot: documents.CalibratedRobot, *,
     shared_std: float | None = None,
 ) -> RecommendedDocument:  # fmt: skip
-    """Return a model for one robot: parameters with covariance, ICRs, and what a controller is given.
+    """Return a model for one robot: parameters with covariance, ICRs, and numbers for a controller.
 
-    `shared_std` is that of `controller_numbers`.
+    `shared_std` is passed to `controller_numbers`.
     """
     std = np.sqrt(np.diag(covariance)).tolist()
     return RecommendedDocument(
@@ -263,7 +263,7 @@ MULTIPLIER_BETWEEN_SHARE = 0.02
 Ten recorded drives of a Warthog differ by 1.4 %, 60 simulated robots with two drives each by 1.9 %."""
 
 RADIUS_BETWEEN_STD = 0.006
-"""Standard deviation of the radius factors between drives: ten recorded drives of a Warthog."""
+"""Standard deviation of the radius factors between drives, measured on ten recorded drives of a Warthog."""
 
 
 def controller_numbers(
@@ -273,8 +273,8 @@ def controller_numbers(
 
     Parameters
     ----------
-    shared_std : standard deviation of the multiplier between drives where several were pooled; default: that of other
-        robots
+    shared_std : standard deviation of the multiplier between drives where several were pooled; default: the value of
+        other robots
     """
     std = dict(zip(geometry._fields, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     left, right = (1.0 if scale is UNSET else scale for scale in (robot.left_scale, robot.right_scale))
@@ -295,7 +295,7 @@ def parameter_documents(one: FittedModel) -> tuple[tuple[str, ...], dict[str, Pa
 
 
 LARGEST_PARAMETER = 1e6
-"""Of a parameter, in its unit: beyond it is damage, whose squares overflow."""
+"""Largest size of a parameter, in its unit. A larger value is damage, and its square could overflow."""
 
 
 def fitted_model(
@@ -306,7 +306,7 @@ def fitted_model(
     Raises
     ------
     LookupError, ValueError
-        Its terms or numbers are not those of a motion model.
+        Its terms or numbers do not form a motion model.
     """
     model = find_model(name)
     k = len(model.terms)
@@ -327,11 +327,11 @@ POSE_AFTER_M = CHOICE_HORIZON_M
 """Distance after which the errors of a calibration are stated to controllers."""
 
 LARGEST_SHARE = 0.5
-"""A calibration whose 95 % error is more than this share of the distance is not fit for use."""
+"""Largest 95 % error of a calibration, as a share of the distance. Beyond it the calibration is not fit for use."""
 
 
 def unfit_reasons(calibration: Calibration) -> tuple[Note, ...]:
-    """Return why a calibration is not fit for use, by what it was tested on; empty where it is."""
+    """Return why a calibration is not fit for use, from its held-out errors; empty where it is fit."""
     reasons = [one for one in calibration.notes if is_grave(one)]
     p95, expected = calibration.held_out_m(RECOMMENDED, POSE_AFTER_M)
     _, without = calibration.held_out_m(NO_SLIP, POSE_AFTER_M)
@@ -347,7 +347,7 @@ def unfit_reasons(calibration: Calibration) -> tuple[Note, ...]:
 
 
 def export_notes(calibration: Calibration) -> tuple[Note, ...]:
-    """Return what to know before a controller uses a calibration."""
+    """Return the notes that a user needs before a controller uses a calibration."""
     found = [one for one in unfit_reasons(calibration) if one not in calibration.notes]
     for name in calibration.fitted.not_shown:
         why = f"not shown by this driving: {name} ({TERMS[name].meaning}); its value is the prior's"
@@ -359,7 +359,7 @@ def export_notes(calibration: Calibration) -> tuple[Note, ...]:
 
 
 def factor_to_old(calibration: Calibration) -> float | None:
-    """Return the multiplier over the one that the log's odometry was made with, None where that is not known."""
+    """Return the ratio of the multiplier to the multiplier of the log's odometry; None where the latter is unknown."""
     old_width_m = calibration.robot.twist_width_m
     if old_width_m is UNSET:
         return None

@@ -1,7 +1,8 @@
 """The motion models of one run: fitted (for `icrtool.fit`), and each tested on distance it was not fitted to.
 
-What is fitted is fitted on windows that keep clear of the trials that it is tested in (`icrtool.calibration.held_out`);
-the filter's own ICRs, momentary and final, stand beside. Rows with a gyro turn by it and by the wheels.
+Each model is fitted to windows that share no distance with its test trials (`icrtool.calibration.held_out`). The
+filter's momentary and final ICRs are compared with these models. Rows with a gyro combine the turn rates of gyro and
+wheels.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def with_motion(run: Run) -> RunDocument:
     Notes
     -----
     ICRs and controller numbers come from one fit of `FIVE` to the windows of the drive, so that
-    (right - left) / b is the multiplier. With preset ``paper`` they are those of the filter at the end.
+    (right - left) / b is the multiplier. With preset ``paper`` they are the filter's estimates at the end.
     """
     recording = pooled.recording_of(run, width_m=width_or_usual_m(run.track_width_m))
     try:
@@ -114,7 +115,7 @@ def _with_verdict(document: RunDocument, multiplier_std: str = "") -> RunDocumen
 
 
 class Model(NamedTuple):
-    """What predicts motion from wheel speeds: ICRs per start, or one triple; `knows` as in `ComparedRow`."""
+    """ICRs that predict motion from wheel speeds: per start, or one triple; `knows` as in `ComparedRow`."""
 
     name: str
     icrs: FrozenIcrs
@@ -122,13 +123,13 @@ class Model(NamedTuple):
 
 
 class ComparedRow(NamedTuple):
-    """A row that is not the filter's.
+    """A row whose numbers do not come from the filter.
 
     Attributes
     ----------
     errors_of : its errors in trials, NaN where it has none; path : its path from one state to another, None where it
         has none
-    knows : what its numbers were learned from, where that is not what `icrtool.records.rows` states of the row
+    knows : what its numbers were learned from; empty where `icrtool.records.rows` states it
     """
 
     name: str
@@ -149,13 +150,13 @@ def adaptive_rows(recording: Recording, heading: str, calibrations: Sequence[Cal
 
 
 class ComparedModels(NamedTuple):
-    """How the rows of a report were tested that are not the filter's.
+    """The test of those rows of a report that do not come from the filter.
 
     Attributes
     ----------
     table : of the run's recording: its trials, blocks of distance, and fits
     track : the run's drive
-    heading : what the rows with a measured heading go by, ``gyro`` or ``heading``; empty without
+    heading : kind of the measured heading that rows use, ``gyro`` or ``heading``; empty without one
     notes : what was left out of the table and why, and what was corrected
     calibration : what ``icrtool calibrate`` gives for this run alone; None where the track width is not known
     """
@@ -176,7 +177,7 @@ def compare_models(
     Parameters
     ----------
     run : a finished run, or one read back
-    headings : measured headings, best first, for the models that need not turn by wheels alone
+    headings : measured headings, best first, for the models with a measured turn rate
     calibrations : row ``adaptive`` begins with the first one that was not fitted to this log, else with other robots
 
     Raises
@@ -187,7 +188,7 @@ def compare_models(
     Notes
     -----
     Cross-validation (Stone 1974; see `icrtool.calibration.held_out` for what is left out of a trial's fit). The
-    filter's momentary ICRs know the drive up to the start, its final ones all of it.
+    filter's momentary ICRs were learned before the start of a trial, its final ICRs from the whole drive.
     """
     recording, heading, notes = _with_heading(run, headings)
     parts = {"ahead of": recording.lever.ahead, "to the right of": recording.lever.aside}
@@ -226,7 +227,7 @@ def _with_heading(run: Run, headings: Iterable[MeasuredHeading]) -> tuple[Record
 
 
 def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
-    """Yield the held-out rows, those of the filter's ICRs with a measured heading last."""
+    """Yield the held-out rows; the rows of the filter's ICRs with a measured heading come last."""
     for name in found.rows:
         if name == NO_SLIP:
             continue
@@ -235,7 +236,7 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
     if found.has_gyro:
         (recording,) = found.recordings
         for one in models_of(run):
-            # Neither has an arm about which a measured turn moves the robot: with a gyro both would be no_slip_gyro.
+            # Both have the middle of the ICRs at the origin: with a measured turn both would equal no_slip_gyro.
             if not row_of(one.name).compared:
                 of_past = one.name == "icr"
                 lines = partial(past_gyro_lines, recording.track) if of_past else partial(pooled.gyro_line, recording)
@@ -244,7 +245,7 @@ def _rows(run: Run, found: HeldOut, kind: str) -> Iterator[ComparedRow]:
 
 
 def models_of(run: Run) -> tuple[Model, ...]:
-    """Return the filter's ICRs at each start and its final ones; those of track width and published skid factor."""
+    """Return the filter's ICRs at each start, its final ICRs, and the ICRs of track width and published skid factor."""
     table = run.table
     momentary = FrozenIcrs(table.y_icr_right_m, table.y_icr_left_m, table.x_icr_m)
     models = [Model("icr", momentary, momentary_knows(run))]
@@ -288,11 +289,11 @@ def turned_path(run: Run, recording: Recording, turned: Floats, rows: slice) -> 
 def _errors_turned(
     run: Run, recording: Recording, icrs: FrozenIcrs, lines: Callable[[], PastLines], trials: Trials
 ) -> TrialErrors:
-    """Return the errors (k, h) of ICRs (n,) or (1,) along the path of `turned_path`, which is kept for no longer.
+    """Return the errors (k, h) of ICRs (n,) or (1,) along the path of `turned_path`.
 
     Parameters
     ----------
-    lines : gives scale and bias of the gyro, from the state of each on
+    lines : scale and bias of the gyro, each from one state on
 
     Notes
     -----

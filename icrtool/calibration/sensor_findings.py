@@ -1,8 +1,8 @@
-"""What the alignment of one log shows of its sensors: verdict, reason and setting for each of its findings.
+"""Findings of one log's alignment about its sensors: verdict, reason and setting of each.
 
-The numbers are those of the run (``alignment`` in run.json), so that `fit` and `calibrate` cannot disagree. Positions
+The numbers are taken from the run (``alignment`` in run.json), so that `fit` and `calibrate` cannot disagree. Positions
 show only antenna forward - x ICR and antenna right - middle of the ICRs: an antenna further ahead has the same effect
-as ICRs further back. One of both has to be known.
+as ICRs further back. To separate the two, one of them must be known.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ FINDING_KINDS = {
 """By their keys in files."""
 
 WEAK = 3.0
-"""A standard deviation up to so many times the useful one is weak; above it, the drive does not show the parameter."""
+"""Largest ratio of a standard deviation to the useful one that counts as weak. Above it the parameter is not shown."""
 
 SHOWN_STRAIGHT = ("left_scale", "right_scale", "gnss_delay_s", "heading_offset_deg")
-"""What driving straight on shows."""
+"""Parameters that a straight drive shows."""
 
 DELAYS = ("gnss_delay_s", "heading_delay_s", "gnss_delay_against_heading_s")
 RESPONSE_PART = "the robot's own response to its wheels is part of it"
 
 STEADY = 0.15
-"""A speed is steady where its standard deviation is less than this share of its mean."""
+"""Ratio of a speed's standard deviation to its mean below which the speed counts as steady."""
 
 MOVING_MPS, TURNING_DEGPS = 0.05, 2.0
 
@@ -110,7 +110,7 @@ def calibrate_log(run: Run, *, x_icr_m: float | None = None) -> documents.Sensor
 
 
 def with_sensors(calibration: Calibration, sensors: documents.SensorDocument) -> Calibration:
-    """Return a calibration with what its only log shows of its sensors."""
+    """Return a calibration with the sensor findings of its only log."""
     return replace(
         calibration, **{name: getattr(sensors, name) for name in documents.CalibrationFile.__struct_fields__[1:]}
     )
@@ -161,7 +161,7 @@ def _reason(key: str, driven: documents.SensorDrive) -> str:
 def _derive(
     run: Run, direct: Mapping[str, documents.SensorParameter], x_icr_m: float | None
 ) -> dict[str, documents.SensorParameter]:
-    """Return antenna and ICRs, as far as one of them is known; else the middle of the ICRs is assumed at y = 0."""
+    """Return the places of antenna and ICRs that follow from the known one; unless known, the ICRs' middle is y = 0."""
     of_antenna_and_icrs = [direct[key] for key in (ANTENNA_AHEAD, ANTENNA_ASIDE, SEPARATION)]
     (ahead, ahead_std), (aside, aside_std), (separation, separation_std) = map(_numbers, of_antenna_and_icrs)
     of_ahead, of_aside, of_separation = (one.verdict for one in of_antenna_and_icrs)
@@ -199,7 +199,7 @@ def _settings(parameters: Mapping[str, documents.SensorParameter], run: Run) -> 
     """Return the settings of parameters that are known well enough, and are large enough, to be configured."""
     wheels = run.config.wheels
     left, right = (1.0 if given == "auto" else given for given in (wheels.left_scale, wheels.right_scale))
-    # the parameter of each, the value that changes nothing, the least difference, and what the setting is multiplied by
+    # setting, parameter, neutral value, least difference from it, present value that the estimate is multiplied by
     rows = (
         ("frames.heading_offset_deg", "heading_offset_deg", 0.0, 0.3, 1.0),
         ("frames.reference_delay_s", "gnss_delay_s", 0.0, RESPONSE_S, 1.0),
@@ -213,7 +213,7 @@ def _settings(parameters: Mapping[str, documents.SensorParameter], run: Run) -> 
     for key, name, neutral, least, times in rows:
         value, std = _numbers(parameters[name])
         large = abs(value - neutral) > max(SETTING_SIGMAS * std, least)
-        # a stream that seems to lead shows a robot that follows its wheels with a delay
+        # a stream that seems to lead: the robot's motion lags its wheels
         leads = name in DELAYS and value <= 0.0
         if parameters[name].verdict == "shown" and large and not leads:
             settings[key] = round(times * value, 4)

@@ -1,8 +1,8 @@
-"""Groups of runs compared: what each teaches, how they differ, and what the calibration of one costs on another.
+"""Comparison of groups of runs: their parameters, the differences, and the error of one's calibration on another.
 
-The transfer matrix holds the errors of the calibration of the row in the trials of the column's runs. On its diagonal a
-calibration would be tested on what it was fitted to; there each trial is predicted without its log or, in a group of a
-single run, by a fit to the rest of the drive.
+An element of the transfer matrix holds the errors of the row's calibration in the trials of the column's runs. On the
+diagonal both are the same group. There each trial is predicted by a fit without its log or, in a group of a single run,
+by a fit to the rest of the drive.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ TWO_SIDED = 1.96
 """Standard deviations in a 95 % interval."""
 
 SAME_ROUTE_M = 1.0
-"""Two drives took the same route where they are nowhere further apart at the same distance."""
+"""Largest distance between two drives on the same route, at equal driven distance [m]."""
 
 COMPARED = ("y_icr_right_m", "y_icr_left_m", "x_icr_m", "multiplier", "radius_left", "radius_right")
 
@@ -61,8 +61,8 @@ def compare_groups(groups: Mapping[str, Sequence[Run]]) -> documents.GroupCompar
     -----
     Parameters of different logs are independent, and their covariances are clustered by distance. Errors and their
     differences have intervals from blocks of the distance of all runs of a group
-    (`icrtool.kernels.error_statistics`), differences from pairs of blocks where both are of the same trials or the
-    same route.
+    (`icrtool.kernels.error_statistics`). If both groups have the same trials or the same route, the intervals of
+    differences come from pairs of blocks.
     """
     if len(groups) < 2:
         raise ConfigError("groups", "only one is given", "name two or more to compare")
@@ -85,7 +85,7 @@ def compare_calibrations(
     for (row, result), (column, own) in product(results.items(), results.items()):
         held_out = found = tested[column, column]
         if row != column:
-            # Parameters that refer to another track width or wheel radius are those of another robot.
+            # Another track width or wheel radius: another robot.
             ours, theirs = result.calibration, own.calibration
             same_width = math.isclose(ours.width_m, theirs.width_m, rel_tol=1e-3)
             found = held_out._replace(errors=np.full_like(held_out.errors, np.nan))
@@ -127,24 +127,25 @@ def _verdict(
     change = f"by {with_std(one.difference, one.std)}"
     if not one.significant:
         change += ", which may be chance"
+    differs = f"The multiplier of {second} differs from the multiplier of {first} {change}"
     if cost.p95_m is None:
-        return f"The multiplier of {second} differs from that of {first} {change}."
+        return f"{differs}."
     low, high = cost.p95_low_m, cost.p95_high_m
     sentence = f"costs {with_interval(cost.p95_m, low, high)} at 95 % after {CHOICE_HORIZON_M:g} m on {second}"
     if low is not None and high is not None and low <= 0.0 <= high:
         sentence += ", which may be chance"
-    return f"The multiplier of {second} differs from that of {first} {change}; a calibration of {first} {sentence}."
+    return f"{differs}; a calibration of {first} {sentence}."
 
 
 class _Tested(NamedTuple):
-    """Errors (k, h) [m] of trials, and path lengths (k,) [m] at their starts; recordings one behind the other."""
+    """Errors (k, h) [m] of trials, and path lengths (k,) [m] at their starts; recordings in sequence."""
 
     errors: Floats
     path: Floats
 
 
 def _test(result: CalibrationResult, recordings: Sequence[Recording], *, own: bool) -> _Tested:
-    """Test a calibration in recordings; those of its own are predicted by fits that do not contain them."""
+    """Test a calibration in recordings; with `own`, each is predicted by a fit that does not contain it."""
     errors, path, before = [], [], 0.0
     for i, one in enumerate(recordings):
         trials = cut_trials(one, TRANSFER_HORIZONS_M)
@@ -169,7 +170,7 @@ def _sum_up(
 
 
 def _differences(first: _Tested, second: _Tested, *, paired: bool) -> list[documents.ErrorsAt]:
-    """Return the difference of errors at each horizon, second minus first; of the same trials only where both are."""
+    """Return the difference of errors at each horizon, second minus first; `paired`: over trials that both have."""
     found = []
     same = np.array_equal(first.path, second.path)
     for h, horizon in enumerate(TRANSFER_HORIZONS_M):

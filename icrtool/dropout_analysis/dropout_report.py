@@ -1,4 +1,4 @@
-"""The whole dropout report of a run: all that ``icrtool dropout-report`` gives."""
+"""The complete dropout report of a run, as ``icrtool dropout-report`` gives it."""
 
 from __future__ import annotations
 
@@ -52,15 +52,15 @@ def dropout(
     seed: int = DEFAULT_SEED,
     sink: ErrorSink | None = None,
 ) -> report.DropoutReport:
-    """Return how far the predicted position is off after distances without GNSS (Pentzer 2014, Section 6.4).
+    """Return the errors of the predicted position after distances without GNSS (Pentzer 2014, Section 6.4).
 
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
-    horizons_m : distances without GNSS, in any order; default those of the run's configuration
+    horizons_m : distances without GNSS, in any order; default: from the run's configuration
     starts : ``moving`` counts each standstill once, ``all`` takes every recorded state, as the paper does
-    models : what to predict with; default `models_of` of the run
-    seed : of what the reference's own error is drawn from
+    models : models that predict; default `models_of` of the run
+    seed : of the random draws of the reference's own error
     sink : receives every single error (for ``--trials``)
 
     Returns
@@ -73,7 +73,7 @@ def dropout(
     DataError
         The run has fewer than two states.
     ConfigError
-        A horizon that is no distance.
+        A horizon is not a positive number.
     ValueError
         Two models of one name.
 
@@ -82,9 +82,9 @@ def dropout(
     A trial starts at a recorded state and keeps its ICRs; wheel speeds alone predict the path. The error is the
     horizontal distance to the filter's estimate at the first state that is the horizon further along the path. A
     start is counted but gives no trial where less path is left, where the path crosses a gap in the wheel data, or
-    where it ends in a real GNSS outage. Of a standstill only the last state starts trials: the others would be copies,
-    and a parked robot would set the result. Overlapping trials are not independent: the
-    intervals come from blocks of path of at least four horizons (`icrtool.kernels.error_statistics`).
+    where it ends in a real GNSS outage. Only the last state of a standstill starts trials: the other states would
+    repeat the same trial, and a parked robot would decide the result. Overlapping trials are not independent. Therefore
+    the intervals come from blocks of path of at least four horizons (`icrtool.kernels.error_statistics`).
     """
     check_type(run, Run, MAKE_RUN)
     request = ReportRequest(
@@ -118,16 +118,16 @@ def dropout_report(
     baseline: report.BaselineReport | None = None,
     sink: ErrorSink | None = None,
 ) -> report.DropoutReport:
-    """Return how far a robot can drive without GNSS, with all that ``icrtool dropout-report`` gives.
+    """Return how far a robot can drive without GNSS, as complete as ``icrtool dropout-report``.
 
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
-    horizons_m, budgets_m : distances without GNSS [m]; errors [m] whose distances are reported
+    horizons_m, budgets_m : distances without GNSS [m]; largest allowed errors [m], for which the distance is reported
     gates, strict_gates, allow_unusable : acceptance limits, and how they are checked
     outage_s, outage_at_s : lengths and begins of forced outages [s]
-    starts, reference : the states that trials start from, and what trials are compared with
-    without_events, with_jumps : the trials that count
+    starts, reference : states that trials start from; estimates that trials are compared with
+    without_events, with_jumps : which trials count
     ladder, seed : whether models are tested on held-out distance; seed of the random draws
     score : topics of poses in the log; each becomes a row ``topic:NAME``
     log, calibrations, baseline, sink : as in `report_on`
@@ -135,7 +135,7 @@ def dropout_report(
     Raises
     ------
     ConfigError, DataError, LogError, RunError
-        As of `report_on`.
+        As `report_on`.
 
     Notes
     -----
@@ -169,15 +169,16 @@ def report_on(
     baseline: report.BaselineReport | None = None,
     sink: ErrorSink | None = None,
 ) -> report.DropoutReport:
-    """Return the dropout report that is asked for.
+    """Return the dropout report of a request.
 
     Parameters
     ----------
     run : of `icrtool.fit` or `icrtool.open_run`
-    log : that the run was made of, as `icrtool.read_log` takes it: scored topics are read from it
-    calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`; each becomes a row, ``calibration``, or
-        ``calibration:STEM`` of its file where there are several; with ``_gyro`` behind it where both have a gyro. Row
-        ``adaptive`` begins with the first one that was not fitted to this log, without one with other robots
+    log : the log of the run, in a form that `icrtool.read_log` takes; scored topics are read from it
+    calibrations : of `icrtool.calibrate` or `icrtool.open_calibration`. Each becomes a row ``calibration``, or
+        ``calibration:STEM`` with the stem of its file where there are several, and a row with ``_gyro`` at the end
+        where both have a gyro. Row ``adaptive`` begins with the first calibration that was not fitted to this log;
+        without one, with other robots
     baseline : an earlier report, for limits such as ``"icr.p95@10m <= 1.1 * baseline"``
     sink : receives every single error, see `icrtool.dropout_analysis.trials.ErrorSink`
 
@@ -197,7 +198,7 @@ def report_on(
         run = replace(run, sensors=replace(run.sensors, jumps=()))
     whole = run
     if request.without_events:
-        # A gap in place of each slip event: no trial, window or forced outage crosses a gap.
+        # Each slip event becomes a gap: no trial, window or forced outage crosses a gap.
         run = replace(run, in_gap=run.in_gap | run.slipping)
     limits = [report.parse_gate(gate) for gate in request.gates]
     lengths_s = forced_lengths_s(run, request)
@@ -208,7 +209,7 @@ def report_on(
     forced = [outage for plan in plans for outage in shown_paths.force_outages(run, plan)]
     compared = with_smoothed_reference(run) if request.reference == "smoothed" else run
     unusable = "" if run.usable or request.allow_unusable else str(run.document.unusable_because)
-    # Before the comparison, whose columns of a long log are as large as theirs.
+    # Computed and released before the comparison, whose columns are as large: this bounds memory.
     examples, by_turning = shown_paths.example_trials(compared), split_by_turning(compared, request.starts)
     give_back_freed()
     used, further = _calibration_rows(compared, () if unusable else calibrations)
@@ -268,7 +269,7 @@ def report_on(
 
 
 def _scored_topics(request: ReportRequest, log: str | Path | None) -> Sequence[TopicPoses]:
-    """Return the poses of the topics that are asked for.
+    """Return the poses of the requested topics.
 
     Raises
     ------
@@ -298,9 +299,9 @@ def _report(
 
     Parameters
     ----------
-    errors : of its models
-    with_events : errors of all trials, where those of `errors` cross no slip event
-    notes : of the rows, in addition to those of the run
+    errors : errors of its models
+    with_events : errors of all trials, where the trials of `errors` cross no slip event
+    notes : notes about the rows, in addition to the run's notes
     """
     made = None if found is None else found.calibration
     notes = (*run.notes, *(() if found is None else found.notes), *notes)
@@ -339,7 +340,7 @@ def _report(
         reference_error=errors.reference,
         by_learning=errors.by_learning,
         calibrations=calibrations,
-        # Without when it was made: the same run, the same file.
+        # Without the date: the same run gives the same file.
         recommended=None if made is None else msgspec.structs.replace(made, created=UNSET),
         budgets=budgets,
         best=report.best_row(errors, calibrations) if usable else None,
@@ -362,8 +363,8 @@ def _report(
 def _counts(
     errors: report.OpenLoopErrors, with_events: report.OpenLoopErrors | None
 ) -> Iterator[documents.CountDocument]:
-    """Yield how many starts were a trial at each horizon, and why the others were none."""
-    # starts at a gap, at an outage or at a standstill are counted as without the option
+    """Yield how many starts gave a trial at each horizon, and why the others gave none."""
+    # starts at a gap, at an outage or at a standstill are counted the same with and without the option
     counts = (with_events or errors).counts
     crossing = counts.trials - errors.counts.trials
     driven = distance_text(errors.run_document.drive.distance_m)
@@ -386,7 +387,7 @@ def _counts(
 def _ladder(
     errors: report.OpenLoopErrors, calibrations: Sequence[UsedCalibration], found: ComparedModels | None, why_none: str
 ) -> documents.LadderDocument:
-    """Return how the models were compared; why there is no comparison where it was left out."""
+    """Return how the models were compared, or why the comparison was left out."""
     if found is None:
         return documents.LadderDocument(left_out=why_none)
     given, turned = {one.name for one in calibrations}, f"_{found.heading}"
@@ -416,14 +417,14 @@ def _ladder(
 
 
 def forced_lengths_s(run: Run, request: ReportRequest) -> Sequence[float]:
-    """Return the lengths of outages to force: those asked for, else those of the run's configuration."""
+    """Return the lengths [s] of outages to force: from the request, else from the run's configuration."""
     return request.outage_s if request.outage_s is not None else run.config.dropout.forced_outage_s
 
 
 def _calibration_rows(
     run: Run, calibrations: Sequence[Calibration]
 ) -> tuple[tuple[UsedCalibration, ...], list[ComparedRow]]:
-    """Return what is known of each calibration, and the model of its row."""
+    """Return the record of each used calibration, and the models of their rows."""
     used, models = [], []
     if not calibrations:
         return (), []

@@ -1,7 +1,7 @@
 """The dropout report, and what it is compared with: budgets, acceptance limits for CI, an earlier report.
 
-`DropoutReport` is what `icrtool.dropout` and `icrtool.dropout_report` return. It stands here and not among the records
-because it holds a calibration, which is made of fits. No code that makes it is here, and no kernel.
+`icrtool.dropout` and `icrtool.dropout_report` return a `DropoutReport`. It is not in `icrtool.records` because it holds
+a calibration, which depends on fits. The code that computes a report is in other modules.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ class OpenLoopErrors:
 
     Attributes
     ----------
-    run_document : what run.json of the run holds
+    run_document : content of the run's run.json
     horizons_m : (h,) ascending
     results : one per model
     counts : trials, and starts without a trial, by horizon; the same for every model
     states : recorded states
-    standing : states in which the robot stood: their trials are nearly copies of one another
-    reference : what a perfect model would show, by horizon
+    standing : states in which the robot stood: their trials are nearly equal
+    reference : errors that a perfect model would show, by horizon
     by_learning : trials of the momentary ICRs before and after the ICRs were first learned; None without that model
     """
 
@@ -79,19 +79,19 @@ class OpenLoopErrors:
 
 @dataclass(frozen=True, slots=True, repr=False, eq=False)
 class DropoutReport(OpenLoopErrors):
-    """Open-loop errors by model and horizon, and what else was asked for.
+    """Open-loop errors by model and horizon, and the other requested results.
 
-    `icrtool.dropout` gives the errors alone, `icrtool.dropout_report` all of it.
+    `icrtool.dropout` gives the errors alone, `icrtool.dropout_report` the complete report.
 
     Attributes
     ----------
-    document : what report.json holds
-    run_directory : where the run was read from, None for one just made
-    reference_north_m, reference_east_m : (n,) what trials are compared with, at every state
-    usable : distances and numbers may be used, or were asked for all the same
-    worst, examples, outages : those of `document`, with their paths
-    calibration : of this run alone, which `recommended` stands for; None where it was left out
-    baseline : an earlier report that this one is compared with
+    document : content of report.json
+    run_directory : directory that the run was read from; None for a run just made
+    reference_north_m, reference_east_m : (n,) positions that trials are compared with, at every state
+    usable : distances and numbers may be used, or the request accepts an unusable run
+    worst, examples, outages : the same as in `document`, with their paths
+    calibration : from this run alone, the model of row `recommended`; None where it was left out
+    baseline : an earlier report that this report is compared with
     """
 
     document: documents.DropoutDocument
@@ -133,7 +133,7 @@ class DropoutReport(OpenLoopErrors):
         ----------
         path : directory of the report; default: ``dropout`` in the directory the run was read from
         plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
-        figures : ``all``: those of the paper too
+        figures : ``all``: the paper's figures too
 
         Raises
         ------
@@ -182,11 +182,11 @@ class BaselineReport:
 
     @property
     def tool_version(self) -> str:
-        """Version that made it."""
+        """Version of icrtool that made the report."""
         return escaped(self.document.tool_version)
 
     def at(self, model: str, horizon_m: float) -> tuple[documents.ErrorRow | None, BlockSums | None]:
-        """Return the numbers of a model at a horizon, and their block sums; None for what the report does not have."""
+        """Return the numbers of a model at a horizon, and their block sums; None where the report has none."""
         for one in self.document.models:
             for row in one.by_horizon:
                 if one.name == model and math.isclose(row.horizon_m, horizon_m, rel_tol=1e-6):
@@ -200,7 +200,7 @@ class BaselineReport:
         return None, None
 
     def number_for(self, gate: Gate) -> tuple[float, BlockSums | None]:
-        """Return the number [m] that a limit is about, NaN where there is none, and its block sums.
+        """Return the number [m] that a limit bounds, NaN where there is none, and its block sums.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class BaselineReport:
         return (math.nan if reached is None else reached[0]), None
 
     def changes(self, run_document: RunDocument) -> tuple[str, ...]:
-        """Return what differs beside the numbers: log, configuration, version; a sentence each."""
+        """Return the differences in log, configuration and version, one sentence each."""
         found = []
         if not self.is_of(run_document):
             found.append(f"another recording than in the baseline ({self.log}): the difference has a wider interval")
@@ -266,7 +266,7 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
                 within_budget(report.horizons_m, result.column(name), budget_m)
                 for name in ("p95_high_m", "p95_low_m", "p95_next_high_m", "p95_next_low_m")
             )
-            # An end that stays within the budget as far as there are intervals has no such distance.
+            # A bound that stays within the budget at every horizon with an interval has no such distance.
             low, high, next_low, next_high = (None if end is None or end[1] else end[0] for end in ends)
             quiet = documents.column_of(result.without_events, "p95_m")
             free = within_budget(report.horizons_m, quiet, budget_m) if len(quiet) else None
@@ -279,19 +279,20 @@ def budget_distances(report: OpenLoopErrors, budget_m: float) -> tuple[BudgetDis
 def best_row(
     errors: OpenLoopErrors, calibrations: Sequence[documents.UsedCalibration] = ()
 ) -> documents.BestRow | None:
-    """Return the row to drive with by wheels alone; None where no row that a robot can drive with has trials.
+    """Return the best row for driving by wheels alone; None where no row that a robot can drive with has trials.
 
     Parameters
     ----------
-    calibrations : those of the report; one that was fitted to this log is not compared
+    calibrations : calibrations of the report; one that was fitted to this log is not compared
 
     Notes
     -----
-    The smallest expected error near 10 m: a mean differs less by chance than a percentile. A row for comparison is as
-    good where its expected error is smaller, or larger by less than the interval of the difference.
+    The best row has the smallest expected error near 10 m; a mean has less random variation than a percentile. A row
+    for comparison is equally good if its expected error is smaller, or larger by less than the interval of the
+    difference.
     """
     own = {one.name for one in calibrations if one.fitted_to_this}
-    # A localisation in the log has other sensors than the wheels.
+    # A localisation in the log uses other sensors besides the wheels.
     own |= {one.name for one in errors.results if kind_of(one.name) == TOPIC_ROW}
     rows = {one.name: row_of(one.name) for one in errors.results if not turned_by(one.name) and one.name not in own}
     results = {one.name: one for one in errors.results if one.name in rows and rows[one.name].on_robot}
@@ -349,8 +350,8 @@ def check_gate(
 
     Parameters
     ----------
-    baseline : what a limit relative to the baseline is compared with; without one such a limit is not checked
-    strict : a relative limit is missed by the number alone, not only beyond the interval of the difference
+    baseline : earlier report for limits relative to it; without one such a limit is not checked
+    strict : a relative limit fails if the number exceeds it; otherwise only if the excess is beyond the interval
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Paths without GNSS that are shown one by one: the worst and typical trials, forced outages, and those of the log."""
+"""Paths without GNSS that are shown one by one: worst and typical trials, forced outages, and the log's outages."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ EXAMPLE_HORIZON_M = 15.0
 ALIKE_RAD = np.radians(10.0)
 STRAIGHT_SHARE, LONGEST_CHORD = 0.05, 1.1
 TYPICAL_OF = 30
-"""Trials enough to find the median error."""
+"""Approximate number of trials from which the typical one, with the median error, is chosen."""
 
 LONGEST_SHARE = 0.5
-"""Spaced outages leave at least this share of the time between them to learn."""
+"""Largest share of the moving time that spaced outages take. The filter learns in the rest."""
 
 MOST_SPACED = 10
 
 SAME_M = 1e-6
-"""Before the first outage the disturbed run is the undisturbed one, to rounding."""
+"""Largest difference [m] between disturbed and undisturbed run before the first outage. They differ only by
+rounding."""
 
 FIXES_COMPARED_S = 1.0
-"""Fixes of this time after an outage are compared with the open-loop path, which is driven on for as long."""
+"""Time after an outage whose fixes are compared with the open-loop path [s]. The path is driven on for this time."""
 
 
 def worst_trials(
@@ -51,8 +52,8 @@ def worst_trials(
 
     Parameters
     ----------
-    compared : held-out models, of which ``recommended`` is evaluated; without them the momentary ICRs
-    further : rows whose paths are shown too
+    compared : held-out models; the trials are the worst of ``recommended``, without it of the momentary ICRs
+    further : further rows whose paths are shown
     """
     track, models = track_of(run), models_of(run)
     ends, rows = counted_ends(track, np.array([horizon_m]), starts), compared.rows if compared is not None else ()
@@ -79,13 +80,12 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
 
     Notes
     -----
-    Cornering: the heading changes by about half a turn, or as nearly so as the drive has it. Straight: of the
-    twentieth part of the trials that end furthest from their start. Typical: of those, the one with the median error
-    of the momentary ICRs.
+    Cornering trials: the change of heading is closest to half a turn. Straight trials: the 5 % of the trials that end
+    furthest from their start. The typical trial of each group has its median error, with the momentary ICRs.
     """
     track, models = track_of(run), models_of(run)
     ends = trial_ends(track, np.array([horizon_m]))[:, 0]
-    # A parked start repeats the same path many times: the last state of each stop stands for it.
+    # Starts during a stop repeat the same path: only the last state of each stop is used.
     moving = np.flatnonzero((ends >= 0) & ~standing_states(track))
     if not len(moving):
         return ()
@@ -95,10 +95,10 @@ def example_trials(run: Run, horizon_m: float = EXAMPLE_HORIZON_M) -> tuple[Exam
         return np.asarray(column[reached] - column[moving])
 
     chord = np.hypot(change(track.north), change(track.east))
-    # Further than its wheels rolled: the reference jumped.
+    # A chord longer than the distance that the wheels rolled: the reference jumped.
     chord[chord > LONGEST_CHORD * horizon_m] = 0.0
     straight = moving[chord >= np.quantile(chord, 1 - STRAIGHT_SHARE)]
-    del chord  # of a long log each column is large
+    del chord  # a column of a long log is large
     off = np.abs(np.abs(change(track.heading)) - np.pi)
     found = []
     for group in (moving[off <= off.min() + ALIKE_RAD], straight):
@@ -148,8 +148,7 @@ def plan_outages(run: Run, length_s: float, at_s: Sequence[float] = ()) -> tuple
     Raises
     ------
     ConfigError
-        An outage that does not fit into the drive, or into the time between two others, or lies in one that the log
-        has itself.
+        An outage does not fit into the drive or into the time between two others, or overlaps an outage of the log.
     """
     last = float(run.table.t_s[-1])
     if not length_s > 0:
@@ -182,7 +181,7 @@ def force_outages(run: Run, spans_ns: Sequence[tuple[int, int]]) -> tuple[Outage
     """
     setup = set_up_again(run, tuple(spans_ns))
     output = run_ekf(*setup)
-    # An outage at the very start delays the first state of the disturbed run: the last rows are those of both.
+    # An outage at the start delays the first state of the disturbed run: rows are matched from the end.
     rows = min(len(output.x), len(run.table))
     north, east = output.x[-rows:, 0], output.x[-rows:, 1]
     away = np.hypot(north - run.table.north_m[-rows:], east - run.table.east_m[-rows:])
@@ -217,10 +216,9 @@ def _meets(begin_s: Floats, length_s: float, spans_s: Floats) -> Bools:
 
 
 def _spaced(run: Run, length_s: float) -> list[float]:
-    """Return the begins [s] of outages, even in the time the robot moves, after convergence; half of it is to learn.
+    """Return the begins [s] of outages, evenly spaced in the moving time after convergence; half of it stays free.
 
-    Time from which an outage would reach into one of the log's own, a gap in the wheel data or a jump of the reference,
-    is not one to begin in.
+    No outage begins where it would overlap an outage of the log, a gap in the wheel data or a jump of the reference.
     """
     t, last = run.table.t_s, float(run.table.t_s[-1])
     moves = ~standing_states(track_of(run))[:-1]
@@ -236,16 +234,17 @@ def _spaced(run: Run, length_s: float) -> list[float]:
         raise ConfigError("outage", text, "choose a shorter one")
     free = (rest - count * length_s) / (count + 1)
     begins = before + free + np.arange(count) * (length_s + free)
-    # Where the robot stood for a while, the outage begins when it goes on.
+    # If an outage would begin while the robot stands, it begins when the robot moves again.
     return [float(t[place - 1]) for place in np.searchsorted(moved, begins, side="right")]
 
 
 def real_outages(run: Run) -> tuple[Outage, ...]:
     """Return the log's own GNSS outages: open loop with wheels and the ICRs of the last fix before.
 
-    The end error is the distance to the fixes that ended the outage, not to the filter: a filter that drove on with its
-    wheels is as wrong as the open-loop path. An outage that never ends, and one with a gap in the wheel data, has no
-    end error and is left out; so is one that the drive begins with: neither position nor ICRs were known before it.
+    The end error is the distance to the fixes that ended the outage, not to the filter, because the filter used only
+    its wheels in the outage and has the same error as the open-loop path. Three kinds of outages are left out: outages
+    that never end and outages with a gap in the wheel data have no end error; before an outage at the begin of the
+    drive neither position nor ICRs were known.
     """
     track, table, fixes = track_of(run), run.table, run.sensors.fixes
     (forward, right), origin = run.sensors.facts.antenna_m, int(table.stamp_ns[0])
@@ -259,7 +258,7 @@ def real_outages(run: Run) -> tuple[Outage, ...]:
         after = last + int(gaps[0]) if len(gaps) else min(after, len(table) - 1)
         path = open_loop_path(track, *table.icrs_at(first), first, after)
         stamps = table.stamp_ns[first : after + 1]
-        # how far the antenna on the path is from the used fixes since the outage's end
+        # distance from the antenna on the path to each used fix after the outage
         rows = np.flatnonzero(run.gnss.used & (fixes.stamp_ns >= end) & (fixes.stamp_ns <= max(end, stamps[-1])))
         cos, sin = np.cos(path.heading), np.sin(path.heading)
         at, of = (fixes.stamp_ns[rows] - stamps[0]) / 1e9, (stamps - stamps[0]) / 1e9

@@ -1,7 +1,7 @@
-"""Which recorded states open-loop trials start from, and what they are compared with.
+"""Start states of open-loop trials, and the reference that trials are compared with.
 
-From which state on the ICRs were learned; which trials turn; the filter's estimate or the smoother's as the reference,
-and the error that it has itself.
+The module finds the state from which on the ICRs were learned and the trials that turn. The reference is the filter's
+or the smoother's estimate; its own error is computed here, too.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from icrtool.records.plain_data import known
 from icrtool.records.run import ICR_COLUMNS, Run, track_of
 
 STANDING_MPS = 0.01
-"""The robot stands while both tracks are slower than this."""
+"""Speed of both tracks below which the robot stands [m/s]."""
 
 
 def standing_states(track: Track) -> Bools:
-    """Return the states (n,) after which the robot stands; the last state, which has no interval, is none of them."""
+    """Return the states (n,) after which the robot stands; False for the last state, which has no interval."""
     standing: Bools = (np.abs(track.v_left) < STANDING_MPS) & (np.abs(track.v_right) < STANDING_MPS)
     standing[-1:] = False
     return standing
 
 
 def counted_ends(track: Track, horizons_m: Floats, counted: Starts, starts: Ints | None = None) -> Rows:
-    """Return `ends_from` some starts, default all states, those marked that do not count."""
+    """Return `ends_from` some starts, default all states; starts that do not count are marked."""
     starts = starts if starts is not None else np.arange(len(track.distance))
     ends = ends_from(track, horizons_m, starts)
     if counted == "moving":
@@ -54,11 +54,11 @@ def first_learned(run: Run) -> int | None:
 
     Notes
     -----
-    An ICR is learned when its standard deviation has made 90 % of its fall (`icrtool.estimation.convergence`), as
-    Pentzer 2014 (Section 5.2) counts it for the estimate itself. The standard deviation is taken because a trial that
-    starts there does not know the final value yet. An ICR whose standard deviation does not fall by half was known
-    from the start where it is at most `WEAK_SHARE` of y_right - y_left, the limit of "weakly shown", and is never
-    learned otherwise. A warm start has learned the ICRs before the first state.
+    An ICR is learned when its standard deviation has made 90 % of its decrease (`icrtool.estimation.convergence`).
+    Pentzer 2014 (Section 5.2) applies the same criterion to the estimate. The standard deviation is used here because
+    the final estimate is not known at the start of a trial. If the standard deviation of an ICR does not decrease by
+    half, the ICR was known from the start if its standard deviation is at most `WEAK_SHARE` of y_right - y_left, the
+    limit of "weakly shown"; otherwise it is never learned. A warm start has learned the ICRs before the first state.
     """
     if run.began_with is not None:
         return 0
@@ -74,16 +74,16 @@ def first_learned(run: Run) -> int | None:
 
 
 DRAWS = 20_000
-"""Errors drawn a horizon: p95 is then known to 1 %."""
+"""Number of errors drawn for each horizon. With this number p95 is known to 1 %."""
 
 POSE = ("north_m", "east_m", "heading_rad")
 
 GNSS_NIS, HEADING_NIS = 2.0, 1.0
-"""Mean normalised innovation squared where the noise is right: the number of measured components."""
+"""Expected mean NIS of fixes and of headings if the noise is right: the number of measured components."""
 
 
 class DrawnTrials(NamedTuple):
-    """Some trials of one horizon [m], and the states at which they start and end; empty where it has none."""
+    """Trials of one horizon [m]: the states at which they start and end; empty where the horizon has no trial."""
 
     horizon_m: float
     start: Ints
@@ -91,7 +91,7 @@ class DrawnTrials(NamedTuple):
 
 
 def drawn_trials(horizons_m: Floats, ends: Rows) -> list[DrawnTrials]:
-    """Return `DRAWS` trials of each horizon (h,), or none, by the states (h, n) at which those of all starts end."""
+    """Return `DRAWS` trials of each horizon (h,), or none; `ends` (h, n) are the states at which trials end."""
     drawn = []
     for horizon_m, column in zip(horizons_m.tolist(), ends, strict=True):
         start = np.flatnonzero(column >= 0)
@@ -102,12 +102,12 @@ def drawn_trials(horizons_m: Floats, ends: Rows) -> list[DrawnTrials]:
 
 
 def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int) -> tuple[ReferenceRow, ...]:
-    """Return the error that the reference puts into the trials of each horizon.
+    """Return the error in the trials of each horizon that comes from the reference.
 
     Parameters
     ----------
     run : its states are the reference
-    trials : of each horizon, in groups
+    trials : trials of each horizon, in groups
     seed : of the draws, which begin anew with each group
 
     Notes
@@ -117,15 +117,15 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
 
         e = dp_s - dp_e + dpsi_s J D,    J the turn by 90 degrees,
 
-    to first order, with the mean square var(p_s) + var(p_e) + var(psi_s) |D|^2. The variances are those of the filter
-    (or of the smoother, where it is the reference). They follow from the noise of the fixes that the alignment stated
-    or measured; where fixes or headings spread more than that, mean NIS / components > 1, the variances grow by that
-    factor (Birge 1932). Mean and 95th percentile are those of drawn normal errors. Errors of start and end count as
-    independent: what both share, an offset of all fixes, is in no trial, and what they share in part makes the result
-    an upper bound. A heading offset common to the whole log is not in the variances.
+    to first order, with the mean square var(p_s) + var(p_e) + var(psi_s) |D|^2. The variances are taken from the filter
+    (or from the smoother, where it is the reference). They follow from the stated or measured noise of the fixes. If
+    fixes or headings spread more, mean NIS / components > 1, the variances are multiplied by this ratio (Birge 1932).
+    Mean and 95th percentile are computed from drawn normal errors. Errors of start and end are treated as independent.
+    An offset of all fixes cancels in every trial; partly correlated errors make the result an upper bound. A heading
+    offset common to the whole log is not in the variances.
     """
     table, noise = run.table, run.document.filter
-    # Fixes and headings spread by these factors more than the filter assumes, in variance; at least 1.
+    # Ratios of measured to assumed variance of fixes and headings; at least 1.
     position = max((noise.nis_gnss_mean or 0.0) / GNSS_NIS, 1.0)
     heading = max((noise.nis_heading_mean or 0.0) / HEADING_NIS, 1.0)
     every = [one for group in trials for one in group]
@@ -133,7 +133,7 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
     def at_ends(column: Floats) -> list[tuple[Floats, Floats]]:
         return [(column[one.start], column[one.end]) for one in every]
 
-    # one column after the other: a run that was read back may hold none of them
+    # columns are read one after the other: a run that was read back may not hold them in memory
     stds = at_ends(table.std_north_m), at_ends(table.std_east_m), at_ends(table.std_heading_rad)
     generators = (rng for group in trials for rng in repeat(np.random.default_rng(seed), len(group)))
     rows = []
@@ -158,7 +158,7 @@ def reference_error(run: Run, trials: Sequence[Sequence[DrawnTrials]], seed: int
 
 
 def with_smoothed_reference(run: Run) -> Run:
-    """Return a run whose positions and headings are the smoother's.
+    """Return a run with the positions and headings of the smoother.
 
     Raises
     ------
@@ -167,8 +167,8 @@ def with_smoothed_reference(run: Run) -> Run:
 
     Notes
     -----
-    Starts, their ICRs, the wheel speeds and the path length stay the filter's: only where a trial begins, where it
-    points, and what its end is compared with change.
+    Starts, their ICRs, the wheel speeds and the path length are still the filter's. Only the pose at the start of a
+    trial and the position that its end is compared with change.
     """
     if run.smoothed is None:
         raise RunError(run.directory or run.name, "it has no smoothed states", "run icrtool fit --smooth")
@@ -179,7 +179,7 @@ def with_smoothed_reference(run: Run) -> Run:
 SPLIT_HORIZON_M = 5.0
 STRAIGHT_RAD = math.radians(10.0)
 CELLS_A_HORIZON = 20
-"""Cells of path a horizon is cut into, to find the range of the heading."""
+"""Number of cells of path in a horizon, to find the range of the heading."""
 
 SPLIT_MODELS = ("icr", "no_slip")
 
@@ -187,7 +187,8 @@ SPLIT_MODELS = ("icr", "no_slip")
 def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
     """Return the errors of straight and turning trials of `SPLIT_HORIZON_M` (Pentzer 2014, Section 6.4, Figs. 33-34).
 
-    What counts is the range of the heading over the path, so that an S is a turn. A part without trials is left out.
+    A trial turns if the range of the heading over its path is large, so an S-curve is a turn. A part without trials is
+    left out.
     """
     track = track_of(run)
     ends = counted_ends(track, np.array([SPLIT_HORIZON_M]), starts)
@@ -204,9 +205,10 @@ def split_by_turning(run: Run, starts: Starts) -> tuple[TurningSplit, ...]:
 
 
 def heading_range(track: Track, horizon_m: float) -> Floats:
-    """Return how far apart the headings [rad] are from each state (n,) to the one a horizon on, to a cell of path."""
+    """Return the range of the headings [rad] from each state (n,) over one horizon, accurate to a cell of path."""
     size = horizon_m / CELLS_A_HORIZON
-    # A step longer than a horizon counts as a little more than one: a damaged speed fills no memory.
+    # A step longer than a horizon counts as slightly more than one horizon, so that a damaged speed needs no more
+    # memory.
     distance = track.distance
 
     def cells_of(part: Floats) -> Floats:
@@ -216,7 +218,7 @@ def heading_range(track: Track, horizon_m: float) -> Floats:
     steps = np.diff(cells_of(distance[first]), prepend=0.0)
     cell = np.cumsum(np.minimum(steps, CELLS_A_HORIZON + 1.0)).astype(np.int64)
     cells = np.arange(cell[-1] + CELLS_A_HORIZON + 1)
-    # In a cell without a state the heading lies between those around it.
+    # In a cell without a state the heading is interpolated.
     highest, lowest = (
         sliding_window_view(np.interp(cells, cell, extreme.reduceat(track.heading, first)), CELLS_A_HORIZON + 1)
         for extreme in (np.maximum, np.minimum)

@@ -1,4 +1,4 @@
-"""Rows of poses that the robot's own localisation computed: a topic of the log in the trials of the other rows."""
+"""Rows of poses that the robot's own localisation computed: a topic of the log, tested in the trials of the report."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from icrtool.records.text import distance_text
 from icrtool.records.topic_poses import TopicPoses
 
 PIECES = 8
-"""Parts of equal distance of a drive, whose errors are compared with that of the whole drive."""
+"""Number of parts of equal distance. The errors over the parts are compared with the error over the whole drive."""
 
 GROWTH_OF_RANDOM_WALK = math.sqrt(PIECES)
-"""Ratio of the errors over the whole drive and over a part, of a position that drifts as a random walk; a heading that
-drifts makes it larger, a position that is measured makes it about 1."""
+"""Ratio of the error over the whole drive to the error over a part, for a position that drifts as a random walk. With a
+heading that drifts the ratio is larger; with a measured position it is about 1."""
 
 FEWEST_COMPARED, MOST_COMPARED = 200, 4000
-"""States in which a topic is compared with the reference over the whole drive."""
+"""Smallest and largest number of states in which a topic is compared with the reference over the whole drive."""
 
 NOT_OPEN_LOOP = "GNSS or a map while it drives: not open loop"
 GROWS = "not known: computed on the robot; its error grows with distance, as of dead reckoning"
@@ -37,7 +37,7 @@ UNDECIDED = "not known: computed on the robot; whether GNSS or a map is in it do
 
 
 class Departure(NamedTuple):
-    """How far a path departs from the reference, rms [m], after the best turn, scale and shift.
+    """Rms distance [m] of a path from the reference, after the best turn, scale and shift.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Departure(NamedTuple):
 
     @property
     def grows(self) -> bool | None:
-        """Whether the error grows with distance, by two standard deviations; None where neither shows."""
+        """Whether the error grows with distance, by two standard deviations; None where the data do not decide."""
         if not (self.whole_m > 0.0 and self.piece_m > 0.0):
             return None
         log_ratio, drifting = math.log(self.whole_m / self.piece_m), math.log(GROWTH_OF_RANDOM_WALK)
@@ -66,7 +66,7 @@ def topic_rows(run: Run, track: Track, scored: Iterable[TopicPoses]) -> tuple[li
 
     Parameters
     ----------
-    track : of the run's states
+    track : track of the run's states
 
     Raises
     ------
@@ -107,7 +107,7 @@ def topic_rows(run: Run, track: Track, scored: Iterable[TopicPoses]) -> tuple[li
 def _errors(poses: TopicPoses, t: Floats, track: Track, trials: Trials) -> TrialErrors:
     """Return the errors (k, h) of a topic's displacement and turn, position and heading aligned at each start.
 
-    A trial needs poses all along: without one before, after, or across a gap there is none.
+    A trial needs poses along its whole path. Before the first pose, after the last one and across a gap there is none.
 
     Notes
     -----
@@ -152,7 +152,7 @@ def _wheels_depart(run: Run, track: Track, covered: np.ndarray) -> bool:
 
 
 def _compared_rows(track: Track, covered: np.ndarray) -> Ints:
-    """Return the states at equal steps of distance at which a topic has poses and the reference is one."""
+    """Return states at equal steps of distance at which a topic has poses and the reference is usable."""
     rows = rows_at_steps(track.distance, max(float(track.distance[-1]) / MOST_COMPARED, 1e-6))
     return np.asarray(rows[covered[rows] & ~track.in_outage[rows]])
 
@@ -175,7 +175,7 @@ def _departure(place: Complexes, reference: Complexes, distance: Floats) -> Depa
 
 
 def _misfit(place: Complexes, reference: Complexes) -> float:
-    """Return what the best turn, scale and shift of places (n,) leave of a reference (n,), rms [m] (Umeyama 1991)."""
+    """Return the rms distance [m] of places (n,) from a reference (n,) after best turn, scale, shift (Umeyama 1991)."""
     ours, theirs = place - place.mean(), reference - reference.mean()
     size = float(np.vdot(ours, ours).real)
     fitted = ours * (np.vdot(ours, theirs) / size) if size > 0.0 else 0.0

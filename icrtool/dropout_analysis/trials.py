@@ -42,23 +42,26 @@ from icrtool.records.run import Run, track_of
 from icrtool.records.text import counted
 
 LARGEST_TABLE_BYTES = 96 << 20
-"""Errors held at a time, with where their trials end: horizons are taken in groups below it, however long the log."""
+"""Largest memory of the errors held at a time and the ends of their trials [bytes]. Horizons are computed in groups
+that need less, for logs of any length."""
 
 BYTES_A_TRIAL = 12
-"""An error, and where its trial ends."""
+"""Memory of one trial [bytes]: its error and the state at which it ends."""
 
 BULK_IN_P95 = 3.0
+"""Range of the first 50 bins of a histogram, as a multiple of p95."""
+
 MOST_BULKS = 10.0
-"""A histogram has some 50 bins up to three times p95, and no more than ten times as many up to the largest error."""
+"""Largest ratio of the largest error to the range of the first 50 bins. It limits a histogram to some 500 bins."""
 
 SHORTEST_HORIZON_M = 1e-3
-"""Less than what a state is known to."""
+"""Shortest horizon [m]. It is below the accuracy of a state."""
 
 STARTS_AT_ONCE = 1 << 14
-"""Starts tried by a thread at a time."""
+"""Number of starts that a thread computes at a time."""
 
 TRIAL_THREADS = 2
-"""The kernels run beside each other; more threads would need more memory and find little more to do."""
+"""Number of threads that compute trials. More threads need more memory and save little time."""
 
 
 ErrorSink = Callable[[str, Floats, Floats], None]
@@ -77,13 +80,13 @@ def measure_errors(
     sink: ErrorSink | None = None,
     track: Track | None = None,
 ) -> OpenLoopErrors:
-    """Return the errors of all models; parameters and errors are those of `icrtool.dropout`, and more.
+    """Return the errors of all models; other parameters and errors as in `icrtool.dropout`.
 
     Parameters
     ----------
-    further : models that are not the filter's, in addition
-    starts_of_further : states from which theirs, and all heading errors, are measured: nearer ones are copies
-    track : `icrtool.records.run.track_of` the run, where it is at hand: of a long log it is large
+    further : additional models whose numbers do not come from the filter
+    starts_of_further : start states of their trials, and of all heading errors: closer starts give nearly equal trials
+    track : `icrtool.records.run.track_of` the run, where it exists already, because it is large for a long log
     """
     if len(run.table) < 2:
         raise DataError(run.name, f"the run has {counted(len(run.table), 'state')}", "at least two are needed")
@@ -118,7 +121,7 @@ def measure_errors(
                     touching = [None if one is None else one[sparse] for one in slipping]
                 else:
                     errors, tested, touching = _errors(track, model, ends, pool), blocks, slipping
-                # Beside each other, columns of a long log would fill the memory.
+                # One after the other: all columns of a long log together would fill the memory.
                 each = pool.map if together > TRIAL_THREADS else map
                 at_each = partial(_at_horizon, row_of(model.name).spread)
                 rows.extend(each(at_each, group.tolist(), errors.T, of_few.heading.T[columns], tested, touching))
@@ -131,7 +134,7 @@ def measure_errors(
                         of_some, errors = errors, np.full((len(track.distance), len(group)), np.nan)
                         errors[sparse] = of_some
                     sink(model.name, group, errors)
-                del errors  # before those of the next model are made
+                del errors  # frees memory before the next model
             drawn.append(drawn_trials(group, ends))
     by_learning = None
     if before:
@@ -150,9 +153,10 @@ def measure_errors(
 
 
 def _errors_of_few(track: Track, predictors: Sequence[Model | ComparedRow], trials: Trials) -> list[TrialErrors]:
-    """Return the errors (k, h) in some trials by model, of the filter's models those of their turns alone.
+    """Return the errors (k, h) in some trials by model; for the filter's models only heading errors.
 
-    Of all horizons at once: a model drives the log for them once, before the tables of all starts fill the memory.
+    All horizons are computed at once, so that a model drives the log only once. This is done before the tables of all
+    starts need memory.
     """
     none = np.empty((0, trials.ends.shape[1]))
     return [
@@ -255,13 +259,13 @@ def _at_horizon(
     spread: statistics.Spread, metres: float, errors: Floats, turned: Floats, blocks: statistics.Blocks | None,
     slipping: Bools | None,
 ) -> _AtHorizon:  # fmt: skip
-    """Return the errors (n,) of one model at one horizon in numbers; `turned` (k,) are those of its turns [rad].
+    """Return the statistics of one model at one horizon: `errors` (n,) [m], `turned` (k,) errors of its turns [rad].
 
     `slipping` (n,) marks the trials that touch a slip event; `spread` is what is known of other drives.
     """
     ranked = statistics.RankedTrials.of(errors)
     trials, expected, p50, p95, largest = ranked.summary()
-    # Bins that show the bulk of the trials, few outliers apart, in at most some hundred bins.
+    # Bins that show most trials in detail although there are outliers, in at most some hundred bins.
     shown_m = 0.0 if math.isnan(largest) else max(min(largest, BULK_IN_P95 * p95), largest / MOST_BULKS)
     bins = ranked.histogram(statistics.round_bin_width(shown_m))
     sums = statistics.block_sums(errors, blocks, ranked, p50, p95)
@@ -276,7 +280,7 @@ def _at_horizon(
 
 
 def _result(model: Model | ComparedRow, found: Iterable[_AtHorizon]) -> documents.ModelResult:
-    """Return the errors of one model from those at each horizon."""
+    """Return the result of one model from its statistics at each horizon."""
     rows, bins, sums, free = zip(*found, strict=True)
     blocks = []
     for row, one in zip(rows, sums, strict=True):

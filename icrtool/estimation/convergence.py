@@ -10,16 +10,17 @@ from icrtool.records.run_document import IcrColumn
 from icrtool.records.tables import States
 
 ARRIVED_S = 2.0
-"""An estimate has arrived when it stays within 10 % of its final change for this long: an overshoot passes through."""
+"""Time for which an estimate must stay within 10 % of its final change to have converged [s]. An overshoot crosses this
+range faster."""
 
 SMALLEST_CHANGE_M = 0.03
-"""The time of an estimate that moved less than this from its start is that of its standard deviation."""
+"""Smallest change of an estimate that shows its convergence [m]. Below it the standard deviation shows it."""
 
 LEARNED_SHARE = 0.9
-"""Part of its fall after which a standard deviation has fallen, and the ICR is learned."""
+"""Share of the decrease of a standard deviation after which the ICR is learned."""
 
 LEAST_FALL = 0.5
-"""A standard deviation that loses less than this part of itself shows that the drive added nothing to the start."""
+"""Smallest relative decrease of a standard deviation. With less the drive added nothing to the start."""
 
 
 def converge(table: States, until_s: float | None = None) -> dict[IcrColumn, tuple[float, float] | None]:

@@ -1,4 +1,4 @@
-"""From aligned sensors and a configuration to what the kernel needs: times, noises, the start."""
+"""From aligned sensors and a configuration to the arguments of the kernel: times, noises, the start."""
 
 from __future__ import annotations
 
@@ -47,36 +47,36 @@ near to 0 in place of 0.11 m. It costs robots of 0.2 m nothing.
 """
 
 FARTHEST_START_M, LARGEST_START_STD_M = 1000.0, 10_000.0
-"""Bounds of a warm start: those that a configured start has."""
+"""Largest distance of an ICR and largest standard deviation in a warm start [m], as for a configured start."""
 
 GAP_SPEED_STD_MPS = 2.0
 GAP_TURN_STD_RADPS = 1.0
-"""Standard deviation of how far the pose may move in the first second of a gap in the wheel data."""
+"""Standard deviation of the pose's motion in the first second of a gap in the wheel data."""
 
 WHEEL_GAP_IN_INTERVALS = 2.5
-"""Slow wheel streams: an interval is a gap only when it is this many times the usual one."""
+"""Smallest ratio of a gap to the usual interval between wheel samples, for slow streams."""
 
 LEAST_ICR_IN_HALF_WIDTHS = 0.2
-"""The ICRs lie outside the tracks (Pentzer 2014, Section 2); an antenna that is off centre may move them in by this."""
+"""Smallest distance of a y ICR from the centre line, in half track widths. ICRs lie outside the tracks (Pentzer 2014,
+Section 2), but an antenna off centre may shift them."""
 
 EVENT_MARGIN_S = 0.2
-"""A slip event is taken to begin and end by so much earlier and later: where it does is known no better."""
+"""Time by which slip events are extended on both sides [s], because begin and end are uncertain by this time."""
 
 RECOVERY_COUNT = 10
 RECOVERY_S = 1.0
-"""The filter accepts rejected measurements again when so many agree with each other for this long."""
+"""Time for which rejected measurements must agree with each other to be accepted again [s]."""
 
 TURN_WANDER_RAD = math.radians(1.2)
-"""How far a body turns more or less than its wheels show, a random walk [rad/sqrt(s)]: the errors of an attitude
-sensor hide it, estimated headings of 0.1 deg do not, and the ICRs would follow it."""
+"""Random walk of the difference between a body's turn and its wheels' turn [rad/sqrt(s)]. Errors of an attitude sensor
+hide it, but with estimated headings of 0.1 deg the ICRs would follow it."""
 
 CHANGE_S = 0.5
-"""A change of the turn rate takes so long."""
+"""Duration of a change of the turn rate [s]."""
 
 MEMORY_S = 0.5
-"""Estimated headings of 0.1 deg are averaged over this time: followed sample by sample, they teach the ICRs of the
-shortest turns. Tracked robots turn by 2 % more in those than over some metres, wheels of few counts show no turn in
-them."""
+"""Time over which estimated headings of 0.1 deg are averaged [s]. Otherwise the ICRs would be learned from the shortest
+turns. In these, tracked robots turn by 2 % more than over some metres, and encoders with few counts show no turn."""
 
 
 class FilterSetup(NamedTuple):
@@ -95,12 +95,12 @@ class FilterSetup(NamedTuple):
 
 
 def check_start(config: Config) -> None:
-    """Refuse ICRs configured to start on the other side, where the preset keeps the sides.
+    """Refuse configured initial ICRs on the wrong side, if the preset keeps the sides.
 
     Raises
     ------
     ConfigError
-        They are; the key is named.
+        An ICR is on the wrong side; the key is named.
     """
     settings = config.filter
     if not settings.rules.keeps_sides:
@@ -132,9 +132,9 @@ def set_up_filter(
     sensors : the aligned streams
     noise : process noise of the pose, in place of the configured one
     changes_s : terrain changes, seconds since the first recorded state; the ICR covariance is inflated there
-    warm_start : what another run ended with, in place of the configured start
-    outages_ns : half-open spans in which GNSS and heading are taken away
-    start : ICRs that a run started from; default: those of `initial_icrs`
+    warm_start : final ICRs of another run, in place of the configured start
+    outages_ns : half-open spans in which GNSS and heading are left out
+    start : ICRs that a run started from; default: `initial_icrs`
 
     Raises
     ------
@@ -160,7 +160,7 @@ def set_up_filter(
         heading_z=headings.heading_rad[sample],
         heading_r=headings.var_rad2[sample],
         change_t=np.empty(0),
-        # none in an outage that is made: what a run does there must not know what only the fixes showed
+        # no events in a forced outage: the run must not use findings there that came from fixes
         slipping=intervals_in(wheels.stamp_ns, events) & ~intervals_in(wheels.stamp_ns, outages_ns),
     )
     start = initial_icrs(config) if start is None else start
@@ -220,7 +220,7 @@ def _start_state(
 
 
 def _check_warm_start(start: WarmStart) -> None:
-    """Refuse ICRs and a covariance that no run ends with."""
+    """Refuse ICRs and a covariance that cannot be the end of a run."""
     icrs, covariance = np.asarray(start.icrs_m, np.float64), np.asarray(start.covariance_m2, np.float64)
     if icrs.shape != (3,) or not (np.abs(icrs) <= FARTHEST_START_M).all():
         found = ", ".join(f"{value:.4g}" for value in icrs.ravel()[:3])
@@ -231,12 +231,12 @@ def _check_warm_start(start: WarmStart) -> None:
 
 
 def initial_icrs(config: Config) -> IcrStart:
-    """Return the ICRs at the start and their standard deviations: configured, else those of the preset.
+    """Return the ICRs at the start and their standard deviations: configured, else from the preset.
 
-    Nothing of the log is in them. In preset ``field`` they are those of the robot's published skid factor where it has
-    one (`SKID_FACTOR_STD`), else those of skid-steer robots (`USUAL_FACTOR`). There, a
-    configured start inside the tracks is moved out to them: no turn rate that close to W = 0 lets the filter find back
-    in reasonable time. A start far from the tracks is taken to be as uncertain as far.
+    They do not depend on the log. In preset ``field`` they come from the robot's published skid factor where it has one
+    (`SKID_FACTOR_STD`), else from usual skid-steer robots (`USUAL_FACTOR`). In this preset a configured start inside
+    the tracks is moved out to the tracks, because close to W = 0 the filter would need very long to recover. The
+    standard deviation of a start far from the tracks equals its distance from them.
     """
     settings, robot, half = config.filter, config.robot, width_or_usual_m(config.robot.track_width_m) / 2
     factor = None if robot.track_width_m is None else robot.skid_factor
@@ -283,10 +283,10 @@ def _samples_that_err_alike(sensors: SensorData, noise: ProcessNoise) -> float:
     Notes
     -----
     An error with correlation exp(-|t|/tau), sampled much faster than tau, averages over time T like T / (2 tau)
-    independent samples. Precise headings of variance s^2 that err alike over tau, in process noise of density q, leave
-    sqrt(2 tau s^2 q): with tau = s^2 / (2 q) the filter becomes as certain as the estimate, and no more. Its memory is
-    then sqrt(2 tau s^2 / q): at least `MEMORY_S` with the usual noise. All headings count: what an outage takes away
-    must not change how the rest is weighed.
+    independent samples. With precise headings of variance s^2 and correlation time tau, and process noise of density q,
+    the filter's variance is sqrt(2 tau s^2 q). With tau = s^2 / (2 q) it equals s^2, the variance of the estimate. The
+    filter's memory is then sqrt(2 tau s^2 / q), at least `MEMORY_S` with the usual noise. All headings count, so that
+    an outage does not change the weights of the other headings.
     """
     tau_s, stamps = sensors.facts.heading_correlation_s, sensors.headings.stamp_ns
     if sensors.facts.headings_are_precise:
@@ -303,9 +303,10 @@ def _samples_that_err_alike(sensors: SensorData, noise: ProcessNoise) -> float:
 def _response_variance(data: FilterInputs, width_m: float) -> Floats:
     """Return the growth of the heading's variance while the wheels change the turn rate (n,) [rad^2/s].
 
-    A body answers its wheels later than they turn, or slips less before it does: each change of the turn rate moves the
-    heading by up to `RESPONSE_S` times that change. Within a change these errors have one sign, so that white noise as
-    large as a step's own error would leave most of it to the ICRs. `width_m` is the ICRs' separation.
+    A body follows its wheels with a delay, or slips less at first. Each change of the turn rate therefore moves the
+    heading by up to `RESPONSE_S` times this change. Within a change the errors of all steps have one sign, so white
+    noise with the size of a single step's error would be too small, and most of the error would go into the ICRs.
+    `width_m` is the ICRs' separation.
     """
     t = data.wheel_t
     turned = np.concatenate([[0.0], np.cumsum((data.v_left - data.v_right)[:-1] * np.diff(t))]) / width_m

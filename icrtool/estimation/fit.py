@@ -38,14 +38,14 @@ def fit_filter(
     Notes
     -----
     The EKF of Pentzer 2014, Eqs. 13-25, event by event; ``filter.preset`` chooses between the paper's constants and
-    start (``paper``) and those made for field logs (``field``).
+    start (``paper``) and constants for field logs (``field``).
     """
     begin = watch if watch is not None else lambda _: None
     begin("aligning")
     log = choose_reference(log, config)
     measurements = align(log, config)
     inputs, datum, rejected = log.inputs, log.datum, log.rejected_fixes
-    # Its columns that the filter does not use take as much memory as half of the states.
+    # The log's columns that the filter does not use need half of the memory of the states.
     del log
     begin("filter")
     filtered = run_filter(measurements.sensors, config, warm_start=warm_start, changes_s=request.changes_s)
@@ -71,13 +71,13 @@ def fit_filter(
 
 
 SAME_JUMP_NS = 10**9
-"""Jumps closer together than this are one: no trial fits between them."""
+"""Time between two jumps below which they count as one [ns]. No trial fits between them."""
 
 FOLLOWED_SIGMAS, FOLLOWS_WITHIN_S = 3.0, 5.0
-"""The filter has followed where its estimate is this near to a fix; it takes no longer than this."""
+"""Distance to a fix, in standard deviations, at which the filter has followed it, and the longest time for it [s]."""
 
 BRIDGED = 0.25
-"""Steps whose sum is less than this part of the largest have taken each other back."""
+"""Ratio of the sum of steps to the largest step below which the steps cancel each other."""
 
 
 def followed_jumps(
@@ -88,12 +88,12 @@ def followed_jumps(
     Parameters
     ----------
     sensors : with the jumps of fixes and headings
-    gnss, heading : what the filter did with them
+    gnss, heading : outcome of fixes and headings in the filter
 
     Notes
     -----
-    A filter that rejects fixes drives on with its wheels, and jumps when it follows them again. Where they have come
-    back by then it does not jump at all.
+    A filter that rejects fixes continues with its wheels, and jumps when it follows the fixes again. If the fixes have
+    come back by then, it does not jump.
     """
     used = gnss.stamp_ns[gnss.used], heading.stamp_ns[heading.used]
     noise = np.sqrt(sensors.fixes.var_north_m2 + sensors.fixes.var_east_m2)
@@ -109,14 +109,14 @@ def followed_jumps(
         end = jump.end_ns if jump.kind == "heading" else _first_from(near, jump.end_ns)
         return msgspec.structs.replace(jump, end_ns=min(end, jump.end_ns + round(FOLLOWS_WITHIN_S * 1e9)))
 
-    # the filter follows nothing between the jumps of one rejection
+    # between the jumps of one rejection the filter does not follow the reference
     spans = [
         settled(one)
         for one in _joined([followed(jump) for jump in sensors.jumps], -1)
-        # steps that have taken each other back are no jump
+        # steps that cancel each other are no jump
         if one.kind == "heading" or math.hypot(one.moved_north_m, one.moved_east_m) >= BRIDGED * one.size_m
     ]
-    # what is decided takes in what is undecided about it
+    # a decided jump includes the undecided jumps around it
     decided = _joined([one for one in spans if not one.undecided], SAME_JUMP_NS)
     begins, free = [one.begin_ns for one in decided], []
     for one in spans:
@@ -135,7 +135,7 @@ def _first_from(stamps: Ints, at: int) -> int:
 
 
 def _joined(jumps: list[ReferenceJump], near_ns: int) -> list[ReferenceJump]:
-    """Return jumps, each joined to the one before where it begins at most so long after its end."""
+    """Return jumps, each joined to the one before where it begins at most `near_ns` after its end."""
     found: list[ReferenceJump] = []
     for jump in sorted(jumps, key=attrgetter("begin_ns")):
         if not found or jump.begin_ns > found[-1].end_ns + near_ns:

@@ -1,4 +1,4 @@
-"""What a drive shows of the ICRs: the information it holds, what to drive next, and how far its stretches disagree."""
+"""What a drive shows of the ICRs: its information, what to drive next, and the disagreement of its stretches."""
 
 from __future__ import annotations
 
@@ -24,28 +24,35 @@ from icrtool.records.run_document import ExcitationDocument, Excited, NumberByIc
 from icrtool.records.tables import States
 
 STATE_WINDOW_M, WINDOW_IN_SEPARATIONS = 2.0, 3.0
-"""Distance of the wheels, spins included, over which displacement and turn are compared: this, or so many times
-y right - y left where that is less. Slip is a share of the distance: over 2 m it hides the ICRs of a robot of 0.2 m."""
+"""Distance of the wheels, with spins, over which displacement and turn are compared: the smaller of this distance [m]
+and this multiple of y right - y left. Slip is a share of the distance; over 2 m it hides the ICRs of a robot of 0.2
+m."""
 
 STRETCH_IN_WINDOWS = 10.0
-"""Windows of one stretch err alike: slip, ground and heading errors last for some metres."""
+"""Number of windows in a stretch. Errors within a stretch are correlated, since slip, ground and heading errors last
+for some metres."""
 
 WIDTH_M = 1.0
-"""Track width of the terms here: any will do, the ICRs do not depend on it."""
+"""Track width of the terms here [m]. The ICRs do not depend on its value."""
 
 HEADING_BIAS_RAD = math.radians(1.0)
 SCALE_ERROR = 0.02
-"""What is never known better before a drive: the heading's offset, and the wheels' scales, both and their difference.
-A circle alone cannot separate the ICRs from these."""
+"""Standard deviation of the wheels' scale, and of the difference of the sides' scales, before a drive. A circle alone
+does not separate the ICRs from these scales and the heading's offset."""
 
 Y_OF_STRETCH, X_OF_STRETCH = 0.04, 0.1
-"""How far the ICRs of one stretch are expected to lie from those of the drive, in parts of y right - y left, before a
-drive: ground and slip. x_icr moves with the speed of a turn as well: the prior of side slip, 0.1 s over a turn gain of
-0.6 (`icrtool.motion.models`), is 0.1 of 0.9 to 1.8 m at 0.5 to 1.1 m/s."""
+"""Prior standard deviation of a stretch's ICRs from the drive's ICRs by ground and slip, as a share of y right - y
+left.
 
-SLIPS, LEAST_SLIP = 0.4, 0.25
-"""A robot whose ICRs lie so much further apart than its tracks, in parts of b, slips as others do. One whose wheels
-roll has less slip to vary; at least this part of it."""
+x_icr also changes with the speed of a turn: the prior of side slip, 0.1 s over a turn gain of 0.6
+(`icrtool.motion.models`), is 0.1 of 0.9 to 1.8 m at 0.5 to 1.1 m/s."""
+
+SLIPS = 0.4
+"""Excess of y right - y left over the track width, as a share of b, from which on a robot has the usual slip. With less
+slip, its variation is smaller in proportion."""
+
+LEAST_SLIP = 0.25
+"""Smallest variation of slip, as a share of the usual variation, for a robot whose wheels roll."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +61,12 @@ class StateWindows(Windows):
 
     Attributes
     ----------
-    residuals : (3 w,) forward, right [m] and turn [rad] of the wheels' motion less that of the states
+    residuals : (3 w,) forward, right [m] and turn [rad] of the wheels' motion minus the states' motion
     jacobian : (3 w, 6) by y_icr_right, y_icr_left, x_icr [m], heading offset [rad], scale of both wheels, difference
     turned_rad : (w,) turn by the wheels; end_m : (w,) their distance at the end; stretch : (w,) number of its stretch
     distance_m : of the wheels, whole drive
-    separation_m : y right - y left of the ICRs that the wheels' motion is by
-    noise : (3,) standard deviation that the states give to each kind of residual
+    separation_m : y right - y left of the ICRs that give the wheels' motion
+    noise : (3,) standard deviation of each kind of residual by the noise of the states
     """
 
     residuals: Floats
@@ -75,7 +82,7 @@ class StateWindows(Windows):
 def cut_states(table: States, track: Track, track_width_m: float | None) -> StateWindows:
     """Return windows of states that follow one another, with the motion by constant ICRs.
 
-    Those are the run's final ones where they can be, else those of the track width.
+    The ICRs are the run's final ones where they are possible, else ICRs from the track width.
 
     Parameters
     ----------
@@ -122,7 +129,7 @@ def cut_states(table: States, track: Track, track_width_m: float | None) -> Stat
 
 
 def prior_std(width_m: float) -> Floats:
-    """Return the standard deviations (6,) of what `StateWindows.jacobian` is by, before a drive."""
+    """Return the standard deviations (6,) of the parameters in `StateWindows.jacobian` before a drive."""
     return np.array([width_m, width_m, width_m, HEADING_BIAS_RAD, SCALE_ERROR, SCALE_ERROR])
 
 
@@ -134,33 +141,38 @@ def final_covariance(
     track_width_m: float | None = None,
     since_s: float = 0.0,
 ) -> Floats:
-    """Return the covariance (3, 3) of the final ICRs [m^2]: from how much the stretches of their drive differ.
+    """Return the covariance (3, 3) of the final ICRs [m^2], from the differences between stretches of the drive.
 
     Parameters
     ----------
     windows : with the final ICRs; y right - y left is the prior's standard deviation, too
-    filter_covariance : (3, 3) of the ICRs at the end, and
-    process_icr_mps : process noise of the filter: both give how fast it forgets
+    filter_covariance : (3, 3) of the ICRs at the end; with the process noise it gives the filter's memory
+    process_icr_mps : process noise of the filter
     track_width_m : b; None: not known
-    since_s : of the last terrain change: what was driven before shows other ICRs
+    since_s : time of the last terrain change; the drive before shows other ICRs
 
     Notes
     -----
-    The filter's own variance is that of constant ICRs in noise as large as its process noise: four times too wide on
-    even ground, and it holds no slip that varies along the drive. Here it is the sandwich covariance (Liang and Zeger
-    1986) of a fit over the windows, clustered by stretches of `STRETCH_IN_WINDOWS`, heading offset and wheel scales
-    marginalised, with one stretch's worth of what stretches are expected to differ by (`Y_OF_STRETCH`). Its residuals
-    are those of the final ICRs, so that a fit that would end elsewhere counts too; their scale is no less than the
-    noise of the states, which follow poor fixes only slowly. A window weighs exp(-distance since / D): D = P / q is the
-    memory of a Kalman filter with variance P and process noise q by distance.
+    The filter's own covariance assumes that the ICRs vary with its process noise. On even ground its variance is four
+    times too large, and it does not include slip that varies along the drive. Here the result is the sandwich
+    covariance (Liang and Zeger 1986) of a fit over the windows, clustered by stretches of `STRETCH_IN_WINDOWS`, with
+    heading offset and wheel scales marginalised. The expected difference between stretches (`Y_OF_STRETCH`) is added
+    with the weight of one stretch. The residuals are computed with the final ICRs, so that a difference between filter
+    and fit increases the covariance. Their scale is at least the noise of the states, because states follow poor fixes
+    only slowly. The weight of a window is exp(-distance since / D), where D = P / q is the memory of a Kalman filter
+    with variance P and process noise q by distance.
 
-    Coverage of 2 standard deviations, combined for pairs. Five recorded Warthog drives on grass and asphalt and one of
-    a Husky, parts of one log: halves y 11 of 12, x 5 of 6; thirds y 27 of 28, x all of 14; quarters y 50 of 52, x all
-    of 26. Four logs on grass: y 11 of 12, x all of 6; halves of different ones 78 %. 49 drives of simulated contact
-    physics on even ground, with three kinds of heading: halves y 98 to 99 %, 0.5 to 0.56 of it (rms), x all. 117
-    simulated drives with random sensors and faults, against the same filter on true poses of the same drive: y all,
-    x 98 %; that truth has the drive's own slip, and is nearer than another drive. Halves of recorded drives, which
-    hold other turns at other speeds, are the least certain, x_icr above all.
+    Coverage of 2 standard deviations, combined for pairs:
+
+    - Parts of one log, five recorded Warthog drives on grass and asphalt and one of a Husky: halves y 11 of 12, x 5 of
+      6; thirds y 27 of 28, x all of 14; quarters y 50 of 52, x all of 26.
+    - Four logs on grass: y 11 of 12, x all of 6; halves of different logs 78 %.
+    - Halves of 49 drives of simulated contact physics on even ground, with three kinds of heading: y 98 to 99 %, rms
+      difference 0.5 to 0.56 of the standard deviation, x all.
+    - 117 simulated drives with random sensors and faults, compared with the same filter on true poses of the same
+      drive: y all, x 98 %. This reference contains the drive's own slip, so it is closer than another drive.
+
+    Halves of recorded drives are the least certain, most of all in x_icr, because they have different turns and speeds.
     """
     width_m, kept = windows.separation_m, windows.track.t[windows.begin] >= since_s
     if np.count_nonzero(kept) < 2:
@@ -186,21 +198,27 @@ def multiplier_std(covariance: Floats, track_width_m: float) -> float:
 SPIN_BOTH = "drive two full turns on the spot to the right and two to the left"
 
 SLIP_SHARE = 0.03
-"""Part of distance and of turn that slips differently from one window to the next."""
+"""Standard deviation of slip from window to window, as a share of distance and of turn."""
 
 SHOWN_SHARE, WEAK_SHARE = 0.03, 0.1
-"""Standard deviations in parts of y right - y left up to which an ICR is shown, and weakly."""
+"""Largest standard deviations of an ICR that is shown, and of an ICR that is weakly shown, as shares of y right - y
+left."""
 
 AT_LIMIT = 1.1
-"""A y ICR within this many times the filter's limit is the limit, not an estimate."""
+"""Ratio of a y ICR to the filter's limit below which it is the limit and not an estimate."""
 
 TURNS_NEEDED_RAD = math.pi
-STEERS, SURELY_TURNED_RAD = 0.1, 0.1
-"""Sides that turn by less than this part of what the robot turns do not turn it; and more than headings err."""
+STEERS = 0.1
+"""Ratio of the turn by the sides to the robot's turn below which the sides do not turn the robot."""
+
+SURELY_TURNED_RAD = 0.1
+"""Smallest turn that counts for this ratio [rad]. It is larger than the error of headings."""
+
 ONE_DIRECTION = 0.15
-"""Turns are in one direction where those to the other side are less than this share of them."""
+"""Ratio of the turns to one side to the turns to the other below which a drive turns in one direction."""
+
 SPIN_RATIO = 3.0
-"""A turn counts as a spin where the sides differ by this many times their mean."""
+"""Ratio of the sides' difference to their mean from which on a turn is a spin."""
 
 
 def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> ExcitationDocument:
@@ -209,7 +227,7 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
     Parameters
     ----------
     windows : of the recorded states
-    unlearned : of `unlearned_icrs`, which are not shown, whatever the drive could
+    unlearned : result of `unlearned_icrs`; these ICRs are not shown, even if the drive could show them
 
     Notes
     -----
@@ -242,12 +260,12 @@ def find_excitation(windows: StateWindows, unlearned: Mapping[str, str]) -> Exci
 
 
 def _turns(track: Track, width_m: float) -> tuple[Floats, Bools]:
-    """Return how far a robot turns with each wheel sample (n,) [rad], and which of these turns are spins."""
+    """Return the turn of a robot with each wheel sample (n,) [rad], and which of these turns are spins."""
     turns, spins = np.empty(len(track.t)), np.empty(len(track.t), np.bool_)
     for lo in range(0, len(track.t), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE)
         left, right = track.v_left[some], track.v_right[some]
-        # noise of standing encoders is no turn
+        # noise of encoders at rest is no turn
         moving = np.abs(left) + np.abs(right) > 0.02
         turns[some] = np.where(moving, track.held[some] * (left - right) / width_m, 0.0)
         spins[some] = np.abs(left - right) > SPIN_RATIO * np.abs(left + right) / 2
@@ -277,7 +295,7 @@ def unlearned_icrs(table: States, *, std_m: Floats, least_icr_m: float) -> dict[
 def _lacking(
     stds: dict[str, float], verdicts: dict[str, Excited], right: float, left: float, windows: StateWindows
 ) -> list[Note]:
-    """Return findings: what is not shown, why, and what to drive."""
+    """Return findings about ICRs that are not shown: the reason, and what to drive."""
     lacking = [name for name, verdict in verdicts.items() if verdict != "shown"]
     if not lacking:
         return []

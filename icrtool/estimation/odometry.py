@@ -20,15 +20,15 @@ from icrtool.records.run_document import DriveDocument
 from icrtool.records.tables import Icrs, States
 
 SHORTEST_STEP_M, STEP_IN_STD = 0.1, 5.0
-"""Chords of the driven path are at least this long, and so many standard deviations of the position."""
+"""Smallest length of a chord of the driven path, in metres and in standard deviations of the position."""
 
 LEAST_MODELLED = 0.5
-"""Part of a chord that the model shows where the speed within it is the model's."""
+"""Ratio of the model's distance to a chord from which on the speed within the chord follows the model."""
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryPath:
-    """Where wheel speeds alone lead from the first recorded state.
+    """Path by wheel speeds alone from the first recorded state.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ OdometryName = Literal["icr", "no_slip"]
 
 
 def odometry_icrs(run: Run) -> dict[OdometryName, Icrs]:
-    """Return the constant ICRs of a run's odometries: its final ones, and where b is known those of no slip."""
+    """Return the constant ICRs of a run's odometries: its final ICRs, and where b is known the ICRs without slip."""
     icrs: dict[OdometryName, Icrs] = {"icr": run.table.icrs_at(-1)}
     return icrs if run.track_width_m is None else icrs | {"no_slip": no_slip_icrs(run.track_width_m)}
 
@@ -60,12 +60,12 @@ def drive_wheels(table: States, in_gap: Bools, icrs: Icrs, every: int = 1) -> Od
     table : the recorded states
     in_gap : bool (n,), whether the interval after a state is a gap in the wheel data
     icrs : the run's final ones, or `no_slip_icrs`
-    every : the path is kept at the first state, at so many states each, and at the last
+    every : number of states between two kept points of the path; the last state is kept, too
 
     Notes
     -----
-    Nobody knows what the wheels did in a gap. The filter's displacement stands in for it, turned by the heading error
-    that the odometry has gathered so far, so that a gap neither adds an error nor forgives one.
+    The motion of the wheels in a gap is not known. The filter's displacement replaces it, turned by the heading error
+    of the odometry at the begin of the gap, so that a gap does not change the error.
     """
     kept = np.append(np.arange(0, len(table) - 1, every), len(table) - 1)
     path = OpenLoopPath(*np.empty((3, len(kept))))
@@ -85,7 +85,7 @@ def _pieces(table: States, in_gap: Bools, icrs: Icrs) -> Iterator[tuple[slice, O
         north, east, psi = float(track.north[first]), float(track.east[first]), float(track.heading[first])
         cos, sin = math.cos(turned), math.sin(turned)
         if first:
-            # The error at the gap's begin is carried over it: the displacement turned by `turned`, less itself.
+            # The heading error at the gap's begin rotates the displacement: rotated displacement minus displacement.
             step_north, step_east = north - float(track.north[first - 1]), east - float(track.east[first - 1])
             miss_north += step_north * cos - step_east * sin - step_north
             miss_east += step_north * sin + step_east * cos - step_east
@@ -145,7 +145,7 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
     rows = chord_rows(north, east, max(SHORTEST_STEP_M, STEP_IN_STD * noise))
     chords = np.hypot(np.diff(north[rows]), np.diff(east[rows]))
     if rows[-1] != len(table) - 1:
-        # what is left at the end is shorter than a step, and counts for nothing
+        # the rest at the end is shorter than a step and does not count
         rows, chords = np.append(rows, len(table) - 1), np.append(chords, 0.0)
     distance = float(chords.sum())
     modelled, lasted = np.diff(table.distance_m[rows]), np.diff(table.t_s[rows])
@@ -164,14 +164,14 @@ def drive_summary(table: States, jumps: Iterable[ReferenceJump] = ()) -> DriveDo
 
 
 LONGEST_GYRO_HOLE_S = 1.0
-"""A gyro silent for longer than this is not trusted."""
+"""Longest time without a sample in a gyro that is used [s]."""
 
 
 def measured_headings(run: Run) -> Iterator[MeasuredHeading]:
-    """Yield the headings measured apart from the position reference, a gyro's before an attitude sensor's.
+    """Yield the headings measured independently of the position reference, a gyro's before an attitude sensor's.
 
-    A heading that needs positions is left out (estimated, or a field of the position's messages), like one that does
-    not cover the run.
+    A heading that needs positions (estimated, or a field of the position's messages) is left out, and a heading that
+    does not cover the run.
     """
     sensors = run.sensors
     stamps = run.table.stamp_ns

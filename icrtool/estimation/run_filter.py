@@ -36,31 +36,31 @@ from icrtool.records.samples import WheelSamples
 from icrtool.records.tables import States
 
 OUTAGE_S = 2.0
-"""Longer than this without a usable fix is a GNSS outage."""
+"""Shortest GNSS outage [s], a time without a usable fix."""
 
 OUTAGE_IN_INTERVALS = 5.0
-"""... and at least this many times the usual interval between fixes."""
+"""Shortest GNSS outage, in usual intervals between fixes. Both limits must be exceeded."""
 
 
 LONGEST_CARRY_S, CLEARLY = 1.0, 2.0
-"""A precise heading is carried on by the wheels for less than this, and where it is so many times as certain as the
-filter's own: among noisy fixes it is not."""
+"""Longest time for which a precise heading is extended by the wheels' turn [s], and smallest ratio of the filter's
+standard deviation to its own. With a smaller ratio the filter's heading is kept."""
 
 LEAST_WHEEL_TRAVEL_M = 0.1
-"""Wheels that travel less than this to and fro have not turned."""
+"""Distance that wheels roll forward and backward together, below which they have not turned [m]."""
 
 FAR_IN_SIGMAS = 6.0
-"""Positions that spread by more than this many of their standard deviations have moved."""
+"""Spread of positions, in their standard deviations, above which the robot has moved."""
 
 
 class Filtered(NamedTuple):
-    """What the filter made of the sensors; the names are those of `icrtool.records.run.Run`.
+    """Results of the filter, with the names of `icrtool.records.run.Run`.
 
     Attributes
     ----------
     covariance : (6, 6) at the end
     noise : process noise of the pose that the run was made with
-    least_icr_m : what the filter kept the y ICRs from the centre line; -inf: anywhere
+    least_icr_m : smallest distance of the y ICRs from the centre line in the filter; -inf: no limit
     began_with : ICRs and covariance of the warm start, None without one
     icr_start : ICRs that it started from where there is no warm start
     changes_s : terrain changes, seconds since the first recorded state, in order
@@ -168,7 +168,8 @@ def noise_of(run: Run) -> ProcessNoise:
 
 
 TOLERATED_NIS = 1.25
-"""Mean NIS of a stream, each counted up to its gate, per degree of freedom: 1 is expected where the noise is right."""
+"""Largest mean NIS of a stream per degree of freedom, each NIS limited to its gate. 1 is expected with the right
+noise."""
 
 STEP = 2.0
 LARGEST_POSITION_MPS = 10.0
@@ -178,7 +179,8 @@ TAIL_DEGREES = 4.0
 """Degrees of freedom of Student's t: Lange, Little and Taylor 1989 recommend it where outliers are few but gross."""
 
 LIKE_COST = 0.1
-"""Costs that differ by less than this a measurement are alike: it is what 5 % of error in both deviations costs."""
+"""Largest difference of two costs per measurement that count as equal. An error of 5 % in both deviations costs
+this."""
 
 MOST_ROUNDS = 3
 
@@ -186,7 +188,7 @@ Moving = tuple[Bools, Bools]
 """Which fixes (m,) and which headings (h,) were measured while the wheels turned."""
 
 MOST_SEARCHED_SAMPLES = 60_000
-"""Wheel samples the search looks at: ten minutes at 100 Hz."""
+"""Largest number of wheel samples in the search: ten minutes at 100 Hz."""
 
 
 def run_adaptively(
@@ -252,18 +254,19 @@ def find_noise(
     headings: bool,
     largest_degps: float = LARGEST_HEADING_DEGPS,
 ) -> ProcessNoise:
-    """Return the smallest process noise, from `start` up by doubling, whose cost is that of the best one.
+    """Return the smallest process noise, from `start` up by doubling, whose cost equals the smallest cost.
 
     Parameters
     ----------
     cost : by noise, see `innovation_cost`
     positions, headings : whether the noise of the position, and of the heading, is searched for
-    largest_degps : of the heading: what the turns of the wheels miss of its own turns
+    largest_degps : upper limit of the heading's noise: difference between the turns of heading and wheels
 
     Notes
     -----
-    One coordinate after the other, each over all its doublings: too small a noise rejects nearly all measurements, and
-    the first doublings may change nothing. Smallest: a noise whose cost is within `LIKE_COST` of the least is as good.
+    The coordinates are searched one after the other, each over all its doublings: with too small a noise nearly all
+    measurements are rejected, and the first doublings may change nothing. Costs within `LIKE_COST` of the smallest cost
+    count as equal.
     """
     cost_of = functools.cache(cost)
     largest = (LARGEST_POSITION_MPS if positions else 0.0, largest_degps if headings else 0.0)
@@ -284,7 +287,7 @@ def find_noise(
 
 
 def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float:
-    """Return what the innovations of a run cost: the mean over the fixes, and that over the headings, added.
+    """Return the cost of the innovations of a run: the mean over the fixes plus the mean over the headings.
 
     Parameters
     ----------
@@ -294,8 +297,9 @@ def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float
     -----
     Twice the negative log-likelihood of innovations with covariance S under Student's t with nu = `TAIL_DEGREES`,
     without its constant: (nu + d) ln(1 + NIS / nu) + ln det S, rejected ones included (Lange, Little and Taylor 1989).
-    A normal likelihood raises the noise for a few gross errors. One that ends at the gate is least where everything
-    is rejected. Means: samples of a fast stream err alike, so that their number is no weight.
+    A normal likelihood would raise the noise for a few gross errors. A likelihood limited to the gate would be best
+    where all measurements are rejected. Means are used because errors of a fast stream's samples are correlated, so
+    that their number must not be a weight.
     """
     fixes = output.gnss_code > UNSEEN
     headings = (output.heading_code > UNSEEN) & (output.heading_nis > 0.0)
@@ -311,7 +315,7 @@ def innovation_cost(output: FilterOutput, moving: Moving | None = None) -> float
 
 
 def _states(wheels: WheelSamples, output: FilterOutput) -> States:
-    """Return the recorded states; their columns are those of the output, whose variances become deviations."""
+    """Return the recorded states from the columns of the output; its variances are converted to deviations in place."""
     first = len(wheels.stamp_ns) - len(output.x)
     stamps = wheels.stamp_ns[first:]
     std = np.maximum(output.variance, 0.0, out=output.variance)
@@ -328,9 +332,10 @@ def _states(wheels: WheelSamples, output: FilterOutput) -> States:
 
 
 def carry_headings(table: States, sensors: SensorData, used: Bools) -> None:
-    """Carry the headings (h,), where they are precise and `used` (h,), on by the wheels' turn; changes the states.
+    """Extend precise and `used` headings (h,) by the wheels' turn, as headings of the states; changes the states.
 
-    The filter averages them to learn the ICRs; each of them is nearer to the body's heading than their average.
+    The filter averages headings to learn the ICRs, but a single heading is closer to the body's heading than the
+    average.
     """
     if not (sensors.facts.headings_are_precise and used.any()):
         return
@@ -382,12 +387,12 @@ def smooth(run: Run) -> States:
     Returns
     -------
     States
-        One row per state of the run, at the same stamps. The path length is that of the smoothed ICRs.
+        One row per state of the run, at the same stamps. The path length is computed with the smoothed ICRs.
 
     Notes
     -----
-    The filter's noises are the smoother's: where the wheels contradict the reference, the smoothed ICRs still follow
-    process noise of `filter.process_icr_mps`.
+    The smoother uses the filter's noises: where the wheels contradict the reference, the smoothed ICRs still vary with
+    the process noise `filter.process_icr_mps`.
     """
     setup = set_up_again(run)
     smoothed = run_smoother(*setup)

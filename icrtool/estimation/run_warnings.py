@@ -1,4 +1,4 @@
-"""What a user should know before trusting a run, as findings."""
+"""Findings that a user needs before trusting a run."""
 
 from __future__ import annotations
 
@@ -21,40 +21,46 @@ from icrtool.records.run_document import ExcitationDocument
 from icrtool.records.tables import States
 
 MULTIPLIERS = (0.9, 6.0)
-"""ICRs nearer to each other, or further apart, in parts of the track width, are no robot's that slips."""
+"""Smallest and largest distance between the ICRs of a robot that slips, in track widths."""
 
-ROLLS, ROLLS_STD = 0.02, 0.05
-"""A robot whose ICRs are as far apart as its tracks, within this or two standard deviations of at most the second, does
-not slip in turns: track widths are measured no better."""
+ROLLS = 0.02
+"""Largest difference of the multiplier from 1, if two standard deviations are smaller, at which a robot does not slip
+in turns. Track widths are measured no more accurately."""
+
+ROLLS_STD = 0.05
+"""Largest standard deviation of the multiplier for this finding."""
 
 LOPSIDED_M, LOPSIDED_SIGMAS = 0.05, 3.0
-"""ICRs whose middle is off by more than this are not treated as even ones."""
+"""Distance of the ICRs' middle from the sensor above which they are not symmetric: in metres and in standard
+deviations, the larger one."""
 
 USUAL_X_M = 0.15
-"""Skid-steer robots have their x_icr within about this of the body origin (Pentzer 2014: 0.06 and 0.14 m)."""
+"""Usual largest distance of x_icr from the body origin for skid-steer robots [m] (Pentzer 2014: 0.06 and 0.14 m)."""
 
 TWIST_SIGMAS = 2.0
-"""A body twist turns as the robot does where the separation of its ICRs is not larger than the track width by so many
-standard deviations: its controller knows the slip, or it is fused with a gyro."""
+"""Excess of the ICRs' separation over the track width, in standard deviations, below which a body twist turns as the
+robot does. Its controller then corrects the slip, or the twist is fused with a gyro."""
 
 WORTH_WARNING_SHARE = 0.1
 DELAY_SIGMAS = 3.0
 LARGEST_TURN_LEFT, LEFT_SIGMAS = 0.5, 2.0
-"""Wheels explain almost none of the turns where more than this share of their variance is left, by so many standard
-deviations."""
+"""Unexplained share of the turns' variance above which wheels explain almost none of the turns, and the number of
+standard deviations by which it must be above."""
 
 USELESS_HEADING_DEGPS = 50.0
-"""The heading by wheels with more noise than this errs by 5 deg after a second."""
+"""Heading noise above which the wheels are useless for turns [deg/s]. The heading by wheels then errs by 5 deg after 1
+s."""
 
 CONTRADICTION_SIGMAS, CONTRADICTION_SHARE = 3.0, 0.1
-"""Estimates of a y ICR that differ by more than both, the second in parts of the separation, contradict each other."""
+"""Difference of two estimates of a y ICR above which they contradict each other: in standard deviations, and as a share
+of the separation. Both must be exceeded."""
 
 UNUSABLE_SHARE = 0.3
-"""With more than this share of the fixes, or of the headings, rejected, the filter did not follow them."""
+"""Share of rejected fixes or headings above which the filter did not follow them."""
 
 REJECTED = {"fixes": "fixes_rejected", "headings": "headings_rejected"}
 MOSTLY_REJECTED = {"fixes": "fixes_mostly_rejected", "headings": "headings_mostly_rejected"}
-"""Codes of rejected measurements, by what is rejected; the second where the run is not usable for them."""
+"""Codes of findings about rejected fixes and headings; `MOSTLY_REJECTED` is for a run that is not usable."""
 
 
 def unusable_reasons(
@@ -75,10 +81,10 @@ def unusable_reasons(
     ----------
     rejected : `rejected_share` of the fixes, and of the headings
     contradiction : of `contradicts_windows`
-    filtered : how the wheels show that a filter made them; nothing else is then worth a reason
+    filtered : evidence that a filter made the wheel speeds; it is then the only reason
     twist_separation : (y_r - y_l) / b by a body twist that was converted with b, and its standard deviation; None for
         other wheels
-    wheels : what is known of them; without turns that were compared, the filter's noise of the heading decides
+    wheels : facts about them; without compared turns, the filter's noise of the heading decides
     inverted : the right ICR ended left of the left one
     """
     if filtered:
@@ -126,8 +132,9 @@ def _twist_reasons(separation: float, std: float) -> list[Note]:
 
     Notes
     -----
-    A twist that turns as the robot does shows ICRs as far apart as the width that it was converted with. Differential
-    drives turn by a few percent less than their wheels: their ICRs are further apart by more than their deviation.
+    If a twist turns as the robot does, the separation of its ICRs equals the width that it was converted with.
+    Differential drives turn by a few percent less than their wheels, so that the separation of their ICRs is larger by
+    more than its deviation.
     """
     if separation >= 1.0 + TWIST_SIGMAS * std:
         return []
@@ -139,7 +146,7 @@ def _twist_reasons(separation: float, std: float) -> list[Note]:
 
 
 def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str, Finding]) -> str:
-    """Return in what the final y ICRs contradict those of windows of the drive; empty where they agree.
+    """Return how the final y ICRs contradict the ICRs from windows of the drive; empty where they agree.
 
     Parameters
     ----------
@@ -148,8 +155,8 @@ def contradicts_windows(table: States, covariance: Floats, findings: Mapping[str
 
     Notes
     -----
-    The filter weighs each sample, the windows (`icrtool.alignment.estimator`) compare motion over metres and know
-    delays. On recorded and simulated drives whose streams agree they differ by up to 0.04 of the separation.
+    The filter uses single samples. The windows (`icrtool.alignment.estimator`) compare motion over metres and include
+    delays. On recorded and simulated drives whose streams agree, both differ by up to 0.04 of the separation.
     """
     right, left = findings.get("y_icr_right_m"), findings.get("y_icr_left_m")
     apart = []
@@ -173,7 +180,7 @@ def rejected_share(code: Bytes) -> float:
 
 
 def noise_warnings(name: str, config: Config, noise: ProcessNoise) -> list[Note]:
-    """Return what was done about wheels that contradict the position reference."""
+    """Return findings about noise that was raised because wheels contradict the reference."""
     configured, found = configured_noise(config), list[Note]()
     if noise.position_mps != configured.position_mps:
         causes = "slip, clock offsets, repeated samples, fixes worse than they state"
@@ -196,7 +203,7 @@ def run_warnings(
     *,
     inverted: bool,
 ) -> tuple[Note, ...]:
-    """Return what a user should know before trusting the numbers.
+    """Return the findings that a user needs before trusting the numbers.
 
     Parameters
     ----------
@@ -226,7 +233,7 @@ def run_warnings(
 
 
 def _cause_of_rejection(delay: Finding | None) -> str:
-    """Return why measurements were rejected, as far as their delay against the wheels shows it."""
+    """Return the possible cause of rejected measurements, from their delay against the wheels."""
     scatter = "they jump or scatter by more than they state"
     if delay is None or delay.value is None or delay.std is None:
         return f"their clock, or {scatter}; this drive does not show their delay"
@@ -245,9 +252,9 @@ def antenna_warning(name: str, table: States, covariance: Floats) -> list[Note]:
 
     Notes
     -----
-    An antenna off the centre line and sides that slip unequally look the same: only the difference shows
-    (`icrtool.calibration.sensor_findings`). So do an antenna ahead of the body origin and an x_icr behind it. Nothing
-    is moved.
+    An antenna off the centre line has the same effect as unequal slip of the sides, and an antenna ahead of the body
+    origin the same effect as an x_icr behind it: only differences are shown (`icrtool.calibration.sensor_findings`).
+    Nothing is corrected.
     """
     settled = slice(len(table) // 2, None)
     middle = float(np.median(table.y_icr_right_m[settled] + table.y_icr_left_m[settled])) / 2

@@ -78,10 +78,10 @@ def summarise(
 
     Parameters
     ----------
-    measurements : what the alignment made of a log
-    filtered : what the filter made of that
+    measurements : result of the alignment
+    filtered : result of the filter
     config : the effective configuration
-    request : what was asked of the fit
+    request : request of the fit
     inputs, datum, rejected_fixes : of the log
     """
     table, sensors, width = filtered.table, filtered.sensors, config.robot.track_width_m
@@ -185,9 +185,9 @@ def _notes(
 
 
 def filter_summary(measurements: Measurements, filtered: Filtered, config: Config) -> FilterDocument:
-    """Return what the filter was run with, and the statistics of its innovations over measurements not gated.
+    """Return the settings of the filter, and the statistics of its innovations over measurements not gated.
 
-    The mean NIS is 2 of fixes and 1 of headings where the noise is right.
+    If the noise is right, the mean NIS is 2 for fixes and 1 for headings.
     """
     start = filtered.began_with
     return FilterDocument(
@@ -224,9 +224,10 @@ def learned(filtered: Filtered, config: Config, clock_std_s: float = 0.0) -> tup
 
     Parameters
     ----------
-    clock_std_s : of the time between position and heading: positions that lag look like an x_icr further back
+    clock_std_s : standard deviation of the time between position and heading; a lag of positions has the same effect as
+        an x_icr further back
 
-    Preset ``paper``: the filter's own covariance, and what the drive could show.
+    In preset ``paper`` the result is the filter's own covariance, and what the drive could show.
     """
     table, width = filtered.table, config.robot.track_width_m
     track = track_of_states(table, filtered.in_gap, filtered.outages_ns)
@@ -264,14 +265,14 @@ def icr_summary(
     table: States, convergence: dict[IcrColumn, tuple[float, float] | None], covariance: Floats, of_filter: Floats,
     x_clock_std_m: float, multiplier: tuple[float, float] | None, hidden: Collection[str],
 ) -> IcrDocument:  # fmt: skip
-    """Return the ICRs: final, mean and standard deviation over the states after convergence, and when they did.
+    """Return the ICRs: final, mean and standard deviation over the states after convergence, and its times.
 
     Parameters
     ----------
     covariance : (3, 3) of the final ICRs [m^2]; of_filter : the filter's own
     x_clock_std_m : part of the clocks in the standard deviation of x
     multiplier : (y_r - y_l) / b and its standard deviation, None where b is not known
-    hidden : ICRs that are not shown, and have no number; nor has a multiplier made of one
+    hidden : ICRs that are not shown; they have no number, and a multiplier computed from one has no number either
     """
     settled = max((span[1] for span in convergence.values() if span is not None), default=0.0)
     after = table.t_s >= settled
@@ -321,7 +322,7 @@ def gnss_summary(
     datum: Datum | None, rejected_fixes: dict[str, int], outcome: MeasurementOutcome, fixes: Fixes,
     measurements: Measurements,
 ) -> GnssDocument:  # fmt: skip
-    """Return how many fixes were used and rejected, by class too, and how far the filter is from those it trusts."""
+    """Return numbers of used and rejected fixes, also by class, and the filter's distance from the fixes it trusts."""
     delay = measurements.findings["position_delay_s"]
     difference = outcome.difference[outcome.used & ~fixes.down_weighted]
     classes = {

@@ -1,9 +1,9 @@
 """A motion model that learns from the past of a drive, sample by sample: on board, and as row ``adaptive`` of a report.
 
-It begins with a prior, a calibration or what is known of robots, and adds the windows of driven distance that have
-ended, by the terms, residuals, weights and priors of `icrtool.motion.window_fit`. Solutions follow one another by
-Gauss-Newton steps; the normal equations are added to. Until a drive is `REBUILT_TO_M` long they are also made anew from
-time to time, since its first windows were linearised far from what later ones show.
+It begins with a prior: a calibration, or what is known of robots. Each window of driven distance that has ended adds to
+the normal equations, with the terms, residuals, weights and priors of `icrtool.motion.window_fit`. Gauss-Newton steps
+give the next solution. On the first `REBUILT_TO_M` of a drive the normal equations are also computed anew from time to
+time, because the first windows were linearised far from the later solution.
 """
 
 from __future__ import annotations
@@ -26,16 +26,23 @@ from icrtool.motion.recording import NO_CONSTANTS, LogConstants, size_of
 from icrtool.motion.window_fit import RESIDUAL_KINDS, Residuals, constant_std, heading_wander, residuals_of
 
 WINDOWS_AS_ONE = 80.0
-"""Number of windows that count as one independent one. A stretch of 20 m holds 160, and shows a term about twice."""
+"""Number of windows that count as one independent window. A stretch of 20 m holds 160 windows and shows a term about
+twice."""
 
 GAUSS_NEWTON_STEPS = 3
 """Steps from one solution to the next."""
 
-SHARE_OF_DISTANCE, SHORTEST_M, LONGEST_M = 0.02, 0.5, 6.0
-"""The parameters are solved for again after this share of the driven distance, within these bounds [m]."""
+SHARE_OF_DISTANCE = 0.02
+"""Distance between two solutions, as a share of the driven distance."""
 
-REBUILT_SHARE, REBUILT_TO_M = 0.3, 150.0
-"""All windows are linearised anew each time the distance has grown by this share, up to this distance [m]."""
+SHORTEST_M, LONGEST_M = 0.5, 6.0
+"""Shortest and longest distance between two solutions [m]."""
+
+REBUILT_SHARE = 0.3
+"""Growth of the driven distance, as a share, after which all windows are linearised anew."""
+
+REBUILT_TO_M = 150.0
+"""Driven distance up to which all windows are linearised anew [m]."""
 
 SETTLE_S = 0.5
 """Time from the end of a window to its use [s]: the wheels may be read later than the poses by `LARGEST_DELAY_S`."""
@@ -44,23 +51,26 @@ LARGEST_DELAY_S = 0.4
 """Largest delay between wheels and poses [s], four standard deviations of its prior."""
 
 FEWEST_FOR_WANDER = 60
-"""Number of windows from which on it is estimated how much a heading wanders. Fewer show how the prior is off."""
+"""Number of windows from which on the wander of the heading is estimated. Fewer windows show the prior's error."""
 
-USUAL_STD, USUAL_COUNTS_AS = (0.03, 0.03), 4.0
-"""Spread of residuals before there are any, of displacements [m^0.5] and turns [rad/m^0.5], and the number of
-independent windows that it counts as. The first few windows fit almost exactly, whatever they show."""
+USUAL_STD = (0.03, 0.03)
+"""Spread of residuals before a drive, of displacements [m^0.5] and of turns [rad/m^0.5]."""
+
+USUAL_COUNTS_AS = 4.0
+"""Number of independent windows that `USUAL_STD` counts as. The first few windows are always fitted almost exactly, so
+their residuals do not show the spread."""
 
 MOST_PENDING = 1000
-"""Number of samples after which those of a robot that stands are taken."""
+"""Number of samples after which the pending samples of a robot that stands are taken."""
 
 WHEELS_MODEL, TURNED_MODEL = MODELS[RECOMMENDED], MODELS[RECOMMENDED].with_gyro()
-"""The model by the wheels alone, and with a gyro."""
+"""The models with wheels alone, and with wheels and gyro."""
 
 SHARED_TERMS = [name for name in WHEELS_MODEL.terms if name in TURNED_MODEL.terms]
 SHARED_OF_WHEELS, SHARED_OF_TURNED = (
     [one.terms.index(name) for name in SHARED_TERMS] for one in (WHEELS_MODEL, TURNED_MODEL)
 )
-"""Places of the terms that both have, in the one without and in the one with a gyro."""
+"""Places of the common terms in the model without a gyro, and in the model with a gyro."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +94,7 @@ class TermsPrior:
 
     @classmethod
     def of_wheels(cls, width_m: float, mean: Floats, covariance: Floats, source: str = "") -> TermsPrior:
-        """Return a prior of the terms without a gyro; what a gyro adds is as gyros usually are."""
+        """Return a prior from the terms without a gyro; the terms of the gyro have their usual prior."""
         gyro_std = np.array([TERMS[name].std for name in GYRO_TERMS])
         k = len(SHARED_OF_WHEELS)
         turned_mean, turned = np.zeros(k + len(gyro_std)), np.zeros((k + len(gyro_std), k + len(gyro_std)))
@@ -113,7 +123,7 @@ class Learned(NamedTuple):
 
 
 class Estimate:
-    """Parameters of a model and constants of a drive, with the normal equations of the windows so far.
+    """Parameters of a model and constants of a drive, with the normal equations of the windows that have ended.
 
     Attributes
     ----------
@@ -121,7 +131,7 @@ class Estimate:
     matrix, vector : (k + c, k + c), (k + c,) of the data: x solves (prior + matrix) x = prior mean + vector
     scale : (2,) robust standard deviation of the residuals of displacements and turns
     wander : of the heading, for each metre [rad^2/m]
-    fitted, constants : x as what predicts
+    fitted, constants : x as the model and the constants that predict
     """
 
     def __init__(self, model: MotionModel, width_m: float, mean: Floats, covariance: Floats) -> None:
@@ -135,7 +145,7 @@ class Estimate:
         self.fitted, self.constants = FittedModel(model, mean, covariance), NO_CONSTANTS
 
     def solve_anew(self, windows: Windows, wheels: FittedModel | None = None) -> None:
-        """Solve with all windows so far, linearised at every step; `wheels` as in `residuals_of`."""
+        """Solve with all windows that have ended, linearised at every step; `wheels` as in `residuals_of`."""
         kind = np.repeat(RESIDUAL_KINDS, len(windows.begin))
         few = len(windows.begin) < FEWEST_FOR_WANDER
         evaluate = residuals_of(windows, self.model, self.width_m, wheels, 0.0 if few else None)
@@ -198,8 +208,8 @@ def _scale_of(residuals: Floats, kind: Ints) -> Floats:
 class AdaptiveModel:
     """A motion model that starts from a prior and learns from the samples of a drive as they come.
 
-    Frames and signs are those of `icrtool`: x forward, y right, turns clockwise. It holds some kilobytes, opens no file
-    and knows no log.
+    Frames and signs follow `icrtool`: x forward, y right, turns clockwise. It holds some kilobytes and opens no file or
+    log.
 
     Parameters
     ----------
@@ -208,7 +218,7 @@ class AdaptiveModel:
 
     Attributes
     ----------
-    distance_m : driven so far
+    distance_m : driven until the last sample
     """
 
     def __init__(self, prior: TermsPrior, *, with_gyro: bool = False) -> None:
@@ -288,7 +298,7 @@ class AdaptiveModel:
 
         Parameters
         ----------
-        v_left, v_right : at the configured wheel radius; gyro_radps : of a model with a gyro
+        v_left, v_right : at the configured wheel radius; gyro_radps : turn rate of the gyro, for a model with a gyro
 
         Notes
         -----
@@ -302,7 +312,7 @@ class AdaptiveModel:
         return found[:, 0] if np.ndim(v_left) == 0 else found
 
     def _take(self, samples: Floats) -> list[Learned]:
-        """Take samples, and solve at each knot where that is due."""
+        """Take samples, and solve at each knot where a solution is due."""
         found = []
         for knot in range(self._drive.take(samples), self._drive.count):
             at_m, size = knot * self._drive.every_m, self._drive.size

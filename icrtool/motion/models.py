@@ -1,7 +1,7 @@
 """Motion models that are linear in their parameters: body twist (v_x, v_y, omega) = sum theta_k phi_k(V_l, V_r).
 
 A `Term` is one phi with its prior, a `MotionModel` a list of terms. Adding either is one entry below. Body frame: x
-forward, y right, omega clockwise. Track width b, v = (V_l + V_r) / 2, w = (V_l - V_r) / b. Speeds are those at the
+forward, y right, omega clockwise. Track width b, v = (V_l + V_r) / 2, w = (V_l - V_r) / b. Speeds refer to the
 configured wheel radius.
 
 The track ICRs (Pentzer 2014, Eqs. 8-12) are a member: with W = y_r - y_l the twist is
@@ -31,7 +31,7 @@ class WheelMotion(NamedTuple):
     v, w : mean speed [m/s], (V_l - V_r) / b [rad/s]
     spin : |V_l - V_r| / (|V_l| + |V_r|): 0 straight ahead, 1 on the spot
     b : track width [m]
-    gyro : turn rate of a gyro [rad/s], clockwise; turn : that of a wheels-only model; zeros where neither is used
+    gyro : turn rate of a gyro [rad/s], clockwise; turn : turn rate of a wheels-only model [rad/s]; zeros where not used
     """
 
     v: Floats
@@ -43,7 +43,7 @@ class WheelMotion(NamedTuple):
 
 
 def wheel_motion(v_left: Floats, v_right: Floats, width_m: float, gyro: Floats | None = None) -> WheelMotion:
-    """Return what the terms are made of, from speeds at the configured wheel radius (n,) [m/s]."""
+    """Return the inputs of the terms, from speeds at the configured wheel radius (n,) [m/s]."""
     both = np.abs(v_left) + np.abs(v_right)
     spin = np.divide(np.abs(v_left - v_right), both, out=np.zeros_like(both), where=both > 0.0)
     none = np.zeros_like(both)
@@ -59,9 +59,9 @@ class Term:
     ----------
     axis : which of v_x, v_y, omega it adds to
     column : its value per unit parameter, (n,); formula : the same in the symbols of `WheelMotion`, for other programs
-    mean, std : prior of the parameter: how real robots differ
-    wide : standard deviation of that prior where the data look for a term that few drives show; 0: as `std`
-    meaning : for a reader, with source
+    mean, std : prior of the parameter: mean and spread of real robots
+    wide : standard deviation of a wider prior, for a term that few drives show; 0: no wider prior
+    meaning : words for a reader, with source
     nominal : the parameter without slip
     """
 
@@ -98,7 +98,7 @@ TERMS: dict[str, Term] = {
 """Every term by name."""
 
 GYRO_TERMS = ("gyro_scale", "wheels_weight")
-"""Terms of a model with a gyro: without evidence about the wheels, its turn rate is the gyro's."""
+"""Terms that a gyro adds to a model. At their prior means the turn rate is the gyro's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ class MotionModel:
     ----------
     label : for tables
     source : who proposed it
-    stds : priors of a fit, where they are not those of the terms
+    stds : prior standard deviations of a fit, where they differ from the terms' own
     """
 
     name: str
@@ -139,9 +139,9 @@ class MotionModel:
 
         Notes
         -----
-        Few drives show how slip changes with curvature and speed: the priors are narrow. A drive that shows a term by
-        more than `SHOWN_SIGMAS` has a variance of its prior that exceeds the narrow one by what it shows beyond that
-        (empirical Bayes, positive part: Efron and Morris 1973).
+        Few drives show how slip changes with curvature and speed, so the priors are narrow. If the wide fit gives a
+        parameter theta with |theta| > `SHOWN_SIGMAS` standard deviations s, the variance of its prior grows by
+        theta^2 - (`SHOWN_SIGMAS` s)^2 (empirical Bayes, positive part: Efron and Morris 1973).
         """
         beyond = widened.parameters**2 - (SHOWN_SIGMAS * widened.std) ** 2
         wide = np.array([TERMS[name].wide > 0.0 for name in self.terms])
@@ -150,7 +150,7 @@ class MotionModel:
 
     @property
     def uses_gyro(self) -> bool:
-        """Whether the turn rate is the weighted mean of a gyro's and that of a wheels-only model."""
+        """Whether the turn rate is the weighted mean of the gyro's turn rate and a wheels-only model's turn rate."""
         return GYRO_TERMS[0] in self.terms
 
     def with_gyro(self) -> MotionModel:
@@ -160,10 +160,10 @@ class MotionModel:
 
 
 NO_SLIP, FIVE, RECOMMENDED = "no_slip", "five", "recommended"
-"""Names of the models that are fitted: without free terms; for ICRs and controller; to predict with."""
+"""Names of the models that are fitted: without free terms; for ICRs and controller; for predictions."""
 
 CONTROLLER = "controller"
-"""Row of what a differential-drive controller makes of multiplier and radius factors; these come from `FIVE`."""
+"""Name of the row that drives like a differential-drive controller, with multiplier and radius factors of `FIVE`."""
 
 _FIVE = ("vx_v", "vx_w", "omega_w", "omega_v", "vy_w")
 _EIGHT = (*_FIVE, "vy_vw", "omega_sw", "omega_vw")
@@ -210,7 +210,7 @@ class TrackGeometry(NamedTuple):
     Attributes
     ----------
     y_icr_right_m, y_icr_left_m, x_icr_m : track ICRs
-    multiplier : (y_r - y_l) / b, beside the radius factors
+    multiplier : (y_r - y_l) / b; it is used together with the radius factors
     radius_left, radius_right : wheel radius over the configured one
     """
 
@@ -223,7 +223,7 @@ class TrackGeometry(NamedTuple):
 
 
 ICR_VALUES = 3
-"""So many values of a `TrackGeometry`, the first, are ICRs."""
+"""Number of values at the start of a `TrackGeometry` that are ICRs."""
 
 
 def track_geometry(model: MotionModel, parameters: NDArray[Any], width_m: float) -> TrackGeometry:
@@ -232,12 +232,12 @@ def track_geometry(model: MotionModel, parameters: NDArray[Any], width_m: float)
     Notes
     -----
     y_r = (d v_x / d V_l) / (d omega / d V_l), y_l = (d v_x / d V_r) / (d omega / d V_r), x from v_y = -x omega of a
-    turn. A radius factor of a side is that by which its speed must be multiplied for one W to give the turn:
+    turn. The radius factors multiply the speeds of the sides, so that one W gives the turn of both:
     a_l = W d omega / d V_l, a_r = -W d omega / d V_r.
     """
     of = dict(zip(model.terms, parameters.tolist(), strict=True))
     term = {name: of.get(name, TERMS[name].nominal) for name in _FIVE}
-    # V_l adds half of itself to v and its share of b to w, V_r takes away the latter
+    # v = (V_l + V_r) / 2 and w = (V_l - V_r) / b: half the sum and half the difference of the columns
     x_left, x_right = (term["vx_v"] + term["vx_w"]) / 2.0, (term["vx_v"] - term["vx_w"]) / 2.0
     turn_left = (term["omega_v"] / 2.0 + term["omega_w"]) / width_m
     turn_right = (term["omega_v"] / 2.0 - term["omega_w"]) / width_m
@@ -260,8 +260,8 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
     Returns
     -------
     parameters : (6,) of the terms, for wheels of the configured radius
-    by : (6, 5) derivatives by the three ICRs [1/m], by a scale of both wheel speeds, and by the scale of the left less
-        that of the right
+    by : (6, 5) derivatives by the three ICRs [1/m], by a scale of both wheel speeds, and by the difference of the left
+        and the right scale
 
     Notes
     -----
@@ -284,9 +284,12 @@ def parameters_of_icrs(icrs_m: Floats, width_m: float) -> tuple[Floats, Floats]:
     return np.array([value[term] for term in terms]), np.array([by[term] for term in terms])
 
 
-NOT_SHOWN, SHOWN_SIGMAS = 0.7, 3.0
-"""A drive that leaves this share of a prior's standard deviation shows nothing of the parameter, unless it lies two
-standard deviations from the prior's mean; so many of them widen the prior."""
+NOT_SHOWN = 0.7
+"""Ratio of a parameter's standard deviation to its prior's above which the drive does not show the parameter. A
+parameter that differs from the prior's mean by two standard deviations or more counts as shown all the same."""
+
+SHOWN_SIGMAS = 3.0
+"""Number of standard deviations that a parameter must differ from zero to widen its prior."""
 
 TINY = 1e-20
 
@@ -342,9 +345,9 @@ class FittedModel:
 
 
 class Lever(NamedTuple):
-    """Whether it is known where on the robot the position is measured, ahead and to the right of the body's origin.
+    """Whether the measured point of the position is known, ahead and to the right of the body's origin.
 
-    What is not known looks like an ICR that is off centre: it is a constant of the log, not an error of a controller.
+    An unknown part has the same effect as ICRs off centre. It is a constant of the log, not an error of a controller.
     """
 
     ahead: bool = False
@@ -355,17 +358,18 @@ NO_LEVER = Lever()
 
 
 def controller_model(five: FittedModel, lever: Lever, width_m: float) -> FittedModel:
-    """Return what a differential-drive controller drives with the multiplier and radius factors of a fit of `FIVE`.
+    """Return the model of a differential-drive controller with the multiplier and radius factors of a fit of `FIVE`.
 
     Parameters
     ----------
-    five : with the turn rate of the wheels, or of wheels and gyro
-    lever : of the position; where a part of it is not known, the motion that it makes of a turn is kept
+    five : the fit, with the turn rate of the wheels, or of wheels and gyro
+    lever : of the position; for an unknown part, the velocity that a turn gives to the measured point is kept
 
     Notes
     -----
     v_x = (a_l V_l + a_r V_r) / 2, omega = (a_l V_l - a_r V_r) / (m b). With V_l = v + w b / 2 and V_r = v - w b / 2 the
-    turn rate is that of the fit, and v_x differs from it by (y_r + y_l) / 2 omega, v_y by -x omega: what a lever makes.
+    turn rate equals the fit's. v_x differs from the fit's by (y_r + y_l) / 2 omega, v_y by -x omega; a lever has the
+    same effect.
     """
     values = dict(zip(five.model.terms, five.parameters.tolist(), strict=True))
     if lever.aside:
@@ -379,7 +383,7 @@ def controller_model(five: FittedModel, lever: Lever, width_m: float) -> FittedM
 
 
 def find_model(name: str) -> MotionModel:
-    """Return a model by name, ``_gyro`` behind it for the one with a gyro.
+    """Return a model by name; a name with ``_gyro`` at the end gives the model with a gyro.
 
     Raises
     ------

@@ -21,26 +21,32 @@ from icrtool.motion.models import NO_LEVER, FittedModel, Lever, wheel_motion
 from icrtool.records.measurements import TURNING_MPS
 
 WINDOWS_M = (5.0, 10.0)
-"""Lengths of the windows [m]. With one length alone, a circle of that circumference would show nothing."""
+"""Lengths of the windows [m]. With one length alone, a circle of this circumference would show nothing."""
 
 FULL_SIZE_WIDTH_M = 0.5
-"""Windows, their distances and stretches are those of robots of this track width and wider; smaller ones drive, and
-err, in proportion."""
+"""Track width from which on windows and stretches have their full length [m]. For smaller robots all lengths shrink in
+proportion, as their paths and errors do."""
 
 EVERY_M = 0.5
-"""A window of each length starts every so much distance."""
+"""Distance between the starts of two windows of one length [m]."""
 
-MOST_STARTS, LEAST_OFTEN_M = 800, 2.5
-"""Windows of long drives start further apart: about so many of a length in all logs, but at least every half window."""
+MOST_STARTS = 800
+"""Approximate number of windows of one length in all logs together. On long drives windows start further apart."""
+
+LEAST_OFTEN_M = 2.5
+"""Largest distance between the starts of two windows [m]: half the shortest window."""
 
 RECORDING_STEP_S = 0.1
-"""Wheel samples are joined to steps of this length."""
+"""Length of the steps to which wheel samples are joined [s]."""
 
-MOST_RECORDING_STEPS, LONGEST_RECORDING_STEP_S, LONGEST_STEP_M = 10_000, 0.4, 0.25
-"""Steps are longer where there would be more of them, but not longer than this in time and distance."""
+MOST_RECORDING_STEPS = 10_000
+"""Number of steps above which longer steps are used."""
+
+LONGEST_RECORDING_STEP_S, LONGEST_STEP_M = 0.4, 0.25
+"""Longest step in time [s] and in distance [m]."""
 
 STRETCH_M = 20.0
-"""Distance whose errors depend on one another, for the covariance: twice the longest window."""
+"""Distance within which errors depend on one another [m], for the covariance: twice the longest window."""
 
 FEWEST_FIT_WINDOWS = 10
 
@@ -56,9 +62,9 @@ class Recording:
     path, sha256 : the log's first file; empty where it is not known
     gyro_reversed : the gyro counts turns in the other direction, and its sign was changed
     begin_ns : stamp of the first state; 0 where it is not known
-    lever : what is known of the place of the position on the robot
-    x_clock_std_m : what is not known of the time between position and heading looks like an x_icr so far off
-    wheel_scales : of left and right, from the speeds that models are fitted to to those of `track`
+    lever : which parts of the measured point's place on the robot are known
+    x_clock_std_m : standard deviation of x_icr [m] from the unknown time between position and heading
+    wheel_scales : ratios of the left and right speeds of `track` to the speeds that models are fitted to
     """
 
     name: str
@@ -81,7 +87,7 @@ class Recording:
 
 
 class LogConstants(NamedTuple):
-    """What is a recording's own, beside the parameters of its robot.
+    """Constants of one recording, in addition to the parameters of its robot.
 
     Attributes
     ----------
@@ -128,7 +134,8 @@ def cut_windows(
     Parameters
     ----------
     lengths_m : default `WINDOWS_M`, less for small robots
-    pooled : of all that is fitted together, default the recording: the more it is, the coarser windows and steps
+    pooled : distance and time of all recordings fitted together, default this recording. Larger totals give windows
+        that start further apart, and longer steps
 
     Raises
     ------
@@ -148,8 +155,7 @@ def cut_windows(
 def samples_a_step(recording: Recording, pooled_s: float | None = None) -> int:
     """Return how many wheel samples make a step of the fits; `pooled_s` is the time of all that is fitted together.
 
-    A tenth of a second; on a long drive longer, up to four tenths, as long as a step is no more than a quarter of a
-    metre.
+    A step is 0.1 s long. On a long drive it is longer, at most 0.4 s and 0.25 m.
     """
     held = recording.track.held
     lasting, travel = held > 0.0, np.empty(len(held))
@@ -188,7 +194,7 @@ def steps_of(recording: Recording, pooled_s: float | None = None) -> Track:
 
 
 MOST_TRIALS = 4_000
-"""Trials of a long drive start further apart: about so many."""
+"""Approximate largest number of trials. On long drives trials start further apart."""
 
 
 class Trials(NamedTuple):
@@ -207,15 +213,15 @@ class Trials(NamedTuple):
 def cut_trials(recording: Recording, horizons_m: Sequence[float], pooled: Totals | None = None) -> Trials:
     """Return the trials of a recording from states in which it moves.
 
-    They are as far apart as the steps of the fits are long, about `MOST_TRIALS` of a long drive: nearer ones are copies
-    of one another.
+    Their starts are one step of the fits apart, further on a long drive (about `MOST_TRIALS`): trials that start closer
+    together are nearly equal.
 
     Parameters
     ----------
-    pooled : of all that is fitted together, default the recording
+    pooled : distance and time of all recordings fitted together, default this recording
     """
     track = recording.track
-    # starts where it stands are copies of one another
+    # trials that start while the robot stands are nearly equal
     least = np.diff(track.t)
     least *= TURNING_MPS
     moving = np.flatnonzero(np.diff(track.distance) > least)
@@ -230,7 +236,7 @@ class TrialErrors(NamedTuple):
     Attributes
     ----------
     position : distance between open-loop position and reference [m]
-    heading : size of the difference between open-loop turn and that of the reference [rad]
+    heading : size of the difference between the open-loop turn and the reference's turn [rad]
     """
 
     position: Floats
@@ -238,7 +244,7 @@ class TrialErrors(NamedTuple):
 
     @classmethod
     def none(cls, shape: tuple[int, ...]) -> TrialErrors:
-        """Return errors of trials that have none yet, a horizon contiguous."""
+        """Return errors that are all NaN, each horizon contiguous in memory."""
         return cls(*(np.full(shape[::-1], np.nan).T for _ in cls._fields))
 
 
@@ -246,8 +252,8 @@ ErrorsOf = Callable[[Trials], TrialErrors]
 """Gives the errors (k, h) of a model in trials."""
 
 PathAt = Callable[[Floats], tuple[Floats, Complexes]]
-"""Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]: each
-call drives all of it."""
+"""Gives heading (m,) [rad] and place (m,) [m], forward + j right of the first step, of a path at times (m,) [s]. Each
+call computes the whole path."""
 
 
 def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> TrialErrors:
@@ -259,7 +265,8 @@ def trial_errors(recording: Recording, start: Ints, end: Rows, path: PathAt) -> 
 
     Notes
     -----
-    The parameters are constants, so the path from any start is the same path, turned and shifted: one pass serves all.
+    The parameters are constants, so the path from any start is the same path, turned and shifted. One pass over the
+    samples gives all trials.
     """
     track, first = recording.track, int(start.min())
     s, e = start - first, end - first
@@ -285,7 +292,8 @@ def predicted_path(
 
     Notes
     -----
-    Nothing moves through a gap in the wheel data. The offset of the reference's heading is taken from that of the path.
+    The path stands still in a gap of the wheel data. The offset of the reference's heading is subtracted from the
+    path's heading.
     """
     of = steps if steps is not None else recording.track
 
@@ -306,14 +314,19 @@ def predicted_path(
     return at_times
 
 
-TURN_S, FEWEST_TURNS = 1.0, 10
-"""Turns over this time are compared, at least so many."""
+TURN_S = 1.0
+"""Time over which turns are compared [s]."""
+
+FEWEST_TURNS = 10
+"""Number of turns below which a gyro is not compared."""
 
 GYRO_PRIOR_STD = np.array([10.0, 0.005, 0.2])
-"""Of scale, whose sign is open, bias [rad/s] and lead [s]: on a circle only this separates scale and bias."""
+"""Prior standard deviations of a gyro's scale, bias [rad/s] and lead [s]. The scale's is wide because its sign is
+unknown. On a circle only the prior separates scale and bias."""
 
 GYRO_SCALE_RANGE = 0.1
-"""A gyro whose turn differs from the reference's by more than this share does not measure the robot's yaw."""
+"""Largest difference between a gyro's turn and the reference's turn, as a share. Beyond it the gyro does not measure
+the robot's yaw."""
 
 
 class GyroLine(NamedTuple):
@@ -352,29 +365,35 @@ def fit_gyro_line(t: Floats, rate: Floats, turned: Floats, at: Floats, heading: 
 
 
 GYRO_START_STD = (0.02, 0.005)
-"""Standard deviations of scale and bias [rad/s] of a gyro before a drive: those of `TERMS` and `GYRO_PRIOR_STD`."""
+"""Standard deviations of a gyro's scale and bias [rad/s] before a drive, the same as in `TERMS` and
+`GYRO_PRIOR_STD`."""
 
-TURN_NOISE_RAD, GUESSED_TURNS = 0.01, 5
-"""Spread of the differences of turns over `TURN_S` before a drive, and how many differences the guess counts as."""
+TURN_NOISE_RAD = 0.01
+"""Spread of the differences of turns over `TURN_S` that is assumed before a drive [rad]."""
+
+GUESSED_TURNS = 5
+"""Number of measured differences that the assumed spread counts as."""
 
 MISSED_TURN_SHARE = 0.05
-"""Standard deviation of a difference in parts of the turn, beside the spread: lags and slip differ from turn to turn.
+"""Standard deviation of a difference of turns that grows with the turn, as a share of it. It is added to the spread,
+because lags and slip differ from turn to turn.
 
-Without it a robot that stands first is so certain that one turn moves the scale by 6 % (a recorded Warthog on asphalt).
-"""
+Without it the spread of a robot that stands at first is too small, and one turn moves the scale by 6 % (a recorded
+Warthog on asphalt)."""
 
 MEAN_TO_STD = 1.2533
-"""Standard deviation over mean size, for normal values."""
+"""Ratio of the standard deviation of normal values to their mean size."""
 
 MOST_SIGMAS = 3.0
 """A larger difference counts as this many standard deviations in the spread of the differences."""
 
 RENEWED_S = 10.0
-"""Scale and bias of a gyro are taken anew so often: they change slowly. In the first seconds more often."""
+"""Time between two lines of a gyro [s]. Scale and bias change slowly; in the first seconds of a drive the lines follow
+more often."""
 
 
 class PastLines(NamedTuple):
-    """Lines of a gyro, each from the turns that had ended before the state from which it holds.
+    """Lines of a gyro; each holds from one state on, and comes from turns that ended before this state.
 
     Attributes
     ----------
@@ -391,8 +410,8 @@ def past_gyro_lines(track: Track) -> PastLines:
 
     Notes
     -----
-    Recursive least squares over turns of `TURN_S` (Kalman 1960, constant state): normal equations are added to. Each
-    turn has the soft-L1 weight of what the line before missed it by.
+    Recursive least squares over turns of `TURN_S` (Kalman 1960, constant state): each turn adds to the normal
+    equations, with the soft-L1 weight of its residual from the line before.
     """
     t, lasted = track.t - track.t[0], track.cumulate(np.ones(len(track.t)))
     turned = np.zeros(len(t)) if track.gyro is None else track.cumulate(track.gyro)

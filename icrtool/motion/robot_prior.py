@@ -14,7 +14,7 @@ from icrtool.motion.adaptive import TURNED_MODEL, WHEELS_MODEL, TermsPrior
 from icrtool.motion.models import TERMS, FittedModel
 
 BETWEEN_DRIVES = 0.15
-"""Standard deviation of a term between drives of one robot, as a share of that between robots (`TERMS`).
+"""Standard deviation of a term between drives of one robot, as a share of its standard deviation between robots.
 
 Ten recorded drives of one robot differ by 0.006 in vx_v, 0.06 in vx_w, 0.008 in omega_w, 0.002 in omega_v and 0.06 in
 vy_w; from ground to ground omega_w differs by 0.03.
@@ -30,7 +30,7 @@ def known_robots() -> dict[str, dict[str, float | str]]:
 
 
 def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
-    """Return what is known of a robot of which nothing is known but its track width b.
+    """Return the prior of a robot of which only the track width b is known.
 
     Parameters
     ----------
@@ -40,8 +40,8 @@ def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
     Notes
     -----
     Median and variance of each term over the robots of ``robot_terms.toml``. The prior of the term
-    (`icrtool.motion.models.TERMS`) counts as one more robot, whose term is not known; the median is of n robots, so a
-    further robot differs from it by 1 + 1 / n times the variance.
+    (`icrtool.motion.models.TERMS`) counts as one more robot. The median comes from n robots, so a further robot differs
+    from it with 1 + 1 / n times the variance.
     """
     robots = [terms for name, terms in known_robots().items() if name != without]
     mean, variance = [], []
@@ -55,15 +55,15 @@ def prior_of_robots(track_width_m: float, *, without: str = "") -> TermsPrior:
 
 
 def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedModel | None, source: str) -> TermsPrior:
-    """Return what fitted models of a robot show of its next drive.
+    """Return the prior that fitted models of a robot give for its next drive.
 
     Parameters
     ----------
-    fitted, turned : by the wheels alone, and with a gyro; of terms that one lacks, `prior_of_robots` is taken
+    fitted, turned : models with wheels alone, and with a gyro; terms that both lack have the prior of `prior_of_robots`
 
     Notes
     -----
-    The covariance of the parameters, and that between drives (`between_drives`).
+    The covariance is the sum of the parameters' covariance and the covariance between drives (`between_drives`).
     """
     of_robots = prior_of_robots(track_width_m)
     mean, covariance = _placed(WHEELS_MODEL.terms, of_robots.mean, of_robots.covariance, fitted)
@@ -77,7 +77,7 @@ def prior_of_model(track_width_m: float, fitted: FittedModel, turned: FittedMode
 def _placed(
     terms: tuple[str, ...], mean: Floats, covariance: Floats, fitted: FittedModel
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    """Return mean and covariance of terms, those of a fitted model for a further drive, the others as they were."""
+    """Return mean and covariance of terms: terms of the fitted model for a further drive, other terms unchanged."""
     names = fitted.model.terms
     of_fit = [names.index(name) for name in terms if name in names]
     at = [terms.index(name) for name in terms if name in names]
@@ -93,7 +93,7 @@ def between_drives(names: tuple[str, ...]) -> Floats:
 
     Notes
     -----
-    Of terms that few drives show (`Term.wide`), it is the whole of their prior.
+    For terms that few drives show (`Term.wide`), the variance between drives is the variance of their prior.
     """
     std = [TERMS[name].std * (1.0 if TERMS[name].wide else BETWEEN_DRIVES) for name in names]
     return np.diag(np.square(std))

@@ -1,11 +1,12 @@
 """Robust fit of motion models to windows of driven distance, pooled over recordings.
 
-Heading and place are sums over the wheel samples, and so are their derivatives: all windows of a recording cost one
-pass over its samples (`icrtool.kernels.window_residuals`). What is left out of a fit is subtracted from its normal
-equations, so one fit serves all folds.
+Heading, place and their derivatives are sums over the wheel samples, so one pass over the samples of a recording gives
+all its windows (`icrtool.kernels.window_residuals`). To leave a fold out, its part is subtracted from the normal
+equations, so one fit gives the solutions of all folds.
 
 Each recording has constants of its own, which are not part of a calibration (`icrtool.motion.recording.LogConstants`).
-Of several recordings they are eliminated from the normal equations of each (`icrtool.kernels.elimination`).
+With several recordings, the constants are eliminated from each recording's normal equations
+(`icrtool.kernels.elimination`).
 """
 
 from __future__ import annotations
@@ -36,42 +37,45 @@ from icrtool.motion.models import FittedModel, MotionModel, model_columns, wheel
 from icrtool.motion.recording import STRETCH_M, LogConstants, size_of
 
 LAST_DELAY_STEP_SIGMAS = 0.1
-"""Delays have kinks, where a shorter last step is not found."""
+"""Largest last step of a delay, in its standard deviations. The residuals have kinks over the delay, where a shorter
+step is not reached."""
 
 REWEIGHTS = 2
 
 FEWEST_TO_SUBTRACT = 4
-"""Of fewer recordings each is too large a part of all: the others are fitted anew."""
+"""Number of recordings from which on one of them is subtracted from the fit of all. With fewer, the others are fitted
+anew, because one recording is a large part of all."""
 
 
 CONSTANT_STD = np.array([np.radians(3.0), 0.1, 0.02, 0.2])
-"""Prior of `LogConstants` about zero: a heading that was aligned before, clocks of one robot, a gyro of one robot."""
+"""Prior standard deviations of `LogConstants` about zero [rad, s, rad/s, s]: the heading was aligned before, and the
+clocks and the gyro belong to one robot."""
 
 CONSTANTS_OF_WHEELS = 2
-"""So many of them, the first, are there without a gyro, too."""
+"""Number of constants, at the start of `LogConstants`, that a recording without a gyro has."""
 
 RESIDUAL_KINDS = (0, 0, 1)
-"""Residuals of a window: forward and right, whose spread is one, and turn."""
+"""Kind of each residual of a window: forward and right have a common spread, the turn has its own."""
 
 FEWEST_RESIDUALS = 10 * len(RESIDUAL_KINDS)
-"""Fewer that are left beside a fold give no parameters."""
+"""Number of residuals outside a fold below which no parameters are computed."""
 
 
 def constant_std(model: MotionModel) -> Floats:
-    """Return the prior of the constants of each recording that a model has."""
+    """Return the prior standard deviations of a recording's constants that the model uses."""
     return CONSTANT_STD if model.uses_gyro else CONSTANT_STD[:CONSTANTS_OF_WHEELS]
 
 
 def heading_wander(turned: Floats, length_m: Floats) -> float:
-    """Return the variance of a heading that slip makes wander, for each metre [rad^2/m]; 0 of windows of one length.
+    """Return the growth of a heading's variance by slip per metre [rad^2/m]; 0 for windows of one length.
 
     Parameters
     ----------
-    turned : (w,) turn of a model less that of the reference [rad]; length_m : (w,) of the windows
+    turned : (w,) turn of a model minus the reference's turn [rad]; length_m : (w,) of the windows
 
     Notes
     -----
-    What longer windows stray more than short ones: what both have is of the reference.
+    The increase of the variance from short to long windows. The part common to both is the reference's noise.
     """
     short, long = float(length_m.min()), float(length_m.max())
     if short == long:
@@ -81,7 +85,7 @@ def heading_wander(turned: Floats, length_m: Floats) -> float:
 
 
 def shortening(wander: float, length_m: Floats) -> Floats:
-    """Return the share (w,) of its displacement that a window goes on average where slip makes its heading wander.
+    """Return the mean ratio (w,) of a window's displacement to its value without wander of the heading.
 
     Parameters
     ----------
@@ -104,22 +108,22 @@ def residuals_of(
     windows: Windows, model: MotionModel, width_m: float, wheels: FittedModel | None = None,
     wander: float | None = None,
 ) -> Residuals:  # fmt: skip
-    """Return what gives the residuals of all windows of one recording for one model, by sqrt(length).
+    """Return a function that gives the residuals of all windows of one recording for one model, over sqrt(length).
 
-    Displacements alone do not separate a turn from side slip, and show little of a spin on the spot: turns are
-    residuals, too, weighted by their own spread.
+    Displacements alone do not separate a turn from side slip, and show little of a spin on the spot. Therefore turns
+    are residuals, too, weighted by their own spread.
 
     Parameters
     ----------
     windows : of `icrtool.motion.recording.cut_windows`
-    model, width_m : what predicts, and the track width b [m]
+    model, width_m : the model, and the track width b [m]
     wheels : for a model with a gyro, the wheels-only model whose turn rate it combines with the gyro's
-    wander : of `heading_wander`, where it is known [rad^2/m]; default: that of these windows
+    wander : of `heading_wander`, where it is known [rad^2/m]; default: computed from these windows
 
     Returns
     -------
-    A function of parameters (k,) and constants (c,), `LogConstants`, those of a gyro only for a model with one. It
-    returns residuals (3 w,), forward, right [m^0.5], then turn [rad/m^0.5], and their derivatives (3 w, k + c).
+    A function of parameters (k,) and constants (c,), `LogConstants`; constants of a gyro only for a model with a gyro.
+    It returns residuals (3 w,), forward, right [m^0.5], then turn [rad/m^0.5], and their derivatives (3 w, k + c).
     """
     steps, root = windows.track, np.sqrt(windows.length_m)
     seen, seen_turned = windows.moved, windows.turned
@@ -134,7 +138,7 @@ def residuals_of(
         # the gyro's bias and time are two more columns of the turn rate
         axes = np.append(axes, [OMEGA, OMEGA])
         of_terms = np.concatenate([of_terms, np.ones((2, len(steps.t)))])
-    # by how much each parameter raises the gyro's share of the turn rate
+    # derivative of the gyro's weight in the turn rate by each parameter
     gains = np.array([{"gyro_scale": 1.0, "wheels_weight": -1.0}.get(name, 0.0) for name in model.terms])
 
     def evaluate(parameters: Floats, constants: Floats) -> tuple[Floats, Floats]:
@@ -152,7 +156,7 @@ def residuals_of(
         strayed = heading_wander(turned * root, windows.length_m) if wander is None else wander
         share = shortening(strayed, windows.length_m)
         moved, moved_by = window_residuals(path, start, end, seen, offset, root, share)
-        # terms, those of the gyro, offset, delay: to terms, then `LogConstants`
+        # from the order terms, gyro columns, offset, delay to the order terms, `LogConstants`
         terms = len(axes)
         jacobian = np.concatenate([moved_by, turned_by])[:, [*range(k), terms, terms + 1, *range(k, terms)]]
         return np.concatenate([moved, turned]), jacobian
@@ -161,7 +165,7 @@ def residuals_of(
 
 
 class Fold(NamedTuple):
-    """What is left out together: a recording, or some distance of a single one.
+    """Data that are left out together: a recording, or a block of distance of a single one.
 
     Attributes
     ----------
@@ -193,9 +197,9 @@ class PooledFit(FittedModel):
     ----------
     wheels : as in `FittedModel`, fitted to the same windows
     pool : the windows
-    wide : fit of the model with wide priors, which showed those of this one; None where no term has a wide prior
-    solution : of all parameters, those of the model first, then the constants of each recording. Those of several
-        recordings follow the model's; those of a single one are parameters like them.
+    wide : fit of the model with wide priors, which gave the priors of this fit; None where no term has a wide prior
+    solution : all parameters: first the model's, then the constants of each recording. Constants of several recordings
+        were eliminated; constants of a single recording were fitted like the model's parameters.
     """
 
     wheels: PooledFit | None = None
@@ -228,12 +232,12 @@ class PooledFit(FittedModel):
         return x[first : first + own]
 
     def without(self, fold: Fold) -> Prediction | None:
-        """Return the model as fitted without a fold, and the constants of the fold's recording for that.
+        """Return the model fitted without a fold, and the constants of the fold's recording for this model.
 
         Returns
         -------
-        None where too little is left. The constants of a recording that is left out whole are found in it, of many to
-        first order of the parameters' change.
+        None where too little is left. The constants of a recording that is left out whole are estimated in it; with
+        many recordings, to first order of the parameters' change.
         """
         if fold not in self._left_out:
             self._left_out[fold] = self._fit_without(fold)
@@ -255,12 +259,12 @@ class PooledFit(FittedModel):
         model = self.model if shown is None else replace(self.model, stds=()).as_shown(shown[0])
         if fold.whole:
             gradient, curvature = (of_recordings[i] for of_recordings in self._by_recording)
-            # the priors may be others without the recording
+            # without the recording the priors may differ
             pull = model.prior_std**-2.0 - self.model.prior_std**-2.0
             gradient, curvature = gradient - pull * (self.parameters - model.prior_mean), curvature - np.diag(pull)
             covariance = self._covariance(np.linalg.inv(self.curvature - curvature))
-            # a Newton step: at the minimum the gradients of all residuals and of the prior sum to zero, so what is left
-            # without some is minus theirs
+            # a Newton step: at the minimum the gradients of all residuals and of the prior sum to zero, so the gradient
+            # without the fold is minus the fold's gradient
             steps = np.linalg.solve(self.curvature - curvature, gradient)
             fitted = FittedModel(model, self.parameters + steps, covariance, wheels)
             own = self._own(self.solution.x, i) - self.solution.gain[i] @ steps
@@ -276,7 +280,7 @@ class PooledFit(FittedModel):
         return self._refits[recording]
 
     def _reweighted(self, clear: Bools, model: MotionModel) -> tuple[Floats, Floats]:
-        """Return all parameters of a single recording as fitted to some residuals (m,), and the model's covariance.
+        """Return all parameters of a single recording, fitted to some residuals (m,), and the model's covariance.
 
         Parameters
         ----------
@@ -284,8 +288,8 @@ class PooledFit(FittedModel):
 
         Notes
         -----
-        A Newton step, then two of a new fit's reweighted steps, with residuals that follow the parameters to first
-        order: over some metres they do so nearly exactly.
+        A Newton step, then two reweighted steps of a new fit. Residuals are linear in the parameters; over some metres
+        this is nearly exact.
         """
         at, (mean, std), pool = self.solution, self.pool.prior(model), self.pool
         residuals, jacobian, pull = at.residuals[clear], at.jacobian[clear], std**-2.0
@@ -309,7 +313,7 @@ class PooledFit(FittedModel):
 
         Notes
         -----
-        A parameter's variance exceeds that of independent residuals by as much as with the recording.
+        The ratio of a parameter's variance to its variance with independent residuals is kept as with the recording.
         """
         grown = np.sqrt(np.diag(self.covariance) / np.diag(np.linalg.inv(self.curvature)))
         return np.asarray(inverse * np.outer(grown, grown), np.float64)

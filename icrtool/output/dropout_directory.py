@@ -1,6 +1,6 @@
-"""``RUN/dropout/``: what `icrtool dropout-report` leaves behind, whole or not at all, and what report.json holds.
+"""``RUN/dropout/``: the files of `icrtool dropout-report`, written whole or not at all, and the content of report.json.
 
-And the reports that a later one is compared with: a report.json, those of runs, or those of a batch.
+The module also opens a baseline for a later report: a report.json, or the reports of runs or of a batch.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from icrtool.records.text import escaped
 REPORT_FILE = "report.json"
 TRIALS_FILE = "trials.parquet"
 DROPOUT_DIRECTORY = "dropout"
-"""Where a report stands in its run directory."""
+"""Name of a report's directory in its run directory."""
 DROPOUT_FAMILY = "icrtool/dropout/"
 
 
@@ -48,20 +48,20 @@ def write_report(
     stamp_ns: Ints | None = None,
     inside: Path | None = None,
 ) -> DropoutReport:
-    """Write a report, whole or not at all; an old one in its place is replaced. The list of its run names its files.
+    """Write a report, whole or not at all, in place of an old one; its files are added to the list of its run.
 
     Parameters
     ----------
-    analyse : gives the report; it is called with what takes every single trial, None where they are not written
+    analyse : gives the report; it is called with the sink for single trials, None where trials are not written
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
-    figures : ``all``: those of the paper too
-    stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: they are not written
+    figures : ``all``: the paper's figures too
+    stamp_ns : (n,) of the starts, to write every single trial to trials.parquet; None: trials are not written
     inside : as in `icrtool.output.files.atomic.check_directory`
 
     Raises
     ------
     OutputError
-        Something that is not a dropout report stands in its place, or beside its files, or the disk does not take it.
+        Something that is not a dropout report is in its place or among its files, or the disk does not take it.
     """
     with atomic_directory(directory, REPORT, inside) as partial:
         with trials_file(partial / TRIALS_FILE, stamp_ns) if stamp_ns is not None else nullcontext() as sink:
@@ -84,7 +84,7 @@ def is_dropout_directory(directory: Path) -> bool:
 
 REPORT = Kind(
     "dropout report",
-    # In a run, one whose report.json was damaged is to be made again.
+    # In a run, a report with a damaged report.json may be replaced.
     lambda place: is_dropout_directory(place) or is_run_directory(place.parent),
     re.compile(REPORT_FILES),
 )
@@ -140,7 +140,7 @@ def comparison_rows(report: DropoutDocument) -> Iterator[tuple[Any, ...]]:
 
 
 ROWS_A_GROUP = 1 << 18
-"""Trials written at a time: 6 MB."""
+"""Number of trials written at a time: 6 MB."""
 
 
 @contextmanager
@@ -217,9 +217,9 @@ class Baseline:
         return sorted(set(self.reports) - set(logs))
 
     def find(self, name: str, content: Collection[str]) -> BaselineReport | None:
-        """Return the report of a log: that of the same content, else of the same name; None where there is none.
+        """Return the report of the log with the same content, else with the same name; None where there is none.
 
-        `content` is the SHA-256 of each of its files. A baseline that is one report file is that of any log.
+        `content` is the SHA-256 of each of the log's files. A baseline of one report file is compared with any log.
 
         Raises
         ------
@@ -274,7 +274,7 @@ def read_baseline(path: Path, log: str = "", inside: Path | None = None) -> Base
 
     Parameters
     ----------
-    log : its name in a batch; default: that in the report
+    log : its name in a batch; default: the name in the report
     inside : as in `open_regular`
 
     Raises

@@ -1,6 +1,6 @@
-"""Every figure of a directory or a page, once: name, title, caption, the function that draws it, and when it does.
+"""All figures of directories and pages: name, title, caption, the function that draws each, and when it is drawn.
 
-matplotlib is imported when the first figure is drawn: a page of finished pictures needs their captions alone.
+matplotlib is imported when the first figure is drawn, because a page of finished pictures needs only captions.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class Entry(NamedTuple):
 
     Attributes
     ----------
-    of : what it is drawn of
-    title, caption : one line each: what it shows, what to see; ``{}`` is the distance in the name of the file
+    of : kind of its subject
+    title, caption : one line each: what the figure shows, what to look for; ``{}`` is the distance in the file's name
     place : module and name of its function in ``icrtool.output.figures``
-    parts : what follows the name in the names of its files, with further arguments of the function; empty: no figure
+    parts : suffixes of its files' names, each with further arguments of the function; empty: no figure
     with_place : its axes may be coordinates of a map grid
-    further : of the paper; drawn where all figures are asked for
+    further : a figure of the paper that is drawn only where all figures are requested
     """
 
     of: Subject
@@ -136,11 +136,11 @@ FIGURES = {
         "calibrations.transfer",
     ),
 }  # fmt: skip
-"""By the name of the file; a name that ends in ``_`` goes on with a distance."""
+"""All figures by the names of their files. To a name that ends in ``_`` a distance is added."""
 
 
 def drive_charts(position_word: str) -> tuple[Chart, ...]:
-    """Return what the script of a run's page draws of the drive, its map first; captions go on from the pictures'."""
+    """Return the drawings of a drive on a run's page, its map first; their captions extend the pictures' captions."""
     icrs, differences = FIGURES["icr_estimates"], FIGURES["gnss_difference"]
     return (
         Chart(
@@ -184,7 +184,7 @@ def draw_figures(
 
     Parameters
     ----------
-    directory : made where it is not there
+    directory : is made if it does not exist
     formats : of ``png``, ``svg`` and ``pdf``
 
     Raises

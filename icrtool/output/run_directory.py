@@ -1,4 +1,4 @@
-"""The run directory: what `icrtool fit` leaves behind, and how it is read back; the newest run, the log of a run."""
+"""The run directory: write and read the files of `icrtool fit`; find the newest run, and the log of a run."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ PAGE_FILE = "report.html"
 STATES_FORMATS: tuple[StatesFormat, ...] = get_args(StatesFormat)
 
 MOST_CSV_STATES = 1_000_000
-"""With more states, states.csv would have over 300 MB, and take longer to read than the log."""
+"""Largest number of states that are written as CSV by default. With more, states.csv has over 300 MB and takes longer
+to read than the log."""
 
 RUN_FAMILY = "icrtool/run/"
 
@@ -53,7 +54,7 @@ RUN_FILES = (
     r"run\.json|events\.csv|measurements\.npz|(states|smoothed)\.(csv|parquet)|B2SUMS"
     rf"|report\.html|{PICTURE_FILES}|dropout/({REPORT_FILES})?"
 )
-"""Names of the files in a run directory; a directory with a file of another name is not replaced."""
+"""Pattern of the names of files in a run directory. A directory with a file of another name is not replaced."""
 
 
 def check_target(
@@ -84,7 +85,7 @@ def check_target(
 
 
 def _is_made_from(directory: Path, log: Path) -> bool:
-    """Return whether a run was made from a log: from a file in the same place, or from files of the same content."""
+    """Return whether a run was made from a log: from files at the same path, or with the same content."""
     files = [file for file in files_of_log(log) if file.is_file()]
     inputs = _inputs_of(directory)
     try:
@@ -171,7 +172,7 @@ def _asked_of(directory: Path) -> _Asked | None:
 
 
 def write_run(run: Run, directory: Path, **options: Any) -> None:
-    """Write a run directory, whole or not at all; parameters and errors as of `new_run`."""
+    """Write a run directory, whole or not at all; parameters and errors as in `new_run`."""
     with new_run(run, directory, **options):
         pass
 
@@ -187,24 +188,24 @@ def new_run(
     note: Callable[[str], None] | None = None,
     inside: Path | None = None,
 ) -> Iterator[Path]:
-    """Write a run, and give its new directory before that is put in its place at the end of the block.
+    """Write a run and give its new directory; at the end of the block the directory is put in its place.
 
-    What the block writes there belongs to the run, and where it fails the old run stays.
+    Files that the block writes there belong to the run. If the block fails, the old run is unchanged.
 
     Parameters
     ----------
     run : its smoothed states, where it has them, are written as ``smoothed`` in the same format
-    directory : where it shall appear; an old run there is replaced, with all that was made from it
-    states : format of the states; default: ``csv``, of more than `MOST_CSV_STATES` ``parquet``
+    directory : where it shall appear; an old run there is replaced, with all files that were made from it
+    states : format of the states; default: ``csv``, for more than `MOST_CSV_STATES` states ``parquet``
     plots : formats of the figures, of ``png``, ``svg`` and ``pdf``; none: no figures
-    figures : ``all``: those of the paper too
-    note : called with one line where an old run was replaced and what the new one does not have was removed
+    figures : ``all``: the paper's figures too
+    note : called with one line if an old run was replaced and files that the new run does not have were removed
     inside : as in `check_directory`
 
     Raises
     ------
     OutputError
-        A file, a foreign directory or a run with files of others is there, or the disk does not take it.
+        A file, another directory or a run with files that icrtool did not write is there, or the disk does not take it.
     """
     if unknown := set(plots) - set(formats.PLOT_FORMATS):
         raise ValueError(f"plots: {unknown} are not among {formats.PLOT_FORMATS}")
@@ -213,7 +214,7 @@ def new_run(
         if states != "csv" and note is not None:
             note(f"{directory}: {len(run.table):,} states: written as states.parquet, not states.csv (--states csv)")
     with atomic_directory(directory, RUN, inside) as partial, ThreadPoolExecutor(1) as pool:
-        # Not ".", which is the old run wherever it is moved.
+        # Not ".": it would name the old run even after that is renamed.
         place = Path(os.path.realpath(directory))
         before = set(names_in(place))
         states_written = pool.submit(run_columns.write_states, run.table, partial / f"states.{states}", states)
@@ -231,7 +232,7 @@ def new_run(
         formats.write_sums(partial, {name: formats.file_b2sum(partial / name) for name in files})
         yield partial
     if note is not None and (gone := before.difference(names_in(place))):
-        # A folder stands for what was in it.
+        # A folder is listed in place of its files.
         tops = [name for name in sorted(gone) if gone.isdisjoint(f"{one}/" for one in PurePosixPath(name).parents)]
         note(f"{directory}: replaced: removed {listed(tops, 5)}")
 
@@ -252,7 +253,7 @@ class _Sources(Record, frozen=True):
 
 
 def _inputs_of(directory: Path) -> tuple[InputFile, ...]:
-    """Return the inputs in a run.json that nobody checked yet."""
+    """Return the inputs in a run.json that was not checked."""
     try:
         return formats.read_document(directory / RUN_FILE, _Inputs, directory, escape=False).inputs
     except (OSError, ValueError, RecursionError):
@@ -268,7 +269,7 @@ def is_run_directory(directory: Path) -> bool:
 
 RUN = Kind(
     "run directory",
-    # One whose run.json was damaged is to be made again.
+    # A run with a damaged run.json may be replaced.
     lambda place: is_run_directory(place) or is_regular(place / formats.SOURCES_FILE, place),
     re.compile(RUN_FILES),
 )
@@ -287,7 +288,7 @@ def events_csv(events: Sequence[EventDocument]) -> bytes:
 FIT_AGAIN = "fit the log again"
 
 NAMES_IN_THE_LOG = ("topic", "message_type")
-"""Keys of run.json whose texts stand there as in the log."""
+"""Keys of run.json whose texts are stored as in the log, without escapes."""
 
 
 def open_run(path: str | Path, *, whole: bool = True) -> Run:
@@ -296,8 +297,9 @@ def open_run(path: str | Path, *, whole: bool = True) -> Run:
     Parameters
     ----------
     path : a directory that `icrtool fit` or `Run.write` made, or its address
-    whole : hold all columns; else the standard deviations of states in Parquet are read where they are used, and the
-        file has to stay as it is: a third less memory
+    whole : hold all columns; otherwise standard deviations of states in Parquet are read where they are used. This
+        needs a third less memory, but the file must not change
+
 
     Raises
     ------
@@ -312,7 +314,7 @@ def open_run(path: str | Path, *, whole: bool = True) -> Run:
 
 
 def _run_in(directory: Path, place: Path, *, whole: bool) -> Run:
-    """Return the run in a directory on disk; `place`: that it stands for."""
+    """Return the run in a directory on disk; `place`: the place or address that errors name."""
     stored = _read_document(directory)
     sums = formats.read_sums(directory)
     check_sum(directory, RUN_FILE, sums)
@@ -356,7 +358,7 @@ def log_of(run: Run) -> Path:
     Raises
     ------
     RunError
-        It is not where it was when the run was made.
+        The log is no longer at the path from which the run was made.
     """
     files = [place_of(file.path) for file in run.document.inputs]
     if len(files) == 1 and isinstance(files[0], UrlPath):
@@ -409,18 +411,18 @@ def _read_document(directory: Path) -> dict[str, Any]:
     if schema != RUN_SCHEMA:
         why = f"its schema is {shortened(schema, LONGEST_NAME)}, this icrtool reads {RUN_SCHEMA}"
         raise RunError(directory, why, FIT_AGAIN)
-    # What a log wrote there is printed from here on.
+    # Texts from a log in it may be printed from here on.
     return {
         key: value if key == "inputs" else escaped_texts(value, NAMES_IN_THE_LOG) for key, value in document.items()
     }
 
 
 def _read_states(directory: Path, stem: str, sums: Mapping[str, str], *, whole: bool) -> States | None:
-    """Read the states of this name, in the format that the run has; None where it has none of them."""
+    """Read the states of this name, in the run's format; None where the run has none."""
     for states in STATES_FORMATS:
         if (name := f"{stem}.{states}") in sums:
             with ThreadPoolExecutor(1) as pool:
-                # Both read the file from end to end; hashing leaves the interpreter to the other.
+                # Both threads read the whole file; hashing releases the GIL.
                 checked = pool.submit(check_sum, directory, name, sums)
                 try:
                     return run_columns.read_states(directory / name, states, directory, whole=whole)
@@ -430,12 +432,12 @@ def _read_states(directory: Path, stem: str, sums: Mapping[str, str], *, whole: 
 
 
 def check_sum(directory: Path, name: str, sums: Mapping[str, str]) -> None:
-    """Refuse a file of a run whose sum is not that of the list.
+    """Refuse a file of a run whose sum differs from the sum in the list.
 
     Raises
     ------
     RunError
-        It is not, or the file cannot be read.
+        The sums differ, or the file cannot be read.
     """
     try:
         found = formats.file_b2sum(directory / name, directory)

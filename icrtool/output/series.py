@@ -1,4 +1,4 @@
-"""Long columns as pictures and pages draw them: fewer points, where lines break, where a scale ends; and colours."""
+"""Long columns for pictures and pages: fewer points, breaks of lines, ends of scales; and colours."""
 
 from __future__ import annotations
 
@@ -10,28 +10,30 @@ import numpy as np
 from icrtool.kernels.arrays import ROWS_AT_ONCE, Floats, Ints
 
 BLUE, ORANGE, GREEN, RED, PURPLE = "#2166ac", "#e08214", "#1b7837", "#b2182b", "#762a83"
-"""Of pictures and of what is exported; a page has them once more for a dark screen (`page.css`)."""
+"""Colours of pictures and exports. `page.css` has them too, with further colours for a dark screen."""
 
 LINE_POINTS = 2400
-"""Points of a drawn line: some three per pixel column of every figure."""
+"""Approximate number of points of a drawn line: some three per pixel column of every figure."""
 
 SAMPLED_ROWS = 40_000
-"""Rows enough to find the range of a column for drawing."""
+"""Approximate number of rows from which the range of a column is found for drawing."""
 
 TYPICAL_PERCENT, HEADROOM = 99.5, 1.6
+"""Percentile of differences, and the ratio of the end of their scale to it. A few outliers do not flatten the rest."""
+
 LEAST_END_M = 0.001
-"""A scale of differences ends at `HEADROOM` times the 99.5 % one: a few outliers do not flatten the rest."""
+"""Smallest end of a scale of differences [m]."""
 
 RANGE_PERCENT = (0.2, 99.8)
-"""A range passes over the extremes of so little of the time: one spike does not flatten the rest."""
+"""Percentiles of a column between which its range is shown. One spike does not flatten the rest."""
 SCALE_MARGIN, LEAST_HALF_RANGE_M = 1.12, 0.02
 
 BREAK_SHARE, BREAK_IN_INTERVALS = 0.01, 5.0
-"""No line is drawn over a gap of this share of the time and this many times the usual interval."""
+"""Shortest gap over which no line is drawn: this share of the time, and this many usual intervals."""
 
 
 def every_so_many(rows: int, most: float) -> tuple[Ints, int]:
-    """Choose about `most` of so many rows: every so many-th and the last one; return them and every how many-th."""
+    """Choose about `most` of `rows` rows at an equal step, and the last row; return the rows and the step."""
     every = max(math.ceil(rows / most), 1)
     return np.unique(np.append(np.arange(0, rows, every), rows - 1)), every
 
@@ -47,12 +49,12 @@ def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
     Parameters
     ----------
     columns : float64 (n,) each; NaN breaks the line
-    points : about how many rows to choose
+    points : approximate number of rows to choose
 
     Returns
     -------
-    int64 (m,), increasing: first and last row, and in each of equally many rows those of the least and the greatest
-    value of each column; and the first row of every break. All rows where there are no more than `points`.
+    int64 (m,), increasing: first and last row; the rows of the smallest and the largest value of each column in equal
+    groups of rows; the first row of every break. All rows if there are no more than `points`.
     """
     rows = len(columns[0])
     if rows <= points:
@@ -73,7 +75,7 @@ def extremes(*columns: Floats, points: int = LINE_POINTS) -> Ints:
 
 
 def percentiles(column: Floats, shares: tuple[float, ...]) -> list[float]:
-    """Return about the percentiles of a column (n,), from every so many-th row where it is long."""
+    """Return approximate percentiles of a column (n,), from rows at an equal step where it is long."""
     return [float(value) for value in np.percentile(column[:: 1 + len(column) // SAMPLED_ROWS], shares)]
 
 
@@ -114,7 +116,7 @@ def scale_end_m(differences: Floats) -> float:
 
 
 def breaks_after(t: Floats) -> Ints:
-    """Return the rows (k,) of times (n,) behind which a line breaks: nothing was measured for long."""
+    """Return the rows (k,) of times (n,) after which a line breaks, because a long gap follows."""
     interval = np.diff(t)
     if not len(interval):
         return np.empty(0, np.int64)

@@ -1,4 +1,4 @@
-"""Files of simulations: a log with its truth beside it, the track speeds to drive, and the directory of a study.
+"""Files of simulations: a log with its truth in the same folder, given track speeds, and the directory of a study.
 
 A study is written whole or not at all: every run as CSV, parameters and statistics as JSON, the picture.
 """
@@ -26,17 +26,17 @@ SPEED_COLUMNS = ("t_s", "v_left_mps", "v_right_mps")
 
 
 def truth_path(log: Path) -> Path:
-    """Return where the truth of a log stands: beside it, ``LOG.truth.csv``."""
+    """Return the path of a log's truth: ``LOG.truth.csv`` in the log's folder."""
     return log.with_name(f"{log.name}.truth.csv")
 
 
 @contextmanager
 def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
-    """Give places to write a log and its truth to; put both in place when the block ends well.
+    """Give hidden paths to write a log and its truth to; put both in place when the block ends well.
 
     Parameters
     ----------
-    log : where the log shall appear; its truth appears beside it, see `truth_path`
+    log : where the log shall appear; its truth appears at `truth_path`
     force : replace what is there, if it is a log (a file, or a bag directory)
 
     Raises
@@ -59,10 +59,10 @@ def log_and_truth(log: Path, *, force: bool) -> Iterator[tuple[Path, Path]]:
             try:
                 yield fresh / log.name, fresh / truth.name
             except OutputError as err:
-                # It names the hidden directory.
+                # The bag's metadata names the hidden directory.
                 raise OutputError(log, err.why, err.advice) from err
             sync_tree(fresh)
-            # Killed from here on, it leaves a log without its truth, never with that of another log.
+            # If the process is killed from here on, the log has no truth, but never the truth of another log.
             remove(truth)
             put(fresh / log.name, log.absolute())
             put(fresh / truth.name, truth.absolute())
@@ -76,7 +76,7 @@ BAG = Kind(
 
 
 def write_truth(table: TruthTable, path: Path) -> None:
-    """Write the truth; numbers in the shortest form that reads back the same."""
+    """Write the truth, each number in the shortest form that is exact."""
     import pyarrow as pa
     import pyarrow.csv as pc
 
@@ -88,7 +88,7 @@ def write_truth(table: TruthTable, path: Path) -> None:
 
 
 def read_speeds(path: Path) -> TrackSpeeds:
-    """Read track speeds from a CSV with columns ``t_s, v_left_mps, v_right_mps``; others are passed over.
+    """Read track speeds from a CSV with columns ``t_s, v_left_mps, v_right_mps``; other columns are ignored.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def check_study_target(directory: Path) -> None:
     Raises
     ------
     OutputError
-        A file, a directory that is not a study of ours, or one with files of others is there.
+        A file, a directory that is not a study, or a study with files that icrtool did not write is there.
     """
     check_directory(directory, STUDY)
 

@@ -1,7 +1,8 @@
-"""Blocks: what a document states, once; laid out here as text and Markdown, by `icrtool.cli.printing`, and on a page.
+"""Blocks: the content of a document in one form; laid out as text and Markdown here, in a terminal, and on a page.
 
-A document (a run, a report, a comparison) is a list of blocks. Whatever lays them out knows nothing of runs or reports.
-It lists all that may be stated: what is empty in it (`stated`) is not laid out.
+A document (a run, a report, a comparison) is a list of blocks. The code that lays blocks out (here, in
+`icrtool.cli.printing` and `icrtool.output.page`) does not depend on runs or reports. A document lists all possible
+blocks; empty blocks are left out of the layout (`stated`).
 """
 
 from __future__ import annotations
@@ -14,48 +15,48 @@ from typing import Literal, NamedTuple
 from icrtool.records.text import escaped, shortened
 
 TEXT_WIDTH = 100
-"""Characters in a line of plain text."""
+"""Largest number of characters in a line of plain text."""
 
 BRIEF_WIDTH, BRIEF_LINES = 80, 2
-"""Columns of a terminal that a brief answer fills, and lines of a labelled sentence in it."""
+"""Largest number of columns of a brief answer, and of lines of a labelled sentence in it."""
 
 MOST_ITEMS = 4
-"""Sentences of a list in a brief answer."""
+"""Largest number of sentences of a list in a brief answer."""
 
 LABEL = 10
-"""Width of the labels of labelled sentences, beside two blanks."""
+"""Number of characters of the labels of sentences; two blanks follow."""
 
 NARROWEST, NARROWEST_LAST = 8, 12
-"""Characters that are left of a cell of text in a table that is too wide, and of the lines of a sentence in it."""
+"""Smallest width of a shortened cell of text in a table that is too wide, and of a wrapped last column [characters]."""
 
 Look = Literal["title", "good", "bad", "as is"]
 Grade = Literal["good", "care", "bad", "fact"]
 
 BRIEF, VERBOSE, PAGE = 0, 1, 2
-"""Depth of a section: always shown, with -v and folded on a page, and on a page alone."""
+"""Depth of a section: always shown; with -v, and folded on a page; only on a page."""
 
 
 class Title(NamedTuple):
-    """What a document is about, and how much it rests on."""
+    """Subject of a document, and the amount of data behind it."""
 
     text: str
     facts: str
 
 
 class Line(NamedTuple):
-    """A line that is more than a sentence: a title, a verdict, or what is copied and so is never wrapped."""
+    """A line that is not a plain sentence: a title, a verdict, or a text to copy, which is never wrapped."""
 
     text: str
     look: Look
 
 
 class Cell(NamedTuple):
-    """A cell with a second number beside the first, and further lines; a brief table has the first number alone.
+    """A cell with a first and a second number, and further lines; a brief table has only the first number.
 
     Attributes
     ----------
-    order : of a table that a page sorts, what it is sorted by, "" last; None: by the text
-    link, note : on a page, where it leads, and what is shown where it is pointed at
+    order : sort key of the cell on a page, "" last; None: the text
+    link, note : on a page, target of its link, and text shown when the pointer is on it
     """
 
     text: str
@@ -66,7 +67,7 @@ class Cell(NamedTuple):
     note: str = ""
 
     def lines(self) -> tuple[str, ...]:
-        """Return its lines; numbers beside others stand in a column."""
+        """Return the lines of the cell; second numbers are aligned in a column."""
         return (f"{self.text} {self.aside:>7}" if self.aside else self.text, *self.more)
 
 
@@ -76,12 +77,12 @@ class Table(NamedTuple):
     Attributes
     ----------
     align : ``l`` or ``r`` for each column; the last one holds for the columns after it too
-    rows : as many cells in each; in a row of a table that is searched fewer, the last of which is a sentence
+    rows : a cell a column; a row of a searched table may have fewer cells, of which the last is a sentence
     head : names of the columns; empty: none
     caption : what it shows
-    moments : seconds at which each row begins, which a page shows on its map; empty: none
-    search : of each row the `words` in which a page looks for others, and by name what is chosen from lists; a page
-        then sorts the table too; empty: it does neither
+    moments : times at which the rows begin [s], which a page shows on its map; empty: none
+    search : for each row the `words` that a page searches, and by name the values for its lists of choices. A page also
+        sorts such a table; empty: it does neither
     """
 
     align: str
@@ -142,7 +143,7 @@ class Items(NamedTuple):
 
 
 class Chart(NamedTuple):
-    """What a page's script draws in its element `name`, its title, and what to see there."""
+    """A drawing of a page's script in the element `name`, with its title and caption."""
 
     name: str
     title: str
@@ -154,10 +155,10 @@ class Figure(NamedTuple):
 
     Attributes
     ----------
-    names : begin the names of its pictures
-    drawing : template of what a page's scripts draw in place of them; empty: nothing
-    charts : what is drawn there
-    folded : a page shows the titles of its pictures first
+    names : beginnings of the names of its pictures
+    drawing : template of the drawing that a page's scripts make in place of the pictures; empty: none
+    charts : charts of this drawing
+    folded : whether a page shows only the titles of its pictures at first
     """
 
     names: tuple[str, ...]
@@ -171,9 +172,9 @@ class Section(NamedTuple):
 
     Attributes
     ----------
-    lead, text : the answer in a few words, and the sentence that goes on from there
-    label : what stands before them in a brief answer; empty: they do not
-    name : of its place on a page
+    lead, text : the answer in a few words, and the rest of its sentence
+    label : label of lead and text in a brief answer; empty: they are not printed there
+    name : name of its place on a page
     """
 
     title: str
@@ -187,13 +188,13 @@ class Section(NamedTuple):
 
 
 Block = str | Title | Line | Table | Facts | Checks | Items | Figure | Section
-"""A `str` is a sentence; what follows its first line is indented by two more characters."""
+"""Any block. A `str` is a sentence; its lines after the first are indented by two more characters."""
 
 Printed = str | Line | Table
 
 
 def stated(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Yield the blocks that state something: without empty sentences of facts, and without what is empty then."""
+    """Yield the blocks that are not empty, after empty sentences of facts are left out."""
     for block in blocks:
         match block:
             case Section():
@@ -226,7 +227,7 @@ GRADE_MARKS: dict[Grade, str] = {"good": "ok", "care": "!", "bad": "!", "fact": 
 
 
 def printed(blocks: Iterable[Block], *, verbose: bool) -> Iterator[Printed]:
-    """Yield what is printed of a document: the brief answer in `BRIEF_WIDTH`, or all but what is for a page alone."""
+    """Yield the printed parts of a document: the brief answer in `BRIEF_WIDTH`, or all parts that are not page-only."""
     for block in stated(blocks):
         if isinstance(block, str | Line):
             yield block
@@ -262,7 +263,7 @@ def _printed_section(section: Section, verbose: bool) -> Iterator[Printed]:
 
 
 def _labelled(block: Facts | Checks, verbose: bool) -> Iterator[tuple[str, str, int]]:
-    """Yield what stands before each sentence, the sentence, and in how many lines of a brief answer."""
+    """Yield the label before each sentence, the sentence, and its largest number of lines in a brief answer."""
     if isinstance(block, Facts):
         widest = max((len(name) for name, _ in block.rows), default=0)
         for number, (name, text) in enumerate(block.rows):
@@ -276,17 +277,17 @@ def _labelled(block: Facts | Checks, verbose: bool) -> Iterator[tuple[str, str, 
 
 
 def _sentence(first: str, text: str, most: int, look: Look = "as is", *, verbose: bool) -> Printed:
-    """Return a sentence behind its label, in so many lines of a brief answer at most; no path is broken."""
+    """Return a sentence after its label, in at most `most` lines of a brief answer; no path is broken."""
     if verbose:
         return Table("l", [(first[:-2], text)])
     return Line("\n".join(_wrap(text, first, " " * len(first), BRIEF_WIDTH, most)) or first.rstrip(), look)
 
 
 def fitted_to(table: Table, width: int, fewest: int) -> tuple[Table, list[str]]:
-    """Return a table with one line a row that fits a width as far as it can, and the columns that are left out for it.
+    """Return a table with one line a row, fitted to a width where possible, and the columns that are left out.
 
-    The widest cells of text are shortened first; then columns are left out, from the middle, until `fewest` are left. A
-    last column of text is wrapped, and needs no more than a few words.
+    The widest cells of text are shortened first. Then columns are left out, from the middle, until `fewest` are left. A
+    last column of text is wrapped, and needs the width of only a few words.
     """
     sides, head = table.sides(), [list(map(str, table.head))] if table.head else []
     rows = [*head, *table.lines()]
@@ -356,7 +357,7 @@ def _markdown_lines(blocks: Iterable[Block]) -> Iterator[str]:
 
 
 def _escaped_markdown(text: str) -> str:
-    """Return text with what Markdown would take for markup escaped."""
+    """Return text with Markdown's markup characters escaped."""
     plain = re.sub(r"([\\`*_{}\[\]<>|#~&$])", r"\\\1", escaped(" ".join(text.split())))
     # GitHub and GitLab notify whom an @ names, also behind an escape: a word joiner parts it from the name
     return plain.replace("@", "@\u2060")

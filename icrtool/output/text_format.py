@@ -1,4 +1,4 @@
-"""Words and numbers as a reader of our figures and tables meets them."""
+"""Words and numbers in the form of figures and tables."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ GLOSSARY = {
     "95 %, expected": "19 of 20 trials end nearer than the first; the second is the mean over all trials.",
     "σ": "One standard deviation.",
 }
-"""What the words of a run's page mean; those of its rows are in `icrtool.records.rows`."""
+"""Meanings of the words on a run's page. The words for rows are in `icrtool.records.rows`."""
 
 MOST_LINES = 50
-"""Jumps of the reference that are printed, the largest decided ones first."""
+"""Largest number of jumps of the reference that are printed, the largest decided ones first."""
 
 
 def run_title(summary: RunDocument) -> str:
-    """Return the log's name, and the robot's where it has one; `summary` is that of a run."""
+    """Return the log's name, and the robot's where it has one, from a run's `summary`."""
     log, robot = summary.log, summary.config.robot.name
     return f"{log}  ({robot})" if robot else str(log)
 
 
 def position_word(summary: RunDocument) -> str:
-    """Return what the position measurements are called: fixes of a receiver, or a reference that was metric already."""
+    """Return the words for the position measurements: fixes of a receiver, or a reference that was metric already."""
     return "GNSS fixes" if summary.gnss.datum is not None else "position reference"
 
 
 def role_word(summary: RunDocument, role: Role) -> str:
-    """Return what a stream is called: a position reference that was metric already is no GNSS."""
+    """Return the word for a stream: a position reference that was metric already is not called GNSS."""
     return ROLE_WORDS[role] if summary.gnss.datum is None else role
 
 
@@ -56,7 +56,7 @@ def topics_text(topics: str) -> str:
 
 
 def jump_lines(jumps: Sequence[ReferenceJumpDocument]) -> list[str]:
-    """Return a line for each jump of the reference: when, how large, why it is one, and what follows."""
+    """Return a line for each jump of the reference: time, size, reason, and effect on trials."""
     listed = sorted(jumps, key=lambda one: (one.undecided, -one.size_m))[:MOST_LINES]
     lines = [
         f"reference jump from {one.begin_s:.1f} to {one.end_s:.1f} s: {_jump_size(one)}: {one.why}; "
@@ -88,7 +88,7 @@ def xml_text(text: str) -> str:
 
 
 def signed(metres: float, digits: int = 3) -> str:
-    """Return a number with its sign, to the millimetre, as print has it (a minus, not a hyphen)."""
+    """Return a number with its sign, to the millimetre, with a typographic minus instead of a hyphen."""
     return f"{metres:+.{digits}f}".replace("-", "−") if round(metres, digits) else f"{0:.{digits}f}"
 
 

@@ -1,4 +1,4 @@
-"""Simulate a robot on a path, the sensors of Pentzer 2014, Section 4, and what is recorded of them."""
+"""Simulate a robot on a path, the sensors of Pentzer 2014, Section 4, and their recording."""
 
 from __future__ import annotations
 
@@ -20,32 +20,34 @@ from icrtool.simulation.friction import FrictionRobot, slide_path
 from icrtool.simulation.truths import IcrTruth, Truth
 
 CURVED_SWINGS = ((0.8, 1.4), (0.2, 3.0))
-"""Share of the curvature, and length in radii per radian, of the two oscillations of path ``curved``: the heading
-varies by up to 1.7 rad, without a short period."""
+"""Two oscillations of path ``curved``: share of the curvature, and length in radii per radian. With these values the
+heading varies by up to 1.7 rad and has no short period."""
 
 TRUTH_STEP_S = 0.001
-"""Track speeds of a path are held this long by default; every sensor is slower."""
+"""Default time for which track speeds of a path are held [s]. The intervals of all sensors are longer."""
 
 PAPER_ICRS_M: Icrs = (0.5, -0.75, -0.25)
-"""Pentzer 2014, Section 5."""
+"""True y_icr_right, y_icr_left, x_icr of the simulations in Pentzer 2014, Section 5 [m]."""
 
 GYRO_STD_RADPS = 0.003
 
 MOST_SIMULATED_SAMPLES = 20_000_000
-"""Of a sensor, and steps of the truth: five and a half hours at the default step."""
+"""Largest number of samples of a sensor and of steps of the truth: 5.5 h at the default step."""
 
 LARGEST_SETTING, SMALLEST_SETTING = 1e6, 1e-9
-"""Magnitudes of the numbers of a drive and its sensors, in their units; 0 is allowed where it has a meaning."""
+"""Largest and smallest size of a setting of a drive or sensor, in its unit. 0 is allowed where it has a meaning."""
 
 START_NS = 1_760_000_000_000_000_000
+"""Stamp of time 0 [ns]."""
+
 DATUM = (40.7934, -77.86, 350.0)
-"""Where and when: latitude, longitude [deg], height [m] of the first pose, and the stamp of time 0."""
+"""Latitude, longitude [deg] and height [m] of the first pose."""
 
 LARGEST_RTK_STD_M, LARGEST_SBAS_STD_M = 0.05, 0.6
-"""NavSatStatus of a receiver by its noise: GBAS, SBAS, or a plain fix."""
+"""Largest standard deviations of fixes with status GBAS and SBAS in NavSatStatus [m]; above both it is a plain fix."""
 
 TruthTable = dict[str, Floats | Ints]
-"""The truth at every wheel stamp: the columns of the truth CSV, (n,) each."""
+"""Truth at every wheel stamp: the columns of the truth CSV, (n,) each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ class TrackSpeeds:
 
 @dataclass(frozen=True, slots=True)
 class DrivePlan:
-    """What is simulated: the robot's true ICRs, or its contacts; its path and its motors.
+    """Plan of a simulated drive: the robot's true ICRs, or its contacts; its path and its motors.
 
     Attributes
     ----------
@@ -115,12 +117,12 @@ class Sensors:
     wheel_rate_hz, heading_rate_hz, gnss_rate_hz : samples per second
     metres_per_count : travel of one encoder count
     input_noise_mps, input_bias_mps : white noise per sample and bias, on both track speeds
-    gnss_std_m : of north and of east, white
+    gnss_std_m : standard deviation of north and of east, white
     outages_s : (begin, end) without fixes
     heading_std_rad, heading_resolution_rad : white noise, and the step that headings are rounded to
     heading_offset_rad : added to every heading, clockwise
     antenna_forward_m, antenna_right_m : position of the antenna, body frame
-    gnss_delay_s, heading_delay_s : how much their stamps lag behind the wheels' clock
+    gnss_delay_s, heading_delay_s : lag of their stamps behind the wheels' clock
     """
 
     wheels: Literal["ideal", "encoder", "commanded"] = "encoder"
@@ -172,7 +174,7 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
     ConfigError
         It names the impossible value.
     """
-    # Numbers whose samples fill the memory, or that are no size of a robot, a sensor or a drive.
+    # Refuse numbers whose samples fill the memory, and numbers that no robot, sensor or drive has.
     for part in (plan, sensors, plan.path, *([] if plan.robot is None else [plan.robot])):
         for name in (each.name for each in fields(part) if not isinstance(part, TrackSpeeds)):
             for number in _numbers_in(getattr(part, name)):
@@ -202,7 +204,7 @@ def check_drive(plan: DrivePlan, sensors: Sensors) -> None:
 
 
 def _check_robot(plan: DrivePlan) -> None:
-    """Refuse what a robot on sliding contacts cannot be given: ICRs that change, and track speeds."""
+    """Refuse settings that a robot on sliding contacts cannot have: ICRs that change, and given track speeds."""
     if plan.robot is not None and plan.changes:
         advice = "leave --change out, or --dynamics"
         raise ConfigError("change", "the ICRs of a robot on sliding contacts follow from forces", advice)
@@ -211,7 +213,7 @@ def _check_robot(plan: DrivePlan) -> None:
 
 
 def _numbers_in(value: object) -> Iterator[float]:
-    """Yield the numbers of a field: itself, or those of the tuples in it."""
+    """Yield the numbers of a field: the field itself, or the numbers in its tuples."""
     if isinstance(value, tuple):
         for each in value:
             yield from _numbers_in(each)
@@ -258,14 +260,14 @@ def track_speeds(forward: Floats, turn: Floats, icrs_m: tuple[float, float, floa
 
 
 def drive_plan(plan: DrivePlan, tail_s: float, rng: np.random.Generator | None = None) -> Truth:
-    """Return the true motion over a plan's duration and `tail_s` [s] more: the last wheel speed needs a next sample.
+    """Return the true motion over a plan's duration plus `tail_s` [s]: the last wheel speed needs a next sample.
 
     `rng` draws the ground of a robot on sliding contacts; default: seed 0.
     """
     end = plan.duration_s + tail_s + 2 * plan.step_s
     given = plan.path.t_s if isinstance(plan.path, TrackSpeeds) else np.empty(0)
     edges = np.array([time for time, _ in plan.changes])
-    # Divided, not multiplied: k / 100 and j / 20 are then the same double where they are the same time.
+    # A division, because k / 100 and j / 20 give the same double for the same time; products may differ.
     grid = np.arange(math.ceil(end / plan.step_s)) / round(1 / plan.step_s)
     t = np.union1d(grid, np.concatenate([given[given < end], edges[edges < end]]))
     command_t = t
@@ -314,7 +316,7 @@ def sense(truth: Truth, sensors: Sensors, duration_s: float, rng: np.random.Gene
         travels = [np.floor(travel / sensors.metres_per_count) * sensors.metres_per_count for travel in travels]
         v_left, v_right = (np.diff(travel) / interval for travel in travels)
     gnss_t = sample_times(sensors.gnss_rate_hz, duration_s)
-    # Drawn for the whole drive: an outage changes no fix outside it.
+    # Noise is drawn for the whole drive, so that an outage changes no fix outside it.
     noise = rng.normal(0.0, 1.0, (len(gnss_t), 2)) * sensors.gnss_std_m
     seen = np.ones(len(gnss_t), np.bool_)
     for begin, end in sensors.outages_s:
@@ -351,7 +353,7 @@ def _wheel_speed(
     else:
         edges = np.append(wheel_t, len(wheel_t) / sensors.wheel_rate_hz)
         speed = np.diff(np.interp(edges, truth.t_s, getattr(truth, f"travel_{side}_m"))) / np.diff(edges)
-    # Drawn even where the noise is zero: then a run with noise differs from one without by the noise alone.
+    # Noise is drawn even if its size is zero, so that runs with and without noise differ by the noise alone.
     noise: Floats = rng.normal(0.0, 1.0, len(wheel_t)) * sensors.input_noise_mps
     return speed + sensors.input_bias_mps + noise
 

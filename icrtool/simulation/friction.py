@@ -13,7 +13,7 @@ from icrtool.records.tables import Icrs
 from icrtool.simulation.truths import FrictionTruth
 
 STEERING_HZ = 0.5
-"""Turn rate that the driver commands for a heading error, in rad/s for each rad: an error halves in 1.4 s."""
+"""Ratio of the turn rate that the driver commands to the heading error [rad/s per rad]. An error halves in 1.4 s."""
 
 GRIP_CELL_M = 0.1
 """Length of the cells of ground in which the friction is constant [m]."""
@@ -25,10 +25,10 @@ LEAST_FRICTION = 0.05
 """Smallest friction coefficient that is drawn: below it a robot hardly moves."""
 
 ICR_WINDOW_S = 2.0
-"""ICRs are fitted to the motion over this time [s]: single steps of a straight drive show none."""
+"""Time over which ICRs are fitted to the motion [s]. Single steps of a straight drive show no ICRs."""
 
 SHOWN_TURN_RADPS = 0.02
-"""A turn rate of this size counts as much as the mean ICRs of the whole drive [rad/s]."""
+"""Turn rate at which the motion has the same weight as the mean ICRs of the whole drive [rad/s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +37,15 @@ class FrictionRobot:
 
     Attributes
     ----------
-    half_track_m : centre line of a side from the middle
-    contact_forward_m : contacts of a side, ahead of the body origin: two wheels, or the road wheels of a track
+    half_track_m : distance from the middle to the centre line of a side
+    contact_forward_m : places of the contacts of a side, ahead of the body origin: two wheels, or a track's road wheels
     mass_forward_m, mass_height_m : centre of mass, ahead of the body origin and above the ground
     gyration_m : radius of gyration about the vertical axis
     friction : Coulomb's coefficient along the track; lateral_friction : sideways, as a multiple of it. With 2.4 the
-        wheeled robot has the mean ICRs of the paper's Table II, with 2.0 the tracked one those of Table I.
-    friction_std : standard deviation of the friction of each side along the path, as a share of it
-    friction_length_m : distance over which that variation is correlated
-    creep : share of the track speed at which friction is 0.7 of its limit: soft ground has more
+        wheeled robot has the mean ICRs of the paper's Table II, with 2.0 the tracked robot has the mean ICRs of Table
+    I. friction_std : standard deviation of the friction of each side along the path, as a share of it friction_length_m
+    : distance over which the friction's variation is correlated creep : share of the track speed at which friction is
+    0.7 of its limit: soft ground has more
     """
 
     mass_kg: float = 118.0
@@ -83,7 +83,8 @@ def scaled_robot(robot: FrictionRobot, track_width_m: float) -> FrictionRobot:
 def draw_grip(robot: FrictionRobot, rng: np.random.Generator) -> Floats:
     """Return the friction coefficient (g, 2) of left and right side, by cell of driven distance.
 
-    A first-order autoregression along the path, independent by side: right and left wheels run on other ground.
+    A first-order autoregression along the path, independent for each side: left and right wheels run on different
+    ground.
     """
     kept = np.exp(-GRIP_CELL_M / robot.friction_length_m)
     grip = np.empty((GRIP_CELLS, 2))
@@ -135,7 +136,7 @@ def slide_path(
 
 
 def fitted_icrs(t: Floats, velocity: Floats, left: Floats, right: Floats) -> Floats:
-    """Return the ICRs (n, 3) that explain the motion about each time best.
+    """Return the ICRs (n, 3) that best explain the motion around each time.
 
     Notes
     -----

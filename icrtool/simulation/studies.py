@@ -1,7 +1,7 @@
 """Studies: the paper's simulations (Pentzer 2014, Section 5) over many seeds, on the paper's robot or on one's own.
 
-A study is a row of `STUDIES`: what varies, what is measured of each run, which numbers are reported of it, and which of
-them is the answer. `run_study` carries out each; `icrtool.output.figures.study` draws it.
+A study is a row of `STUDIES`. It states what varies, what is measured in each run, which numbers are reported, and
+which number is the answer. `run_study` runs a study; `icrtool.output.figures.study` draws it.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from icrtool.simulation.study_records import (
 from icrtool.simulation.study_runs import FATES, Progress, Scenario, run_scenarios, trace
 
 PAPER_TRACK_WIDTH_M = 0.51
-"""Pentzer 2014, Section 5: the robot of the simulations."""
+"""Track width of the simulated robot in Pentzer 2014, Section 5 [m]."""
 
 MOST_RUNS = 100_000
-"""Runs of a setting."""
+"""Largest number of runs of a setting."""
 
 SHOWN_S = 20.0
-"""First seconds of a run that the picture of convergence shows."""
+"""Time from the start of a run that the picture of convergence shows [s]."""
 
 GUARDS = {"no guard": UNGUARDED, "guard, printed derivatives": PRINTED, "guard, true derivatives": GUARDED}
 """Eqs. 8-10; Eqs. 32-34 with Eqs. 28-29 as printed; Eqs. 32-34 with their true derivatives, as icrtool uses them."""
@@ -63,11 +63,11 @@ def in_preset(request: StudyRequest, preset: str) -> Scenario:
 def by_preset(
     change: Callable[[Scenario, Any], Scenario], choices: Sequence[str] = ()
 ) -> Callable[[StudyRequest], Iterator[Setting]]:
-    """Return what gives a setting for each preset, and for each of the choices or of the values of a request.
+    """Return a function that yields a setting for each preset and each choice, or each value of a request.
 
     Parameters
     ----------
-    change : what a preset's scenario becomes for a value
+    change : gives the scenario for a preset's scenario and a value
     """
 
     def vary(request: StudyRequest) -> Iterator[Setting]:
@@ -89,15 +89,15 @@ def driving(base: Scenario, **path: Any) -> Scenario:
 
 
 def at_rate(base: Scenario, rate: float) -> Scenario:
-    """Return a scenario recorded at another rate of wheels and heading, and of the fixes where theirs is higher."""
+    """Return a scenario with another rate of wheels and heading; a higher rate of the fixes is reduced to it."""
     gnss_rate = min(rate, base.sensors.gnss_rate_hz)
     return sensing(base, wheel_rate_hz=rate, heading_rate_hz=rate, gnss_rate_hz=gnss_rate)
 
 
 def from_source(base: Scenario, name: str) -> Scenario:
-    """Return a scenario with encoders, or with the commands that the motors get at a low rate and follow with a lag.
+    """Return a scenario with encoders, or with motor commands at a low rate that the motors follow with a lag.
 
-    The bias is between command and track; the drives are the same.
+    The bias is the difference of command and track speed. The drives of both scenarios are the same.
     """
     if name == "encoder":
         return sensing(base, wheels="encoder", input_bias_mps=0.0)
@@ -107,7 +107,8 @@ def from_source(base: Scenario, name: str) -> Scenario:
 def on_circle(base: Scenario, radius: float) -> Scenario:
     """Return a scenario on a circle, with inflation.
 
-    The faster track keeps one speed: at radius 0 the robot spins, and the wider the circle, the slower it turns.
+    The speed of the faster track is the same for all radii. At radius 0 the robot spins; on a wider circle it turns
+    slower.
     """
     outer, path = abs(base.plan.icrs_m[1]), cast(PathPlan, base.plan.path)
     speed = path.speed_mps * (radius / (radius + outer) if radius else 1.0)
@@ -176,7 +177,7 @@ def shown_path(paths: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def consistency_numbers(levels: Sequence[Level]) -> list[StudyNumber]:
-    """Return NEES, NIS and coverage of each case, beside what they should be."""
+    """Return NEES, NIS and coverage of each case, with their expected values."""
     numbers = []
     for level in levels:
         name, case, by_run = level.setting.series, consistency_of(level.found), level.metrics()
@@ -217,7 +218,7 @@ def by_speed_error(word: str, sensors_field: str, figures: str, paper: str) -> S
 PATHS: tuple[PathKind, ...] = ("circle", "curved", "lawnmower", "spins")
 PATH_TIMES = {"circle": "2.9-12.8 s, driven (Figs. 15, 17)", "": "5-15 s, driven"}
 STARTS = ("proper start", "inverted start")
-START_FATES = {"no guard": "those with y_icr_right > 0 (Fig. 6)", "": "all (Fig. 7)"}
+START_FATES = {"no guard": "starts with y_icr_right > 0 (Fig. 6)", "": "all (Fig. 7)"}
 CHANGE_TIMES = {"inflated": "0.03-0.17 s (Fig. 9)", "": "100-140 s (Fig. 8)"}
 RADIUS_TIMES = {0.0: "0.1 s (Fig. 10)", 2.0: "1.8 s (Fig. 10)"}
 TABLE_III = {
@@ -270,8 +271,8 @@ STUDIES: dict[str, Study] = {
         numbers=(
             Number("{series}, {value}: convergence time (10-90 %)", "change*_rise_*_s", "spread", "s", CHANGE_TIMES),
             Number("{series}, {value}: all three stay within 10 % after", "change*_settle_s", "spread", "s"),
-            Number("{series}, {value}: … in so many of the changes", "change*_settle_s", "percent found", "%"),
-            Number("{series}, {value}: ends inverted", "inverted", "percent", "%"),
+            Number("{series}, {value}: share of the changes with such a time", "change*_settle_s", "percent found",
+            "%"), Number("{series}, {value}: ends inverted", "inverted", "percent", "%"),
         ),
         title="Time to follow a change, inflated: {answer}",
         answer=Number("{series}", "change*_settle_s", "median", "s", at=("inflated",)),
@@ -381,7 +382,7 @@ STUDIES: dict[str, Study] = {
 
 
 def default_request(name: str, config: Config) -> StudyRequest:
-    """Return a study with the paper's parameters, and the configuration's robot for the start of preset ``field``."""
+    """Return the request of a study: the paper's parameters; the configuration's robot for preset ``field``'s start."""
     if config.robot.track_width_m is None:
         config = replace(config, robot=replace(config.robot, track_width_m=PAPER_TRACK_WIDTH_M))
     study = STUDIES[name]
@@ -408,10 +409,10 @@ def run_study(request: StudyRequest, progress: Progress | None = None) -> StudyR
     study = STUDIES[request.name]
     plan, times_s = request.plan, study.changes_s
     if plan.robot is not None and times_s:
-        why = f"study {request.name} changes known ICRs; those of a robot on sliding contacts follow from forces"
+        why = f"study {request.name} changes known ICRs; the ICRs of a robot on sliding contacts follow from forces"
         raise ConfigError("dynamics", why, "leave --dynamics out")
     if times_s and not plan.changes:
-        # The ICRs change at the usual times, as far as the drive goes.
+        # The ICRs change at the usual times that lie within the drive.
         if plan.duration_s <= times_s[0]:
             why = f"{plan.duration_s:g} s end before the first change, at {times_s[0]:g} s"
             raise ConfigError("duration", why, "drive longer, or give earlier times with --change")

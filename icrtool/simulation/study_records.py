@@ -1,4 +1,4 @@
-"""What a study is, what it is asked for and what it found; the numbers that are reported of its levels."""
+"""Records of a study: its definition, request and result; the numbers that are reported for its levels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from icrtool.simulation.drives import DrivePlan, PathPlan, Sensors
 from icrtool.simulation.study_runs import ICR_NAMES, STUDY_STATES, Measure, Scenario
 
 PLAN = DrivePlan(step_s=0.005)
-"""A study holds track speeds no longer than any wheel interval."""
+"""Default drive of a study. Its track speeds are held for 0.005 s, which is not longer than any wheel interval."""
 
 IDEAL = Sensors(wheels="ideal", heading_resolution_rad=0.0)
 
@@ -34,7 +34,7 @@ class StudyRequest:
     plan, sensors : the drive and its sensors; a study varies one of their settings
     config : filter and robot
     presets : the filter presets to compare
-    values : settings of what is varied; empty where nothing is
+    values : values of the varied setting; empty where none is varied
     paths : the kinds of path to compare, where a study compares them
     """
 
@@ -69,9 +69,9 @@ class Setting(NamedTuple):
     Attributes
     ----------
     series : the preset, guard or case
-    value : what varies within a series; empty where nothing does
-    scenario : how it is run
-    names : the columns of the CSV that name it, beside ``series``
+    value : the value that varies within a series; empty where none varies
+    scenario : drive, sensors and filter of its runs
+    names : the columns of the CSV that name the setting, in addition to ``series``
     """
 
     series: str
@@ -81,7 +81,7 @@ class Setting(NamedTuple):
 
 
 class Level(NamedTuple):
-    """A setting, and what was found in its runs (runs, ...) by name; numbers a run are columns of the CSV."""
+    """A setting, and the results of its runs (runs, ...) by name; results with one number a run are CSV columns."""
 
     setting: Setting
     found: Mapping[str, Floats]
@@ -92,7 +92,7 @@ class Level(NamedTuple):
         return {"series": self.setting.series, **self.setting.names}
 
     def numbers(self) -> dict[str, Floats]:
-        """Return the numbers a run (runs,)."""
+        """Return the numbers with one value a run (runs,), by name."""
         return {name: values for name, values in self.found.items() if values.ndim == 1}
 
     def metrics(self) -> dict[str, dict[str, float]]:
@@ -158,8 +158,10 @@ HOW: dict[How, Callable[[Sequence[Floats]], tuple[float, ...]]] = {
     "extreme medians": lambda levels: (float(min(map(np.median, levels))), float(max(map(np.median, levels)))),
     "first": lambda levels: _percentiles(levels[0]),
 }
-"""Numbers from the columns (runs,) of levels: 5th percentile, median and 95th percentile of all (``spread``) or of the
-first level; their median, mean or share; between the levels, the range of their means, least and greatest median."""
+"""Functions that compute numbers from the columns (runs,) of levels, by name.
+
+Over all levels: 5th percentile, median and 95th percentile (``spread``), median, mean or share. Over the first level:
+the same three percentiles (``first``). Between levels: range of the means, least and greatest median."""
 
 
 def _percentiles(values: Floats) -> tuple[float, ...]:
@@ -168,7 +170,7 @@ def _percentiles(values: Floats) -> tuple[float, ...]:
 
 
 def _middle(values: Floats) -> float:
-    """Return the median; a run without a number counts as beyond all others, and NaN stands for beyond half."""
+    """Return the median; a run without a number counts as infinite; NaN where the median is infinite."""
     middle = float(np.median(np.nan_to_num(values, nan=np.inf)))
     return middle if math.isfinite(middle) else math.nan
 
@@ -178,13 +180,13 @@ class Number(NamedTuple):
 
     Attributes
     ----------
-    what : its name, with {series}, {value} and {icr}; the levels of one name are put together
-    columns : pattern of the columns it is made of, with {icr}
+    what : its name, with {series}, {value} and {icr}; levels with the same name are joined
+    columns : pattern of the columns that it is computed from, with {icr}
     how : its computation, a key of `HOW`
     unit : of the number
-    paper : the paper's number as text, or that by value or series; by an empty key for all others
-    at : the values it is reported of, or which of all
-    series : the only series it is reported of; empty: all
+    paper : the paper's number as text, or a mapping from value or series to text, with an empty key for all others
+    at : the values for which it is reported, or a function that chooses them
+    series : the only series for which it is reported; empty: all
     """
 
     what: str
@@ -225,15 +227,15 @@ class Study:
     ----------
     about : one line
     vary : the settings of a request
-    measures : what is measured of each run
-    numbers : what is reported of the levels
-    title, answer : title of the picture, with {answer} and {value}, and the number that it gives of each series
+    measures : functions that measure each run
+    numbers : the numbers that are reported for the levels
+    title, answer : title of the picture, with {answer} and {value}, and the number of each series that it states
     figures : figures of the paper
-    varies : what its values are, with unit; empty where it takes none
-    varied : the option of the command that they are values of
-    changes_s : the ICRs change at these times, where no others are given
-    plan, sensors, presets, runs, values, paths : of the usual request
-    summary : what study.json holds of a level beside the statistics of its numbers
+    varies : name of the varied setting, with unit; empty where none is varied
+    varied : option of the command for this setting
+    changes_s : default times at which the ICRs change
+    plan, sensors, presets, runs, values, paths : of the default request
+    summary : content of study.json for a level, in addition to the statistics of its numbers
     """
 
     about: str
@@ -285,7 +287,7 @@ class StudyResult:
         return reported([self.study.answer], self.levels)
 
     def records(self) -> list[dict[str, Any]]:
-        """Return what study.json holds of the levels."""
+        """Return the content of study.json for the levels."""
         return [{**one.names, **self.study.summary(one.found), "metrics": one.metrics()} for one in self.levels]
 
 

@@ -1,6 +1,6 @@
-"""Filter many simulated runs on all cores; each is reduced at once to the numbers that a study needs of it.
+"""Filter many simulated runs on all cores; each is reduced at once to the numbers that a study needs.
 
-What is measured of a run are named numbers, the columns of its CSV, and arrays for its picture.
+A measurement of a run gives named numbers, which are columns of the study's CSV, and arrays for its picture.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from icrtool.simulation.truths import Truth
 Progress = Callable[[float], None]
 
 STOP_EVERY_S = 5.0
-"""The whole covariance is kept so often [s], and at the end."""
+"""Time between two rows at which the complete covariance is kept [s]; it is also kept at the end."""
 
 
 ICR_NAMES = ("y_icr_right", "y_icr_left", "x_icr")
@@ -38,10 +38,10 @@ FATES = ("converged", "inverted", "elsewhere")
 
 SETTLED_SHARE = 0.1
 SETTLED_M = 0.02
-"""An estimate has settled when its error stays below a tenth of its initial error, or below 2 cm."""
+"""Error below which an estimate has always settled [m]; otherwise it has settled below a tenth of its initial error."""
 
 CONVERGED_M = 0.1
-"""A run has converged where all three ICRs, averaged over its last tenth, are within this distance of the truth [m]."""
+"""Largest error of a converged run's ICRs [m]: all three, averaged over the last tenth of the run."""
 
 LAST_SHARE = 10
 
@@ -53,10 +53,10 @@ TRIAL_STARTS = 40
 """Open-loop trials per run; their starts are evenly spaced."""
 
 COVARIANCE_FROM_S = 10.0
-"""Covariances count after this time: before, the initial values of the presets still have an effect."""
+"""Time after which covariances count [s]. Before it, the presets' initial values have an effect."""
 
 LEAST_STD = 1e-12
-"""Avoids division by zero."""
+"""Smallest standard deviation to divide by. It avoids a division by zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class Scenario:
     ----------
     config : its filter section is used, and its robot for the start of preset ``field``
     inflate : inflate the ICR covariance at the drive's ICR changes (Section 5.2)
-    guard : sign guard, of `icrtool.kernels.filter_records`, with the Euler steps of Eq. 14; None: those of the preset
+    guard : sign guard, of `icrtool.kernels.filter_records`, with the Euler steps of Eq. 14; None: as in the preset
     model_icr_std_m : the truth obeys the filter's model, Eq. 14 with process noise drawn from Q (Eq. 30), from ICRs
         drawn with this standard deviation on; None: constant ICRs and exact kinematics
     """
@@ -111,7 +111,7 @@ class StudyRun:
 
 Found = dict[str, float | Floats]
 Measure = Callable[[StudyRun], Found]
-"""Reduces a run to numbers, or arrays as large in all runs of a scenario."""
+"""Reduces a run to numbers, or to arrays that have the same shape in all runs of a scenario."""
 
 
 def run_scenarios(
@@ -123,11 +123,11 @@ def run_scenarios(
     ----------
     seed : run i of every scenario draws from the generator seeded (seed, i): scenarios differ by their setting alone,
         and a run does not depend on how many there are or on the number of cores
-    measures : what to keep of a run
+    measures : functions that give the results to keep of a run
 
     Returns
     -------
-    list of the columns of `measures`, (runs, ...), a scenario each
+    list with one element a scenario: the columns of `measures`, (runs, ...)
     """
     for scenario in scenarios:
         drives.check_drive(scenario.plan, scenario.sensors)
@@ -191,7 +191,7 @@ def _simulate(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, F
 
 
 def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readings, Floats, None]:
-    """Return the measurements of true states (n, 6) that obey the filter's model, and those."""
+    """Return the measurements of true states (n, 6) that obey the filter's model, and the states."""
     plan, sensors = scenario.plan, scenario.sensors
     t = drives.sample_times(sensors.wheel_rate_hz, plan.duration_s)
     speeds = drives.track_speeds(*drives.plan_body(cast(PathPlan, plan.path), t, plan.icrs_m), plan.icrs_m)
@@ -200,7 +200,7 @@ def _simulate_model(scenario: Scenario, rng: np.random.Generator) -> tuple[Readi
     variance = np.array(process_variance(scenario.config, configured_noise(scenario.config)))
     noise = rng.normal(0.0, 1.0, (len(t), 6))
     states = model_states(x0, t, *speeds, np.sqrt(variance), scenario.config.filter.rules.rate_invariant, noise)
-    # States are measured at the wheel stamps that fall together with a fix or a heading.
+    # States are measured at wheel stamps that equal the stamp of a fix or a heading.
     fix, sample = (
         np.arange(0, len(t), max(1, round(sensors.wheel_rate_hz / rate)))
         for rate in (sensors.gnss_rate_hz, sensors.heading_rate_hz)
@@ -233,7 +233,7 @@ def readings_log(readings: Readings, sensors: Sensors) -> RobotLog:
 
 
 def measure_estimates(run: StudyRun) -> Found:
-    """Return, over the second half of a run, mean error and its rms, with the stated std, by ICR; and NIS."""
+    """Return mean and rms error and the stated std of each ICR over the second half of a run, and the NIS."""
     half = len(run.t_s) // 2
     error = run.x[half:, 3:] - run.truth[half:, 3:]
     numbers: Found = {"inverted": inverted(run)}
@@ -337,9 +337,9 @@ def measure_fate(run: StudyRun) -> Found:
 
 
 def trace(begin_s: float = 0.0, end_s: float = np.inf, name: str = "trace") -> Measure:
-    """Return what keeps time, ICR estimates and left track speed between two times, as array `name`.
+    """Return a measure that keeps time, ICR estimates and left track speed between two times, as array `name`.
 
-    It is (about 400, 5) [s, m, m, m, m/s].
+    The array is (about 400, 5) [s, m, m, m, m/s].
     """
 
     def kept(run: StudyRun) -> Found:
@@ -362,7 +362,7 @@ def measure_open_loop(run: StudyRun) -> Found:
 
     Notes
     -----
-    Section 6.4 with the ICRs the filter ended with, over starts all along the true path.
+    Section 6.4 with the filter's final ICRs, over starts along the whole true path.
     """
     truth = run.motion
     if truth is None:
@@ -388,10 +388,10 @@ def measure_open_loop(run: StudyRun) -> Found:
 
 
 def measure_consistency(run: StudyRun) -> Found:
-    """Return mean NEES and NIS, the errors at the end in their standard deviations; and those of all stops.
+    """Return mean NEES and NIS, the final errors in standard deviations, and arrays of the values at all stops.
 
-    The arrays: ``stops_s`` (s,), ``all nees`` (s,), of those that count ``settled nees`` (c,), and over their standard
-    deviations ``ratio`` (c, 6); ``all nis_gnss`` (m,), ``all nis_heading`` (h,).
+    The arrays: ``stops_s`` (s,), ``all nees`` (s,); of the stops that count ``settled nees`` (c,) and the errors in
+    standard deviations ``ratio`` (c, 6); ``all nis_gnss`` (m,), ``all nis_heading`` (h,).
     """
     stops_s = run.t_s[run.stops]
     nees, ratio = errors_over_std(run.x[run.stops] - run.truth[run.stops], run.P)
@@ -409,7 +409,8 @@ def errors_over_std(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
 
     Notes
     -----
-    The heading error is wrapped. The covariance is scaled to correlations first: metres and radians differ by orders.
+    The heading error is wrapped. The covariance is scaled to correlations first, because metres and radians differ by
+    orders of magnitude.
     """
     error = error.copy()
     error[..., 2] = wrapped(error[..., 2])

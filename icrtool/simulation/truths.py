@@ -55,7 +55,7 @@ class IcrTruth(Truth):
 
     Attributes
     ----------
-    icrs_m : (c, 3); which : int64 (n,) row of it that holds over [k, k+1)
+    icrs_m : (c, 3); which : int64 (n,), the row of `icrs_m` that holds over [k, k+1)
     """
 
     icrs_m: Floats

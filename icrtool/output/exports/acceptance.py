@@ -1,4 +1,4 @@
-"""Dropout reports for machines that watch pull requests: JUnit XML, and Markdown to paste."""
+"""Dropout reports for the CI of pull requests: JUnit XML, and Markdown to paste."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _summary_blocks(report: DropoutReport) -> list[Block]:
 
 
 def limit_section(verdicts: Sequence[FleetVerdict]) -> Section:
-    """Return the verdicts under what they come to, those that are not met first; empty without any."""
+    """Return the verdicts under their common result, limits that are not met first; empty without any."""
     missed = sum(not one.passed for one in verdicts)
     title = f"Acceptance limits not met: {missed}" if missed else "All acceptance limits are met"
     return Section(title, [Items([one.line for one in sorted(verdicts, key=lambda one: one.passed)])])

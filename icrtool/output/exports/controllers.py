@@ -32,7 +32,7 @@ NOT_PLANAR = 0.001
 """Variance of z, roll and pitch, which a plane does not show: the value the controller's own documentation gives."""
 
 ODOMETRY_USED = (6, 11)
-"""Of robot_localization's fifteen, x y z roll pitch yaw, their velocities, accelerations: vx and vyaw."""
+"""Places of vx and vyaw among the 15 values of robot_localization: x y z roll pitch yaw, velocities, accelerations."""
 
 
 CONTROLLER_PLACES: dict[ControllerTarget, tuple[str, ...]] = {
@@ -46,7 +46,7 @@ CONTROLLER_PLACES: dict[ControllerTarget, tuple[str, ...]] = {
         "  drive_controller:", "    ros__parameters:",
     ),
 }  # fmt: skip
-"""Where the parameters of a diff_drive_controller stand in each robot's configuration."""
+"""Lines above the parameters of a diff_drive_controller in each robot's configuration."""
 
 
 NAV2 = """\
@@ -124,7 +124,7 @@ def format_export(calibration: Calibration, target: ControllerTarget) -> str:
 
 
 def _parameters(calibration: Calibration, errors: ControllerErrors, target: ControllerTarget) -> list[str]:
-    """Return the lines of YAML: of a diff_drive_controller in its place, or for nav2 and robot_localization."""
+    """Return the lines of YAML: for a diff_drive_controller of the target, or for nav2 and robot_localization."""
     rest = _number(NOT_PLANAR)
     pose, twist = (
         f"[{_number(x)}, {_number(y)}, {rest}, {rest}, {rest}, {_number(yaw)}]"
@@ -170,7 +170,7 @@ def _header(calibration: Calibration, errors: ControllerErrors, driven: str) -> 
         [one[name] for name in ICR_COLUMNS] for one in (calibration.geometry, calibration.geometry_std)
     )
     robot = f", {_one_line(name)}" if (name := calibration.robot.name) else ""
-    # That of a report has no date: the same run, the same file.
+    # The calibration of a report has no date, so that the same run gives the same file.
     fitted = f", fitted {calibration.created[:10]}" if calibration.created else ""
     origin = f"icrtool {__version__}: {_one_line(calibration.log_names())}, {driven}{robot}{fitted}"
     icrs = (
@@ -204,7 +204,7 @@ def _number(value: float) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Return text fit for a comment: whatever a log is called."""
+    """Return a text on one line for a comment; the name of a log may hold any character."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 

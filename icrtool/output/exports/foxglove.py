@@ -1,7 +1,7 @@
 """A run as MCAP for Foxglove and other ROS 2 tools, with a layout that shows it.
 
 World ``map``: ENU about the datum of the run; bodies x forward, y left, z up (REP-103). Body ``base_link`` is the
-filter's, ``icr_odometry`` and ``no_slip_odometry`` are where wheel speeds alone lead. Stamps are those of the log.
+filter's estimate; ``icr_odometry`` and ``no_slip_odometry`` are computed from wheel speeds alone. Stamps are the log's.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 INTERVAL_S = 0.05
-"""States are written 20 times a second at most."""
+"""Shortest interval between two written states [s]."""
 
 WORLD = "map"
 LIBRARY = EXPORTED_MCAP.decode()
@@ -79,7 +79,7 @@ DEFINITIONS = {
         "float64 severity\nfloat64 confidence\n"
     ),
 }
-"""Message types of our own; the file holds their definitions."""
+"""Definitions of icrtool's own message types. They are written into the file."""
 
 
 def write_foxglove(run: Run, path: Path) -> None:
@@ -98,7 +98,7 @@ def write_foxglove(run: Run, path: Path) -> None:
     Notes
     -----
     Topics: ``/tf``; ``/filter/odometry``, ``/icr/odometry``, ``/no_slip/odometry`` (``/smoothed/odometry`` where the
-    run has it), and ``path`` beside each; ``/filter/fix``, ``/gnss/fix`` and ``/gnss/fix_rejected`` where the run has a
+    run has it), and a ``path`` for each; ``/filter/fix``, ``/gnss/fix`` and ``/gnss/fix_rejected`` where the run has a
     place on the globe; ``/icrs``, ``/open_loop_error``, ``/events`` and ``/outages``.
     """
     store, globe, paths = _typestore(), globe_of(run), paths_of(run)
@@ -159,7 +159,7 @@ def _transforms(paths: Sequence[ExportPath], rows: Ints, store: Typestore) -> wr
 
 
 def _odometry(run: Run, path: ExportPath, rows: Ints) -> write_log.TopicPlan:
-    """Return the poses of a path; its twist is what its ICRs make of the wheel speeds."""
+    """Return the poses of a path; the twist is computed from the wheel speeds with the path's ICRs."""
     table, stamps, (z, w) = run.table, path.stamp_ns[rows], path.quaternion
     icrs = (column[rows] if len(column) > 1 else column for column in path.icrs)
     v_x, v_y, omega = body_velocity(table.v_left_mps[rows], table.v_right_mps[rows], *icrs)
@@ -276,7 +276,8 @@ VIEW_IN_EXTENT = 1.4
 def foxglove_layout(run: Run) -> dict[str, Any]:
     """Return the layout of a run as plain data: paths from above, map, ICRs ± σ, open-loop error, speeds, events.
 
-    It is that of ``foxglove_layout.json``, as Foxglove exports it; the camera sees all of the filter's path.
+    It is the layout in ``foxglove_layout.json``, as Foxglove exports it, with a camera that shows the filter's whole
+    path.
     """
     text = files("icrtool.output.exports").joinpath("foxglove_layout.json").read_text(encoding="utf-8")
     layout: dict[str, Any] = json.loads(text)

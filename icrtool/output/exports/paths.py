@@ -3,7 +3,7 @@
 Text is for evo and KITTI tools, GeoJSON for QGIS and web maps, KML 2.2 for Google Earth.
 
 x is east, y is north, z is up; yaw is counter-clockwise from east; the body's x is forward and its y left. The origin
-is the datum of the run, or that of its position reference where it was metric already.
+is the datum of the run, or the origin of its position reference where this was metric already.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from icrtool.records.text import distance_text
 PathName = Literal["filter", "smoothed", "icr", "no_slip"]
 
 ERROR_HORIZON_M = 10.0
-"""Open-loop errors are exported after this distance."""
+"""Distance after which open-loop errors are exported [m]."""
 
 LINE_CELL_M = 0.05
-"""A line has a point where it enters another cell of a grid of this side."""
+"""Side of the grid cells that thin a line [m]. A line has a point where it enters another cell."""
 
 METRIC_ONLY = "its position reference is metric, so its place on the globe is not known"
 
@@ -55,7 +55,7 @@ class ExportPath:
     stamp_ns : int64 (n,), of the log's clock
     x_m, y_m : float64 (n,), east and north of the datum
     yaw_rad : float64 (n,), counter-clockwise from east, unwrapped
-    icrs : the ICRs that turn wheel speeds into this path's velocities; those of the filter for filter and smoother
+    icrs : ICRs that give this path's velocities from wheel speeds; for filter and smoother the filter's ICRs
     end_error_m : distance to the filter's estimate at the last state
     """
 
@@ -105,7 +105,7 @@ def paths_of(run: Run) -> tuple[ExportPath, ...]:
 
 
 def about_run(run: Run) -> dict[str, str | bool | None]:
-    """Return what an export states of the run that it was made from."""
+    """Return the facts that an export states about its run."""
     return {
         "log": run.name,
         "robot": run.config.robot.name,
@@ -148,7 +148,7 @@ def rows_apart(stamp_ns: Ints, interval_s: float) -> Ints:
 
 
 def line_rows(x_m: Floats, y_m: Floats) -> Ints:
-    """Return rows (m,) of points (n,) that draw a line, two at least: where it enters another cell of a fine grid."""
+    """Return rows (m,) of points (n,) at which a line enters another cell of a fine grid, at least two."""
     rows = places(y_m, x_m, LINE_CELL_M)
     return rows if len(rows) > 1 else np.repeat(rows, 2)
 
@@ -164,7 +164,7 @@ def outage_rows(run: Run) -> Iterator[tuple[tuple[int, int], slice]]:
 SUFFIXES: dict[TrajectoryFormat, str] = {"evo": ".tum", "kitti": ".kitti"}
 
 DIGITS = 9
-"""Decimals of positions [m] and of entries of rotations."""
+"""Number of decimals of positions [m] and of entries of rotations."""
 
 
 def format_trajectory(path: ExportPath, target: TrajectoryFormat) -> str:
@@ -177,7 +177,7 @@ def format_trajectory(path: ExportPath, target: TrajectoryFormat) -> str:
     """
     cos, sin = np.cos(path.yaw_rad), np.sin(path.yaw_rad)
     columns = (cos, -sin, path.x_m, sin, path.y_m) if target == "kitti" else (path.x_m, path.y_m, *path.quaternion)
-    # Adding zero takes the sign off a rounded -0.0.
+    # Adding zero turns -0.0 into 0.0.
     rows = zip(*((np.round(column, DIGITS) + 0.0).tolist() for column in columns), strict=True)
     if target == "kitti":
         return "".join(f"{c} {n} 0 {x} {s} {c} 0 {y} 0 0 1 0\n" for c, n, x, s, y in rows)
@@ -192,17 +192,17 @@ def is_trajectory(first: bytes) -> bool:
 
 
 STATE_CELL_M = 0.2
-"""A state becomes a point where the path enters another cell of a grid of this side."""
+"""Side of the grid cells that thin the states [m]. A state becomes a point where the path enters another cell."""
 
 DEGREE_DIGITS = 9
-"""Decimals of latitude and longitude: 0.1 mm."""
+"""Number of decimals of latitude and longitude, for 0.1 mm."""
 
 Feature = dict[str, Any]
 """A feature of GeoJSON."""
 
 
 def format_geojson(run: Run) -> str:
-    """Return a feature collection, no line end; each feature's attribute ``layer`` is what it is.
+    """Return a feature collection, no line end; the attribute ``layer`` states the kind of each feature.
 
     Layers: ``path`` (a line for each of filter, smoother, ICR and no-slip odometry), ``state`` (points along the
     filter's path, at most one in 0.2 m), ``fix``, ``event`` and ``outage`` (a line).
@@ -309,7 +309,7 @@ def _event_features(run: Run, globe: Globe) -> Iterator[Feature]:
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 
 TRACK_INTERVAL_S = 1.0
-"""The drive over time has a place each second."""
+"""Interval between two places of the drive over time [s]."""
 
 EXPORT_COLORS: dict[PathName | str, str] = {
     "filter": "#000000", "smoothed": "#606060", "icr": BLUE, "no_slip": ORANGE, "outage": "#ffff00",

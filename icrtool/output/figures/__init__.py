@@ -1,4 +1,4 @@
-"""Results as figures. The only package that imports matplotlib: it does so when it is imported itself."""
+"""Results as figures. Only this package imports matplotlib; importing this package imports it."""
 
 import logging
 
@@ -6,7 +6,7 @@ from icrtool.errors import OutputError
 
 _logger = logging.getLogger("matplotlib")
 _level = _logger.level
-# What matplotlib prints about a home directory that it cannot write is of no use to the reader of a report.
+# matplotlib's messages about a home directory that it cannot write do not help the reader of a report.
 _logger.setLevel(logging.ERROR)
 try:
     import matplotlib.font_manager  # noqa: F401

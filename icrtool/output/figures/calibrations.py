@@ -1,4 +1,4 @@
-"""Figures of calibrations (residuals, a forecast, the cost of a foreign one) and of the logs of a batch."""
+"""Figures of calibrations (residuals, a forecast, errors on other groups) and of the logs of a batch."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 CIRCLES = 20
 
 FORECAST_KEY_COLUMNS = 4
-"""Of the legend of a forecast."""
+"""Number of columns in the legend of a forecast."""
 
 
 @style.styled
 def forecast_figure(
     forecast: Forecast, title: str, budgets_m: tuple[float, ...], measured_m: float, gyro: Forecast | None = None
 ) -> Figure:
-    """Return the figure of a forecast; a dashed line for each budget, and where the calibration's errors end."""
+    """Return the figure of a forecast, with a line for each budget and a line where measured errors end."""
     reached = within_budget(forecast.distance_m, forecast.p95_m, budgets_m[0]) if budgets_m else None
     answer = f"{error_text(forecast.p95_m[-1])} off (95 %) at the end of {forecast.distance_m[-1]:.0f} m"
     if reached is not None:
@@ -57,7 +57,7 @@ def forecast_figure(
         grown.axvline(measured_m, label="measured up to here", **style.MEAN)
     grown.set(xlabel="Distance without GNSS [m]", ylabel="Error [m]", xlim=(0.0, None), ylim=(0.0, None))
     path.plot(forecast.east_m, forecast.north_m, label="path", **style.HALF_WIDTH | {"linestyle": "-"})
-    # Where the forecast is extrapolated its circles would bury the path.
+    # Circles of extrapolated errors would hide the path.
     measured = np.flatnonzero(forecast.distance_m <= measured_m)
     rows = measured[:: max(len(measured) // CIRCLES, 1)]
     for east, north, radius in zip(forecast.east_m[rows], forecast.north_m[rows], forecast.p95_m[rows], strict=True):
@@ -73,7 +73,8 @@ def forecast_figure(
 
 
 SHOWN_PERCENT = 97.0
-"""The axes reach as far as this share of the residuals; a few outliers would leave the rest a dot."""
+"""Percentile of the residuals at which the axes end. Without it a few outliers would shrink the other points to a
+dot."""
 
 BEFORE_LOOK: style.Look = style.spot("0.62", 3.2, "s", "0.62") | {
     "markeredgewidth": 0.0,
@@ -162,25 +163,26 @@ def transfer(found: GroupComparison) -> Figure:
 ROW_IN = 0.22
 MOST_CALENDAR_ROWS = 40
 LEAST_DAYS = 1.0
-"""Shown of the calendar: matplotlib gives a single date four years."""
+"""Shortest span of a date axis [days]. matplotlib would show four years for a single date."""
+
 LONGEST_ROBOT, LONGEST_GROUP, LONGEST_LOG = 24, 24, 34
-"""Characters of a label that there is space for."""
+"""Largest number of characters in the label of a robot, a group and a log."""
 
 GROUP_LOOKS: tuple[style.Look, ...] = tuple(
     {"linestyle": "none", "marker": marker, "color": color}
     for marker, color in zip("os^DvP", ("#1b6ca8", "#d95f02", "#1b9e77", "#7570b3", "#a6761d", "#666666"), strict=True)
 )
-"""Of robots or groups, in turn."""
+"""Colours and markers of robots or groups, in turn."""
 
 
 class FleetNumbers(NamedTuple):
-    """What the figures of a batch show.
+    """Numbers in the figures of a batch.
 
     Attributes
     ----------
     points : the logs with a date and both lateral ICRs
     errors_m : 95 % error after 10 m of each log, by group and name
-    model : whose errors they are
+    model : the model of these errors
     """
 
     title: str
@@ -224,7 +226,7 @@ def fleet_icrs(fleet: FleetNumbers) -> Figure:
 
 @style.styled
 def fleet_errors(fleet: FleetNumbers) -> Figure:
-    """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs those of the largest."""
+    """Return the 95 % error after 10 m [m] of every log, a row a log, by group; of many logs the largest errors."""
     errors = [
         (group, log, error)
         for group, logs in fleet.errors_m.items()

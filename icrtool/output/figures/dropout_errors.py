@@ -23,25 +23,29 @@ if TYPE_CHECKING:
 PANEL_HEIGHT_IN, LOW_PANEL_IN = 2.0, 1.45
 
 P95 = style.line("black", width=1.2)
-"""The 95 % mark is a solid line, the expected value a dashed one (`MEAN`), in every picture."""
+"""Line of the 95 % mark: solid in every picture; the expected value is dashed (`MEAN`)."""
 
 THIN = 0.9
 BAND_ALPHA = 0.18
 CURVE_POINTS = 200
 
 LEAST_SHOWN = 0.7
-"""The scale of errors begins at this part of the least that is drawn, and ends so much above the greatest."""
+"""Ratio of the lower end of the scale to the smallest drawn error, and of the largest drawn error to the upper end."""
+
 MOST_DECADES = 4.0
 LABEL_PT, LABEL_LINE_PT = 5.0, 13.0
 SPACE_OF_LABEL = 0.09
-"""A distance is written to the left of its mark where it leaves this part of the width."""
+"""Width of a distance's label, as a share of the axis. The label is left of its mark where it fits there."""
 
-LEAST_HISTOGRAM_IN_P95, MOST_HISTOGRAM_IN_P95 = 1.3, 4.0
-"""The histograms of a picture share one scale: up to the largest p95 and a margin, but at most so many times that of
-the first model. The share of trials beyond it is written at its end."""
+LEAST_HISTOGRAM_IN_P95 = 1.3
+"""Ratio of the end of the histograms' common scale to the largest p95 of the models."""
+
+MOST_HISTOGRAM_IN_P95 = 4.0
+"""Largest ratio of the end of the scale to the first model's p95. The share of trials beyond the end is written
+there."""
 
 SUMMARY_KEY_COLUMNS = 3
-"""Of the legend of the summary."""
+"""Number of columns in the legend of the summary."""
 
 MOSTLY_BEYOND_PCT = 90.0
 
@@ -50,7 +54,7 @@ MOSTLY_BEYOND_PCT = 90.0
 def dropout_summary(report: DropoutReport) -> Figure:
     """Return 95 % and expected error [m] over distance without GNSS [m]: how far each model stays within the budget.
 
-    The rows that are shown and pictured; those for comparison are thin lines.
+    It shows the rows that are shown and pictured; rows for comparison are thin lines.
     """
     models = [*_models(report), *(one for one in _pictured(report) if row_of(one.name).compared)]
     budgets_m = list(dict.fromkeys(one.budget_m for one in report.document.budgets))
@@ -61,10 +65,10 @@ def dropout_summary(report: DropoutReport) -> Figure:
     if best is not None:
         title = f"{shortened(best.model, LONGEST_ROW_NAME)}: within {best.budget_m:g} m (95 %) for {best.short_text}"
     elif known := [row for row in models[0].document.by_horizon if row.p95_m is not None]:
-        # Of a run that is not usable no distance is stated.
+        # For a run that is not usable no distance is stated.
         refused = "" if report.usable else "Do not use: "
         title = f"{refused}{error_text(known[-1].p95_m)} off (95 %) after {known[-1].horizon_m:g} m"
-    # Beside the models: the mean of the first, budget, outages.
+    # Entries in addition to the models: the mean of the first model, budget, outages.
     most = max(row.trials for row in report.document.trials)
     keys_in = style.KEY_ROW_IN * max(-(-(len(models) + 3) // SUMMARY_KEY_COLUMNS) - 2, 0)
     subtitle = f"{run_title(report.run_document)}: up to {most:,} trials a distance; bands: 95 % intervals"
@@ -79,7 +83,7 @@ def dropout_summary(report: DropoutReport) -> Figure:
     if outages:
         look = style.spot("black", 7.0, "X") | {"zorder": 5, "label": "real outage"}
         axes.plot(column_of(outages, "distance_m"), column_of(outages, "end_error_m"), **look)
-    # The scale holds all that is drawn from the first horizon on, over at most `MOST_DECADES`.
+    # The scale holds all errors from the first horizon on, over at most `MOST_DECADES`.
     drawn = [*(one.column("p95_m") for one in models), models[0].column("expected_error_m")]
     errors = np.concatenate([*drawn, budgets_m, column_of(outages, "end_error_m")])
     errors = errors[np.isfinite(errors) & (errors > 0)]
@@ -137,7 +141,7 @@ def dropout_histogram(report: DropoutReport, horizon_m: float) -> Figure:
         The report has no such horizon.
     """
     h = _place(report, horizon_m)
-    # A model of constant parameters may have no trial of a length that others have.
+    # A model of constant parameters may have no trial of a length for which other models have one.
     results = [result for result in _pictured(report) if len(result.histograms[h].left)]
     p95 = [float(result.column("p95_m")[h]) for result in results]
     least, most = map(error_text, (min(p95), max(p95)))
@@ -180,10 +184,10 @@ def _place(report: DropoutReport, horizon_m: float) -> int:
 def _draw_model(
     axes: Axes, result: ModelResult, horizons_m: Floats, first_m: float, pen: style.Look, *, first: bool
 ) -> None:  # fmt: skip
-    """Draw the 95 % error of a model with its interval; of the `first` one also the expected error.
+    """Draw the 95 % error of a model with its interval; for the `first` model also the expected error.
 
-    A row for comparison has no interval. Between horizons lines are as `budget_distances` has them, from no error at
-    no distance.
+    A row for comparison has no interval. Lines interpolate between horizons like `budget_distances`, from error 0 at
+    distance 0.
     """
     x = np.linspace(first_m, horizons_m[-1], CURVE_POINTS)
     known = np.isfinite(result.column("p95_m"))
@@ -203,7 +207,7 @@ def _draw_model(
 def _mark_reaches(
     axes: Axes, reached: list[BudgetDistance], pens: Mapping[str, style.Look], lowest_m: float
 ) -> None:  # fmt: skip
-    """Mark where models use up a budget: the nearest is named to the left of its curve, others below to the right."""
+    """Mark where models reach a budget: the nearest is written left of its curve, the others below, to the right."""
     below_pt = LABEL_PT
     for number, one in enumerate(sorted(reached, key=lambda one: one.distance_m)):
         pen = pens[one.model]
@@ -232,7 +236,7 @@ def _draw_bins(axes: Axes, result: ModelResult, h: int, color: str, end_m: float
     beyond = float(bins.percent[bins.left >= end_m].sum())
     where: dict[str, Any] = {"transform": axes.transAxes, "bbox": style.LABEL_BOX}
     if beyond >= MOSTLY_BEYOND_PCT:
-        # Hardly a bar to see: words in their place.
+        # Most trials are beyond the scale: a sentence replaces the bars.
         text = f"{beyond:.0f} % of the trials lie beyond this scale →"
         axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=9.0, **where)
     elif beyond > 0:

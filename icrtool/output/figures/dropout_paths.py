@@ -39,7 +39,7 @@ OUTAGES = {"forced": style.line(style.BAD_FIX_COLOR, width=1.8), "real": style.l
 PATH = style.line(style.FIX_COLOR, width=1.4)
 
 MARK_PT, LINE_PT, CHARACTER_PT = 3.5, 11.0, 5.3
-"""Half the size of a mark, height of a line of text, usual width of a character, in points."""
+"""Half the size of a mark, height of a line of text, usual width of a character [points]."""
 LABEL_OFFSETS_PT = tuple(
     (sign * dx, dy)
     for dx in (7.0, 16.0, 32.0, 56.0)
@@ -47,12 +47,13 @@ LABEL_OFFSETS_PT = tuple(
     for sign in (1, -1)
 )
 LINE_FROM_PT = 20.0
-"""A label further than this from its point has a line to it."""
+"""Distance between a label and its point from which on a line joins them [points]."""
+
 BAR_SHARE = 0.4
-"""The bar of a scale is at most this part of the width."""
+"""Largest length of the bar of a scale, as a share of the width."""
 FRAME_COLOR = "0.75"
 LOST_LOOK: style.Look = {"color": "0.82", "linewidth": 6.0, "solid_capstyle": "butt", "zorder": 1}
-"""Beneath the paths, where no fix corrected the reference."""
+"""Line beneath the paths where no fix corrected the reference."""
 
 SLOWEST_SHOWN_MPS = 0.001
 
@@ -120,7 +121,7 @@ def dropout_worst(report: DropoutReport) -> Figure:
 
 
 def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, east_m: Floats) -> None:
-    """Draw the whole path and, numbered, where the trials start; numbers that would touch stand in a row."""
+    """Draw the whole path and the numbered starts of the trials; numbers that would touch are written in a row."""
     cell = look_down(axes, north_m, east_m, 1.0, ticks=0)
     draw_path(axes, north_m, east_m, cell, PATH, zorder=2)
     number_pt, line_pt = 1.1 * CHARACTER_PT, 0.8 * LINE_PT
@@ -142,7 +143,7 @@ def _draw_overview(axes: Axes, worst: Sequence[TrialDocument], north_m: Floats, 
 
 
 def _draw_scale(axes: Axes) -> None:
-    """Draw a bar of a round length in a corner of a view without lines, in place of ticks."""
+    """Draw a bar of a round length, in place of ticks, in a corner that holds no lines."""
     (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
     width, height = east - west, north - south
     longest = BAR_SHARE * width
@@ -178,7 +179,7 @@ def dropout_outages(report: DropoutReport) -> Figure:
     box_in = fitted_box_in(norths, easts, width_in)
     parts = []
     for kind in OUTAGES:
-        # How many there are of each kind, and the largest end error of each.
+        # Number and largest end error of each kind.
         if ours := [one.document for one in outages if one.document.kind == kind]:
             worst = max(one.end_error_m or 0.0 for one in ours)
             lengths = sorted({round(one.end_s - one.begin_s, 1) for one in ours})
@@ -237,7 +238,7 @@ def _draw_drive(axes: Axes, report: DropoutReport, drive: ExampleTrial, shape: f
 
 
 def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
-    """Write each outage's number and end error beside its end where it fits; the tables have them all."""
+    """Write number and end error near the end of each outage where there is space; the tables hold all of them."""
     axes.apply_aspect()
     point_px, frame = axes.figure.dpi / 72.0, axes.bbox
 
@@ -253,7 +254,7 @@ def _write_errors(axes: Axes, outages: Sequence[Outage]) -> None:
     for number, (one, path) in enumerate(zip(outages, paths, strict=True), start=1):
         text = f"{number}: {error_text(one.document.end_error_m)}"
         width = point_px * CHARACTER_PT * len(text)
-        # Where the label can stand within the frame, nearest first: better across a path than across another label.
+        # Places of the label within the frame, nearest first. Crossing a path is better than crossing another label.
         boxes = {}
         for dx, dy in LABEL_OFFSETS_PT:
             x, y = path[-1] + point_px * np.array([dx, dy]) - (width if dx <= 0 else 0.0, height / 2)

@@ -1,4 +1,4 @@
-"""What the filter made of a drive: its ICRs over time, how they cluster, its distance to the fixes (Pentzer 2014)."""
+"""Estimates of the filter: its ICRs over time, their histograms, its distance to the fixes (Pentzer 2014)."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
 
 SEGMENT = style.line(ORANGE, width=1.6)
 SIDES = {"y_icr_right_m": 1.0, "y_icr_left_m": -1.0, "x_icr_m": 0.0}
-"""Where no slip puts an ICR, in half track widths."""
+"""Places of the ICRs without slip, in half track widths."""
 
 NO_SLIP_PLACE = {"label": "no slip (±b/2, 0)", **style.HALF_WIDTH}
 
 BAND_RANGE_PERCENT = (2.0, 98.0)
 CLUSTER_RANGE_PERCENT = (0.5, 99.5)
-"""As `RANGE_PERCENT`, of the edges of a band and of a histogram."""
+"""Percentiles, as `RANGE_PERCENT`, for the edges of a band and of a histogram."""
 
 LONG_RUN = 2.5
-"""A run this many times longer than its learning gets a panel of its own for the learning."""
+"""Ratio of the run to its learning time from which on the learning has its own panel."""
 LEARNING_MARGIN = 0.6
 LEAST_MARGIN_S = 10.0
 
@@ -128,7 +128,7 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
     axes.fill_between(t[shown] / unit, low[shown], high[shown], color=style.BAND_COLOR, linewidth=0, label="±1σ")
     spread = [*percentiles(value, RANGE_PERCENT), value[0], value[-1], low[-1], high[-1]]
     if first:
-        # The band of the start is as wide as robots differ: it is shown to one standard deviation.
+        # At the start the band is as wide as the spread of robots: it is shown to one standard deviation.
         spread += [low[0], high[0]]
         marks = ("white", "10 %"), ("black", "90 %: converged")
         for second, (fill, label) in zip(run.convergence_s[column] or (), marks, strict=False):
@@ -149,7 +149,7 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
             stretch = segment.begin_s / unit, segment.end_s / unit
             axes.plot(stretch, (mean, mean), zorder=2.5, label="mean between", **SEGMENT)
     _shade_outages(axes, run, unit, "no usable GNSS")
-    # The extreme of an estimate stands at the edge of the panel that cuts it off.
+    # If the panel cuts off an extreme of the estimate, its value is written at the edge.
     low_end, high_end = axes.get_ylim()
     for row, edge, arrow in ((int(value.argmin()), low_end, "↓"), (int(value.argmax()), high_end, "↑")):
         if not low_end <= value[row] <= high_end:
@@ -158,7 +158,7 @@ def _draw_estimate(axes: Axes, run: Run, column: IcrColumn, span_s: tuple[float,
 
 
 def _shade_outages(axes: Axes, run: Run, unit_s: float, label: str) -> None:
-    """Shade the outages over the whole height; one artist however many there are."""
+    """Shade the outages over the whole height, with one artist for any number of outages."""
     spans = (run.outages_ns - run.table.stamp_ns[0]) / 1e9 / unit_s
     if len(spans):
         bars = [(float(begin), float(end - begin)) for begin, end in spans]
@@ -170,7 +170,7 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
     """Draw percent of time over value, and show `span_m` of it."""
     middle = float(np.mean(percentiles(value, CLUSTER_RANGE_PERCENT)))
     low, high = middle - 0.6 * span_m, middle + 0.6 * span_m
-    # The round width of about `ICR_BINS` bins.
+    # A round width that gives about `ICR_BINS` bins.
     target = span_m / ICR_BINS
     width = float(min(round_steps(target), key=lambda step: abs(step - target)))
     first, last = int(np.floor(low / width)), int(np.ceil(high / width))
@@ -196,16 +196,17 @@ def _draw_histogram(axes: Axes, run: Run, column: IcrColumn, value: Floats, weig
 
 MOST_SINGLE = 1500
 TIME_BINS = 300
-"""More used fixes than `MOST_SINGLE` are drawn by their range and median in so many equal times."""
+"""Number of equal times in which more than `MOST_SINGLE` used fixes are drawn, by their range and median."""
+
 MOST_CROSSES = 400
-"""Rejected fixes drawn one by one; of more, the extremes."""
+"""Largest number of rejected fixes that are drawn one by one. Of more, the extremes are drawn."""
 
 
 @style.styled
 def gnss_difference(run: Run) -> Figure:
-    """Return the distance between filter and fixes [m] over time, rejected fixes apart.
+    """Return the distance between filter and fixes [m] over time, with separate marks for rejected fixes.
 
-    Of many fixes, the range and the median in each of `TIME_BINS` equal times are drawn.
+    If there are many fixes, the range and the median in each of `TIME_BINS` equal times are drawn.
     """
     facts, duration_s, fixes = run.document.gnss, float(run.table.t_s[-1]), run.sensors.fixes
     mean, most = facts.mean_difference_m, facts.max_difference_m
@@ -228,7 +229,7 @@ def gnss_difference(run: Run) -> Figure:
     lost = len(run.sensors.losses_ns) > 0
     _shade_outages(axes, run, unit, "no usable GNSS, or RTK lost" if lost else "no usable GNSS")
     axes.set(xlim=(0, max(duration_s / unit, 1e-3)), ylim=(0, top), xlabel=name, ylabel="Difference [m]")
-    # Five short entries stand side by side; with more, or longer ones, there are two rows.
+    # Five short entries fit in one row; more or longer entries need two rows.
     style.add_legend(
         figure, ncols=3 if lost or fixes.down_weighted.any() else 5, columnspacing=1.6, handlelength=2.0
     )  # fmt: skip
@@ -253,7 +254,7 @@ def _draw_used(axes: Axes, t: Floats, difference: Floats, label: str) -> None:
 def _mark(
     axes: Axes, t: Floats, difference: Floats, rows: Bools, top: float, label: str, marker: str, **look: Any
 ) -> None:
-    """Mark fixes where they are, the extremes of many; those above the picture at its upper edge."""
+    """Mark fixes at their difference, of many fixes the extremes; fixes above the picture at its upper edge."""
     beyond = difference > top
     for chosen, shape, where in ((rows & ~beyond, marker, ""), (rows & beyond, "^", ", above")):
         if chosen.any():

@@ -1,6 +1,7 @@
 """A study as a picture: a column of panels for each preset or case.
 
-They are a quantity over what varies, values along time, a distribution over the runs, and shares over a grid.
+A panel shows a quantity over the varied setting, values along time, a distribution over the runs, or shares over a
+grid.
 """
 
 from __future__ import annotations
@@ -47,20 +48,20 @@ def study_subtitle(result: StudyResult) -> str:
 PANEL_IN = 2.1
 
 MARKS_A_LINE = 9
-"""Marks on a line, so that lines are distinguished without colours."""
+"""Number of marks on a line. Marks distinguish lines without colours."""
 
 LEAST_RANGE_M, LEAST_VIEW_M = 0.02, 0.6
 BEYOND = 1.6
-"""A panel of starts shows this many times the largest start."""
+"""Ratio of the range of a panel of starts to the largest start."""
 
 FATE_COLORS = np.array([(0.57, 0.77, 0.93), (0.50, 0.0, 0.10), (0.90, 0.90, 0.90)])
-"""Red, green, blue by `FATES`, mixed by the share of the runs."""
+"""Red, green and blue of each of `FATES`; they are mixed by the shares of the runs."""
 
 STUDY_LOOKS: tuple[style.Look, ...] = (
     *({key: value for key, value in look.items() if key != "label"} for look in style.ICR_LOOKS.values()),
     {"color": GREEN, "linestyle": "-", "marker": "D", "markersize": 3.5},
 )
-"""Of lines that are no ICRs, in turn."""
+"""Looks of lines that show no ICRs, in turn."""
 
 OPEN_LOOP = {"label": "open loop, final ICRs", **STUDY_LOOKS[3]}
 OPEN_LOOP_NO_SLIP = {"label": "open loop, no slip", **style.NO_SLIP_LINE}
@@ -95,19 +96,19 @@ def study_figure(result: StudyResult) -> Figure:
 
 
 def _varied(result: StudyResult) -> str:
-    """Return what a study varies, with a capital."""
+    """Return the name of the setting that a study varies, with a capital."""
     return f"{result.study.varies[:1].upper()}{result.study.varies[1:]}"
 
 
 def over(
     axes: Axes, result: StudyResult, levels: Sequence[Level], columns: dict[str, style.Look], *, log: str = ""
 ) -> None:
-    """Draw columns over what varies: medians, and bars from the 5th to the 95th percentile.
+    """Draw columns over the varied setting: medians, and bars from the 5th to the 95th percentile.
 
     Parameters
     ----------
-    columns : how each is drawn
-    log : the axes that are logarithmic
+    columns : look of each column, by name
+    log : names of the logarithmic axes
     """
     values = [level.setting.value for level in levels]
     for place, (column, look) in enumerate(columns.items()):
@@ -118,13 +119,13 @@ def over(
         axes.set_xscale("log")
         axes.set_xticks(values, [f"{value:g}" for value in values], fontsize=7.5)
         axes.minorticks_off()
-    # On a drive without a turn nothing is missed, and zero has no logarithm.
+    # On a drive without a turn errors are zero, and zero has no logarithm.
     if "y" in log and all((np.asarray(line.get_ydata()) > 0).any() for line in axes.lines):
         axes.set_yscale("log")
 
 
 def _points(axes: Axes, values: Sequence[Any], found: Sequence[Any], look: style.Look, shift: float) -> None:
-    """Draw (low, middle, high) over numbers; over names beside one another."""
+    """Draw (low, middle, high) over numbers, or over names at equal steps."""
     x: Any = values
     if isinstance(values[0], str):
         axes.set_xticks(range(len(values)), [str(value).replace("_", " ") for value in values])
@@ -134,7 +135,7 @@ def _points(axes: Axes, values: Sequence[Any], found: Sequence[Any], look: style
 
 
 def errors(axes: Axes, result: StudyResult, levels: Sequence[Level], *, log: str = "") -> None:
-    """Draw the ICR errors over what varies; bars of settings where a run diverged are cut at the frame."""
+    """Draw the ICR errors over the varied setting; bars of settings with a diverged run are cut at the frame."""
     columns = _by_icr("error_{icr}_m")
     over(axes, result, levels, columns, log=log)
     medians = [level.metrics()[column]["p50"] for level in result.levels for column in columns]
@@ -149,7 +150,7 @@ def _by_icr(column: str) -> dict[str, style.Look]:
 
 
 def inversions(axes: Axes, result: StudyResult, levels: Sequence[Level]) -> None:
-    """Draw how many of the runs end inverted, over what varies."""
+    """Draw the share of the runs that end inverted, over the varied setting."""
     shares = [100 * level.metrics()["inverted"]["mean"] for level in levels]
     axes.plot([level.setting.value for level in levels], shares, color="black", marker="o", markersize=3.5)
     axes.set(ylim=(-4, 104), xlabel=_varied(result))
@@ -221,7 +222,7 @@ def speeds(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
 
 
 def shares(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
-    """Draw which share of the runs has settled, over time."""
+    """Draw the share of the runs that have settled, over time."""
     for number, level in enumerate(levels):
         times = np.sort(level.found["settle_s"])
         settled = np.maximum(times[np.isfinite(times)], 0.01)
@@ -243,7 +244,7 @@ def nees(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
 
 
 def coverage(axes: Axes, _result: StudyResult, levels: Sequence[Level]) -> None:
-    """Draw how much of the time 2 sigma hold the truth, by state."""
+    """Draw the share of the time in which the truth is within 2 sigma, by state."""
     for place, (level, look) in enumerate(zip(levels, STUDY_LOOKS, strict=False)):
         held = consistency_of(level.found)["coverage_pct"]
         _points(axes, STUDY_STATES, [(one, one, one) for one in held], look, 0.15 * (place - 1))
@@ -274,7 +275,7 @@ STUDY_PICTURES: dict[str, tuple[tuple[str, Draw], ...]] = {
     "speed": (("ICR, mean [m]", MEANS), ("ICR, std [m]", SCATTER)),
     "consistency": (("NEES, mean (6 expected)", nees), ("Within 2 sigma [%]", coverage)),
 }  # fmt: skip
-"""The rows of panels of each picture: name of the y axis, and what is drawn."""
+"""Rows of panels of each picture: name of the y axis, and the function that draws."""
 
 TOGETHER: frozenset[str] = frozenset({"consistency"})
 """Pictures whose series share a panel."""
@@ -284,4 +285,4 @@ NOTES: dict[str, str] = {
     "initial": "colours: share of the runs; above the dashed line the start is proper",
     "consistency": "model: truth drawn from Q and R; paper and field: exact kinematics, preset's start",
 }
-"""What stands above the legend."""
+"""Sentences above the legend, by study."""

@@ -1,4 +1,4 @@
-"""How our figures look, and how they become files: no display, no user settings, the same bytes every time."""
+"""The look of all figures, and their files: no display, no user settings, the same bytes every time."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ P = ParamSpec("P")
 PNG_DPI = 130
 
 WIDTH_IN = 7.2
-"""Of most figures: the text width of a page."""
+"""Width of most figures [in]: the text width of a page."""
 
 KEY_ROW_IN = 0.19
-"""Height of a row of a legend; there is space for two."""
+"""Height of a row of a legend [in]. Figures have space for two rows."""
 
 TITLE_CHARACTERS_PER_INCH, SUBTITLE_CHARACTERS_PER_INCH = 10.0, 14.0
 
@@ -44,10 +44,10 @@ WEIGHTS = ("regular", "bold")
 """Weights of the titles' font."""
 
 MISSING = "\u25a1"
-"""Drawn for a character that the font lacks."""
+"""Character that is drawn for a character that the font lacks."""
 
 Look = dict[str, Any]
-"""Keywords of what matplotlib draws: colour, line, marker."""
+"""Keywords of a matplotlib artist: colour, line, marker."""
 
 RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
@@ -80,18 +80,20 @@ SAVE: dict[str, dict[str, Any]] = {
     "svg": {"metadata": {"Date": None, "Creator": "icrtool"}},
     "pdf": {"metadata": {"CreationDate": None, "Creator": "icrtool", "Producer": "icrtool"}},
 }
-"""Keywords by format: nothing that changes from run to run."""
+"""Metadata by format, without values that change from run to run."""
 
 PNG_COLORS = 256
-"""Of a PNG file: half of the time and a third of the bytes of full colour, without a difference to be seen."""
+"""Number of colours of a PNG file. It needs half of the time and a third of the bytes of full colour and looks the
+same."""
 NEARLY_WHITE = 252
 
 LABEL_BELOW_IN, LABEL_LEFT_IN = 0.31, 0.54
-"""Names of axes stand this far from them: matplotlib would lay out all ticks a second and third time to place them."""
+"""Distance of the names of axes below and left of them [in]. Fixed distances save matplotlib two layouts of all
+ticks."""
 
 
 def line(color: str, dash: str | tuple[float, tuple[float, ...]] = "-", width: float = 1.3) -> Look:
-    """Return how a line is distinguished: by dash and by luminance, so that a grey print still reads."""
+    """Return the look of a line: dash and luminance distinguish it on a grey print."""
     return {"color": color, "linestyle": dash, "linewidth": width}
 
 
@@ -112,30 +114,30 @@ COLORS: dict[Color, str] = {
     "green": GREEN, "purple": PURPLE, "blue": BLUE, "orange": ORANGE, "grey": "#666666", "brown": "#8c510a",
     "pink": "#c51b7d", "teal": "#01665e", "olive": "#7a7a00", "slate": "#5c6f8a",
 }  # fmt: skip
-"""The colours of rows on paper; on pages they are those of page.css."""
+"""Colours of rows on paper, by name. On pages the colours of page.css are used."""
 
 DASHES: dict[Dash, str | tuple[float, tuple[float, ...]]] = {
     "solid": "-", "dashed": (0, (6, 2)), "dotted": (0, (1.5, 1.5)), "dashdot": (0, (6, 1.5, 1.2, 1.5)),
 }  # fmt: skip
 
 ROW_WIDTH = 1.45
-"""Width of the line of most rows, in points."""
+"""Width of the line of most rows [points]."""
 
 ICR_LOOKS: dict[str, Look] = {
     "y_icr_right": {"label": "y right", "color": BLUE, "linestyle": "-", "marker": "o", "markersize": 3.5},
     "y_icr_left": {"label": "y left", "color": RED, "linestyle": (0, (6, 2)), "marker": "s", "markersize": 3.5},
     "x_icr": {"label": "x", "color": "0.25", "linestyle": (0, (1.5, 1.5)), "marker": "^", "markersize": 3.5},
 }
-"""Of the three ICRs where they share a panel, by `icrtool.simulation.study_runs.ICR_NAMES`."""
+"""Looks of the three ICRs in a common panel, by `icrtool.simulation.study_runs.ICR_NAMES`."""
 
 
 LABEL_BOX: Look = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
-"""Behind text that lies on lines."""
+"""Box behind text that lies on lines."""
 
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw with our settings and matplotlib's own defaults, whatever a matplotlibrc sets."""
+    """Draw with the settings of this module and matplotlib's defaults; a matplotlibrc has no effect."""
     settings = cast(dict[str, Any], mpl.rcParams)
     defaults = cast(dict[str, Any], mpl.rcParamsDefault)
     with mpl.rc_context():
@@ -169,8 +171,8 @@ def new_figure(
 
     Parameters
     ----------
-    title : what the figure answers, with the number
-    subtitle : of what it is, and what is drawn
+    title : the answer of the figure, with its number
+    subtitle : the subject, and what is drawn
     margins_in : left, right, top and bottom of its axes [in]
     wspace, hspace : between axes, as a share of their width and height
     """
@@ -209,7 +211,7 @@ def spot(fill: str, size: float = 5.5, marker: str = "o", color: str = "black") 
 def write_beside(
     axes: Axes, text: str, place: tuple[float, float], offset_pt: tuple[float, float] = (0.0, 0.0), **look: Any
 ) -> None:
-    """Write a text so many points from a place, on a box of its own that hides the lines below it."""
+    """Write a text at an offset [points] from a place, on a box that hides the lines below it."""
     axes.annotate(text, place, xytext=offset_pt, textcoords="offset points", **{"bbox": LABEL_BOX} | look)
 
 
@@ -234,7 +236,7 @@ def picture_bytes(figure: Figure, form: str) -> bytes:
             pixels = canvas.buffer_rgba()  # type: ignore[no-untyped-call]
             picture = Image.frombuffer("RGBA", canvas.get_width_height(), pixels, "raw", "RGBA", 0, 1)
             few = picture.convert("RGB").quantize(PNG_COLORS, Image.Quantize.FASTOCTREE)
-            # The tree's white is the mean of all that is nearly white.
+            # The palette's white is the mean of all nearly white colours.
             few.putpalette([255 if part >= NEARLY_WHITE else part for part in few.getpalette() or []])
             few.save(memory, "png", compress_level=1, dpi=(figure.dpi, figure.dpi))
         else:

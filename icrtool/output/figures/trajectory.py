@@ -1,4 +1,4 @@
-"""The trajectory: fixes, filter, and where the wheels alone would have led (Pentzer 2014, Fig. 14)."""
+"""The trajectory: fixes, filter, and the paths by wheel speeds alone (Pentzer 2014, Fig. 14)."""
 
 from __future__ import annotations
 
@@ -24,18 +24,21 @@ if TYPE_CHECKING:
 MARGINS_IN = (0.75, 0.2, 0.6, 1.3)
 
 LARGEST_DETOUR = 0.75
-"""Odometry is shown this far outside the filter's path, in sizes of that path; what leads further is cut off."""
+"""Distance outside the filter's path to which odometry is shown, in sizes of this path. Further parts are cut off."""
 
 SMALLEST_DRIVE_M = 2.0
 TIME_STEPS_S = (5.0, 10.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1800.0, 3600.0, 7200.0, 14400.0)
 MOST_TIMES = 12
 MOST_MARKED_JUMPS = 5
+
 REJECTED_CELLS = 40.0
+"""Number of cells across the view in which rejected fixes share one cross."""
+
 MOST_REJECTED = 60
-"""Rejected fixes closer together than this part of the view are one cross, and there are at most so many: they would
-bury the path."""
+"""Largest number of crosses of rejected fixes. More crosses would hide the path."""
+
 TIME_CLEARANCE = 0.06
-"""At most so many times are written beside the path, none closer to another than this share of the view."""
+"""Smallest distance between two times that are written at the path, as a share of the view."""
 
 Corners = tuple[Floats, Floats]
 """Least and greatest (north, east) [m]."""
@@ -49,13 +52,13 @@ FIX_LOOKS: dict[int, style.Look] = {
 }
 SLIP_LOOK: style.Look = style.spot("none", 6.5, "D", style.FLOAT_COLOR) | {"markeredgewidth": 1.6, "zorder": 4.6}
 REJECTED_LOOK: style.Look = {"marker": "x", "markersize": 3.6, "markeredgewidth": 0.7, "color": style.BAD_FIX_COLOR}
-"""Markers by class: shape and luminance distinguish them."""
+"""Marker of rejected fixes. Shape and luminance distinguish the markers of all classes."""
 
 ODOMETRIES = {"icr": (style.ICR, 3), "no_slip": (style.NO_SLIP_LINE, 2)}
-"""Pen and order of the paths that wheel speeds alone lead along."""
+"""Pen and order of the paths that are computed from wheel speeds alone."""
 
 MOST_STATES = 500_000
-"""A path of wheels alone is drawn through at most so many states: 1 h at 100 Hz has each, 10 h one in 0.1 s."""
+"""Largest number of states of a drawn path of wheels alone: every state of 1 h at 100 Hz, one in 0.1 s of 10 h."""
 
 
 @style.styled
@@ -88,12 +91,12 @@ def trajectory(run: Run) -> Figure:
         leaves = " (out of view)" if (low < lowest).any() or (high > highest).any() else ""
         label = f"{PATH_WORDS[name]}, ends {distance_text(path.end_error_m)} off{leaves}"
         draw_path(axes, path.north_m, path.east_m, cell, pen, label=label, zorder=order)
-        # copies: views would keep the whole path in memory with the picture
+        # copies, because views would keep the whole path in memory
         ends_m = path.east_m[-1:].copy(), path.north_m[-1:].copy()
         axes.plot(*ends_m, marker="D", color=pen["color"], markersize=5.0, zorder=4.8)
     _draw_jumps(axes, run)
     _draw_times(axes, run, cell)
-    # Where the slip events were: the filter's path through each, and a ring at its begin.
+    # Slip events: the filter's path through each, and a mark at its begin.
     for event in run.sensors.events:
         rows = (table.stamp_ns >= event.begin_ns) & (table.stamp_ns <= event.end_ns)
         if rows.any():
@@ -114,7 +117,7 @@ def _corners(path: States | OdometryPath) -> Corners:
 
 
 def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Floats) -> None:
-    """Draw the fixes in view: those used, by class, and those rejected."""
+    """Draw the fixes in view: used fixes by class, and rejected fixes."""
     fixes, word, gnss = run.sensors.fixes, position_word(run.document), run.gnss
     several = len(np.unique(fixes.fix_class)) > 1
     groups = [
@@ -134,7 +137,7 @@ def _draw_fixes(axes: Axes, run: Run, cell_m: float, lowest: Floats, highest: Fl
 
 
 def _draw_jumps(axes: Axes, run: Run) -> None:
-    """Mark the largest jumps of the reference, each where it was before."""
+    """Mark the largest jumps of the reference, each at the position before the jump."""
     jumps = [jump for jump in run.sensors.jumps if not jump.undecided]
     largest = sorted(jumps, key=lambda jump: -jump.size_m)[:MOST_MARKED_JUMPS]
     if largest:
@@ -144,7 +147,7 @@ def _draw_jumps(axes: Axes, run: Run) -> None:
 
 
 def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
-    """Write the time beside the filter's path every so many seconds or minutes, where it does not cover another one."""
+    """Write the time at the filter's path at round intervals, where it does not cover another time."""
     table = run.table
     span = float(table.t_s[-1])
     every = next((step for step in TIME_STEPS_S if span / step <= MOST_TIMES), TIME_STEPS_S[-1])
@@ -162,16 +165,16 @@ def _draw_times(axes: Axes, run: Run, cell_m: float) -> None:
 
 
 BOX_HEIGHT_IN = (2.4, 5.4)
-"""Least and greatest height of the axes of a whole drive."""
+"""Smallest and largest height of the axes of a whole drive [in]."""
 
 SMALLEST_VIEW_M = 0.5
 FAR_M = 20_000.0
 CELLS_A_VIEW = 1500.0
-"""Points closer than this fraction of the view are one point: about a pixel."""
+"""Number of cells across the view. Points in one cell, about a pixel, are drawn as one point."""
 
 
 JUMP_LOOK: style.Look = style.spot("none", 6.0, "s", style.BAD_FIX_COLOR) | {"zorder": 4.4}
-"""Where the position reference jumps."""
+"""Marker of a jump of the position reference."""
 
 
 def fitted_box_in(norths: Floats, easts: Floats, width_in: float) -> float:
@@ -183,7 +186,7 @@ def fitted_box_in(norths: Floats, easts: Floats, width_in: float) -> float:
 def look_down(axes: Axes, norths: Floats, easts: Floats, shape: float, margin: float = 0.08, ticks: int = 5) -> float:
     """Show all points (n,) [m] in axes `shape` times as wide as high, with a margin; return the side of a cell [m].
 
-    About so many `ticks` are on each axis; 0: none.
+    `ticks` is the approximate number of ticks on each axis; 0: none.
     """
     spans = float(np.ptp(norths)), float(np.ptp(easts))
     height = (1 + 2 * margin) * max(spans[0], spans[1] / shape, SMALLEST_VIEW_M)
@@ -199,7 +202,7 @@ def look_down(axes: Axes, norths: Floats, easts: Floats, shape: float, margin: f
 
 
 def name_directions(axes: Axes) -> None:
-    """Name the axes; of coordinates far from zero (UTM) whole kilometres stand in the name, not at each tick."""
+    """Name the axes; for coordinates far from zero (UTM) the whole kilometres are in the name, not at each tick."""
     from matplotlib.ticker import ScalarFormatter
 
     for name, axis, (lowest_m, _) in (("East", axes.xaxis, axes.get_xlim()), ("North", axes.yaxis, axes.get_ylim())):

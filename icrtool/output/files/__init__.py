@@ -1,1 +1,1 @@
-"""Single files and directories on the disk: whole or not at all, and how each of ours is written."""
+"""Files and directories on the disk: written whole or not at all, and the formats of icrtool's files."""

@@ -1,8 +1,8 @@
 """Files and directories that appear whole or not at all, and replace nothing that icrtool did not write.
 
-Each is written and synced under a hidden name beside its place (``.icrtool-…``), then renamed. A directory exchanges
-its name with the old one; where that is not possible, the old one is renamed aside before, and where a process is
-killed between both renames, the next one that writes there renames it back.
+Each is written and synced under a hidden name in the folder of its place (``.icrtool-…``), then renamed. A new
+directory exchanges its name with the old one. Where this is not possible, the old directory is renamed to a hidden name
+first. If a process is killed between both renames, the next process that writes there renames the old directory back.
 """
 
 from __future__ import annotations
@@ -28,35 +28,36 @@ from icrtool.records.places import check_links, open_regular
 from icrtool.records.process_resources import begin, end, remove, unfinished
 
 IsOurFile = Callable[[bytes], bool]
-"""Whether a file, of which the first bytes are given, is one that we wrote and may replace."""
+"""Whether icrtool wrote a file and may replace it, by the first bytes of the file."""
 
 EXPORTED_MCAP = b"icrtool export"
-"""Library in the header of an MCAP file that `icrtool export` wrote: it is no log of somebody's."""
+"""Library in the header of an MCAP file that `icrtool export` wrote. It shows that the file is not a user's log."""
 
 PACKED_BEGINNINGS = (b"\x28\xb5\x2f\xfd", b"\x1f\x8b", b"BZh", b"\x04\x22\x4d\x18")
-"""How files packed with zstd, gzip, bzip2 and lz4 begin: nothing that icrtool writes, and perhaps a log."""
+"""First bytes of files packed with zstd, gzip, bzip2 and lz4. icrtool writes no such file, and it may be a log."""
 
 RECOGNISED_BYTES = 4096
 
 HIDDEN = ".icrtool-"
-"""How the names of all files begin that are icrtool's and no results."""
+"""Begin of the names of icrtool's files that are not results."""
 
 OF_NOBODY = {".DS_Store", "Thumbs.db", "desktop.ini"}
-"""What file managers leave in a folder that they show."""
+"""Names of files that file managers write into the folders they show."""
 
 PARTIAL_SUFFIX, OLD_SUFFIX = ".partial", ".old"
-"""Suffixes of those that are being written, and of old directories that were renamed aside."""
+"""Suffixes of hidden names: of files and directories being written, and of old directories."""
 
 ABANDONED_S = 3600.0
-"""What was not changed for so long is written by no process any more: a report takes minutes."""
+"""Time without a change after which no process writes a hidden file any more [s]. A report takes minutes."""
 
 NO_SYNC = {errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
 
 SYNC_THREADS = 8
-"""A journal commits what is asked for together: eight threads sync 16 files in a fifth of the time of one."""
+"""Number of threads that sync files. A journal commits simultaneous requests together: eight threads sync 16 files in a
+fifth of the time of one thread."""
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
-"""Of Linux: <fcntl.h>, <linux/fs.h>."""
+"""Constants of Linux, from <fcntl.h> and <linux/fs.h>."""
 
 
 class Kind(NamedTuple):
@@ -66,7 +67,7 @@ class Kind(NamedTuple):
     ----------
     name : for messages ("run directory")
     is_one : whether a directory is one
-    files : matches the names below it of all that icrtool writes there; of a directory, with ``/`` at the end
+    files : matches the names of all files and directories that icrtool writes below it; a directory ends in ``/``
     """
 
     name: str
@@ -93,8 +94,8 @@ def check_place(path: Path, inside: Path | None = None, ours: IsOurFile | None =
     Raises
     ------
     OutputError
-        The directory is missing, or a link below `inside`; a log, a directory, a device or a pipe is there, or another
-        file than one of ours.
+        The directory is missing, or is a link below `inside`; a log, a directory, a device, a pipe or a file that
+        icrtool did not write is there.
     """
     with place_errors(path):
         if not _place_of_file(path, inside, ours).parent.is_dir():
@@ -102,7 +103,7 @@ def check_place(path: Path, inside: Path | None = None, ours: IsOurFile | None =
 
 
 def _place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> Path:
-    """Return the place of a file without links; parameters and errors as of `check_place`."""
+    """Return the place of a file without links; parameters and errors as in `check_place`."""
     place = Path(os.path.realpath(path if inside is None else path.parent))
     if inside is not None:
         check_links(path.parent, inside)
@@ -110,7 +111,7 @@ def _place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> P
     if place.is_dir():
         raise OutputError(path, "is a directory", "name a file")
     if place.is_symlink() or not place.exists():
-        return place  # a link is replaced itself
+        return place  # the link itself is replaced, not its target
     if not place.is_file():
         raise OutputError(path, "is a device or pipe, which would be replaced", "name a file")
     from icrtool.logs.containers.open_log import container_of
@@ -127,19 +128,19 @@ def _place_of_file(path: Path, inside: Path | None, ours: IsOurFile | None) -> P
 
 @contextmanager
 def atomic_file(file: Path, inside: Path | None = None, ours: IsOurFile | None = None) -> Iterator[Path]:
-    """Give a path beside a file to write to; at the end of the block it is synced and moved to its place.
+    """Give a hidden path in the folder of a file to write to; at the block's end it is synced and moved to its place.
 
     Parameters
     ----------
     file : where it shall appear; a log is never replaced
-    inside : a directory above the file. Below it no link is followed: one in the file's place is replaced.
-        None: the user named this file, and a link stays a link: what it leads to is replaced
-    ours : what may be replaced; default: any file that is no log
+    inside : a directory above the file. Below it no link is followed; a link in the file's place is replaced.
+        None: the user named this file. A link in its place is kept, and its target is replaced
+    ours : which files may be replaced; default: any file that is not a log
 
     Raises
     ------
     OutputError
-        As `check_place`, and for every OSError of the block (disk full, no permission); what was there before still is.
+        As `check_place`, and for every OSError of the block (disk full, no permission). The old file is then unchanged.
     """
     with place_errors(file), beside(_place_of_file(file, inside, ours), Path.touch) as partial:
         yield partial
@@ -148,7 +149,7 @@ def atomic_file(file: Path, inside: Path | None = None, ours: IsOurFile | None =
 
 
 def write_file(file: Path, content: str | bytes, inside: Path | None = None, ours: IsOurFile | None = None) -> None:
-    """Write a file, whole or not at all; of a text in UTF-8, what is no character becomes an escape.
+    """Write a file, whole or not at all; a text is written in UTF-8, with escapes for invalid characters.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ def write_file(file: Path, content: str | bytes, inside: Path | None = None, our
 
 
 def make_folders(folder: Path, inside: Path) -> None:
-    """Make a folder below a directory, and those between, where they are not there; no link is followed.
+    """Make a folder below a directory, and the folders between, if they do not exist; no link is followed.
 
     Raises
     ------
@@ -177,24 +178,25 @@ def make_folders(folder: Path, inside: Path) -> None:
 
 
 def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> None:
-    """Refuse a place where a directory of a kind cannot be put; rename back what a killed process left aside.
+    """Refuse a place where a directory of a kind cannot be put; restore an old one that a killed process renamed.
 
     Parameters
     ----------
-    directory : where it shall appear; nothing, an empty directory, or one of the kind without files of others is there
-    inside : a directory above it; below that no link is followed. None: the user named `directory`, and links are
+    directory : where it shall appear; only an empty directory, or one of the kind without other files, may be there
+    inside : a directory above it, below which no link is followed. None: links are followed, because the user named the
+        path
 
     Raises
     ------
     OutputError
-        A file, something else than a directory of the kind, or files of others are there; what is there could not be
-        removed; it is a mount point; or nothing can be known about the place.
+        A file, a directory of another kind, or a file that icrtool did not write is there; the old directory could not
+        be removed; it is a mount point; or the place cannot be examined.
     """
     why, advice = "", "it is left alone; name another place"
     with place_errors(directory):
         if inside is not None:
             check_links(directory, inside)
-        # Unlike `Path.resolve`, this takes a link that leads to itself as it is.
+        # Unlike `Path.resolve`, this does not fail on a link to itself.
         place = Path(os.path.realpath(directory))
         aside = [path for path in place.parent.glob(_hidden_name(place, "*", OLD_SUFFIX)) if not path.is_symlink()]
         if aside and not os.path.lexists(place):
@@ -212,7 +214,7 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
         else:
             folders = [place, *(place / name for name in names_in(place) if name.endswith("/"))]
             if kept := next((one for one in folders if one.is_dir() and not os.access(one, os.W_OK | os.X_OK)), None):
-                # It could be renamed, but not removed: it would stay under a hidden name.
+                # A write-protected directory could be renamed but not removed, and would stay under a hidden name.
                 why = "is write-protected, and so cannot be replaced"
                 advice = f"make {kept.relative_to(place.parent)}/ writable, or name another place"
         if not why and place.is_mount():
@@ -222,12 +224,12 @@ def check_directory(directory: Path, kind: Kind, inside: Path | None = None) -> 
 
 
 def names_in(directory: Path) -> Iterator[str]:
-    """Yield all that is in a directory, relative to it; a directory with ``/`` at its end.
+    """Yield the names of all files and directories below a directory, relative to it; a directory ends in ``/``.
 
     Raises
     ------
     OSError
-        One cannot be looked into: it may hold anything.
+        A directory cannot be read. It may then hold any file.
     """
 
     def unseen(err: OSError) -> None:
@@ -235,7 +237,7 @@ def names_in(directory: Path) -> Iterator[str]:
             raise err
 
     for place, folders, files in os.walk(directory, onerror=unseen):
-        # What another process writes there may be gone at any moment.
+        # Hidden files of another process may disappear at any moment.
         folders[:] = [name for name in folders if not name.startswith(HIDDEN)]
         for name in (*folders, *files):
             path = Path(place, name)
@@ -255,7 +257,7 @@ def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) ->
     Yields
     ------
     Path
-        A new empty directory beside `directory`.
+        A new empty directory in the folder of `directory`.
 
     Raises
     ------
@@ -275,12 +277,12 @@ def atomic_directory(directory: Path, kind: Kind, inside: Path | None = None) ->
 
 @contextmanager
 def beside(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
-    """Make a file or directory under a hidden name beside a place, and remove what has that name at the end.
+    """Make a file or directory under a hidden name in the folder of a place, and remove this name at the end.
 
-    What killed processes left there is removed too.
+    Hidden files that killed processes left there are removed too.
     """
     for left in list(place.parent.glob(_hidden_name(place, "*-*-*"))):
-        # What was renamed aside is needed as long as nothing is in its place.
+        # An old directory under a hidden name is kept as long as nothing is in its place.
         with suppress(FileNotFoundError):
             if _is_left(left) and (left.suffix == PARTIAL_SUFFIX or place.exists()):
                 remove(left)
@@ -294,31 +296,31 @@ def beside(place: Path, make: Callable[[Path], object]) -> Iterator[Path]:
 
 
 def _hidden_name(place: Path, writer: str, suffix: str = "") -> str:
-    """Return a name beside a place, which is never too long."""
+    """Return a hidden name for a place; its length does not depend on the name of the place."""
     return f"{HIDDEN}{blake2b(os.fsencode(place.name), digest_size=8).hexdigest()}-{writer}{suffix}"
 
 
 def _writer() -> str:
-    """Return host and process in letters of a hidden name, and some that are used once."""
+    """Return host and process for a hidden name, with random letters."""
     return f"{crc32(platform.node().encode()):08x}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def _is_left(path: Path) -> bool:
-    """Return whether no process writes what has a hidden name: its own has ended, or it is `ABANDONED_S` old."""
+    """Return whether no process writes a hidden file: its process has ended, or it is `ABANDONED_S` old."""
     host, process, _ = path.name.split("-")[-3:]
     is_here = sys.platform == "linux" and _writer().startswith(f"{host}-")
     return (is_here and not Path("/proc", process).exists()) or path.lstat().st_mtime < time.time() - ABANDONED_S
 
 
 def put(partial: Path, place: Path) -> None:
-    """Put a hidden file or directory, which is synced, in its place; `beside` removes the old one.
+    """Put a synced hidden file or directory in its place; `beside` removes the old one.
 
     Raises
     ------
     OSError
-        It cannot be renamed; what was there still is.
+        It cannot be renamed. The old file or directory is then unchanged.
     """
-    # Where this process is ended by force, the old directory is not to be removed under the hidden name.
+    # If this process is killed, the old directory must not be removed under its hidden name.
     end(partial)
     if not place.is_dir():
         partial.replace(place)
@@ -328,7 +330,7 @@ def put(partial: Path, place: Path) -> None:
         try:
             partial.rename(place)
         finally:
-            # An interruption, or the failure that a network file system reports, may come behind the rename.
+            # An interruption, or an error of a network file system, may come after the rename.
             if place.exists():
                 remove(old)
             else:
@@ -349,7 +351,7 @@ def sync(path: Path) -> None:
     """Have the system write a file's content, or a directory's names, to the disk."""
     if sys.platform == "win32" and path.is_dir():
         return
-    # Windows syncs only what is open for writing.
+    # Windows syncs only files that are open for writing.
     handle = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
     try:
         os.fsync(handle)

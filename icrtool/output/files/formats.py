@@ -1,6 +1,6 @@
-"""The formats of our files: JSON, CSV, pictures, and the list of their sums, by which an edited one is recognised.
+"""Formats of icrtool's files: JSON, CSV, pictures, and the list of their sums, which shows an edited file.
 
-And the documents that are one JSON file: calibrations, and the fleet.json of a batch.
+The module also reads and writes documents of one JSON file: calibrations, and the fleet.json of a batch.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def schema_of(file: Path, inside: Path | None = None) -> str:
 
 
 def parse_json(raw: bytes) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return the content of a JSON file of ours.
+    """Return the content of a JSON file that icrtool wrote.
 
     Raises
     ------
     ValueError, RecursionError
-        It is no JSON, or holds a number that is not finite: icrtool writes none, `json_bytes`.
+        It is no JSON, or holds a number that is not finite, which `json_bytes` never writes.
     """
     return json.loads(raw, parse_constant=_finite, parse_float=_finite)
 
@@ -75,21 +75,21 @@ def read_document(file: Path, kind: type[Document], inside: Path | None = None, 
     Parameters
     ----------
     inside : as in `open_regular`
-    escape : texts are printed later, so they are escaped; names of files are not
+    escape : escape the texts, because they are printed later; names of files are not escaped
 
     Raises
     ------
     OSError, ValueError, RecursionError
-        The file cannot be read, or is not as the record has it.
+        The file cannot be read, or does not agree with the record.
     """
     stored = parse_json(read_regular(file, inside))
     return msgspec.convert(escaped_texts(stored) if escape else stored, kind)
 
 
 def json_bytes(document: msgspec.Struct | Mapping[str, object]) -> bytes:
-    """Return JSON text as every file of ours has it: indented, UTF-8, null for what is not a finite number."""
+    """Return the JSON text of a file: indented, UTF-8, null for a number that is not finite."""
     text = json.dumps(_as_in_the_log(plain(document)), indent=2, ensure_ascii=False, allow_nan=False)
-    # A file name that is no text (lone surrogates) becomes the escapes that JSON has for it.
+    # A file name with lone surrogates, which UTF-8 cannot hold, is written with JSON escapes.
     return (text + "\n").encode("utf-8", errors="backslashreplace")
 
 
@@ -103,7 +103,7 @@ def _as_in_the_log(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
 
 
 def csv_bytes(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes:
-    """Return a table as CSV: numbers in their shortest exact form, empty where there is none, text as `table_cell`."""
+    """Return a table as CSV: numbers in their shortest exact form, an empty cell for None, text as `table_cell`."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -120,7 +120,7 @@ def _cell(value: object) -> object:
 def read_numbers(
     path: Path, needed: Sequence[str], optional: Sequence[str] = (), *, most_bytes: int | None = None
 ) -> dict[str, Floats]:
-    """Read columns of numbers (n,) by name; an empty cell is NaN, other columns are passed over.
+    """Read columns of numbers (n,) by name; an empty cell is NaN, other columns are ignored.
 
     Raises
     ------
@@ -181,17 +181,18 @@ def save_picture(figure: Figure, file: Path, inside: Path | None = None) -> None
 
 
 CHECKSUM_FILE = "B2SUMS"
-"""In a run: the sums of its files as ``b2sum --check`` reads them.
+"""File in a run with the sums of the run's files, in the form that ``b2sum --check`` reads.
 
-It lists every file of the run and of its dropout report, but not the page. The list is true at every moment: while a
-report is replaced it does not name its files.
+It lists every file of the run and of its dropout report, but not the page. The list is correct at every moment: while a
+report is replaced, the list does not name its files.
 """
 
 SOURCES_FILE = ".icrtool-files"
-"""In a run: the absolute paths of the files that it was made from; those in run.json are as they were given."""
+"""File in a run with the absolute paths of the files that the run was made from. run.json holds the paths as given."""
 
 LARGEST_RUN_FILE_BYTES = 1 << 33
-"""Of a file of a run: 70 h at 100 Hz. A file may be far larger than what is on the disk, and take hours to read."""
+"""Largest size of a file of a run [bytes]: 70 h at 100 Hz. A sparse file may state a far larger size, and would take
+hours to read."""
 
 
 def file_b2sum(path: Path, inside: Path | None = None) -> str:
@@ -218,7 +219,7 @@ def read_sums(directory: Path) -> dict[str, str]:
     Raises
     ------
     RunError
-        Its list of them cannot be read.
+        The list of sums cannot be read.
     """
     try:
         lines = read_regular(directory / CHECKSUM_FILE, directory).decode().splitlines()
@@ -239,12 +240,12 @@ def write_sums(directory: Path, sums: Mapping[str, str]) -> None:
 
 
 def list_anew(directory: Path, part: str, names: Iterable[str] = ()) -> None:
-    """Have the list of a run name other files of a part of it; a directory without a list stays so.
+    """Replace the files of a part of a run in the run's list; a directory without a list gets none.
 
     Parameters
     ----------
-    part : a directory of the run; of what is listed below it nothing stays
-    names : of its files, relative to it; none: while it is being replaced
+    part : a directory of the run; all its entries in the list are removed
+    names : its files, relative to it, which are added; none: while the part is being replaced
     """
     if not os.path.lexists(directory / CHECKSUM_FILE):
         return
@@ -263,7 +264,7 @@ def open_calibration(file: Path | str) -> Calibration:
 
     Parameters
     ----------
-    file : what ``icrtool calibrate -o`` or `Calibration.write` wrote
+    file : a file that ``icrtool calibrate -o`` or `Calibration.write` wrote
 
     Raises
     ------
@@ -305,7 +306,7 @@ def write_calibration(document: CalibrationFile, place: Path, inside: Path | Non
 
 
 def calibration_file(place: Path, inside: Path | None = None) -> Path:
-    """Return where a calibration asked for at `place` goes.
+    """Return the path of the calibration file that is written for `place`.
 
     Parameters
     ----------
@@ -326,7 +327,7 @@ def calibration_file(place: Path, inside: Path | None = None) -> Path:
 
 
 def read_fleet(directory: Path) -> FleetDocument:
-    """Return what the fleet.json of a batch holds.
+    """Return the content of a batch's fleet.json.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Results at an address: made in a temporary folder, then uploaded; what makes them count is uploaded last.
+"""Results at an address: made in a temporary folder, then uploaded; the files that make results valid come last.
 
-The one place that writes over a connection. All others write to a folder on disk, which `on_disk` gives them.
+Only this module writes over a connection. All others write to a folder on disk, which `on_disk` gives them.
 """
 
 from __future__ import annotations
@@ -23,20 +23,22 @@ from icrtool.records.places import UrlPath
 Result = TypeVar("Result")
 
 COUNTS = (CHECKSUM_FILE, FLEET_FILE)
-"""Files without which a run, or a batch, does not count: removed before anything is replaced, and uploaded last."""
+"""Files without which a run or a batch is not valid. They are removed before anything is replaced, and uploaded
+last."""
 
 MOST_REQUESTS = 8
-"""That are made at the same time."""
+"""Largest number of requests at the same time."""
 
 _PROBE, _CLAIM = ".icrtool-upload", ".icrtool-writer"
-"""Written and removed before any work is done for the place; there while results are uploaded: by whom."""
+"""Names of two files: the first is written and removed before any work, to test the place; the second states which
+command uploads results and exists during the upload."""
 
 Needed = Callable[[str], bool]
-"""Whether the content of a file is needed, by its name below the place; of others the name alone is."""
+"""Whether the content of a file is needed, by its name below the place. Of other files only the name is needed."""
 
 
 def is_document(name: str) -> bool:
-    """Return whether a file shows what lies beside it, and whether that may be replaced."""
+    """Return whether a file describes results: it states what a folder holds and whether that may be replaced."""
     own = name.endswith((".json", ".html", ".png")) or PurePosixPath(name).name in {SOURCES_FILE, CHECKSUM_FILE}
     return own and not name.startswith("runs/")
 
@@ -50,20 +52,20 @@ def on_disk(
     *,
     writes: bool = True,
 ) -> Iterator[Path]:
-    """Give the folder on disk that stands for a place of results; of an address, upload what changed in it at the end.
+    """Give a folder on disk for a place of results; at the end, upload its changes if the place is an address.
 
     Parameters
     ----------
-    place : on disk it is given itself
-    needed : whose content is fetched; a file that is there and not needed is empty
-    parts : folders that are looked at below an address, beside the files in it; None: all
+    place : a folder on disk, which is given itself, or an address
+    needed : whether the content of a file is fetched; a file at the address that is not needed is empty on disk
+    parts : folders below an address that are listed, in addition to its own files; None: all
     begin : called before the upload
-    writes : an address is written; else it is only read
+    writes : whether the address is written; otherwise it is only read
 
     Raises
     ------
     OutputError
-        The address cannot be read or written; what is there then does not count, or is what was there before.
+        The address cannot be read or written. The results there are then unchanged, or not valid.
     """
     if not isinstance(place, UrlPath):
         yield place
@@ -134,17 +136,17 @@ class _Store:
         self._done(lambda: self._files.pipe_file(self._of(name), content))
 
     def fetch(self, folder: Path, needed: Needed, parts: Collection[str] | None) -> dict[str, tuple[int, int]]:
-        """Make the folder on disk what the address is.
+        """Copy the address to the folder on disk.
 
         Returns
         -------
         dict of str to (int, int)
-            What identifies the content of the files, by their names.
+            Numbers that identify the content of the files, by their names.
         """
         names = []
         self._found = self._what_counts()
         for name in self._names(parts):
-            # A stranger may have written it: it must be the name of a file below the folder.
+            # Anybody may have written the name: it must be the name of a file below the folder.
             path = PurePosixPath(name)
             below = name and not name.endswith("/") and not path.is_absolute() and ".." not in path.parts
             if below and name not in {_PROBE, _CLAIM}:
@@ -157,7 +159,7 @@ class _Store:
         return {name: _identity(folder / name) for name in names}
 
     def upload(self, folder: Path, before: dict[str, tuple[int, int]]) -> None:
-        """Make the address what the folder on disk is now."""
+        """Copy the folder on disk to the address."""
         there = [path for path in folder.rglob("*") if path.is_file() and path.stat().st_size]
         now = {path.relative_to(folder).as_posix(): _identity(path) for path in there}
         gone = [name for name in before if not (folder / name).exists()]
@@ -168,7 +170,7 @@ class _Store:
         last = [name for name in COUNTS if name in now]
         self.remove([name for name in COUNTS if name in before])
         self.remove([name for name in gone if name not in COUNTS])
-        # What a broken upload leaves is known as icrtool's by the first of these, run.json among them.
+        # The first files, run.json among them, show that the rest of an interrupted upload is icrtool's.
         first = [name for name in changed if name.endswith(".json") and name not in last]
         for names in (first, [name for name in changed if name not in {*first, *last}], last):
             if names is last:
@@ -177,7 +179,7 @@ class _Store:
         self.remove([_CLAIM])
 
     def _claim(self) -> bytes:
-        """Return what states that this command writes there, once it is there; the last one that begins goes on.
+        """Write a claim to the place and return it; of several commands the last one that claims continues.
 
         Raises
         ------
@@ -193,18 +195,18 @@ class _Store:
         return claim
 
     def _check_claim(self, claim: bytes) -> None:
-        """Refuse to write on where another command claimed the place at the same time."""
+        """Refuse to continue where another command claimed the place at the same time."""
         self._files.invalidate_cache()
         if self._done(lambda: self._files.cat_file(self._of(_CLAIM))) != claim:
             why = "another command began to write there at the same time"
             raise OutputError(self._place, why, "its results stay; run this command again")
 
     def _what_counts(self) -> list[object]:
-        """Return what the store states of the files without which results do not count."""
+        """Return the store's facts about the files without which results are not valid."""
         return [(about.get("size"), version_of(about)) if (about := self._about(name)) else None for name in COUNTS]
 
     def _about(self, name: str) -> dict[str, Any]:
-        """Return what the store states of a file now; nothing where there is none."""
+        """Return the store's present facts about a file; empty where there is none."""
 
         def ask() -> dict[str, Any]:
             self._files.invalidate_cache()
@@ -229,7 +231,7 @@ class _Store:
         return [name.removeprefix(f"{self._name}/") for name in found]
 
     def _at_top(self) -> list[str]:
-        # `find` with a depth lists all files at az://, and passes over errors at s3://.
+        # `find` with a depth lists all files at az://, and ignores errors at s3://.
         try:
             entries = self._files.ls(self._name, detail=True)
         except FileNotFoundError:

@@ -1,8 +1,8 @@
 """The columns of a run as files: its states and smoothed states, and its measurements with their outcomes.
 
-States are CSV with every bit of every number, or Parquet. ``measurements.npz`` holds the sensors as the filter used
-them, and the outcome of each measurement; of the wheel samples only those before the first recorded state, since the
-others are columns of the states.
+States are exact CSV, or Parquet. ``measurements.npz`` holds the sensors as the filter used them, and the outcome of
+each measurement. Of the wheel samples it holds only the samples before the first recorded state, since the others are
+columns of the states.
 """
 
 from __future__ import annotations
@@ -44,13 +44,15 @@ FLOAT_COLUMNS = tuple(name for name in COLUMNS_OF_STATES if name not in INTEGER_
 DEVIATIONS = frozenset(f"std_{name}" for name in STATE_COLUMNS)
 
 FORMATTED_ROWS = 1024
-"""Rows formatted at a time: their text stays in the processor's cache, and memory does not grow with the log."""
+"""Number of rows formatted at a time. Their text stays in the processor's cache, and memory does not grow with the
+log."""
 
 PARQUET_ROWS = 1 << 17
-"""Rows of a row group: a group is held in memory until it is written."""
+"""Number of rows of a row group. A group is held in memory until it is written."""
 
 FREE_STATES_BYTES = 1 << 29
-"""States take no more than this and `LARGEST_RATIO` times the size of their file: a robot that is parked for hours."""
+"""Memory that states may always have [bytes]. Beyond it they may have `LARGEST_RATIO` times the size of their file, as
+the states of a robot that is parked for hours have."""
 
 
 def write_states(table: States, path: Path, states: StatesFormat) -> None:
@@ -76,7 +78,7 @@ def write_states(table: States, path: Path, states: StatesFormat) -> None:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        # Arrays that share the memory of the columns: to convert these, pyarrow would import pandas.
+        # Arrays that share the memory of the columns: pyarrow's own conversion would import pandas.
         arrays = {
             name: pa.Array.from_buffers(
                 pa.int64() if name in INTEGER_COLUMNS else pa.float64(),
@@ -96,17 +98,17 @@ def write_states(table: States, path: Path, states: StatesFormat) -> None:
 
 
 def read_states(path: Path, states: StatesFormat, inside: Path | None = None, *, whole: bool = True) -> States:
-    """Read what `write_states` wrote.
+    """Read states that `write_states` wrote.
 
     Parameters
     ----------
     inside : as in `open_regular`
-    whole : hold the standard deviations, too; else, of Parquet, they are read where they are used
+    whole : hold the standard deviations, too; otherwise, with Parquet, they are read where they are used
 
     Raises
     ------
     ValueError
-        The columns are not those of the states.
+        The columns are not the columns of states.
     OSError
         The file cannot be read.
     """
@@ -136,14 +138,14 @@ def read_states(path: Path, states: StatesFormat, inside: Path | None = None, *,
         _check_columns(stored.schema, types)
         columns = dict(zip(stored.schema.names, stored.columns, strict=True))
         del stored
-        # Each column's memory goes back before the next is copied.
+        # The memory of each column is freed before the next column is copied.
         return States(**{name: _array(columns.pop(name)) for name in COLUMNS_OF_STATES})
     except pa.ArrowException as err:
         raise ValueError(" ".join(str(err).split())) from err
 
 
 class StoredStates(States):
-    """States whose standard deviations stay in their file, and are read each time that they are used."""
+    """States whose standard deviations stay in the file, and are read each time they are used."""
 
     __slots__ = ("_held", "_read")
     _read: Callable[[str], Floats]
@@ -156,7 +158,7 @@ class StoredStates(States):
         object.__setattr__(self, "_held", held)
 
     def __getattr__(self, name: str) -> Floats:
-        # Called for what is not held.
+        # Called for columns that are not held.
         if name not in DEVIATIONS:
             raise AttributeError(name)
         return self._read(name)
@@ -170,7 +172,7 @@ class StoredStates(States):
 
 
 def _identity(file: BufferedReader) -> tuple[int, ...]:
-    """Return what changes where a file is replaced or written to."""
+    """Return facts of a file that change if it is replaced or written to."""
     status = os.fstat(file.fileno())
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
@@ -197,7 +199,7 @@ def _read_again(path: Path, inside: Path | None, identity: tuple[int, ...], name
 
 
 def _parquet_column(file: pq.ParquetFile, name: str) -> NDArray[Any]:
-    """Return a column without nulls, read group by group: its memory is all that it takes."""
+    """Return a column without nulls, read group by group, so that it needs no more memory than the column."""
     column = np.empty(file.metadata.num_rows, np.int64 if name in INTEGER_COLUMNS else np.float64)
     filled = 0
     for group in range(file.num_row_groups):
@@ -212,7 +214,7 @@ def _parquet_column(file: pq.ParquetFile, name: str) -> NDArray[Any]:
 def _check_columns(schema: pa.Schema, types: dict[str, pa.DataType]) -> None:
     found = [(name, kind) for name, kind in zip(schema.names, schema.types, strict=True) if name in types]
     if sorted(name for name, _ in found) != sorted(types) or dict(found) != types:
-        raise ValueError("its columns are not those of the states")
+        raise ValueError("its columns are not the columns of states")
 
 
 def _array(column: pa.ChunkedArray) -> NDArray[Any]:
@@ -230,9 +232,9 @@ def _csv_chunks(table: States) -> Iterator[bytes]:
         stamps = np.ascontiguousarray(table.stamp_ns[rows])
         numbers = np.stack([columns[name][rows] for name in FLOAT_COLUMNS], 1, dtype=np.float64)
         if np.isfinite(numbers).all():
-            # To find one byte is faster than the three between rows: each row begins with two that are left out.
+            # Finding one byte is faster than finding the three between rows; the first two bytes of a row are skipped.
             texts = [row[2:] for row in orjson.dumps(numbers, option=orjson.OPT_SERIALIZE_NUMPY).split(b"]")[:-2]]
-        else:  # JSON has no word for what is not finite
+        else:  # JSON cannot express a number that is not finite
             texts = [",".join(map(repr, row)).encode() for row in numbers.tolist()]
         stamp_texts = orjson.dumps(stamps, option=orjson.OPT_SERIALIZE_NUMPY)[1:-1].split(b",")
         yield b"\n".join([*map(b",".join, zip(stamp_texts, texts, strict=True)), b""])
@@ -253,7 +255,7 @@ COLUMN_TYPES = {
 
 
 WHEEL_COLUMNS = ("stamp_ns", "v_left_mps", "v_right_mps")
-"""Stored for the samples before the first state; the states hold the others."""
+"""Columns that are stored for wheel samples before the first state. The states hold the other samples."""
 
 
 def write_measurements(run: Run, path: Path) -> None:
@@ -284,14 +286,14 @@ def write_measurements(run: Run, path: Path) -> None:
 def read_measurements(
     directory: Path, table: States, document: RunDocument
 ) -> tuple[States, SensorData, MeasurementOutcome, MeasurementOutcome]:
-    """Read what `write_measurements` wrote: the sensors, and the outcome of fixes and headings.
+    """Read measurements that `write_measurements` wrote: the sensors, and the outcome of fixes and headings.
 
-    The states come back with the columns of the wheels in the wheels' memory.
+    The wheel columns of the returned states share the memory of the wheel samples.
 
     Parameters
     ----------
     directory : of the run
-    table : the states of the run; `document`: its run.json, which holds what is no column
+    table : the states of the run; `document`: its run.json, which holds the facts that are no columns
 
     Raises
     ------
@@ -329,7 +331,7 @@ def read_measurements(
             gyro=gyro,
             facts=document.facts,
             losses_ns=spans_of(document.rtk_losses_ns),
-            # They hold seconds too, which the records of the log do not have.
+            # Columns include seconds, which the records of the log do not have.
             events=msgspec.convert(document.events, tuple[SlipEvent, ...], from_attributes=True),
             jumps=msgspec.convert(document.reference_jumps, tuple[ReferenceJump, ...], from_attributes=True),
             attitude=attitude,
@@ -338,7 +340,7 @@ def read_measurements(
         for group, stamps_ns in (("fixes", fixes.stamp_ns), ("headings", headings.stamp_ns)):
             found = [_checked(columns, f"{group}_{name}", name) for name in OUTCOME_COLUMNS]
             if {len(column) for column in found} != {len(stamps_ns)}:
-                raise ValueError(f"the outcomes of the {group} are not as many as those")
+                raise ValueError(f"the {group} and their outcomes differ in number")
             outcomes.append(MeasurementOutcome(stamps_ns, int(table.stamp_ns[0]), *found))
     except (BadZipFile, KeyError, EOFError, RuntimeError, MemoryError, SyntaxError, TokenError) as err:
         raise ValueError(f"{MEASUREMENTS_FILE}: {err}") from err

@@ -1,8 +1,9 @@
 """The numbers that the script of a run's page draws: the drive, decimated, and the path of each model through it.
 
-Time series keep the least and the greatest value of each interval. A path of constant parameters is turned to where an
-open-loop trial starts. ICRs that differ by start have no such path: the page drives the wheels, not thinned up to
-`MOST_PAGE_STEPS`, with those of the start, and ends where the library does.
+Time series keep the smallest and the largest value of each interval. With constant parameters the page computes one
+path of the drive, and turns and shifts it to the start of a trial. ICRs that differ by start have no such path: the
+page integrates the wheel speeds with the ICRs of the start. Up to `MOST_PAGE_STEPS` samples are not thinned, so the
+path ends where the library's path does.
 """
 
 from __future__ import annotations
@@ -43,13 +44,14 @@ from icrtool.records.rows import REST_OF_DRIVE, Row, rows_of, shown_rows
 from icrtool.records.run import ICR_COLUMNS, MeasurementOutcome, Run, track_of, width_or_usual_m
 
 MOST_PAGE_STEPS = 150_000
-"""Wheel samples of a page; of more, equally many are joined to one."""
+"""Largest number of wheel samples of a page. If there are more, a fixed number of samples is joined to one."""
 
 PATH_POINTS = 200_000
-"""Points of the paths of all models together; of more, equally many are left out between two."""
+"""Largest number of points of all models' paths together. If there are more, the paths are thinned evenly."""
 
 SERIES_POINTS = 16_000
-"""Rows of the time series: some ten per pixel column, so that a stretch of a tenth still has its extremes."""
+"""Number of rows of the time series: some ten per pixel column, so that a tenth of the drive still shows its
+extremes."""
 
 FIX_POINTS = 8_000
 
@@ -62,16 +64,16 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
 
     Parameters
     ----------
-    run : what trials of `report` are compared with are its states
-    report : what report.json holds
-    coordinates : whether the axes of the map count from the datum; else from the first state
+    run : its states are the reference of the trials in `report`
+    report : content of report.json
+    coordinates : whether the axes of the map count from the datum; otherwise from the first state
     """
     table = run.table
     rows, joined = every_so_many(len(table), MOST_PAGE_STEPS)
     north, east = float(table.north_m[0]), float(table.east_m[0])
     origin = (float(round(north)), float(round(east))) if coordinates else (north, east)
     half = None if run.track_width_m is None else run.track_width_m / 2
-    # What the figure of the ICRs shows of each, and where no slip puts them.
+    # Numbers of each ICR as in its figure, and the ICRs without slip.
     shown = [] if half is None else [half, -half]
     for icr in (getattr(table, name) for name in ICR_COLUMNS):
         shown += [*percentiles(icr, RANGE_PERCENT), float(icr[0]), float(icr[-1])]
@@ -94,7 +96,7 @@ def drive_data(run: Run, report: DropoutDocument, *, coordinates: bool) -> dict[
 
 
 def errors_data(report: DropoutDocument) -> dict[str, object]:
-    """Return the errors over distance by model, and those of the reference alone."""
+    """Return the errors over distance by model, and the errors of the reference alone."""
     models = ordered(report.models)
     rows = rows_of(one.name for one in models)
     shown = shown_rows(list(rows))
@@ -116,7 +118,7 @@ def row_look(row: Row) -> dict[str, object]:
 
 
 def _steps_data(run: Run, rows: Ints, origin: tuple[float, float]) -> dict[str, object]:
-    """Return what the wheels did and where the reference was, at every step."""
+    """Return wheel speeds and reference pose at every step."""
     track = track_of(run)
     columns = {
         "left": track.cumulate(track.v_left)[rows],
@@ -152,7 +154,7 @@ def _series_data(run: Run, steps: Ints) -> dict[str, Column]:
 
 
 def _fixes_data(run: Run, origin: tuple[float, float]) -> dict[str, object]:
-    """Return the fixes that the filter used and those that it rejected: where, when, and how far from the filter."""
+    """Return place, time and distance from the filter of the used and of the rejected fixes."""
     fixes, difference = run.sensors.fixes, run.gnss.difference
     found: dict[str, object] = {"top_m": scale_end_m(difference[run.gnss.used])}
     for name, chosen in {"used": run.gnss.used, "rejected": run.gnss.rejected}.items():
@@ -181,11 +183,11 @@ Paths = Iterator[tuple[str, tuple[Floats, Complexes]]]
 def _models_data(
     run: Run, report: DropoutDocument, steps: Ints, joined: int, origin: tuple[float, float]
 ) -> dict[str, object]:
-    """Return the models of the report, and where each of constant parameters leads from the begin of the drive.
+    """Return the models of the report, with the path of each model of constant parameters from the drive's begin.
 
     Parameters
     ----------
-    steps, joined : rows of the states, and every how many-th they are
+    steps, joined : rows of the states, and the number of samples from one row to the next
     """
     recording = cache(lambda kind: turning_recording_of(run, kind, width_m=width_or_usual_m(run.track_width_m)))
     paths = {
@@ -237,7 +239,7 @@ def _held_out(recording_of: Callable[[str], Recording], report: DropoutDocument,
         if recording.track.gyro is not None:
             fits[f"{model}_{kind}"] = replace(_fitted(f"{base}_gyro", ladder.fits), wheels=wheels[base])
         for name, fit in fits.items():
-            # Too short a drive to find the delay of its wheels has no path.
+            # A drive too short to find the delay of its wheels has no path.
             with suppress(DataError):
                 own = own_constants(windows(), fit, recording.width_m)
                 fitted = controller_model(fit, recording.lever, recording.width_m) if model == CONTROLLER else fit
@@ -263,10 +265,10 @@ def _calibrated(recording_of: Callable[[str], Recording], report: DropoutDocumen
 
 
 LARGEST_STEP = 32_000
-"""Units of the largest step: what 16 bits hold, with a margin for rounding."""
+"""Number of units of the largest step: the range of 16 bits less a margin for rounding."""
 
 SMALLEST_UNIT = 1e-7
-"""Metres or radians: finer steps mean nothing."""
+"""Smallest unit of steps [m or rad]. Finer steps have no meaning."""
 
 
 class Column(Record, frozen=True, kw_only=True):
@@ -274,9 +276,9 @@ class Column(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    type : ``f32``: as they are; ``levels``: in multiples of a unit; ``sums``: their steps, in multiples of a unit
+    type : ``f32``: the numbers; ``levels``: numbers in multiples of a unit; ``sums``: steps in multiples of a unit
     data : base64 of little-endian float32 or int16
-    first : number that the steps begin at
+    first : number at which the steps begin
     """
 
     type: Literal["f32", "levels", "sums"]
@@ -302,12 +304,12 @@ def packed_levels(column: Floats) -> Column:
 
 
 def packed_sums(column: Floats | Ints, unit: float | None = None) -> Column:
-    """Return a running sum (n,) for a page: where it begins, and its steps of 16 bits each, in multiples of `unit`.
+    """Return a running sum (n,) for a page: its first number, and steps of 16 bits each in multiples of `unit`.
 
     Notes
     -----
-    The sum is rounded and not the steps, so that its error stays within half a unit everywhere: about 2 micrometres
-    where a step is 0.1 m at most.
+    The sum is rounded, not the steps, so that its error is at most half a unit everywhere: about 2 micrometres for
+    steps up to 0.1 m.
     """
     sums = column - column[0]
     unit = unit or max(float(np.abs(np.diff(sums)).max(initial=0.0)) / LARGEST_STEP, SMALLEST_UNIT)

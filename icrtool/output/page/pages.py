@@ -1,4 +1,4 @@
-"""The pages: ``report.html`` of a run, of a batch, whose table leads to those of its logs, and of a comparison."""
+"""The pages: ``report.html`` of a run, of a batch with links to the pages of its logs, and of a comparison."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def write_page(
     run : of `icrtool.fit` or `icrtool.open_run`
     report : of `icrtool.dropout_report`
     path : the file
-    plots : directory of the run, whose PNG pictures the page shows where no script draws; default: that of `run`
+    plots : directory of the run, whose PNG pictures the page shows where no script draws; default: `run.directory`
     coordinates : False leaves out where on the globe the robot was
     inside : as in `icrtool.output.files.atomic.atomic_file`
 
@@ -99,7 +99,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
     ----------
     run, coordinates : as in `write_page`
     report : what report.json holds
-    pictures : by name; those that the page is to show where no script draws
+    pictures : by name; pictures that the page shows where no script draws
     """
     summary, stated = run.document, report
     if not coordinates:
@@ -141,7 +141,7 @@ def run_page(run: Run, report: DropoutDocument, pictures: Mapping[str, Picture],
 
 
 def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
-    """Return what the page of a run states: the answer, the drive, the errors, the motion model, the warnings."""
+    """Return the blocks of a run's page: the answer, the drive, the errors, the motion model, the warnings."""
     summary = with_verdict(summary, report)
     rows = [
         (
@@ -169,7 +169,7 @@ def page_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
 
 
 def _settings(summary: RunDocument) -> list[Section]:
-    """Return why the streams of a run were taken, what was found of them, and its configuration."""
+    """Return the sections with the choice of streams, the findings about them, and the configuration of a run."""
     why: list[Block] = [Facts([(role_word(summary, one.role), one.why) for one in summary.streams])]
     alignment = []
     for name, one in summary.alignment.items():
@@ -184,7 +184,7 @@ def _settings(summary: RunDocument) -> list[Section]:
 
 
 def read_report(directory: Path) -> DropoutDocument | None:
-    """Return what the report.json of a run directory holds; None where it has none.
+    """Return the content of a run directory's report.json; None where it has none.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def read_report(directory: Path) -> DropoutDocument | None:
 
 
 def pictures_of_run(directory: Path | None) -> dict[str, Picture]:
-    """Return the pictures in a run's directory and in that of its dropout report."""
+    """Return the pictures in the directories of a run and of its dropout report."""
     if directory is None:
         return {}
     sums = _listed(directory)
@@ -228,12 +228,12 @@ def draw_pictures(run: Run) -> dict[str, Picture]:
 
 
 def without_place(run: Run, report: DropoutDocument) -> tuple[RunDocument, DropoutDocument]:
-    """Return what a page states of a run and its report, without the datum and with the first state as origin.
+    """Return the documents of a run and its report without the datum, with the first state as origin.
 
     Notes
     -----
-    Where a position reference is metric its coordinates may be those of a map grid, so the origin moves there too.
-    Magnetic declination and grid convergence narrow the place down, and are left out with their name.
+    Coordinates of a metric position reference may be map coordinates, so their origin is moved, too. Magnetic
+    declination and grid convergence give a hint of the place. They are left out, with their names.
     """
     document, changed = run.document, msgspec.structs.replace
     north, east = float(run.table.north_m[0]), float(run.table.east_m[0])
@@ -261,7 +261,7 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
 
     Parameters
     ----------
-    folder : of the batch; pages of logs that are there are linked
+    folder : of the batch; pages of logs that exist in it are linked
     """
     logs, title, counts = document.logs, folder.absolute().name, document.counts
     unusable = sum(log.status == "done" and not log.usable for log in logs)
@@ -269,7 +269,7 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
     found = [f"{counts.done - unusable} can be used", f"{unusable} cannot", f"{counts.failed} failed{skipped}"]
     found += [f"acceptance limits not met: {document.gates_failed}"] if document.gates_failed else []
     about = f"{len(logs)} logs: {', '.join(found)}. Made with icrtool {document.tool_version}."
-    # Reasons without what is particular to a log: the first part of ``why; advice``.
+    # Reasons without details of a single log: the first part of ``why; advice``.
     reasons = Counter(log.reason.split(";")[0].split(" (tried")[0] for log in logs if log.status == "failed")
     why = Table("lr", [(reason, f"{count}") for reason, count in reasons.most_common()], ("reason", "logs"))
     pictures = pictures_in(folder / "plots", folder)
@@ -285,7 +285,7 @@ def fleet_page(document: FleetDocument, folder: Path) -> str:
 
 
 def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
-    """Return what each robot's logs teach together."""
+    """Return the table of the calibration from all logs of each robot."""
     grouped = any(one.group for one in calibrations)
     rows: list[list[str | Cell]] = []
     for one in calibrations:
@@ -306,9 +306,9 @@ def _robots_table(calibrations: Sequence[FleetCalibration]) -> Table:
 
 
 def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
-    """Return a line a log, which leads to its page; of one that failed the reason stands in place of its numbers."""
+    """Return a table with a row a log that links to its page; a failed log has its reason in place of numbers."""
     named = [key for key in ("robot", "group") if len({getattr(log, key) for log in logs} - {""}) > 1]
-    # Distances within a budget are those of the best model that some log has.
+    # Distances within a budget come from the best model that at least one log has.
     distances = dict.fromkeys(name for log in logs for name in log.errors if "_within_" in name)
     by_model = ([name for name in distances if name.startswith(f"{model}_within_")] for model in IN_CSV)
     budgets = next(filter(None, by_model), [])
@@ -318,7 +318,7 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
         status = Cell("not usable", note=log.reason) if log.status == "done" and not log.usable else log.status
         names = [getattr(log, key) for key in named]
         page = PurePosixPath(log.run) / PAGE_FILE
-        # No link where it is not there, or would lead out of the folder.
+        # No link to a page that does not exist or lies outside the folder.
         link = "" if page.is_absolute() or not is_regular(folder / page, folder) else f"./{quote(str(page))}"
         numbers = [log.reason] if log.status == "failed" else columns.values()
         rows.append([Cell(log.log, link=link), status, *names, *numbers])
@@ -333,7 +333,7 @@ def _logs_table(logs: Sequence[FleetLog], folder: Path) -> Table:
 
 
 def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
-    """Return what the table shows of a log, by the name of its column; `budgets`: error names of distances."""
+    """Return the cells of a log, by the name of the column; `budgets`: error names of distances."""
     columns = {}
     for name in budgets:
         bound, (row, _, budget) = "> " if name in log.bounds else "", name.removesuffix("m_m").rpartition("_within_")
@@ -354,7 +354,7 @@ def _columns(log: FleetLog, budgets: Sequence[str]) -> dict[str, Cell]:
 
 
 def _cell(value: float | None, text: Callable[[Any], str]) -> Cell:
-    """Return a number of a log; what is not known stands last, whatever the order."""
+    """Return the cell of a number of a log; an unknown number is sorted last in any order."""
     return Cell("", order="") if value is None else Cell(text(value), order=value)
 
 

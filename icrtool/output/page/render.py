@@ -1,4 +1,4 @@
-"""Templates and pictures to HTML: everything is escaped and stands in the file, and nothing else may be loaded."""
+"""Templates and pictures to HTML: all texts are escaped, all content is in the file, and nothing else may be loaded."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DOCUMENT_ERRORS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
-"""What a page raises for a JSON document that was edited."""
+"""Errors that a page raises for a JSON document that was edited."""
 
 STYLE_SHEETS = ("vendor/uPlot.min.css", "page.css")
 
 BEGIN = "document.documentElement.classList.replace('no-js', 'js');"
-"""Carried out before anything is shown: what only a script can draw is hidden without one."""
+"""Script that runs before anything is shown. Without scripts, elements that only a script can draw stay hidden."""
 
 UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|mm|km|s|min|h|Hz|m/s|%|°|±)(?![\w]))|(?<=±) (?=[\d.])")
-"""The space between a value and its unit, and those about ±."""
+"""The space between a value and its unit, and the spaces around ±."""
 RANGE = re.compile(r"(?<=\d)-(?=\d+(\.\d+)?\xa0)")
 """The hyphen of a range of values."""
 
@@ -41,28 +41,28 @@ MINUS = re.compile(r"(?<![\w.)])-(?=\d)")
 """The sign of a negative number."""
 
 IN_SCRIPT = {ord("<"): "\\u003c", ord(">"): "\\u003e", ord("&"): "\\u0026"}
-"""Escapes in JSON, so that no text in it can end the element it stands in."""
+"""Escapes in JSON, so that no text in it can end the element around it."""
 
 
 def render(
     scripts: Sequence[str], data: Mapping[str, object] | None, *, title: str, kind: str, blocks: Sequence[Block],
     **content: object,
 ) -> str:  # fmt: skip
-    """Return a page as HTML; text in it is escaped, twice: for a reader, and for HTML.
+    """Return a page as HTML; text in it is escaped twice: for a reader, and for HTML.
 
     Parameters
     ----------
-    scripts : names of files in ``static``, in the order they are carried out
-    data : what the scripts read; None: nothing
-    kind : what is reported on
-    blocks : what the page states; the first `Title` among them is its heading
-    content : what the templates of drawings name
+    scripts : names of files in ``static``, in the order in which they run
+    data : data for the scripts; None: nothing
+    kind : kind of the report, for its title
+    blocks : content of the page; the first `Title` among them is its heading
+    content : values that the templates of drawings name
     """
     from markupsafe import Markup
 
     style = "\n".join(_static(name) for name in STYLE_SHEETS)
     code = [BEGIN, *(_static(name) for name in scripts)]
-    # As a content security policy names a style or a script.
+    # Hashes in the form in which a content security policy names a style or a script.
     of_style, *of_scripts = (
         f"'sha256-{b64encode(sha256(one.encode()).digest()).decode('ascii')}'" for one in (style, *code)
     )
@@ -70,10 +70,10 @@ def render(
         f"default-src 'none'; img-src data:; style-src {of_style}; "
         f"script-src {' '.join(of_scripts)}; base-uri 'none'; form-action 'none'"
     )
-    # JSON that can stand in a script element, whatever text it holds.
+    # JSON with any text that is safe in a script element.
     written = json.dumps(plain(data), allow_nan=False, separators=(",", ":")).translate(IN_SCRIPT)
     return _environment().get_template("base.html").render(
-        # Ours, not of a log: they stand in the page as they are.
+        # Texts of icrtool, not of a log: they are not escaped.
         policy=policy, style=Markup(style), begin=Markup(BEGIN), scripts=[Markup(one) for one in code[1:]],  # noqa: S704
         data=None if data is None else Markup(written),  # noqa: S704 - escaped for a script element
         tool_version=__version__, title=title, kind=kind, blocks=list(stated(blocks)),
@@ -88,7 +88,7 @@ def _environment() -> Environment:
     from markupsafe import Markup, escape
 
     def shown(value: object) -> object:
-        """Return what is printed for a value: text without characters that hide or reorder others."""
+        """Return the printed text of a value, without characters that hide or reorder other characters."""
         return escaped(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
     def with_units(text: str) -> Markup:
@@ -102,7 +102,7 @@ def _environment() -> Environment:
     )  # fmt: skip
     environment.filters |= {
         "units": with_units,
-        # A name may be broken behind its underscores, on a narrow screen.
+        # On a narrow screen a name may be broken after its underscores.
         "breakable": lambda name: Markup("_<wbr>").join(map(escape, escaped(name).split("_"))),
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}",
         "grouped": _grouped,
@@ -113,7 +113,7 @@ def _environment() -> Environment:
 
 
 def _grouped(rows: Sequence[tuple[str, str]]) -> list[tuple[str, list[str]]]:
-    """Return labelled sentences by label; one without a label belongs to that before it."""
+    """Return labelled sentences by label; a sentence without a label belongs to the label before it."""
     found: list[tuple[str, list[str]]] = []
     for name, text in rows:
         if name or not found:
@@ -129,10 +129,10 @@ def _static(name: str) -> str:
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 LARGEST_PICTURE_BYTES = 1 << 24
-"""Ours have less than 1 MB."""
+"""Largest size of a picture that is read [bytes]. Pictures of icrtool have less than 1 MB."""
 
 PICTURE = re.compile(r"[a-z_]{1,40}(_\d{1,4}m)?")
-"""The name of a picture of ours, without its suffix."""
+"""Pattern of the names of icrtool's pictures, without the suffix."""
 
 
 class Picture(NamedTuple):
@@ -140,7 +140,7 @@ class Picture(NamedTuple):
 
     Attributes
     ----------
-    title, caption : one line; what it shows and what to see
+    title, caption : one line each: what it shows, what to look for
     source : data URL
     with_place : its axes may be coordinates of a map grid
     """
@@ -169,7 +169,7 @@ def pictures_in(directory: Path, inside: Path, sums: Mapping[str, str] | None = 
     Raises
     ------
     RunError
-        One is not a picture that icrtool made: a link, another file, too large, or its sum is another.
+        A file is not a picture that icrtool made: a link, another file, too large, or with another sum.
     """
     from icrtool.output.figure_catalogue import entry_of
 

@@ -37,7 +37,7 @@ from icrtool.records.text import counted, distance_text, with_interval, with_std
 
 
 def calibration_blocks(result: CalibrationResult | None, sensors: documents.SensorDocument | None) -> list[Block]:
-    """Return what `icrtool calibrate` prints: numbers, how far on what they were not fitted to, settings of one log."""
+    """Return the output of `icrtool calibrate`: numbers, distances within a budget (held out), settings of one log."""
     blocks = _result_blocks(result) if result is not None else []
     return [*blocks, *_sensor_blocks(sensors)] if sensors is not None else blocks
 
@@ -148,10 +148,10 @@ def held_out_blocks(table: HeldOut) -> list[Block]:
 MEANINGS = "shown: found well enough to set; weak: found roughly; not shown, not separable: this drive cannot find it"
 
 OPTIONS_WIDTH = 76
-"""Characters of options in a line of a terminal of 80 columns, beside indent and backslash."""
+"""Number of characters of options in a line of a terminal of 80 columns, without indent and backslash."""
 
 FORMS = {"_deg": (2, "+", " °"), "_m": (3, "+", " m"), "_s": (3, "+", " s"), "scale": (4, "", "")}
-"""Decimals, sign and unit of a value, by the end of the key."""
+"""Number of decimals, sign and unit of a value, by the end of its key."""
 
 
 def _sensor_blocks(calibration: documents.SensorDocument) -> list[Block]:
@@ -207,7 +207,7 @@ def _columns(forecast: Forecast, gyro: Forecast | None) -> dict[str, Floats]:
 def forecast_document(
     forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
 ) -> documents.ForecastDocument:
-    """Return what ``icrtool forecast --json`` prints."""
+    """Return the document that ``icrtool forecast --json`` prints."""
     columns = {name: column.tolist() for name, column in _columns(forecast, gyro).items()}
     reaches = [
         (metres, known(reach(forecast, metres)), UNSET if gyro is None else known(reach(gyro, metres)))
@@ -242,7 +242,7 @@ def reach(forecast: Forecast, budget_m: float) -> float:
 def forecast_blocks(
     forecast: Forecast, calibration: Calibration, budgets_m: tuple[float, ...], gyro: Forecast | None = None
 ) -> list[Block]:
-    """Return the table of a forecast, and how far within each budget."""
+    """Return the table of a forecast, and the distance within each budget."""
     total = float(forecast.distance_m[-1])
     model = f"{model_text(calibration.fitted)} from {counted(len(calibration.logs), 'log')}"
     kinds = [("", forecast)] if gyro is None else [("", forecast), (", with gyro", gyro)]
@@ -276,7 +276,7 @@ def transfer_csv(found: documents.GroupComparison) -> bytes:
 
 
 def transfer_blocks(found: documents.GroupComparison) -> list[Block]:
-    """Return what `icrtool compare` prints: verdicts, the transfer matrix, differences of each pair, the logs."""
+    """Return the output of `icrtool compare`: verdicts, the transfer matrix, differences of each pair, the logs."""
     names = list(found.groups)
     cells = dict.fromkeys(product(names, names), "-")
     for one in found.transfer:

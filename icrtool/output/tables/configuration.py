@@ -1,4 +1,4 @@
-"""A configuration as TOML: a file to edit, with every key and what it means, and the keys that have a value."""
+"""A configuration as TOML: a file to edit, with every key and its meaning, or only the keys that have a value."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONFIGURATION_HEAD = """\
 
 
 def format_configuration(config: Config) -> str:
-    """Return all keys as TOML that loads as this `config`: those that have another value than their default are set.
+    """Return all keys as TOML that loads as this `config`; keys whose value differs from the default are set.
 
     Notes
     -----

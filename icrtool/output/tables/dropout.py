@@ -77,7 +77,7 @@ def report_blocks(summary: RunDocument, report: DropoutDocument) -> list[Block]:
     Parameters
     ----------
     summary : of the run
-    report : what report.json holds; null for a number that is not known
+    report : content of report.json; null for a number that is not known
     """
     summary = with_verdict(summary, report)
     # How many trials the first row rests on, at the horizon nearest to `CHOICE_HORIZON_M` that has any.
@@ -104,7 +104,7 @@ def with_verdict(summary: RunDocument, report: DropoutDocument) -> RunDocument:
 
 
 def answer_sections(summary: RunDocument, report: DropoutDocument) -> list[Section]:
-    """Return how far the robot goes, whether to trust it, and where it was worst; of what must not be used, that."""
+    """Return distance, trust and worst case; for a run that is not usable, a section that states this."""
     if not (report.usable or report.budgets):
         unknown = Section("How far without GNSS?", ["Not known: the run is not usable."], VERBOSE)
         return [unknown, trust_section(summary, report)._replace(depth=VERBOSE)]
@@ -250,7 +250,7 @@ def _meanwhile(one: TrialDocument, summary: RunDocument, report: DropoutDocument
 
 
 def outage_blocks(report: DropoutDocument) -> list[Block]:
-    """Return the worst outage of each kind, and all of them in a table, beside p95 of trials over as much distance."""
+    """Return the worst outage of each kind, and a table of all outages with p95 of trials over the same distance."""
     parts = []
     for kind in ("forced", "real"):
         if ours := [one for one in report.outages if one.kind == kind]:
@@ -291,7 +291,7 @@ def model_section(report: DropoutDocument) -> Section:
 
 
 def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Table:
-    """Return the parameters of a model with one standard deviation each, and those of the same one with a gyro."""
+    """Return the parameters of a model with one standard deviation each, and the parameters of its form with a gyro."""
     rows = [
         (name if one is fitted else f"with gyro: {name}", plus_minus(value, std, 4),
          "not shown" if name in one.not_shown else "shown", TERMS[name].meaning)
@@ -302,7 +302,7 @@ def parameter_table(fitted: FittedModel, gyro: FittedModel | None = None) -> Tab
 
 
 def numbers_section(summary: RunDocument, report: DropoutDocument) -> Section:
-    """Return what a controller is given, the error with these numbers alone, and its configuration."""
+    """Return the numbers for a controller, the error with these numbers alone, and the controller's configuration."""
     if report.recommended is None or summary.config.robot.track_width_m is None:
         return Section("Which numbers into the controller?", number_blocks(summary))
     calibration = stored_calibration(report.recommended)

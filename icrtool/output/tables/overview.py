@@ -1,4 +1,4 @@
-"""What `icrtool info` prints: what a log is at a glance and what to do with it; with -v every topic and candidate."""
+"""Output of `icrtool info`: an overview of a log and the next command; with -v every topic and candidate."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from icrtool.records.tables import RobotLog
 from icrtool.records.text import counted, listed
 
 OLDEST_DATE_NS = 946_684_800_000_000_000
-"""1 January 2000: stamps before it count from the start of a computer or a simulation."""
+"""Stamp of 1 January 2000 [ns]. Earlier stamps count from the start of a computer or a simulation."""
 
 
 def overview_rows(log: RobotLog, run: Run | None) -> list[Row]:
@@ -94,7 +94,7 @@ def info_blocks(
 
 
 def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Row]:
-    """Yield each topic that is used, or those that come nearest to it, and how many others there are."""
+    """Yield each topic that is used, or the candidates closest to being usable, and the number of other topics."""
     used: set[str] = set()
     if log is not None:
         words: dict[str, list[str]] = {}
@@ -124,7 +124,7 @@ def _topic_rows(survey: SurveyDocument | None, log: RobotLog | None) -> Iterator
 
 
 def _survey_sections(path: str, survey: SurveyDocument | None, log: RobotLog | None) -> Iterator[Section]:
-    """Yield each topic, the candidates of each role with the one that is used, and what they have in common."""
+    """Yield each topic, the candidates of each role with the one that is used, and the time in which all overlap."""
     chosen = {stream.role: stream for stream in log.streams} if log is not None else {}
     if survey is not None:
         rows = [(one.topic, one.message_type, _topic_text(one)) for one in survey.topics]

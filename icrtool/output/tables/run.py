@@ -42,34 +42,34 @@ from icrtool.records.run_document import ControllerNumbers, RunDocument
 from icrtool.records.text import counted, distance_text, shortened
 
 TYPICAL_DELAY_S, SLOW_MPS = 0.1, 0.05
-"""A delay that receivers have, to show what it does; at lower speeds than this it does little."""
+"""Typical delay of receivers [s], to show its effect; speed below which a delay has little effect [m/s]."""
 
 SLIPPING_MULTIPLIER = 1.1
-"""A robot that turns by less than its wheels show by this factor slips."""
+"""Multiplier from which on a robot slips: its wheels show a turn that is larger than its own by this factor."""
 
 SMALLEST_DELAY_S = 0.05
-"""A delay below this is not worth a line."""
+"""Smallest delay that is printed [s]."""
 
 NOTED_SHARE = 0.05
-"""From this share of rejected fixes on, they are a reason for care."""
+"""Share of rejected fixes from which on they are a reason for care."""
 
 NOTED_SCALE = 0.002
-"""A correction of wheel speeds below this is not mentioned."""
+"""Smallest correction of wheel speeds that is printed, as a share."""
 
 SMALLEST_OFFSET_DEG = 0.05
-"""A correction of the heading below this is not mentioned."""
+"""Smallest correction of the heading that is printed [deg]."""
 
 NOT_SHOWN_WORDS = {"weak": "weak: found roughly", "not shown": "not shown: cannot be found"}
-"""What is printed beside an ICR, by the verdict of `find_excitation`."""
+"""Words after an ICR, by the verdict of `find_excitation`."""
 
 AGREES_SIGMAS = 3.0
-"""Two estimates of an ICR agree where they differ by less than so many standard deviations."""
+"""Difference of two estimates of an ICR, in standard deviations, below which they agree."""
 
 LONGEST_TOPIC = 60
-"""Characters of the topics of a stream in a sentence."""
+"""Largest number of characters of a stream's topics in a sentence."""
 
 Row = tuple[str, str]
-"""What a line is about, and its sentence."""
+"""Label of a line, and its sentence."""
 
 
 def format_run(run: Run) -> str:
@@ -136,7 +136,7 @@ def warnings_line(notes: Sequence[Note]) -> str:
 
 
 def number_blocks(summary: RunDocument, fitted: ControllerNumbers | None = None) -> list[Block]:
-    """Return what a controller is given, by the run or as `fitted`, and the ICRs that it comes from."""
+    """Return the numbers for a controller, by the run or as `fitted`, and the ICRs that they come from."""
     width_m, icrs = summary.config.robot.track_width_m, [summary.icr_of_drive(column) for column in ICR_COLUMNS]
     numbers = fitted or summary.controller
     if width_m is not None and numbers is not None:
@@ -188,7 +188,7 @@ def run_checks(summary: RunDocument) -> list[Check]:
 
 
 def _filter_check(summary: RunDocument) -> Iterator[Check]:
-    """Yield where the filter's ICRs ended, and whether they agree with those of the drive, as far as both are known."""
+    """Yield the filter's final ICRs, and whether they agree with the drive's ICRs where both are known."""
     final, final_std = summary.icr.final, summary.icr.final_std
     ends, apart = [], []
     for column in ICR_COLUMNS:
@@ -220,7 +220,7 @@ def excitation_check(summary: RunDocument) -> Check:
         f"{', '.join(name for one, name in weak if one == verdict)} {verdict}"
         for verdict in dict.fromkeys(one for one, _ in weak)
     )
-    # what was lacking stands beside the ICRs; what to drive, alone
+    # what was lacking is printed with the ICRs, what to drive on a line of its own
     lacks = drive.rpartition(": ")[2]
     return Check("care", "excitation", f"{words}{f': {lacks}' if lacks else ''}", more)
 
@@ -315,7 +315,7 @@ def to_drive(summary: RunDocument) -> str:
 
 
 def streams_section(summary: RunDocument) -> Section:
-    """Return what was read, and what the filter made of it."""
+    """Return the streams that were read, and the estimates of the filter."""
     speed = f"{plus_minus(summary.drive.speed_mean_mps, summary.drive.speed_std_mps, 2, '')} m/s (mean ± std)"
     streams = []
     for stream in summary.streams:
@@ -329,7 +329,7 @@ def streams_section(summary: RunDocument) -> Section:
 
 
 def _icr_tables(summary: RunDocument) -> Iterator[Table]:
-    """Yield the ICRs of the drive, how those of the filter converged, and those between the terrain changes."""
+    """Yield the ICRs of the drive, the convergence of the filter's ICRs, and the ICRs between the terrain changes."""
     icr, rows = summary.icr, []
     for column in ICR_COLUMNS:
         found = icr_text(*(summary.icr_of_drive(column) or (None, None)))

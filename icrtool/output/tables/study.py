@@ -1,4 +1,4 @@
-"""A study as text: ours beside what the paper reports."""
+"""A study as text: the numbers of icrtool and the numbers of the paper."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ SHOWN: dict[str, dict[str, str]] = {
     "rate": ERROR_WORDS,
     "speed": {f"mean_{column}": word for column, word in ICR_WORDS.items()} | INVERTED,
 }
-"""Metrics by study, with the heading of their column; the studies left out have no settings to list."""
+"""Metrics by study, with the heading of their column. Other studies have no settings to list."""
 
 
 def study_blocks(result: StudyResult) -> list[Block]:
-    """Return the tables of a study, of at most 80 columns but for the paper's numbers; no line end."""
+    """Return the tables of a study, at most 80 columns wide without the paper's numbers; no line end."""
     request, study = result.request, result.study
     figures = f" (Fig{'s' if len(study.figures) > 2 else ''}. {study.figures})" if study.figures else ""
     icrs = ", ".join(f"{icr:+z.3f}" for icr in request.plan.icrs_m)
@@ -42,7 +42,7 @@ def study_blocks(result: StudyResult) -> list[Block]:
         levels = [row for level in result.levels for row in _level_rows(level, shown)]
         blocks += [Table("lr", levels, ("", varies.rpartition(" ")[2], *shown.values()))]
         blocks += [f"{varies}{errors}; median, and below it [5 %, 95 %] of the runs", ""]
-    # The numbers of one setting stand below its name.
+    # The numbers of one setting are listed below its name.
     rows: list[tuple[str, str, str]] = []
     for head, group in groupby(result.findings, lambda one: one.what.rpartition(": ")[0]):
         rows.append((head, "", ""))
