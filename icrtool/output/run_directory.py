@@ -422,7 +422,7 @@ def _read_states(directory: Path, stem: str, sums: Mapping[str, str], *, whole: 
     for states in STATES_FORMATS:
         if (name := f"{stem}.{states}") in sums:
             with ThreadPoolExecutor(1) as pool:
-                # Both threads read the whole file; hashing releases the GIL.
+                # Both threads read the file from end to end; hashing releases the GIL.
                 checked = pool.submit(check_sum, directory, name, sums)
                 try:
                     return run_columns.read_states(directory / name, states, directory, whole=whole)
