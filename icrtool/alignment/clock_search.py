@@ -1,4 +1,4 @@
-"""Streams that are stamped wrongly by seconds: configured delays, and those that correlations of speeds show."""
+"""Streams that are stamped wrongly by seconds: configured delays, and delays that correlations of speeds show."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ NO_SHIFTS = Shifts(0.0, 0.0, ())
 
 
 def take_shifts(log: RobotLog, config: Config) -> tuple[RobotLog, Config, Shifts]:
-    """Return a log whose streams are moved by their configured delays, or by what their speeds show.
+    """Return a log whose streams are moved by their configured delays, or by delays that their speeds show.
 
     Returns
     -------
@@ -112,7 +112,7 @@ def with_shifts(findings: dict[str, Finding], shifts: Shifts) -> dict[str, Findi
 
 
 def _sentence(word: str, shift_s: float, key: str) -> str:
-    """Return what was found of a stream's clock, and what was done."""
+    """Return the finding about a stream's clock, and the correction."""
     subject = "positions" if word == "gnss" else "headings"
     fact = f"{subject} are stamped {abs(shift_s):.1f} s {'later' if shift_s > 0 else 'earlier'} than the wheels"
     leap = abs(abs(shift_s) - LEAP_S) < 2 * GRID_S
@@ -172,7 +172,7 @@ class _Rates(NamedTuple):
 
 
 def _grid(log: RobotLog) -> Ints:
-    """Return the times of the grid [ns]: those of the wheels, and as much around as streams may be moved."""
+    """Return the times of the grid [ns]: the time of the wheels, extended by the largest shift of a stream."""
     first, last = int(log.wheels.stamp_ns[0]), int(log.wheels.stamp_ns[-1])
     count = min(int((last - first) / (GRID_S * 1e9)) + 1, MOST_STEPS)
     around = round(LONGEST_SHIFT_S / GRID_S)
@@ -210,7 +210,7 @@ def find_shift(wheels: _Rates, other: _Rates) -> float:
         if own is None or seen is None:
             continue
         r2, count = _correlations(own, seen, lags)
-        # all lags with one number of pairs: how much streams overlap shows no clock
+        # one number of pairs for all lags, because the overlap of streams does not show their clocks
         gain -= count.max() * GRID_S / INDEPENDENT_S * np.log1p(-np.minimum(r2, LARGEST_R2))
         best_r = np.maximum(best_r, np.sqrt(r2))
     at = int(gain.argmax())

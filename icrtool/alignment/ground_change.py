@@ -51,7 +51,7 @@ class GroundChange(NamedTuple):
 
 
 def find_change(fit: AlignmentFit) -> GroundChange | None:
-    """Return the change of ground of a drive, None where it shows none.
+    """Return the change of ground of a drive; None where the drive shows no change.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""The noise of fixes and headings: how they step against the motion of the wheels, and what the filter takes it for."""
+"""The noise of fixes and headings: their steps against the motion of the wheels, and the noise that the filter uses."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from icrtool.records.samples import HeadingSamples, PositionFixes
 from icrtool.records.tables import RobotLog
 
 FEWEST_NOISE_STEPS = 40
-"""Fewer steps show no noise; a stretch is evaluated by as many."""
+"""Smallest number of steps that show noise, and number of fixes in a stretch."""
 
 FEWEST_FIXES = 30
 MEDIAN_OF_RAYLEIGH = 1.1774
-"""... over its scale."""
+"""Ratio of the median of a Rayleigh distribution to its scale."""
 
 OUTLIER_SIGMAS = 6.0
-"""A step this many robust deviations out of the usual is no noise."""
+"""Size of a step, in robust standard deviations, above which it is not noise."""
 
 JUMP_SIGMAS = 8.0
-"""... and this many it is a jump or a spike, by itself."""
+"""Size of a step, in robust standard deviations, above which it is a jump or a spike."""
 
 SMALLEST_JUMP_M = 0.1
 PERSISTS_S = 1.0
@@ -35,7 +35,7 @@ PERSISTS_SHARE = 0.5
 """A jump is a step this far out of the usual, after which the fixes stay away for this long; an outlier comes back."""
 
 NOISIER = 1.5
-"""Noise that is this many times what is stated is used instead."""
+"""Ratio of measured to stated noise above which the measured noise is used."""
 
 MOVES_MPS = 0.05
 """Wheels on average faster than this: what delays and jitter of stamps add to the noise shows only then."""
@@ -45,10 +45,10 @@ FROZEN_M, FROZEN_SHARE = 1.0, 0.5
 than half of the distance, the robot does not move."""
 
 HOLE_IN_INTERVALS = 5.0
-"""A stream has a hole between samples that are so many usual intervals apart."""
+"""Interval between two samples, in usual intervals, above which a stream has a hole."""
 
 WHEEL_HOLE_S = 1.0
-"""... and the path is not known between wheel samples this far apart."""
+"""Interval between two wheel samples above which the path between them is not known [s]."""
 
 
 class FixSteps(NamedTuple):
@@ -78,7 +78,7 @@ class FixSteps(NamedTuple):
     def stretches(self, claimed: Bools) -> tuple[Floats, Bools]:
         """Return the white variance of stretches of `FEWEST_NOISE_STEPS` fixes, and whether the robot mostly moves.
 
-        The variance is that of both axes together [m^2], of the fixes that are `claimed` (m,); NaN where unknown.
+        The variance is the sum over both axes [m^2], of the fixes that are `claimed` (m,); NaN where unknown.
         """
         shape = len(self.product) // FEWEST_NOISE_STEPS, FEWEST_NOISE_STEPS
         inside = claimed[:-2] & claimed[1:-1] & claimed[2:] & np.isfinite(self.product)
@@ -188,17 +188,17 @@ def without_frozen(log: RobotLog) -> RobotLog:
 
 
 LARGEST_SANE_GNSS_STD_M, LARGEST_SANE_HEADING_STD_RAD = 100.0, math.radians(60.0)
-"""A message that states more does not know its noise (1000 or 1e6 stand for "unknown")."""
+"""Largest stated standard deviation that is used. A larger one means that the noise is unknown (1000 or 1e6)."""
 
 USUAL_POSITION_STD_M, USUAL_HEADING_STD_DEG = 0.01, 1.0
-"""Pentzer 2014, Eq. 31: an RTK receiver, an attitude sensor."""
+"""Standard deviations of an RTK receiver and of an attitude sensor (Pentzer 2014, Eq. 31)."""
 
 QUIETER = 3.0
-"""A reference whose noise from step to step is so many times below the usual has that noise. One that is a little
-quieter, as lidar poses are, may err alike for longer than a step."""
+"""Ratio of usual to measured noise from which on the measured noise is used. If the measured noise is only slightly
+below the usual one, as for lidar poses, errors may be correlated over more than a step."""
 
 LEAST_POSITION_STD_M, LEAST_HEADING_STD_RAD = 1e-4, math.radians(0.01)
-"""No reference is better: cameras of motion capture resolve a tenth of a millimetre."""
+"""Smallest standard deviations of a reference. Cameras of motion capture resolve 0.1 mm."""
 
 
 def unstated_position_std_m(settings: FilterConfig) -> float:
