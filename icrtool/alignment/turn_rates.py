@@ -254,7 +254,7 @@ AXIS_PRIOR_STD = np.array([0.3, 0.3, 0.3, math.radians(1.0)])
 shows little of the horizontal axes."""
 
 LEAST_AXIS = 0.3
-"""Smallest share of the course's changes that a gyro must show. A gyro with less shows no axis."""
+"""Smallest share of the changes of the course over ground that a gyro must show. A gyro with less shows no axis."""
 
 
 def wheel_rate(track: Track, width_m: float) -> TurnRate:
