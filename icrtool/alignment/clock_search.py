@@ -16,29 +16,30 @@ from icrtool.records.notes import Note, note
 from icrtool.records.tables import RobotLog
 
 LONGEST_SHIFT_S, SHORTEST_SHIFT_S = 30.0, 3.0
-"""Shifts are searched up to the first, and made from the second on: smaller ones the alignment finds by itself."""
+"""Largest shift that is searched, and smallest shift that is corrected [s]. The alignment itself finds smaller ones."""
 
 GRID_S, MOST_STEPS = 0.1, 100_000
-"""Step of the search, and the number of steps of a drive that are compared."""
+"""Step of the search [s], and largest number of steps of a drive that are compared."""
 
 SPEED_OVER_S = 1.0
-"""Speeds and turn rates are those over this time: noise of fixes hides what is faster."""
+"""Time over which speeds and turn rates are averaged [s]. Noise of fixes hides faster changes."""
 
 INDEPENDENT_S = 4.0
-"""Speeds of a robot this far apart are taken as independent."""
+"""Time between two speeds of a robot from which on they count as independent [s]."""
 
 DECISIVE_GAIN, RIVAL_GAIN, RIVAL_S = 25.0, 9.0, 3.0
-"""A shift is made where twice its log-likelihood is larger by the first than without it, and by the second than that of
-any other shift further away than this time: a drive that repeats itself shows none."""
+"""Gains in twice the log-likelihood that a shift needs: over no shift, and over any other shift that is further away
+than the third value [s]. A drive that repeats itself shows no shift."""
 
 LEAST_CORRELATION = 0.8
-"""Speeds that correlate less are not those of one robot, whatever the shift."""
+"""Smallest correlation of two speeds of one robot. With less, no shift is found."""
 
 LARGEST_R2 = 0.98
-"""A better correlation shows no more: a robot answers its wheels a little later, and differently each time."""
+"""Upper limit of a squared correlation. A robot follows its wheels with a small, varying delay, so that a larger value
+has no further meaning."""
 
 LEAP_S = 18.0
-"""GPS time is ahead of UTC by this much since 2017."""
+"""Time by which GPS time is ahead of UTC since 2017 [s]."""
 
 
 class Shifts(NamedTuple):

@@ -11,17 +11,18 @@ from icrtool.alignment.estimator import AlignmentFit
 from icrtool.kernels.arrays import Floats, Ints
 
 CHANGE_WINDOW_S, CHANGE_GROUP_S = 2.0, 10.0
-"""Turns are compared over the first time; what is nearer than the second counts as one observation."""
+"""Time over which turns are compared, and time within which windows count as one observation [s]."""
 
 FEWEST_CHANGE_GROUPS, CHANGE_CANDIDATES = 4, 60
-"""A stretch has so many groups that turn; so many times of the change are compared."""
+"""Smallest number of groups with a turn in a stretch, and number of times of the change that are compared."""
 
 CHANGE_SIGMAS, CHANGE_SHARE = 5.0, 0.1
 """Stretches differ where by more than both: the best of many candidates differs by
 more than 3 sigma by chance, and few groups show a deviation that is itself uncertain."""
 
 LEAST_MULTIPLIER = 0.8
-"""Stretches in which the robot turns more than its wheels are no ground: sides, units or another robot's wheels."""
+"""Smallest multiplier of a stretch. If the robot turns more than its wheels, the cause is not the ground but sides,
+units or another robot's wheels."""
 
 CHANGE_GAIN = 25.0
 """Twice the log-likelihood that a change gains, with an observation for two windows, which overlap: five sigma."""
