@@ -49,7 +49,7 @@ Moment = float | str | datetime
 _CSV_NAME = re.compile(rf"\.csv(?:{PACKED_SUFFIX})?$", re.IGNORECASE)
 
 LONGEST_HEAD_BYTES = 1 << 18
-"""Of the line that names the columns: pandas takes a minute for a million of them."""
+"""Largest size of the line that names the columns [bytes]: pandas takes a minute for a million columns."""
 
 
 def survey_log(
@@ -65,7 +65,7 @@ def survey_log(
     Parameters
     ----------
     path : a log as `open_log` knows them
-    progress : called with the share of the log read so far, 0 to 1
+    progress : called with the share of the log that has been read, 0 to 1
     start, end : as `read_log` takes them
 
     Raises
@@ -162,7 +162,7 @@ def collect_tables(
     Parameters
     ----------
     wanted : fields by channel id
-    progress : called with the share of the log read so far
+    progress : called with the share of the log that has been read
     """
     unread: dict[str, str] = {}
     collectors: dict[int, TopicCollector | None] = {}
@@ -199,7 +199,7 @@ def collect_tables(
 
 
 def _report_definitions(container: Container, channels: Sequence[Channel]) -> None:
-    """Report the channels that are read with a bundled definition, because that of the log is damaged."""
+    """Report the channels that are read with a bundled definition, because the log's definition is damaged."""
     for channel in channels:
         if note := definition_note(channel):
             container.report("definition_bundled", f"{channel.topic}: {note}; the bundled definition is used")
@@ -243,7 +243,7 @@ def cut_of(container: Container, start: float | datetime | None, end: float | da
     if isinstance(start, float) or isinstance(end, float):
         if span is not None:
             first = span[0]
-        else:  # without an index all messages are read for it
+        else:  # without an index the first and last time are found by reading all messages
             blocks = container.blocks(frozenset(channel.id for channel in container.channels))
             first = min((int(block.log_time_ns.min()) for block in blocks if len(block.log_time_ns)), default=0)
     begin_ns = max(nanoseconds(start, first), 0) if start is not None else 0
@@ -274,7 +274,8 @@ def is_table(path: Path) -> bool:
 def table_form(head: bytes, row: bytes) -> tuple[str, str]:
     """Return the character between the columns of a table, and its decimal sign, by its first line and first row.
 
-    Where semicolons or tabs part the columns, as in countries that write a decimal comma, a comma in the row is one.
+    Where semicolons or tabs part the columns, as in countries with a decimal comma, a comma in the row is a decimal
+    sign.
     """
     counts = {sign: head.count(sign.encode()) for sign in (",", ";", "\t")}
     separator = max(counts, key=lambda sign: counts[sign])
@@ -346,11 +347,11 @@ def read_table(path: Path, start: Moment | None = None, end: Moment | None = Non
 
 
 TOPIC_GAP_IN_INTERVALS, SHORTEST_GAP_S = 5.0, 0.1
-"""A gap is longer than so many times the median interval, and than this."""
+"""Least length of a gap: this multiple of the median interval, and this time [s]."""
 
 
 def long_intervals(interval_s: Floats) -> Bools:
-    """Return which intervals (n,) [s] between messages are gaps; of one alone nothing shows it."""
+    """Return which intervals (n,) [s] between messages are gaps; a single interval is none."""
     if len(interval_s) < 2:
         return np.zeros(len(interval_s), np.bool_)
     return np.asarray(interval_s > max(TOPIC_GAP_IN_INTERVALS * float(np.median(interval_s)), SHORTEST_GAP_S))
@@ -362,11 +363,11 @@ class SurveyedTopic(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     messages : how many; None where nothing counts them
-    read : whether it may have a role, so that its messages were read
+    read : its messages were read, because it may have a role
     rate_hz : 1 / median interval; None where it was not read
     gaps : intervals far longer than the median, with the `longest_gap_s`
     unreadable : messages that do not fit their type
-    not_read_because : of a type that has a role
+    not_read_because : why a topic of a type with a role was not read
     """
 
     topic: str

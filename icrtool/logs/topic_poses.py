@@ -31,7 +31,8 @@ from icrtool.records.text import did_you_mean, listed
 from icrtool.records.topic_poses import TopicPoses
 
 LEAST_QUATERNION, LARGEST_QUATERNION = 0.1, 10.0
-"""Norms outside are those of messages without an orientation; between them the norm is taken to be 1."""
+"""Limits of the norm of a quaternion. A message with a norm outside has no orientation; a norm between them counts as
+1."""
 
 
 def _pose_fields() -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -47,7 +48,7 @@ POSE_FIELDS = dict(_pose_fields())
 
 
 def scorable_topics(survey: SurveyDocument, used: Iterable[str]) -> tuple[str, ...]:
-    """Return the topics of a log that hold poses and are not among those `used` as reference, nor goals."""
+    """Return the topics of a log that hold poses and are neither `used` as reference nor goals."""
     taken = set(used)
     return tuple(
         one.topic
@@ -66,7 +67,7 @@ def read_topic_poses(path: str | Path, topics: Sequence[str], progress: Progress
     ----------
     path : as `icrtool.read_log` takes it
     topics : names; of ``tf2_msgs/TFMessage`` the poses of the robot's base in the root of the moving transforms
-    progress : called with the share of the log read so far
+    progress : called with the share of the log that has been read
 
     Raises
     ------

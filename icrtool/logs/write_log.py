@@ -107,7 +107,7 @@ class TopicMessages:
 class TopicPlan:
     """One topic: `fixed` values and per-message `columns`, both by dotted path (``drivers.0.measured_travel``).
 
-    `stamp_ns` (n,) and each column (n,) have a row for each message. A field of neither is zero or empty.
+    `stamp_ns` (n,) and each column (n,) have a row for each message. A field that is in neither is zero or empty.
     """
 
     topic: str
@@ -119,7 +119,7 @@ class TopicPlan:
 
 @cache
 def load_typestore(*, ros1: bool) -> Typestore:
-    """Return the message types of ROS Noetic or of ROS 2 Jazzy, with those of jackal_msgs."""
+    """Return the message types of ROS Noetic or of ROS 2 Jazzy, with the types of jackal_msgs."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
@@ -230,7 +230,7 @@ def serialise_topic(plan: TopicPlan, store: Typestore, *, ros1: bool = False) ->
     blank = encode()
     payload = np.tile(blank, (len(plan.stamp_ns), 1))
     for path, values in plan.columns.items():
-        # The bytes of a number are those that change with it.
+        # The bytes that change with a number are the bytes of the number.
         _put(message, path, np.frombuffer(b"\x11" * values.itemsize, values.dtype)[0])
         changed = np.flatnonzero(encode() != blank)
         _put(message, path, values.dtype.type(0))
@@ -280,7 +280,7 @@ def write_mcap(
     metadata: Mapping[str, str] | None = None,
     library: str = "icrtool",
 ) -> None:
-    """Write one MCAP file of ROS 2 messages (CDR), with the definitions of those types that the store has.
+    """Write one MCAP file of ROS 2 messages (CDR), with the definitions of the types that the store has.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """A chunk of an MCAP file or a ROS 1 bag: where it is, what it decompresses to, and where its records begin.
 
-Its stated size is checked before memory is allocated. The index of messages is only a hint. Each record begins where
-the one before it ends, which is checked for all of them at once; records that it lacks are found by following their
-lengths, and so are all records where it is wrong.
+Its stated size is checked before memory is allocated. The index of messages is only a hint. Each record must begin
+where the record before it ends, which is checked for all records at once. Records that the index lacks are found by
+following their lengths; where the index is wrong, all records are.
 """
 
 from __future__ import annotations
@@ -21,26 +21,29 @@ from numpy.typing import NDArray
 from icrtool.kernels.arrays import Bytes, Ints
 
 LARGEST_CHUNK_BYTES = FREE_BYTES = 1 << 27
-"""An eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; four are in memory at a time."""
+"""Largest decompressed chunk [bytes], an eighth of a gibibyte. Recorders write chunks of 0.75 to some 10 MiB; four are
+in memory at a time."""
 
 LARGEST_RATIO = 100
-"""A log may take this many times its size when decompressed, and `FREE_BYTES` more.
+"""Largest size of a decompressed log over its size; `FREE_BYTES` more are allowed.
 
 Recorded chunks shrink by a factor of 2 to 20, images of one colour by more.
 """
 
 STORED = ("", "none")
-"""What logs call no compression."""
+"""Names of no compression in logs."""
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 PIECE_BYTES = 1 << 24
-"""Decompressed at once: libraries hold twice as much while they do. Of a message that states no size: at most."""
+"""Bytes that are decompressed at once, while libraries hold twice that size; also the largest message that states no
+size."""
 
 MOST_RECORDS = 1 << 18
-"""Records that are followed at a time."""
+"""Number of records that are followed at a time."""
 
 _MOST_GAPS = 1 << 8
-"""Between messages of an index, that are followed; where there are more, all records are."""
+"""Largest number of gaps between messages of an index whose records are followed; with more gaps, all records are
+followed."""
 
 
 class DecompressionError(Exception):
@@ -48,12 +51,12 @@ class DecompressionError(Exception):
 
 
 class Space:
-    """Memory that is used again and again: fresh memory of the system costs as much as reading a file into it."""
+    """Memory that is used again: fresh memory of the system takes the time of reading a file into it."""
 
     _bytes: Bytes = np.empty(0, np.uint8)
 
     def of(self, size: int) -> Bytes:
-        """Return `size` bytes (size,), the same ones as before where there are as many."""
+        """Return `size` bytes (size,), the same memory as before where it is large enough."""
         if len(self._bytes) < size:
             self._bytes = np.empty(size, np.uint8)
         return self._bytes[:size]
@@ -65,9 +68,9 @@ class Chunk(NamedTuple):
     Attributes
     ----------
     at, length : where its content is in the file; before a bag's record is read: where that begins, and 0
-    channels : those it holds, None without an entry
+    channels : the channels that it holds, None without an entry
     begin_ns, end_ns : first and last log time in it, 0 where they are not known
-    index_length : of the message index records that follow it, and of what of a bag's record was not read
+    index_length : length of the message index records that follow it, and of the unread part of a bag's record
     size : of its records, decompressed; -1 where there is no chunk in its place
     compression : as the log calls it
     is_cut : the file ends in it: what can be decompressed is not checked
@@ -94,12 +97,12 @@ class Chunk(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """What is compressed in a chunk.
+    """The compressed part of a chunk.
 
     Attributes
     ----------
     compression : ``""``/``none``, ``lz4``, ``zstd`` or ``bz2``
-    size : of it decompressed, as the log states; of what is not compressed, its own [bytes]
+    size : size when decompressed, as the log states; of uncompressed data, its own size [bytes]
     partial : the data is cut off, or `size` is only a part of it: what can be decompressed is wanted
     checksum : CRC-32 of the decompressed bytes, 0 where that is not checked
     """
@@ -116,7 +119,7 @@ def decompress(packed: Packed, space: Bytes) -> Bytes:
 
     Parameters
     ----------
-    space : for what is decompressed; one byte more than that
+    space : memory for the decompressed bytes, and one byte more
 
     Returns
     -------
@@ -165,11 +168,11 @@ def _in_pieces(decoder: Any, data: Bytes, size: int) -> Bytes:  # noqa: ANN401 -
 
 @dataclass(slots=True)
 class Inflation:
-    """Limits what the chunks of a log are decompressed to, to a multiple of their size in the file.
+    """Limits the decompressed size of the chunks of a log to a multiple of their size in the file.
 
     Attributes
     ----------
-    left : bytes that the next ones may take in addition
+    left : bytes that the next chunks may take in addition
     """
 
     left: int = FREE_BYTES
@@ -180,7 +183,7 @@ class Inflation:
         Raises
         ------
         DecompressionError
-            It is more than one chunk, or the log, may take.
+            It is larger than the limit of a chunk or of the log.
         """
         if unpacked > LARGEST_CHUNK_BYTES:
             raise DecompressionError(f"it claims {unpacked} bytes")
@@ -198,8 +201,8 @@ class Records(NamedTuple):
     Attributes
     ----------
     messages : (4, n) channel, log time [ns], begin and end of the content
-    others : operation code, begin, and begin and end of the content of the other ones
-    stop : the first byte behind: an incomplete record, another kind of record, or the end
+    others : operation code, begin, and begin and end of the content of all other records
+    stop : the first byte after the records: an incomplete record, another kind of record, or the end
     """
 
     messages: Ints

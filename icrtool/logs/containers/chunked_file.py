@@ -28,18 +28,20 @@ CHUNK_THREADS, BLOCKS_AHEAD = 2, 3
 """Threads that make blocks of chunks, and blocks that they make while one is used."""
 
 READERS, SPANS_AHEAD, BYTES_AHEAD = 8, 16, 1 << 26
-"""Of a distant file: threads that read, and pieces and their bytes that are read before they are used."""
+"""For a distant file: number of threads that read; number of pieces, and of bytes, that are read before they are
+used."""
 
 FIRST_SPAN_BYTES, SPAN_BYTES = 1 << 22, 1 << 24
-"""Of chunks that are read in one piece: of the first one, for which all that uses them waits, and of each other one."""
+"""Bytes of chunks that are read in one piece: of the first piece, which the reader waits for, and of each other
+piece."""
 
 JOINED_BYTES = 1 << 22
-"""Of the wanted records of chunks that are made one block: each block has a cost of its own."""
+"""Bytes of wanted records up to which several chunks become one block: each block has a cost of its own."""
 
 SMALL_PART = 0.5
-"""A chunk of which less is wanted is decompressed up to the last wanted message; its checksum is not computed.
+"""Share of a chunk below which it is decompressed only up to the last wanted message; its checksum is not computed.
 
-Of a chunk with images that is a few percent, and most recorders close a chunk behind the image that filled it.
+In a chunk with images a few percent are wanted, and most recorders close a chunk behind the image that filled it.
 """
 
 
@@ -48,14 +50,14 @@ class NotByRangesError(Exception):
 
 
 class Part(NamedTuple):
-    """What is read of a chunk.
+    """The part of a chunk that is read.
 
     Attributes
     ----------
-    messages : where messages begin in the records that are read, by the message index; None without one
-    ranges : begin and end (2, n) of the wanted records, where only those are read
+    messages : where messages begin in the records that are read, by the message index; None without an index
+    ranges : begin and end (2, n) of the wanted records, where only these are read
     held : its bytes, read ahead of a distant file
-    records : the wanted ones, likewise
+    records : the wanted records, read ahead of a distant file
     """
 
     chunk: Chunk
@@ -71,7 +73,7 @@ class Part(NamedTuple):
 
 
 class Spaces(NamedTuple):
-    """Memory for a chunk as it is in the file, for its records, and for those of several chunks."""
+    """Memory for a chunk as it is in the file, for its records, and for the records of several chunks."""
 
     packed: Space
     records: Space
@@ -79,7 +81,7 @@ class Spaces(NamedTuple):
 
 
 def reused_spaces() -> Iterator[Spaces]:
-    """Yield memory for blocks, again when as many further ones have been made as are made ahead: one for each block."""
+    """Yield memory for one block after the other; it is used again when the blocks made ahead have all been made."""
     return cycle([Spaces(Space(), Space(), Space()) for _ in range(BLOCKS_AHEAD + 1)])
 
 
@@ -155,7 +157,7 @@ class ChunkedFile(Container):
         Parameters
         ----------
         space : for the chunk as it is in the file
-        needed : where not 0, so many bytes of its records are enough, and are not checked
+        needed : where not 0, this number of bytes of its records is enough, and they are not checked
 
         Raises
         ------
@@ -189,7 +191,7 @@ class ChunkedFile(Container):
             try:
                 block, inflation = made()
             except (DecompressionError, MemoryError):
-                # what is sound of each, all of it checked
+                # the sound parts of each chunk, all of them checked
                 for part in group:
                     yield from self._read_chunk(part, spaces)
             else:
@@ -197,7 +199,7 @@ class ChunkedFile(Container):
                 yield self._with_possible_times(block)
 
     def _read_ahead(self, remote: RemoteFile, chunks: Iterable[Chunk], wanted: frozenset[int]) -> Iterator[Part]:
-        """Yield parts of a distant file as `_located` does, with what is wanted of the next ones read meanwhile."""
+        """Yield parts of a distant file as `_located` does, while the wanted bytes of the next parts are read."""
 
         def located(span: tuple[list[Chunk], int, int]) -> list[Part]:
             group, begin, end = span
@@ -210,9 +212,9 @@ class ChunkedFile(Container):
             yield from parts()
 
     def _located(self, chunk: Chunk, wanted: frozenset[int]) -> Part:
-        """Return what is read of a chunk: its messages by the message index; of a small part also the wanted ranges.
+        """Return what to read of a chunk: its messages by the message index; of a small wanted part also the ranges.
 
-        It has neither where the index cannot be right.
+        Where the index cannot be right, the part has neither.
         """
         chunk = self._described(chunk)
         if max(chunk.size, chunk.length, chunk.index_length) > LARGEST_CHUNK_BYTES:
@@ -243,7 +245,7 @@ class ChunkedFile(Container):
         return Part(chunk, np.cumsum(sizes) - sizes, ranges, held, records)
 
     def _joined(self, group: Sequence[Part], spaces: Spaces) -> tuple[MessageBlock, Inflation]:
-        """Return the messages of some chunks, and how much less than allowed these inflate.
+        """Return the messages of some chunks, and what is left of their limit of decompressed bytes.
 
         Raises
         ------
@@ -270,7 +272,8 @@ class ChunkedFile(Container):
     def _unpack(self, part: Part, spaces: Spaces, target: Bytes, inflation: Inflation) -> int:
         """Decompress the wanted records of a chunk, and return how many bytes they have.
 
-        Of a part, what is compressed is read up to the last of them, what is not from the first to the last.
+        A compressed part is read from its begin to the last wanted record, an uncompressed part from the first to the
+        last.
 
         Raises
         ------

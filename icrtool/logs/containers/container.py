@@ -30,7 +30,8 @@ Report = Callable[[str, str], None]
 """Takes the code and the text of a problem."""
 
 LATEST_NS = 1 << 62
-"""The year 2116. A log time beyond it is damage, and differences of such times do not fit into 64 bits."""
+"""Latest log time [ns], in the year 2116. A later time is damage, and differences of such times do not fit into 64
+bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +119,12 @@ def ahead(
     work: Callable[[Item], Result], items: Iterable[Item], threads: int, count: int,
     weight: Callable[[Item], float] = lambda _: 0.0,
 ) -> Generator[tuple[Item, Callable[[], Result]]]:  # fmt: skip
-    """Yield items, each with what returns the result of some work on it; threads work on the next ones meanwhile.
+    """Yield items, each with a function that returns the result of work on it; threads work on the next items.
 
     Parameters
     ----------
-    count : of the items worked on before they are used
-    weight : the share that an item takes of what may be worked on before it is used
+    count : number of items that are worked on before they are used
+    weight : the share of an item in the work that may be done ahead
     """
     pending: deque[tuple[Item, Future[Result]]] = deque()
     with ThreadPoolExecutor(threads) as pool:
@@ -209,7 +210,7 @@ def unpack_messages(
 
 
 LARGEST_DESCRIPTIONS_BYTES = 1 << 24
-"""Of the schemas and topics of a log with their definitions: those of 400 topics have 2 MB."""
+"""Largest size of the schemas and topics of a log with their definitions [bytes]; 400 topics have 2 MB."""
 
 
 def ros_type_name(name: str) -> LogText:
@@ -219,11 +220,11 @@ def ros_type_name(name: str) -> LogText:
 
 
 class Origin(NamedTuple):
-    """What was done to have a log on disk, or to read it where it is.
+    """How a log came to the disk, or how it is read at an address.
 
     Attributes
     ----------
-    inputs : what was read for it; empty: the files themselves
+    inputs : the files that were read for it; empty: the log's own files
     transfer : returns in words how it came over a connection; empty for nothing
     remove : removes what was made for it
     """
@@ -239,11 +240,11 @@ class Container(ABC):
     Attributes
     ----------
     path : as errors name it
-    files : those that make it up
+    files : the files that it consists of
     channels : the topics, known before any block is read
-    mixed : of a distant file more was read than wanted
-    message_compression : of each single message; empty for none
-    origin : where it came from, if it was not there before
+    mixed : more of a distant file was read than was wanted
+    message_compression : compression of each single message; empty for none
+    origin : how it came here, if it was fetched or unpacked
     """
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
@@ -278,7 +279,7 @@ class Container(ABC):
         return "; ".join(filter(None, [self.origin.transfer(), why]))
 
     def blocks(self, wanted: frozenset[int], cut: Cut = WHOLE) -> Generator[MessageBlock]:
-        """Yield the messages of the channels in `wanted` in file order; others, and some outside the cut, among them.
+        """Yield the messages of the channels in `wanted` in file order; other messages may be among them.
 
         What an index shows to be outside the cut is not read.
         """

@@ -51,7 +51,8 @@ _ENCODINGS = {
 }  # fmt: skip
 
 _LARGEST_BLOCK_BYTES = (1 << 17) + 1024
-"""Of a zstd block with the frame's header: so many compressed bytes more give all bytes up to a place."""
+"""Largest size of a zstd block with the frame's header [bytes]: this number of further compressed bytes gives all bytes
+up to a place."""
 
 
 def scan_mcap(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
@@ -165,8 +166,8 @@ class McapFile(ChunkedFile):
 
     def _read_index(self) -> list[Chunk] | None:
         if self._source.read_at(0, len(MCAP_MAGIC)) != MCAP_MAGIC:
-            raise LogError(self.path, "not an MCAP file", "its first bytes are not those of MCAP")
-        # those that the index describes; without one, the records do
+            raise LogError(self.path, "not an MCAP file", "its first bytes are not an MCAP file's")
+        # the channels that the index describes; without an index, the records describe them
         self._schemas, self._channels, self._counts, self._described_bytes = {}, {}, {}, 0
         start, summary = self._summary()
         chunks: list[Chunk] = []
@@ -220,7 +221,7 @@ class McapFile(ChunkedFile):
     def _holds_all(self, chunks: Sequence[Chunk], end: int) -> bool:
         """Return whether the chunks of the index lie one behind the other, and no message outside them before `end`.
 
-        A chunk that is not where the index lists it is damage; or the index is wrong, where as many chunks are found
+        A chunk that is not where the index lists it is damage. The index is wrong if the same number of chunks is found
         without it.
         """
         at, damaged = len(MCAP_MAGIC), []
@@ -237,7 +238,7 @@ class McapFile(ChunkedFile):
                     break
                 at += _HEAD_BYTES + length
             at = behind
-        # Asking a distant file for each head takes minutes; it is fetched where it may be damaged, or its index wrong.
+        # To ask a distant file for each head takes minutes; it is fetched where the file or its index may be damaged.
         heads = (self._head(chunk.at - _HEAD_BYTES) for chunk in (chunks[:1] if self._remote is not None else chunks))
         suspect = damaged or any(head != (_CHUNK, chunk.length) for head, chunk in zip(heads, chunks, strict=False))
         if suspect and (self._remote is not None or self._chunks_in_order(end) == len(chunks)):
@@ -312,7 +313,7 @@ class McapFile(ChunkedFile):
             size = len(data)
         if part.chunk.is_cut or needed:
             return Packed(data, compression, min(size, needed or LARGEST_CHUNK_BYTES), partial=True)
-        # a header of zeros is that of an empty chunk; the index may state too much of one that is not
+        # a header of zeros belongs to an empty chunk; for another chunk the index may state too large a size
         if len(data) < packed or (not checksum and not packed and part.chunk.size > 0):
             raise DecompressionError("its header is damaged")
         return Packed(data, compression, size, checksum=checksum)

@@ -40,12 +40,13 @@ from icrtool.records.places import NOT_REGULAR, SAVE_IT, UrlPath, is_special
 from icrtool.records.samples import InputFile
 
 MOST_CHANNELS = 2048
-"""Topics of a log, each publisher of a ROS 1 bag by itself, that are looked at: some 0.5 ms of time each."""
+"""Largest number of channels that are read: topics, and for a ROS 1 bag publishers. Each takes some 0.5 ms."""
 
 MOST_FILES = 5000
-"""Of a recording: one of three days that begins a file every minute has 4,320. Each takes about 1 ms."""
+"""Largest number of files of a recording. One of three days with a file for each minute has 4,320; each takes about 1
+ms."""
 
-# A bag of any version: one of another than 2.0 is refused by name.
+# A bag of any version: a version other than 2.0 is refused by name.
 _CONTAINERS: dict[bytes, type[McapFile | Ros1Bag | SqliteBag]] = {
     mcap_file.MCAP_MAGIC: McapFile,
     ros1_bag.BAG_MAGIC[:9]: Ros1Bag,
@@ -59,7 +60,7 @@ _NOT_A_LOG = (
 
 
 def open_log(path: Path, share: Callable[[float], None] | None = None) -> Container:
-    """Return the opened container at a path or an address; ``-``: of what comes on standard input.
+    """Return the opened container at a path or an address; ``-``: standard input.
 
     Parameters
     ----------
@@ -89,7 +90,7 @@ def open_log(path: Path, share: Callable[[float], None] | None = None) -> Contai
                     log, problem = unpack(log, scratch.path / "unpacked", share)
                 container = _plain_log(log, distant)
             except LogError as err:
-                # Its own path is gone when the user reads this.
+                # The path of the temporary file is gone when the user reads this.
                 raise LogError(
                     path, err.why, "; ".join(filter(None, [problem.text if problem is not None else "", err.advice]))
                 ) from err
@@ -109,7 +110,7 @@ FileState = tuple[int, int, int]
 
 
 def states_of(path: Path) -> dict[str, FileState]:
-    """Return what changes where a file of a log is written to, by their paths; nothing of an address."""
+    """Return by path what changes when a file of a log is written to; nothing for an address."""
     found: dict[str, FileState] = {}
     for file in () if isinstance(path, UrlPath) else files_of_log(path):
         with suppress(OSError):
@@ -123,7 +124,7 @@ def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterabl
 
     Parameters
     ----------
-    before : of `states_of`, before it was opened
+    before : result of `states_of`, before the log was opened
     inputs : the files as they were read
 
     Raises
@@ -142,7 +143,7 @@ def check_unchanged(path: Path, before: Mapping[str, FileState], inputs: Iterabl
 
 @contextmanager
 def plain_file(path: Path) -> Iterator[tuple[Path, InputFile]]:
-    """Give a file on disk, fetched and decompressed where it is at an address or compressed; and what was read for it.
+    """Yield a file on disk, fetched from an address and decompressed where needed; and the file that was read for it.
 
     Raises
     ------
@@ -193,7 +194,7 @@ def _brought(
     why_fetched: str = "",
     share: Callable[[float], None] | None = None,
 ) -> tuple[Path, Origin, Mapping[str, RemoteFile]]:
-    """Return where a log lies on disk, perhaps packed: in a folder to which it was fetched or saved, if it did not.
+    """Return where a log lies on disk, perhaps packed; a log that is not on disk is fetched or saved to a folder.
 
     Parameters
     ----------
@@ -201,7 +202,7 @@ def _brought(
 
     Returns
     -------
-    log, where it came from, and those of its files that are read by ranges, as in `BagDirectory`
+    log, where it came from, and its files that are read by ranges, as in `BagDirectory`
     """
     distant: dict[str, RemoteFile] = {}
     if remote is not None:
@@ -393,7 +394,7 @@ class BagDirectory(Container):
         return (McapFile if storage.suffix == ".mcap" else SqliteBag)(storage, message_compression)
 
     def _merge_channels(self) -> list[Channel]:
-        """Give a topic that stands in several files one number."""
+        """Give a topic one number, though it stands in several files."""
         merged: dict[tuple[str, str, str], Channel] = {}
         for part in self._parts.values():
             numbers: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""The files of a recording: those of a bag directory, and those beside one another that a recorder split or restarted.
+"""The files of a recording: of a bag directory, and of a recorder that split its files or was restarted.
 
 ``drive_{0..3}.bag`` names all files from the first to the last one in the braces, in the order of their numbers or
 dates. It is a path like any other: commands take it, tables show it.
@@ -19,10 +19,10 @@ from icrtool.records.places import UrlPath, open_regular
 from icrtool.records.text import listed
 
 LOG_SUFFIXES = {".mcap", ".bag", ".db3"}
-"""A file with one of these is a recording even if its content is not: that it cannot be read is a result."""
+"""Suffixes of recordings. A file with such a suffix counts as a recording; if it cannot be read, that is reported."""
 
 PACKED_SUFFIX = r"\.(?:zstd|zst|gz|lz4|bz2|xz)"
-"""What the names of compressed files end with."""
+"""Suffixes of compressed files."""
 
 _PACKED_END = re.compile(rf"{PACKED_SUFFIX}$", re.IGNORECASE)
 _ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
@@ -30,7 +30,7 @@ _ARCHIVE_END = re.compile(r"\.(?:zip|tar|tgz|tbz2|txz)$", re.IGNORECASE)
 STORAGE = re.compile(rf"\.(mcap|db3)(?:{PACKED_SUFFIX})?$")
 
 LARGEST_METADATA_BYTES, _DEEPEST = 1 << 18, 20
-"""Of metadata.yaml: the largest of a bag of 200 topics has some 100,000 bytes."""
+"""Largest size [bytes] and depth of metadata.yaml. A bag of 200 topics has some 100,000 bytes."""
 
 LONGEST_SPLIT_GAP_S = 3600.0
 """The files of a split recording follow one another without a gap. A longer gap: they are separate recordings."""
@@ -81,11 +81,11 @@ def storage_files(directory: Path) -> list[Path]:
 
 
 class BagFiles(NamedTuple):
-    """The storage files of a bag directory, and how their messages are compressed each; empty for not at all.
+    """The storage files of a bag directory, and the compression of each message; empty for none.
 
     Attributes
     ----------
-    by_name : no metadata.yaml names them
+    by_name : the files were found by their names, because no metadata.yaml lists them
     """
 
     files: list[Path]
@@ -241,7 +241,7 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
 
 
 _SERIES_NAME = re.compile(r"^(|.*?[_\-. ])((?:19|20)\d\d[\d_.\-T]*|\d+)(\.[A-Za-z]\w*)$")
-"""What comes before a count or a date, the count or date (and count), the suffix."""
+"""Groups: the text before a count or a date; the count, or the date (and count); the suffix."""
 
 STANDARD_INPUT = Path("-")
 """Stands for the log that is given on standard input."""
@@ -302,14 +302,14 @@ def split_files(path: Path) -> list[Path]:
 
 
 def files_of_log(path: Path) -> list[Path]:
-    """Return the files of a log: all of a directory, those of a range, or the one file."""
+    """Return the files of a log: all files of a directory, the files of a range, or the one file."""
     if path.is_dir():
         return sorted(file for file in path.iterdir() if file.is_file())
     return split_files(path) or [path]
 
 
 def log_name(path: Path) -> str:
-    """Return a log's name: that of its (first) file without suffix, or of the directory; ``log`` where it is only dots.
+    """Return a log's name: its (first) file without suffix, or its directory; ``log`` where the name is only dots.
 
     Runs are directories of this name: ``..mcap`` must not be the directory of all runs, nor ``..`` the one above it.
     """

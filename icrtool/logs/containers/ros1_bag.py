@@ -33,12 +33,12 @@ _BAG_MESSAGE, _BAG_HEADER, _INDEX_DATA, _BAG_CHUNK, _CHUNK_INFO, _CONNECTION = 2
 
 _LARGEST_HEADER_BYTES, _LARGEST_CONTENT_BYTES = 1 << 16, 1 << 22
 _HEADER_BYTES = 1 << 12
-"""Of a chunk that are read to learn how it is compressed, where it may be read in part."""
+"""Bytes of a chunk that are read to learn its compression, where it may be read in part."""
 
 _LENGTH = Struct("<I")
 _NONE: Ints = np.empty(0, np.int64)
 _MOST_FIELDS = 100
-"""Of a header outside chunks; real ones have ten at most."""
+"""Largest number of fields of a header outside chunks; real headers have at most ten."""
 
 _MOST_HEADERS = 1 << 4
 """Kinds of headers in a chunk that all records are compared with; further ones are read one by one."""
@@ -103,7 +103,7 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
     table = np.empty((5, len(starts)), np.int64)
     left, rounds = np.arange(len(starts)), 0
     while len(left):
-        # Most have headers of the same fields.
+        # Most records have headers of the same fields.
         size = int(sizes[left[0]])
         fits = sizes[left] == size if rounds < _MOST_HEADERS else np.arange(len(left)) == 0
         heads = unaligned(data, f"V{size}")[starts[left if fits.all() else left[fits]]]
@@ -111,7 +111,8 @@ def scan_bag(data: Bytes, begin: int, hint: Ints | None = None) -> Records:
         values = [(name, begin + 4) for name, begin, end in _fields(header) if end - begin == _VALUE_BYTES.get(name)]
         fields = {name: at for name, at in values if at + _VALUE_BYTES[name] <= size - 4}
         same, end = np.ones(len(heads), np.bool_), 0
-        # Sorted: a name that stands there twice is where it came first in the dict, with the place of its last value.
+        # Sorted: in the dict, a name that stands there twice keeps its first position, with the place of its last
+        # value.
         for name, at in [*sorted(fields.items(), key=lambda one: one[1]), (b"", size - 4)]:
             if at > end:
                 parts = _strided(heads, end, f"V{at - end}")
@@ -146,7 +147,7 @@ def _behind_record(data: memoryview, at: int, end: int) -> int:
 
 
 def _record_ends(data: Bytes, at: Ints) -> Ints:
-    """Return where records (n,) of a bag end that have headers as long as the first; the begin of others."""
+    """Return where records (n,) of a bag end, for headers of the first one's length; else where they begin."""
     lengths, last = unaligned(data, "<u4"), len(data) - 4
     size = 8 + int(lengths[at[0]]) if at[-1] <= last else len(data)
     if at[-1] + size > len(data):
@@ -246,7 +247,7 @@ class Ros1Bag(ChunkedFile):
         self._connections = {n: replace(c, count=counts.get(n, 0)) for n, c in self._connections.items()}
         ordered = sorted(chunks.values(), key=lambda chunk: chunk.at)
         ends = [*(chunk.at for chunk in ordered), first.number(b"index_pos", 8)][1:]
-        # One compression for all, as recorders write; where a chunk has another, that is found when it is read.
+        # One compression for all chunks, as recorders write; another compression of a chunk is found when it is read.
         record = self._record(ordered[0].at) if ordered else None
         kind = record.text(b"compression") if record is not None else "unknown"
         return [

@@ -1,7 +1,7 @@
 """Files that are read at any place: on disk, or in object stores and on web servers, by ranges or fetched whole.
 
 The one place that opens connections, by fsspec, and only for an address that the user, or his manifest, names.
-Credentials are those that the provider's own library finds.
+Credentials are found by the provider's own library.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from icrtool.records.text import LONGEST_NAME
 Result = TypeVar("Result")
 
 QUIET_S, SLOWEST_BPS = 15.0, 10_000
-"""A server may send nothing for this long [s]; and how slowly it may send a range [bytes/s]."""
+"""Longest time in which a server may send nothing [s]; slowest rate at which it may send a range [bytes/s]."""
 
 _NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs", "abfs": "adlfs", "abfss": "adlfs",
           "http": "aiohttp", "https": "aiohttp"}  # fmt: skip
@@ -41,20 +41,22 @@ _NEEDS = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "az": "adl
 _LOGGERS = ("fsspec", "s3fs", "aiobotocore", "botocore", "gcsfs", "google", "adlfs", "azure", "aiohttp")
 
 PAUSES_S = (0.5, 2.0)
-"""Before a request to a web server is made again; the libraries of object stores do so themselves."""
+"""Pauses before a request to a web server is repeated [s]; the libraries of object stores repeat requests
+themselves."""
 
 _FAILURES = (
     ("botocore.exceptions", "BotoCoreError"), ("botocore.exceptions", "ClientError"), ("aiohttp", "ClientError"),
     ("google.auth.exceptions", "GoogleAuthError"), ("gcsfs.retry", "HttpError"),
     ("azure.core.exceptions", "AzureError"), ("fsspec.exceptions", "FSTimeoutError"),
 )  # fmt: skip
-"""What libraries raise beside OSError, where they are loaded."""
+"""Errors that libraries raise in addition to OSError, where they are loaded."""
 
 NEAR_BYTES = 1 << 15
-"""Between two ranges of a distant file that are read too: a request takes as long as some 100 kB."""
+"""Longest gap between two ranges of a distant file that is read with them [bytes]: a request takes the time of some 100
+kB."""
 
 _LEAST_BYTES = 1 << 18
-"""That are read at once: the records of an index follow one another."""
+"""Bytes of a distant file that are read at once, at least: the records of an index follow one another."""
 
 _FETCHED_BYTES, PIECES_AHEAD = 1 << 24, 4
 
@@ -85,7 +87,7 @@ def filesystem(path: UrlPath) -> tuple[Any, str]:
 
 
 def _patience(scheme: str) -> dict[str, Any]:
-    """Return the settings of a file system by which a silent server is given up."""
+    """Return the settings of a file system with which requests to a silent server end."""
     if scheme.startswith("http"):
         from aiohttp import ClientTimeout
 
@@ -131,13 +133,13 @@ def _words_of(cause: BaseException, path: UrlPath) -> str:
         return f"its server sent nothing for {QUIET_S:g} s, or too slowly"
     status = getattr(cause, "status", None)
     if isinstance(status, int):
-        # the rest of such a text is the address, perhaps another one to which the server led
+        # the rest of such a text is the address, or another address to which the server redirected
         return f"its server answered {status} {getattr(cause, 'message', '')}".strip()
     return path.without_own_secrets(str(cause)) or type(cause).__name__
 
 
 def _failures() -> tuple[type[Exception], ...]:
-    """Return what a broken connection or a refused request is raised as."""
+    """Return the errors of a broken connection or a refused request."""
     loaded = [getattr(sys.modules.get(module), name, None) for module, name in _FAILURES]
     return (OSError, ValueError, *(one for one in loaded if one is not None))
 
@@ -158,7 +160,7 @@ def _check_range(answer: Any, begin: int, end: int, size: int) -> None:  # noqa:
 
 
 class Held(NamedTuple):
-    """Bytes of a file from a place on."""
+    """Bytes of a file, beginning at a place."""
 
     at: int
     data: bytes
@@ -169,7 +171,7 @@ class Held(NamedTuple):
 
 
 class _OfThread(local):
-    """What a thread read last."""
+    """The bytes that a thread read last."""
 
     held = Held(0, b"")
 
@@ -197,11 +199,11 @@ class LocalFile:
 
 
 class RemoteFile:
-    """A file behind a connection; each read takes as long as many kilobytes: reads are few, and made ahead.
+    """A file behind a connection. A request takes the time of some 100 kB: requests are few, and made ahead.
 
     Parameters
     ----------
-    about : what its store states about it; None: it is asked
+    about : what its store states about it; None: the store is asked
 
     Raises
     ------
@@ -233,7 +235,7 @@ class RemoteFile:
             return False
 
     def _web_ranges(self, begins: list[int], ends: list[int]) -> list[bytes]:
-        """Return ranges of a file on a web server, each read up to its length and no further.
+        """Return ranges of a file on a web server, each read only up to its length.
 
         Raises
         ------
@@ -270,12 +272,12 @@ class RemoteFile:
         """Return bytes of the file, as many as there are."""
         end = min(at + count, self.size)
         if not self._ends:
-            # All that is read by an index begins with start and end of the file.
+            # To read by an index begins with the start and the end of the file.
             begins = sorted({0, max(self.size - _LEAST_BYTES, 0)})
             self._ends = tuple(map(Held, begins, self._ranges(begins, [begin + _LEAST_BYTES for begin in begins])))
         held = next((one for one in (*self._ends, self._last.held) if one.has(at, end)), None)
         if held is None:
-            # What stands at the end of a file is read from its footer backwards.
+            # The end of a file is read from its footer backwards.
             first = max(min(at, self.size - _LEAST_BYTES), 0)
             held = self.hold(first, max(end - first, _LEAST_BYTES))
         return held.data[at - held.at : end - held.at]
@@ -370,7 +372,7 @@ def most_bytes(folder: Path) -> int:
 
 def read_by_ranges(files: Collection[RemoteFile]) -> str:
     """Return how much was read of some files."""
-    # Ranges overlap a little: of a small file more comes than it has.
+    # Ranges overlap a little: more bytes than a small file has may be read.
     read, size = sum(min(one.bytes_read, one.size) for one in files), sum(one.size for one in files)
     return f"{read / 1e6:.3g} of {size / 1e6:.3g} MB read by ranges"
 
@@ -401,7 +403,7 @@ def _in_folder(path: UrlPath) -> list[tuple[UrlPath, dict[str, Any]]]:
 
 
 def _address(files: Any, name: str, asked_for: UrlPath) -> UrlPath:  # noqa: ANN401 - a file system of fsspec
-    """Return the address of a file that was found, with the query of the one asked for, where a web server needs it."""
+    """Return the address of a found file, with the query of `asked_for` where a web server needs it."""
     url = files.unstrip_protocol(name)
     query = asked_for.url.partition("?")[2] if asked_for.scheme.startswith("http") else ""
     found = place_of(f"{url}?{query}" if query and "?" not in url else url)
@@ -411,7 +413,7 @@ def _address(files: Any, name: str, asked_for: UrlPath) -> UrlPath:  # noqa: ANN
 
 
 def changed_since(path: UrlPath, inputs: Iterable[InputFile]) -> bool:
-    """Return whether the files at an address are not those that they were when they were opened.
+    """Return whether the files at an address changed since they were opened.
 
     Parameters
     ----------
@@ -477,7 +479,7 @@ def fetch_folder(
     Returns
     -------
     inputs : the storage files as run.json states them
-    distant : those that are read by ranges, by their names; they are empty on disk
+    distant : the files that are read by ranges, by their names; they are empty on disk
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""rosbag2's sqlite3 storage: one ``.db3`` file, with or without a write-ahead log beside it.
+"""rosbag2's sqlite3 storage: one ``.db3`` file, with or without a write-ahead log next to it.
 
-Of a damaged file that is read which SQLite reads before the damage; ``sqlite3 .recover`` may bring back the rest.
+A damaged file is read up to the damage; ``sqlite3 .recover`` may bring back the rest.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from icrtool.records.text import LogText
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 _WAL_AT, _IN_WAL_MODE = 18, b"\2"
-"""Place in the header of a database, and value there, that states that it is written by a write-ahead log."""
+"""Place in the header of a database, and the value there where the database uses a write-ahead log."""
 
 _TABLES = frozenset({"topics", "messages", "message_definitions"})
 _FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "count"})
@@ -39,12 +39,13 @@ _FUNCTIONS = frozenset({"group_concat", "length", "typeof", "max", "min", "count
 
 _MOST_TOPICS = 1 << 17
 _STEPS, _QUERY_STEPS, _QUERY_STEPS_PER_BYTE = 1 << 16, 1 << 26, 16
-"""Steps of SQLite's virtual machine: between two checks whether to stop; the most that a query may take; and so many
-more per byte of the file. The pages of a damaged table may refer to one another without end."""
+"""Steps of SQLite's virtual machine: between two checks whether to stop; limit of a query; addition to the limit for
+each byte of the file. The pages of a damaged table may refer to one another without end."""
 
 _FIRST_ROWS, _MOST_ROWS = 64, 1 << 14
 _GROUP_BYTES = _LARGEST_MESSAGE_BYTES = 1 << 24
-"""Of several messages together, and of one: those that icrtool uses have some kilobytes."""
+"""Bytes of messages that are read together, and of the largest message; messages that icrtool uses have some
+kilobytes."""
 
 _UNKNOWN_ROWS = 1 << 40
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
@@ -61,7 +62,7 @@ class SqliteBag(Container):
     Raises
     ------
     LogError
-        Not an SQLite file, or not one of rosbag2's.
+        Not an SQLite file, or not a file of rosbag2.
     """
 
     def __init__(self, path: Path, message_compression: str = "") -> None:
@@ -105,14 +106,14 @@ class SqliteBag(Container):
             is_ahead = file.read(_WAL_AT + 1)[_WAL_AT:] == _IN_WAL_MODE
         if not is_ahead or log.exists():
             return ""
-        return f"its write-ahead log {log.name} is missing, in which a recorder keeps messages: copy it beside the file"
+        return f"its write-ahead log {log.name} is missing, in which a recorder keeps messages: copy it too"
 
     def share_read(self) -> float:
         """Return the last row read as a share of all rows."""
         return self._last_row / max(self._rows, 1)
 
     def close(self) -> None:
-        """Release the database; no new file stays beside it."""
+        """Release the database; no new file stays next to it."""
         self._database.close()
         if self._made_beside is not None:
             self._made_beside.unlink(missing_ok=True)
@@ -153,7 +154,7 @@ class SqliteBag(Container):
                 )
             else:
                 return database
-        # Without `immutable` SQLite writes files beside a log that was recorded in WAL mode.
+        # Without `immutable` SQLite writes files next to a log that was recorded in WAL mode.
         database = self._open("mode=ro&immutable=1")
         try:
             database.execute("SELECT name FROM sqlite_master")
@@ -281,9 +282,9 @@ class SqliteBag(Container):
                 if self._interruption is not None:
                     raise self._interruption from None
                 if count == 1:
-                    self.report("log_damaged", f"damaged ({err}); what SQLite reads before was read; {self._advice}")
+                    self.report("log_damaged", f"damaged ({err}); the rows before the damage were read; {self._advice}")
                     return
-                count //= 2  # those before the damage; or together they are too long
+                count //= 2  # read the rows before the damage; or the rows are too long together
                 continue
             if last is None:
                 return
@@ -312,7 +313,7 @@ class SqliteBag(Container):
         page_bytes = int.from_bytes(head[16:18], "big")
         page_bytes = page_bytes if page_bytes > 1 else 1 << 16
         if size % page_bytes or size < page_bytes * int.from_bytes(head[28:32], "big"):
-            self.report("log_cut_off", f"cut off; what SQLite reads of it was read; {self._advice}")
+            self.report("log_cut_off", f"cut off; the rows that SQLite can read were read; {self._advice}")
         return page_bytes if size % page_bytes else 0
 
 

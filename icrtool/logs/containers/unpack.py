@@ -45,13 +45,15 @@ from icrtool.records.text import LogText, listed
 _PARTS_OF_LOGS = re.compile(rf"^(?!\.).*\.(?:mcap|bag|db3)(?:{PACKED_SUFFIX})?$|\.db3-wal$|^metadata\.yaml$")
 
 _PIECE_BYTES, _DECODER_BYTES = 1 << 20, LARGEST_CHUNK_BYTES
-"""That are unpacked at a time, and that a decoder may hold."""
+"""Bytes that are unpacked at a time, and bytes that a decoder may hold."""
 
 _MOST_ENTRIES, _MOST_FOLDERS = 100_000, 100
-"""Of an archive that are looked at, and folders with logs among them: one recording has one."""
+"""Largest number of entries of an archive that are read, and of folders with logs among them: a recording has one
+folder."""
 
 _LARGEST_EXTRA_BYTES, _LARGEST_READ_BYTES = 1 << 16, 1 << 22
-"""Of a long name in a tar archive; of what zipfile reads at once, such as the directory of an archive."""
+"""Largest long name in a tar archive [bytes]; largest piece that zipfile reads at once, such as an archive's directory
+[bytes]."""
 
 _BEHIND = b"icrtool: behind the last frame"
 _TAR_BLOCK_BYTES, _ZIP = 512, b"PK\x03\x04"
@@ -59,7 +61,7 @@ _SPARSE_MORE = 482
 """Place in the header of a sparse file in a tar archive that states whether a block of places follows it."""
 
 _TAR, _TAR_MARK = b"ustar", slice(257, 262)
-"""What a tar archive has in its first block, and where."""
+"""Mark of a tar archive, and its place in the first block."""
 
 
 class Readable(Protocol):
@@ -71,7 +73,7 @@ class Readable(Protocol):
 
 
 class _Frames:
-    """What a decoder of the standard library, or of lz4, makes of frames that follow one another."""
+    """The output of a decoder of the standard library, or of lz4, for frames that follow one another."""
 
     def __init__(self, make: Callable[[], Any], source: Readable) -> None:
         self._make, self._source, self._decoder = make, source, make()
@@ -91,9 +93,10 @@ class _Frames:
 
 
 class _Zstd:
-    """What zstandard makes of frames that follow one another.
+    """The output of zstandard for frames that follow one another.
 
-    Its reader does not show whether the last frame has ended: a frame of our own behind it comes out only then.
+    Its reader does not show whether the last frame has ended. A further frame is put behind it: its content comes out
+    only if the last frame has ended.
     """
 
     def __init__(self, source: Readable) -> None:
@@ -130,16 +133,16 @@ _DECODING_ERRORS = (
     OSError, EOFError, RuntimeError, ValueError, NotImplementedError, zlib.error, lzma.LZMAError,
     zipfile.BadZipFile, zstandard.ZstdError,
 )  # fmt: skip
-"""What decoders raise of data that is damaged or cut off."""
+"""Errors of decoders for data that is damaged or cut off."""
 
 
 def _scratch_of_host() -> str:
-    """Return what the names of the temporary folders on this host begin with."""
+    """Return the first characters of the names of temporary folders on this host."""
     return f"icrtool-{re.sub(r'[^A-Za-z0-9.]', '_', platform.node())[:64]}-"
 
 
 def _clear_dead(folder: Path) -> None:
-    """Remove the temporary folders of this user and host whose process is gone: a killed one clears nothing."""
+    """Remove the temporary folders of this user and host whose process is gone: a killed process removes nothing."""
     own = _scratch_of_host()
     with suppress(OSError):
         for entry in list(os.scandir(folder)):
@@ -263,11 +266,11 @@ class _Stream:
 
     Parameters
     ----------
-    size : of the part of `source` that it is, by default all [bytes]
+    size : length of the part of `source` that is read, by default all [bytes]
     """
 
     def __init__(self, source: Readable, budget: _Budget, size: float = math.inf) -> None:
-        # What a decoder gives at once is kept where the next bytes are damaged.
+        # Bytes that a decoder returned are kept where the next bytes are damaged.
         self._read: Callable[[int], bytes] = getattr(source, "read1", source.read)
         self._budget, self._left, self._head = budget, size, b""
 
@@ -334,7 +337,7 @@ def _unpacked(
     """Unpack an open file, and return the file or bag directory that is the log."""
     packed = _Stream(file, budget)
     if not is_packed(start := packed.start()):
-        raise LogError(path, "does not decompress", "its first bytes are those of no known compression")
+        raise LogError(path, "does not decompress", "its first bytes belong to no known compression")
     if start.startswith(_ZIP):
         entries = _zip_entries(file, budget)
     else:
@@ -367,7 +370,7 @@ def _unpacked(
         raise LogError(path, "no log in it", f"it holds {listed(others) or 'nothing'}")
     if not found:
         return folder
-    # Whatever its directory is called, a bag is one recording; a file that is there twice is two.
+    # A bag directory is one recording, whatever its name; a file that is there twice is two recordings.
     bags = {group for group in groups.values() if is_bag_directory(group)}
     found = [*bags] + [file for file in found if file.parent not in bags]
     if len(found) > 1:
@@ -392,7 +395,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
         except TarError as err:
             return budget.stop("log_cut_off", f"cut off or damaged ({err})")
         if info.type in {b"L", b"x"}:
-            # A name, or a size, that the header of the next entry has no space for.
+            # A name or a size for which the header of the next entry has no space.
             fields = _extra_fields(info.type, stream.exactly(min(info.size, _LARGEST_EXTRA_BYTES)))
             stream.skip(max(info.size - _LARGEST_EXTRA_BYTES, 0) + -info.size % _TAR_BLOCK_BYTES)
             name = fields.get(b"path", name.encode("utf-8", "surrogateescape")).decode("utf-8", "surrogateescape")
@@ -424,7 +427,7 @@ def _tar_entries(stream: _Stream, budget: _Budget) -> Iterator[tuple[str, _Strea
 
 
 def _extra_fields(kind: bytes, extra: bytes) -> dict[bytes, bytes]:
-    """Return the fields of an extended header: a long name, or those of the pax format (``20 path=drive.mcap``)."""
+    """Return the fields of an extended header: a long name, or the fields of pax (``20 path=drive.mcap``)."""
     if kind == b"L":
         return {b"path": extra.partition(b"\0")[0]}
     fields, at = {}, 0
@@ -437,7 +440,7 @@ def _extra_fields(kind: bytes, extra: bytes) -> dict[bytes, bytes]:
 
 
 class _FrugalFile:
-    """A file of which no more is read at once than a sound archive asks for."""
+    """A file that refuses larger reads than a sound archive needs."""
 
     def __init__(self, file: BufferedReader) -> None:
         self._file = file

@@ -43,7 +43,7 @@ from icrtool.logs.messages.protobuf import definitions_in, descriptors_of, field
 from icrtool.records.text import LONGEST_TEXT, LogText
 
 LONGEST_MESSAGE_BYTES = 1 << 20
-"""Of a message that is decoded by itself; those that icrtool uses have some hundred bytes."""
+"""Largest message that is decoded by itself [bytes]; messages that icrtool uses have some hundred bytes."""
 
 _LARGEST_INTEGER = 1 << 62
 _FLOATS = ("float32", "float64")
@@ -56,7 +56,7 @@ class DecodedValues:
     Attributes
     ----------
     kinds : primitive type by column
-    values : by column one of each readable message (n,): a number, a text, or a list of either
+    values : by column, the value of each readable message (n,): a number, a text, or a list of either
     """
 
     kinds: Mapping[str, str]
@@ -79,7 +79,7 @@ class DecodedValues:
 
 @dataclass(slots=True)
 class ValueDecoder:
-    """Decodes messages one by one; of each it keeps the wanted values alone, however much it holds.
+    """Decodes messages one by one, and keeps only the wanted values, whatever else a message holds.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ def property_of(value: object, name: str) -> object:
 
 
 def value_at(value: object, steps: Sequence[Step], field_of: Callable[[Any, str], object]) -> object:
-    """Return what a message holds at some steps, a list behind a step to all elements; None for nothing."""
+    """Return the value of a message at some steps, a list after a step to all elements; None where it has none."""
     for done, step in enumerate(steps):
         if isinstance(step, str):
             value = None if value is None else field_of(value, step)
@@ -187,14 +187,14 @@ NMEA_SENTENCE = "nmea_msgs/Sentence"
 
 GGA, RMC, GST, HDT = 1, 2, 4, 8
 """Kinds of sentences that are read: fix with quality, fix with validity, deviations of the fix, true heading (HDT, THS,
-UNIHEADINGA). A message with several sentences has the sum."""
+UNIHEADINGA). A message with several sentences has the sum of their kinds."""
 
 QUALITY_OF_MODE = {"A": 1, "D": 2, "P": 3, "R": 4, "F": 5, "E": 6, "M": 7, "S": 8, "N": 0}
 """The mode indicator of RMC as the quality of GGA: autonomous, differential, PPS, RTK fixed and float, and so on."""
 
 NMEA_FIELDS = ("latitude", "longitude", "altitude", "heading", "north_std", "east_std", "heading_std")
-"""What the sentences hold, NaN where one does not: degrees, m above the ellipsoid, degrees clockwise from north, m, m,
-degrees."""
+"""Values of the sentences, NaN where a sentence has none: degrees, m above the ellipsoid, degrees clockwise from north,
+m, m, degrees."""
 
 _KINDS_OF_NMEA = {"sentence_kind": "int32", "quality": "int32", **dict.fromkeys(NMEA_FIELDS, "float64")}
 _SENTENCE = re.compile(rb"\s*[$!]([ -)+-~]{5,})\*([0-9A-Fa-f]{2})\s*")
@@ -226,7 +226,8 @@ class SentenceDecoder:
     def decode(self, data: Bytes, start: Ints, end: Ints) -> DecodedValues:
         """Decode the first of messages [start, end) (n,) of `data`.
 
-        One with a wrong checksum is unreadable, and one without, unless no sentence of the topic has one.
+        A message with a wrong checksum is unreadable. A message without checksum is unreadable, unless no sentence of
+        the topic has one.
         """
         decoded = self.inner.decode(data, start, end)
         texts = decoded.texts("sentence")
@@ -256,12 +257,12 @@ def parse_sentences(text: bytes, *, bare: bool = False) -> dict[str, Any] | None
     """
     whole: dict[str, Any] | None = None
     lines = text.splitlines()
-    # the last of a message that is longer than what is read of it is incomplete
+    # if a message is longer than the bytes that are read, its last sentence is incomplete
     for line in lines if len(text) < LONGEST_TEXT else lines[:-1]:
         if (found := parse_sentence(line, bare=bare)) is not None:
             whole = whole or {}
             kinds = whole.get("sentence_kind", 0) | found.get("sentence_kind", 0)
-            # The place of a GGA, with its height, counts more than that of an RMC.
+            # The position of a GGA has a height: it is preferred to the position of an RMC.
             is_better = found.get("sentence_kind") == GGA
             whole = ({**whole, **found} if is_better else {**found, **whole}) | (
                 {"sentence_kind": kinds} if kinds else {}
@@ -274,7 +275,7 @@ def parse_sentence(text: bytes, *, bare: bool = False) -> dict[str, Any] | None:
 
     Parameters
     ----------
-    bare : one without a checksum is read, too
+    bare : a sentence without a checksum is read, too
     """
     if (long := _LONG.fullmatch(text)) is not None:
         return _parse_long(long[1].decode("ascii")) if _crc_of(long[1]) == int(long[2], 16) else None
@@ -342,7 +343,7 @@ def _number(text: str) -> float:
 
 
 _MINUTES = 60.0
-"""Of a degree; a receiver that rounds writes all of them."""
+"""Minutes of a degree; a receiver that rounds may write 60."""
 
 
 def _degrees(text: str, side: str, sides: str) -> float:
@@ -354,7 +355,7 @@ def _degrees(text: str, side: str, sides: str) -> float:
 
 
 LONGEST_SCHEMA = 1 << 20
-"""Characters of a JSON schema."""
+"""Characters of the longest JSON schema that is read."""
 
 _KINDS = {"integer": "int64", "number": "float64", "boolean": "bool", "string": "string"}
 _OTHER_NAMES = {
@@ -362,17 +363,17 @@ _OTHER_NAMES = {
     "header.stamp.nanosec": ("timestamp.nsec", "timestamp.nanos", "header.stamp.nsec"),
     "header.frame_id": ("frame_id",),
 }
-"""Fields that stand for those of a ROS header in JSON and in Protobuf."""
+"""Fields of JSON and Protobuf that stand for the fields of a ROS header."""
 
 _FOXGLOVE_KINDS = {"frame_id": "string", "name": "string", "sec": "int64", "nsec": "int64"}
-"""Types of fields in Foxglove's schemas, of which JSON may name none; others are float64."""
+"""Types of fields in Foxglove's schemas, for JSON that states no types; other fields are float64."""
 
 _MOST_PATHS, _MOST_NESTED = 512, 3
-"""Fields of an unknown type that are listed, and messages within one another in which they are looked for."""
+"""Largest number of fields of an unknown type that are listed, and depth of nested messages that are searched."""
 
 
 def value_decoder(channel: Channel, wanted: tuple[str, ...]) -> ValueDecoder:
-    """Return the decoder of Protobuf or JSON; a JSON schema without fields leaves it to the messages what they hold."""
+    """Return the decoder of Protobuf or JSON; without fields in a JSON schema, the messages show them."""
     paths, kinds = _columns_of(replace(channel, id=0, topic=LogText(""), count=None), wanted)
     if channel.encoding == "json":
         return ValueDecoder(kinds, paths, parse_json_message, property_of)
@@ -402,7 +403,7 @@ def _columns_of(alike: Channel, wanted: tuple[str, ...]) -> tuple[dict[str, str]
 
 @lru_cache(maxsize=64)
 def definitions_in_schema(text: str, message_type: str) -> Definitions:
-    """Return the message types of a channel's JSON schema, as those of ROS are given; none where it lists no fields.
+    """Return the message types of a channel's JSON schema, in the form of ROS types; none where it lists no fields.
 
     Raises
     ------
@@ -422,7 +423,7 @@ def definitions_in_schema(text: str, message_type: str) -> Definitions:
 
 
 def _count(schema: object, within: list[str], names: FieldNames) -> int:
-    """Return how many fields an object has, with those of the objects in it.
+    """Return how many fields an object has, with the fields of the objects in it.
 
     Raises
     ------
@@ -444,7 +445,7 @@ def _count(schema: object, within: list[str], names: FieldNames) -> int:
 
 
 def _add(definitions: dict[str, tuple[Any, Any]], name: str, schema: object, depth: int) -> None:
-    """Add the fields of an object, and the types of those that are objects."""
+    """Add the fields of an object, and the types of fields that are objects."""
     properties = schema.get("properties") if isinstance(schema, dict) else None
     if not isinstance(properties, dict) or depth > DEEPEST:
         return

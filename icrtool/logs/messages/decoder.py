@@ -2,7 +2,7 @@
 
 The messages of a topic are alike: most have sequences and texts of the same lengths as the message before. A layout's
 program runs, as plain Python, over one message of each shape; the numbers of all messages of that shape are then
-gathered at once. Messages without a like are decoded one by one.
+gathered at once. Messages that are like no other are decoded one by one.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from icrtool.logs.messages.definitions import (
 from icrtool.records.text import LONGEST_TEXT, LogText
 
 _SHAPES_AT_ONCE, _COMPARED_SHAPES, _TRIED_SHAPES = 1 << 10, 1 << 8, 1 << 4
-"""Shapes that messages decoded at once may have; those of them that messages are compared with; and the least."""
+"""Largest number of shapes of messages that are decoded at once; largest and smallest number of shapes with which a
+message is compared."""
 
 _MOST_LENGTHS = 512
-"""Lengths in a message that can be compared; one that states more is a shape of its own."""
+"""Largest number of lengths in a message that are compared; a message with more lengths is a shape of its own."""
 
 _STEPS_PER_BYTE, _LEAST_STEPS, _MOST_STEPS = 4, 256, 1 << 22
 """Steps of the program that one message may take: per byte, and at most. Loops over elements of size zero would never
@@ -47,10 +48,11 @@ _CDR_LITTLE, _CDR_BIG = 1, 0
 
 
 MOST_TEXTS = 4096
-"""Different texts of a field, as names of joints: with one for each message, time and memory would grow tenfold."""
+"""Largest number of different texts of a field, as names of joints: one text for each message would take ten times the
+time and memory."""
 
 FURTHER = "…".encode()
-"""Stands for all further ones."""
+"""Text in place of all further texts of a field."""
 
 
 class _UnreadableError(Exception):
@@ -63,8 +65,8 @@ class Shape(NamedTuple):
     Attributes
     ----------
     readable : whether the messages fit their layout
-    size : bytes that such a message has at least; one that is unreadable has just as many
-    same : offset and content of what such messages have in common; None where too much would have to be compared
+    size : least number of bytes of such a message; an unreadable message has exactly this number
+    same : offset and content of the bytes that such messages share; None where they are too many to compare
     big : whether numbers are big-endian
     taken : by slot the offset of each number, or offset and length of each text
     """
@@ -90,7 +92,7 @@ class _Run:
         self._message, self._stop, self._cdr = message, len(message), layout.cdr
         self._base = self._at = 4 if layout.cdr else 0
         self._steps_left = min(_STEPS_PER_BYTE * len(message) + _LEAST_STEPS + 2 * len(layout.program), _MOST_STEPS)
-        # the ranges that decide the shape: encapsulation and lengths; those beside one another are one
+        # the ranges that decide the shape: encapsulation and lengths; adjacent ranges are joined
         self._same, self._lengths = [[0, self._base]], 0
         self._taken: list[list[Any]] = [[] for _ in range(layout.taken)]
         self._big, readable = False, True
@@ -155,7 +157,7 @@ class _Run:
                 raise _UnreadableError
 
     def _length(self) -> int:
-        """Return the length of a text or a sequence, which has at least so many bytes."""
+        """Return the length of a text or a sequence; the message must have at least that number of bytes left."""
         if self._cdr:
             self._at += (self._base - self._at) & 3
         if self._at + 4 > self._stop:
@@ -174,12 +176,12 @@ class _Run:
 
 @dataclass(slots=True)
 class Decoder:
-    """Decodes messages of one topic; it knows the shapes of those before.
+    """Decodes messages of one topic; it knows the shapes of earlier messages.
 
     Attributes
     ----------
     kinds : primitive type by column that the messages have
-    columns : what holds the messages
+    columns : the class that holds decoded messages
     """
 
     layout: Layout
@@ -188,14 +190,14 @@ class Decoder:
     _known: list[Shape] = field(default_factory=list)
 
     def decode(self, data: Bytes, start: Ints, end: Ints) -> Decoded:
-        """Decode messages [start, end) (n,) of `data`: the first ones, as many as have few enough shapes."""
+        """Decode messages [start, end) (n,) of `data`: the first ones, up to the limit of shapes."""
         size, left = end - start, np.arange(len(start))
         shapes: list[Shape] = []
         shape_of = np.empty(len(start), np.int64)
         while len(left) and len(shapes) < _SHAPES_AT_ONCE:
             first = left[0]
             message = data[start[first] : end[first]].tobytes()
-            # where hardly any message is like another, comparing takes longer than decoding
+            # where few messages are alike, comparison takes longer than decoding
             compare = len(shapes) < min(_COMPARED_SHAPES, _TRIED_SHAPES + (len(start) - len(left)) // 2)
             shape = next((one for one in self._known if one.fits(message)), None) if compare else None
             if shape is None:
@@ -251,7 +253,7 @@ class Decoded:
     Attributes
     ----------
     start : (n,) where each readable message begins in `data`
-    shapes, shape_of : the shapes, and the place of each readable message's among them (n,)
+    shapes, shape_of : the shapes, and the row among them of each readable message (n,)
     readable : (m,) which of the messages given are readable
     """
 
@@ -265,7 +267,7 @@ class Decoded:
     def numbers(self, path: str) -> NDArray[Any]:
         """Return a field of numbers as float64 or int64: (n,) or, of an array, (n, longest).
 
-        What a message lacks is NaN or 0.
+        Values that a message lacks are NaN or 0.
         """
         name, number = self.layout.slots[path]
         letter = name[0] if name.startswith(("int", "float")) else "u"
@@ -351,7 +353,7 @@ class Decoded:
 
 
 def text_numbers(texts: list[bytes], known: dict[bytes, int]) -> list[int]:
-    """Return the numbers of texts; new ones become known, those beyond `MOST_TEXTS` as one."""
+    """Return the numbers of texts; new texts become known, all texts beyond `MOST_TEXTS` under one number."""
     if len(known) + len(texts) <= MOST_TEXTS:
         return [known.setdefault(text, len(known)) for text in texts]
     numbers = []

@@ -1,4 +1,4 @@
-"""Bounds of what the definitions in a log may hold, and of what may be parsed of all of them."""
+"""Bounds of the content of each definition in a log, and of the definitions that are parsed together."""
 
 from __future__ import annotations
 
@@ -10,19 +10,24 @@ from icrtool.logs.containers.container import Channel
 from icrtool.records.text import LONGEST_TEXT
 
 MOST_FIELDS = 20_000
-"""Fields of a message type, with those of the types in it. Real definitions have some hundred."""
+"""Largest number of fields of a message type, with the types in it. Real definitions have some hundred."""
 
 MOST_NAME_CHARACTERS = 1 << 20
-"""Sum of the characters of all full names of fields of a message type, with the types in it. The schemas of all of
+"""Largest sum of the characters of all full names of fields of a message type, with the types in it. All schemas of
 Foxglove together have 40,000."""
 
 MOST_PARSED = 1 << 19
-"""Characters of the different definitions that are parsed for one log: a second of CPU. Those of 30 topics have
-100,000."""
+"""Largest number of characters of the definitions that are parsed for one log: 1 s of CPU time. The definitions of 30
+topics have 100,000."""
 
-_LEAST_COST, _IDL_WEIGHT, _IDL_NUMBER_WEIGHT, _SCHEMA_SHARE = 1000, 3, 2000, 8
-"""Any definition takes as long as so many characters of ROS definitions; a character of IDL, or a number in it, as so
-many; so many characters of JSON or bytes of Protobuf take as long as one."""
+_LEAST_COST = 1000
+"""Least cost of any definition, in characters of ROS definitions of the same parsing time."""
+
+_IDL_WEIGHT, _IDL_NUMBER_WEIGHT = 3, 2000
+"""Cost of a character of IDL, and of a number in IDL, in characters of ROS definitions."""
+
+_SCHEMA_SHARE = 8
+"""Characters of JSON, or bytes of Protobuf, whose cost is one character of ROS definitions."""
 
 _IDL_NUMBER = re.compile(r"[\[<]|(?<!=)=(?!=)")
 _LONG_WORD = re.compile(rf"[\w/]{{{LONGEST_TEXT + 1}}}")
@@ -35,7 +40,7 @@ COMMENT_OR_STRING = re.compile(r'(?://|#)[^\n]*|/\*.*?(?:\*/|\Z)|"(?:\\.|[^"\\])
 class FieldNames:
     """Counts the full names of the fields of a message type, before anything is made of them.
 
-    A name that is long, times fields that are many, would fill the memory where each bound for itself does not.
+    A long name of a type with many fields would fill the memory, though each is within its own bound.
 
     Attributes
     ----------
@@ -47,7 +52,7 @@ class FieldNames:
     left: int = MOST_NAME_CHARACTERS
 
     def add(self, *parts: str) -> None:
-        """Count one full name, of its parts with a dot between two.
+        """Count one full name: its parts, joined by dots.
 
         Raises
         ------
@@ -94,12 +99,12 @@ class FieldNames:
 
 @dataclass(slots=True)
 class DefinitionBudget:
-    """What may still be parsed of the definitions in a log, whose topics may each have another one.
+    """The limit of what is parsed of the definitions in a log: each topic may have another definition.
 
     Attributes
     ----------
-    left : characters of ROS definitions, or what takes as long
-    refused : by type and definition, why they cannot be read: that is found out once
+    left : characters of ROS definitions, or the equivalent of other definitions
+    refused : by type and definition, why they cannot be read, found once
     """
 
     left: int = MOST_PARSED
@@ -107,12 +112,12 @@ class DefinitionBudget:
     _parsed: set[tuple[str, str]] = field(default_factory=set)
 
     def take(self, channel: Channel) -> None:
-        """Count the definition of a channel, the first time that it comes.
+        """Count the definition of a channel when it comes for the first time.
 
         Raises
         ------
         DefinitionError
-            Those before it were so long that this one is not parsed.
+            The definitions before it used up the limit, and this definition is not parsed.
         """
         one, cost = (channel.message_type, channel.definition), len(channel.definition)
         if (before := self.refused.get(one)) is not None:
@@ -131,7 +136,7 @@ class DefinitionBudget:
         self._parsed.add(one)
 
     def spend(self, channel: Channel, fields: int | DefinitionError) -> None:
-        """Count the fields of the layout of a channel, which may be many: one that is refused, for the most of them."""
+        """Count the fields of a channel's layout, which may be many; a refused layout counts as `MOST_FIELDS`."""
         if isinstance(fields, DefinitionError):
             self.refused[channel.message_type, channel.definition] = fields
             self.left -= MOST_FIELDS if channel.definition else 0

@@ -22,9 +22,11 @@ _NAMED = re.compile(r"\s*Definition of\b\s*([\w/]*).*", re.IGNORECASE)
 
 _SEPARATOR = f"{SEPARATOR}\n"
 LONGEST_DEFINITION, MOST_TYPES = 1 << 18, 256
-"""Limits for a message type with all types in it: characters and types. The longest bundled one has 6,000 and 12."""
+"""Largest numbers of characters and of types of a message type with all types in it. The longest bundled definition has
+6,000 and 12."""
 LONGEST_IDL, MOST_IDL_NUMBERS = 1 << 16, 256
-"""Characters and lengths, bounds and constants of a definition in IDL; the parser takes 5 ms for each number."""
+"""Largest number of characters of a definition in IDL, and of its numbers (lengths, bounds, constants); the parser
+takes 5 ms for each number."""
 
 _ANNOTATION = re.compile(r"@\s*[\w:]+(?:\s*\([^()]*\))?")
 _VALUE = re.compile(r"=(?!\s*\w+\s*;)[^;=]*")
@@ -32,13 +34,13 @@ _EXPRESSION = re.compile(r"[()+\-*/%|^&~]|<[^<>]*<[^<>]*<")
 
 
 def full_name(message_type: str) -> str:
-    """Return ``package/msg/Name`` for ``package/Name``; a name without a package, as Protobuf's, as it is."""
+    """Return ``package/msg/Name`` for ``package/Name``; a name without a package, as in Protobuf, stays."""
     package, _, name = message_type.partition("/")
     return f"{package}/msg/{name}" if name else message_type
 
 
 def plain_definition(text: str, own_name: str) -> str:
-    """Return a definition whose line ends, separators and names of types are those that rosbags reads.
+    """Return a definition in the form that rosbags reads: its line ends, separators and names of types.
 
     Lines end with LF, there is no byte order mark, and a separator and the name of a type are lines of their own.
 

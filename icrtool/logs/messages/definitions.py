@@ -1,8 +1,8 @@
 """Message definitions, and where the wanted fields of a type are: its definition compiled to a small program.
 
-Definitions are the log's own (text, IDL, schema), else the bundled vendor ones, else those of ROS 2 Humble. A message
-has no index: the offset of a field depends on the strings and sequences before it. The program lists what to pass over
-and what to take; `icrtool.logs.messages.decoder` runs it over one message of each shape.
+A definition is taken from the log (text, IDL, schema), else from the bundled vendor types, else from ROS 2 Humble. A
+message has no index: the offset of a field depends on the strings and sequences before it. The program lists which
+bytes to pass over and which fields to take; `icrtool.logs.messages.decoder` runs it over one message of each shape.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SIZES = {
     "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
 }  # fmt: skip
 LONGEST_UNROLLED = 4096
-"""Longest fixed array of which elements are taken: a covariance has 36."""
+"""Longest fixed array whose elements are taken: a covariance has 36."""
 
 DEEPEST, LONGEST_FIXED, MOST_NUMBERS = 32, 1 << 31, 1 << 16
 """Bounds of a definition: messages within one another, elements of a fixed array, numbers taken.
@@ -43,7 +43,7 @@ DEEPEST, LONGEST_FIXED, MOST_NUMBERS = 32, 1 << 31, 1 << 16
 Real definitions reach a depth of 6; a definition that refers to itself has no end.
 """
 MOST_ELEMENTS, MOST_TAKEN = 256, 1024
-"""Taken of a sequence, and of sequences in the elements of a sequence together."""
+"""Largest number of elements taken from a sequence, and from all sequences in the elements of a sequence together."""
 
 Step = str | int | None
 """A field's name, an element's place, or None for all elements of a sequence."""
@@ -51,7 +51,7 @@ Step = str | int | None
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+|\*)\]")
 
 COUNTED = -1
-"""In place of a number of elements: the message states it before them."""
+"""Used in place of a number of elements that the message states before the elements."""
 
 
 def ros_definitions(channel: Channel) -> Definitions:
@@ -75,7 +75,7 @@ def definition_note(channel: Channel) -> str:
 def _known_definitions(
     message_type: str, text: str, written: Literal["msg", "idl"], encoding: str
 ) -> tuple[Definitions, str]:
-    """Return the definitions that a type needs, and why the log's own are not used where they are not.
+    """Return the definitions that a type needs, and why the log's own definitions are not used; empty where they are.
 
     Raises
     ------
@@ -201,7 +201,7 @@ class Operation(NamedTuple):
     Attributes
     ----------
     kind : `NUMBERS`, `TEXT` or `LOOP`
-    size, number : bytes of a number; how many numbers or elements, or `COUNTED`
+    size, number : bytes of one number; count of numbers or elements, or `COUNTED`
     slot : number of the slot that takes it, -1 where it is passed over
     counter : number of the slot that takes a counted number of elements, -1 where it is passed over
     body : what each element of a loop is made of
@@ -218,7 +218,7 @@ class Operation(NamedTuple):
 
     @property
     def takes(self) -> bool:
-        """Whether anything in it is taken."""
+        """Whether the operation takes any field."""
         return self.slot >= 0 or self.counter >= 0 or any(operation.takes for operation in self.body)
 
 
@@ -236,8 +236,8 @@ class Layout:
     Attributes
     ----------
     slots : by path
-    fields : of the type, with those of the types in it
-    taken : how many slots the program knows; of a field that a definition has twice, the last one counts
+    fields : number of fields of the type, with the types in it
+    taken : number of slots; if a definition has a field twice, the last one counts
     """
 
     program: tuple[Operation, ...]
@@ -369,11 +369,11 @@ def compile_layout(
 
     Parameters
     ----------
-    definitions : of the type and all types it contains
+    definitions : definitions of the type and of all types in it
     message_type : ``package/Name``
     wanted : paths such as ``header.stamp.sec``, ``orientation_covariance[0]``, ``position[*]``,
-        ``drivers[*].measured_travel``; those the type does not have are left out of the layout's slots. Of a sequence
-        in each element of a sequence (``a[*].b[*]``) all elements come in a row; ``a[*].b[#]`` are their numbers
+        ``drivers[*].measured_travel``; paths that the type does not have get no slot. For a sequence in each element of
+        a sequence (``a[*].b[*]``) all elements come in a row; ``a[*].b[#]`` are the lengths of the inner sequences
 
     Raises
     ------

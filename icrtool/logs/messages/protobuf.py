@@ -1,8 +1,8 @@
 """Messages in Protobuf: the schema that a channel carries, and what reads the wanted fields of its messages.
 
-Google's library reads both. The type that it reads a message by is made of the wanted fields alone, along each path for
-itself: whatever else a message holds is unknown to it and passed over. With all fields of a schema, a message of 1 MB
-with many empty messages in it could take gigabytes.
+Google's library reads both. The type with which it reads a message has only the wanted fields, along each path
+separately. All other fields of a message are unknown to it, and it passes over them. With all fields of a schema, a
+message of 1 MB with many empty messages in it could take gigabytes.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
     from google.protobuf.descriptor_pb2 import DescriptorProto, FileDescriptorProto
 
 LONGEST_DESCRIPTORS = 1 << 20
-"""Bytes of a FileDescriptorSet; that of all schemas of Foxglove has 60,000."""
+"""Largest size of a FileDescriptorSet [bytes]; the set of all schemas of Foxglove has 60,000."""
 
 SCALAR_TYPES = {
     1: "float64", 2: "float32", 3: "int64", 4: "uint64", 5: "int32", 6: "uint64", 7: "uint32", 8: "bool", 9: "string",
     13: "uint32", 14: "int32", 15: "int32", 16: "int64", 17: "int32", 18: "int64",
 }  # fmt: skip
-"""By the number of a type in FieldDescriptorProto; 14 is an enumeration. Groups and bytes are not read."""
+"""Primitive types by their numbers in FieldDescriptorProto; 14 is an enumeration. Groups and bytes are not read."""
 
 _MESSAGE_TYPE, _OPTIONAL, _REPEATED = 11, 1, 3
 _READ_AS = {9: 12, 14: 5}
-"""Types that are read as others of the same bytes: texts as bytes, which may be no UTF-8, enumerations as int32."""
+"""Types that are read as another type: texts as bytes, because they may be no UTF-8, enumerations as int32."""
 
 
 class ProtobufField(NamedTuple):
@@ -122,7 +122,7 @@ def _name(text: str | bytes) -> str:
 def _types_in(
     messages: Iterable[DescriptorProto], prefix: str, depth: int, names: FieldNames
 ) -> Iterator[tuple[str, DescriptorProto]]:
-    """Yield messages, which lie in `depth` - 1 others, and those within them, with their full names."""
+    """Yield messages at a depth of `depth`, and the messages within them, with their full names."""
     for message in messages:
         name = f"{prefix}{_name(message.name)}"
         names.add(name)
@@ -133,7 +133,7 @@ def _types_in(
 
 
 def definitions_in(descriptors: Descriptors) -> Definitions:
-    """Return message types as those of ROS are given."""
+    """Return message types in the form of ROS types."""
     definitions: dict[str, tuple[Any, Any]] = {}
     for name, fields in descriptors.items():
         known: list[tuple[str, tuple[int, Any]]] = []
@@ -147,7 +147,7 @@ def definitions_in(descriptors: Descriptors) -> Definitions:
 def protobuf_parser(
     descriptors: Descriptors, message_type: str, paths: Iterable[Sequence[Step]]
 ) -> Callable[[bytes], object]:
-    """Return what reads the fields of a message at the steps of each path, None where it cannot be read.
+    """Return a function that reads a message's fields along each path; it returns None for an unreadable message.
 
     Raises
     ------

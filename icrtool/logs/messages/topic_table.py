@@ -20,21 +20,22 @@ from icrtool.logs.messages.definition_bounds import DefinitionBudget
 from icrtool.records.text import LogText
 
 _MOST_EXPECTED = 1 << 22
-"""Numbers of a column that memory is set aside for on the log's word alone."""
+"""Largest number of values for which a column gets memory in advance, by the count that the log states."""
 
 _MESSAGES_AT_ONCE = 1 << 14
-"""That are decoded together."""
+"""Messages that are decoded together."""
 
 LARGEST_VALUE = 1e30
-"""No quantity of a robot is larger, in any unit: what is counts as infinite, so that no power of numbers overflows."""
+"""Largest value that is kept, in any unit; a larger number becomes infinite, so that no power of a finite number
+overflows."""
 
 
 class GrowingColumn:
-    """A column that grows in place, so that all rows are never copied; a single row while all rows are the same.
+    """A column that grows in place, without copies of all rows; it holds a single row while all rows are equal.
 
     Parameters
     ----------
-    lacking : what integers are where a row has fewer elements than others; floats are NaN there
+    lacking : value of integers where a row has fewer elements than others; floats are NaN there
     """
 
     def __init__(self, lacking: int) -> None:
@@ -43,7 +44,7 @@ class GrowingColumn:
         self._values: NDArray[Any] = np.empty(0, np.int64)
 
     def add(self, part: NDArray[Any], expected: int) -> None:
-        """Add a copy of rows (m,) or (m, k), of which `expected` will come in all, as the log states."""
+        """Add a copy of rows (m,) or (m, k), of `expected` rows in all, as the log states."""
         before, held = self._rows, self._values
         self._rows += len(part)
         one = _single_row(part) if len(held) <= 1 else None
@@ -83,7 +84,7 @@ def _single_row(rows: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _copy(source: NDArray[Any], target: NDArray[Any]) -> None:
-    """Copy numbers, which any arithmetic may then use: a signalling NaN becomes a NaN, what is too large infinite."""
+    """Copy numbers, which any arithmetic may then use: a signalling NaN becomes a NaN, a too large number infinite."""
     if target.dtype.kind != "f":
         target[...] = source
         return
@@ -94,13 +95,13 @@ def _copy(source: NDArray[Any], target: NDArray[Any]) -> None:
 
 
 class SetBack(NamedTuple):
-    """How far log time goes back at most from one stored message to the next, and how mixed messages are once sorted.
+    """The largest step of log time back from one stored message to the next, and how sorting mixes the messages.
 
     Attributes
     ----------
     step_ns : the largest step back
-    pieces : into how many a stretch between such steps is cut by sorting, in the mean: 1 where the stretches only
-        change places, about 2 where single messages are out of place, many where times come again
+    pieces : mean number of pieces into which sorting cuts a stretch between such steps: 1 where stretches only change
+        places, about 2 where single messages are out of place, many where times repeat
     before_ns : log time of the last message before the largest step
     """
 
@@ -113,16 +114,16 @@ NOT_SET_BACK = SetBack(0, 0.0)
 
 FRAME_FIELD = "header.frame_id"
 STAMPS = (("header.stamp.sec", "header.stamp.nanosec"), ("stamp.sec", "stamp.nanosec"))
-"""Fields of a message's stamp: in its header, or where it has none beside its values."""
+"""Fields of a message's stamp: in its header, or where it has no header, next to its values."""
 
 HEADER = (*STAMPS[0], FRAME_FIELD, *STAMPS[1])
 """Fields of a message's header, which are read of every topic."""
 
 DISORDER_NS = 2_000_000_000
-"""Messages may be stored out of order by less; a header stamp further from log time is another clock's."""
+"""Limit of the disorder of stored messages [ns]; a header stamp further from log time is from another clock."""
 
 OUT_OF_ORDER_NS = 200_000_000
-"""Messages of one topic are rarely stored further out of order than this."""
+"""Usual limit of the disorder of messages of one topic [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,11 +133,11 @@ class TopicTable:
     Attributes
     ----------
     log_time_ns : int64 (n,)
-    columns : by field path; float64 or int64, (n,) or, for an array field, (n, k), NaN or 0 where a message has less.
-        A text field holds indices into `texts`.
+    columns : by field path; float64 or int64, (n,) or, for an array field, (n, k), NaN or 0 where a message has fewer
+        elements. A text field holds indices into `texts`.
     texts : the distinct texts of each text field
-    unreadable : messages that did not have the shape of their type
-    set_back : of the clock that the messages were logged with
+    unreadable : number of messages that did not have the shape of their type
+    set_back : steps back of the clock that the messages were logged with
     """
 
     topic: LogText
@@ -190,7 +191,7 @@ class TopicTable:
         return np.full(len(self), np.nan) if values is None else values.astype(np.float64, copy=False)
 
     def rows(self, chosen: NDArray[np.bool_] | Ints) -> TopicTable:
-        """Return the table of the chosen messages (n,), or of those in some places (m,)."""
+        """Return the table of the chosen messages (n,), or of the messages in some rows (m,)."""
         columns = {path: values[chosen] for path, values in self.columns.items()}
         return replace(self, log_time_ns=self.log_time_ns[chosen], columns=columns)
 
@@ -209,7 +210,7 @@ class TopicCollector:
 
     Attributes
     ----------
-    channel : the first one; decoders : of each, by its number
+    channel : the first channel; decoders : the decoder of each channel, by its number
     """
 
     channel: Channel
@@ -246,10 +247,10 @@ class TopicCollector:
     def table(self) -> TopicTable:
         """Return what was gathered, sorted by log time, and forget it.
 
-        Publishers may have been built from different versions of the type: the columns that all have are kept.
+        Publishers may have been built from different versions of the type: columns that all publishers have are kept.
         """
         times, numbers = self._times.taken(), self._numbers.taken()
-        # of each publisher by itself: one may be recorded later than another
+        # each publisher by itself: one may be recorded later than another
         stored = [times] if len(self.decoders) == 1 else [times[numbers == one] for one in self.decoders]
         back = max(map(set_back_of, stored), default=NOT_SET_BACK)
         order = None if (times[1:] >= times[:-1]).all() else np.argsort(times, kind="stable")
@@ -300,7 +301,7 @@ class JointColumns(Decoded):
         named, valued = (self.numbers(f"{of}[#]")[:, :joints] for of in (_INTERFACES, _VALUES))
         wanted, column = texts.get(path.removesuffix("[*]").encode(), -2), np.full((len(values), joints), np.nan)
         for _, some in self.by_shape():
-            # messages of a shape have as many interfaces of each joint: their places in a row are the same
+            # messages of one shape have the same number of interfaces of each joint: their places in a row are the same
             rows = np.arange(len(values))[some]
             names, numbers = named[rows[0]], valued[rows[0]]
             both = np.minimum(names, numbers)
@@ -315,7 +316,7 @@ class JointColumns(Decoded):
 
 
 READ_ENCODINGS = ("cdr", "ros1", "protobuf", "json")
-"""Serializations of messages that are read: of ROS 2, of ROS 1, and those of Foxglove."""
+"""Serializations of messages that are read: of ROS 2, of ROS 1, and of Foxglove."""
 
 
 def collector_for(
@@ -324,11 +325,11 @@ def collector_for(
     before: TopicCollector | None = None,
     budget: DefinitionBudget | None = None,
 ) -> TopicCollector:
-    """Return what gathers the wanted columns of a channel: `before`, where another one of the topic came already.
+    """Return the collector of a channel's wanted columns: `before` where another channel of the topic has one.
 
     Parameters
     ----------
-    budget : of the log; None: of this channel alone
+    budget : budget of the log; None: a budget for this channel alone
 
     Raises
     ------

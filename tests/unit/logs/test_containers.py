@@ -339,7 +339,7 @@ def test_ros_2_directory_says_which_of_its_files_cannot_be_read(tmp_path):
     (path / "log_1.mcap").write_bytes(b"")
     read = read_log(path)
     assert read.messages == messages[:90] + messages[180:]
-    assert read.problems == ["log: log_1.mcap: not an MCAP file; its first bytes are not those of MCAP"]
+    assert read.problems == ["log: log_1.mcap: not an MCAP file; its first bytes are not an MCAP file's"]
 
 
 def test_ros_2_directory_whose_named_files_were_renamed_is_read_by_name(tmp_path):

@@ -727,7 +727,9 @@ def test_db3_cut_off_says_so_and_loses_a_page_at_most(tmp_path, end):
     found, problems = read_log(path)
     assert found == messages[: len(found)]
     assert len(found) > 1500 - 3 * 21
-    assert problems[0].startswith("cut.db3: cut off; what SQLite reads of it was read; `sqlite3 cut.db3 .recover")
+    assert problems[0].startswith(
+        "cut.db3: cut off; the rows that SQLite can read were read; `sqlite3 cut.db3 .recover"
+    )
 
 
 def test_db3_rows_that_hold_no_message_are_left_out_and_said(tmp_path):
