@@ -60,7 +60,7 @@ def plan(places: Sequence[Path], output: Path, batch: BatchRequest, folder: Path
     if folder.exists() and not folder.is_dir():
         raise OutputError(output, "a file is there", "name another place for the batch")
     check_tables(folder, page=batch.files.page)
-    # A table of simulated truth beside its log, from a pattern of the shell, is no manifest.
+    # A table of simulated truth next to its log, from a pattern of the shell, is no manifest.
     beside = logs_among([place for place in places if place.is_file()])[1]
     places = [place for place in places if place not in beside]
     entries = [entry for place in places if is_manifest(place) for entry in read_manifest(place)]

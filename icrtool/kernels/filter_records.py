@@ -144,7 +144,7 @@ class FilterOutput(NamedTuple):
 
 
 class Events(NamedTuple):
-    """Events in order of time: (m,) time [s], kind, and row among those of its kind."""
+    """Events in order of time: (m,) time [s], kind, and row among the events of its kind."""
 
     t: Floats
     kind: Ints

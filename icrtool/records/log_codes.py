@@ -95,7 +95,7 @@ OF_FILES: dict[str, Explanation] = {
 OF_CLOCKS: dict[str, Explanation] = {
     "clock_shifted": Explanation(
         "warning",
-        "Speeds or turns of positions or headings are those of the wheels seconds earlier or later: another clock.",
+        "Speeds or turns of positions or headings match the wheels' seconds earlier or later: another clock.",
         "The stream was moved by that time.",
         "Set the clocks of robot and receiver; GPS time is 18 s ahead of UTC.",
     ),
@@ -136,7 +136,7 @@ OF_WHEELS: dict[str, Explanation] = {
     "ground_changed": Explanation(
         "warning",
         "The robot turns differently per turn of its wheels from some time on: another ground, load or tyre pressure.",
-        "ICRs and multiplier of the whole drive lie between those of its stretches.",
+        "ICRs and multiplier of the whole drive lie between the values of its stretches.",
         "Fit with `--terrain-change T`, or each stretch by itself with `--from` and `--to`.",
     ),
     "wheels_commanded": Explanation(

@@ -78,7 +78,7 @@ class LogFacts(Record, frozen=True, kw_only=True):
     heading_from_position : heading and position are fields of the same messages: they have the same delay
     heading_correlation_s : the errors of headings closer together than this are correlated
     heading_is_estimated : the headings are estimated with the positions, and do not exist without positions
-    heading_is_measured : the variance of the headings is that of a reference's poses, as measured
+    heading_is_measured : the variance of the headings is the measured variance of a reference's poses
     turn_wander_rad : how far the heading wanders from the turn of the wheels in a second (rms), noise included; None:
         not known
     antenna_m : the antenna from the body origin, forward and right

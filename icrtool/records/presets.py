@@ -33,8 +33,8 @@ class Preset:
     rate_invariant : process noise does not depend on the number of steps
     step_heading : share of a step's turn that is added to the heading before the step's displacement
     process_noise : of the pose, where none is configured
-    printed_derivatives : the Jacobian is that of Eqs. 28-29 as printed, with the difference of Eqs. 32-34; else it has
-        the true derivatives. Both are the same where the right ICR is right of the left one
+    printed_derivatives : the Jacobian has Eqs. 28-29 as printed, with the difference of Eqs. 32-34; else the true
+        derivatives. Both are the same where the right ICR is right of the left one
     initial_icrs_m : right, left, x [m]; None: the ICRs of usual skid-steer robots of the track width
     initial_icr_std_m : standard deviation [m]; None: the spread of the ICRs of usual robots
     terrain_icr_std_m : of the ICRs after a change of terrain [m]; None: the track width

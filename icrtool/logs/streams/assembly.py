@@ -57,10 +57,12 @@ from icrtool.records.tables import RobotLog
 from icrtool.records.text import LogText, listed
 
 MOST_PIECES = 10.0
-"""Of a stretch of messages: sorted in among others more often, it was recorded while their times came again."""
+"""Largest mean number of pieces into which sorting cuts a stretch of messages. With more, it was recorded while times
+repeated."""
 
 FAR_NS = 100_000_000
-"""Header stamps that log time follows by less are used together with log times of other streams."""
+"""Largest delay of log time after header stamps [ns] with which these are used together with log times of other
+streams."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ class Survey:
 
     Attributes
     ----------
-    tables : of their columns those that candidates do not hold: stamps, turn rates, static transforms
+    tables : columns that no candidate holds: stamps, turn rates, static transforms
     transfer : how much came over a connection, in words; empty for a file on disk
     """
 
@@ -93,7 +95,7 @@ def assemble(survey: Survey, config: Config) -> RobotLog:
     log = _assemble(survey, config, choice)
     others = []
     for other in other_references(survey.candidates, choice, config):
-        # one that cannot be used is no alternative
+        # a reference that cannot be used is no alternative
         with contextlib.suppress(DataError):
             others.append(_assemble(survey, config, other))
     return replace(log, other_references=tuple(others)) if others else log
@@ -172,7 +174,7 @@ def _assemble(survey: Survey, config: Config, choice: Choice) -> RobotLog:
 
 
 def _clock_of(chosen: Mapping[Role, Source], config: Config) -> tuple[Callable[[StampedRows], StampedRows], list[Note]]:
-    """Return what gives stamps the clock that is configured, or that all headers share; and a note.
+    """Return a function that puts stamps on the configured clock, or on the clock of all headers; and a note.
 
     Raises
     ------
@@ -210,12 +212,12 @@ def _gyros(
 
 
 def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Iterator[Note]:
-    """Yield findings about clocks of streams that were set, one for all, and that cannot be used, one for each.
+    """Yield findings about clocks: one for all clocks that were set, one for each clock that cannot be used.
 
     Raises
     ------
     DataError
-        The clock was set back, and times came again: nothing shows which of two samples came first.
+        The clock was set back, and times repeat: nothing shows which of two samples came first.
     """
     back = [
         (rows.set_back, role)
@@ -223,7 +225,7 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         if rows.set_back.pieces > MOST_PIECES or rows.set_back.step_ns > DISORDER_NS
     ]
     if back:
-        # Of streams in which times come again, the largest step: they decide what can be done.
+        # The largest step among the streams in which times repeat, if there are any: they decide what can be done.
         largest = max(back, key=lambda one: (one[0].pieces > MOST_PIECES, one[0].step_ns))[0]
         moment, roles = np.datetime64(largest.before_ns // 10**9, "s"), ", ".join(role for _, role in back)
         why = f"log time goes back by {largest.step_ns / 1e9:.1f} s after {moment}Z ({roles})"
@@ -241,7 +243,7 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
         sense, setting = ("back", "back") if is_back else ("ahead", "forward")
         moment, roles = np.datetime64(before_ns // 10**9, "s"), ", ".join(role for _, role in found)
         why = f"header stamps go {sense} by {size_ns / 1e9:.1f} s after {moment}Z ({roles})"
-        moved = "the later ones are moved by as much, which log time shows"
+        moved = "the later stamps are moved by that step, which log time shows"
         yield note("clock_set", f"{why}: their clock was set {setting} while recording; {moved}")
     for role, rows in streams:
         if rows.note and rows.note not in ("no header", BY_LOG):
@@ -254,7 +256,7 @@ def clock_notes(streams: Sequence[tuple[Role, StampedRows]], name: str) -> Itera
 def common_clock(streams: Sequence[StampedRows]) -> Clock:
     """Return the clock for streams that are used together: header stamps or log time.
 
-    Where some stream has only log times and another's header is far from them, all go by log time.
+    Where one stream has only log times and the header stamps of another are far from log time, all use log time.
     """
     delays = [rows.delay_ns for rows in streams if rows.header_ns is not None]
     return "log" if len(delays) < len(streams) and any(abs(delay) > FAR_NS for delay in delays) else "header"
@@ -306,7 +308,7 @@ def _headings(source: HeadingSource, config: Config, clock: Clock) -> tuple[Head
 
 
 MOST_NOT_FINITE = 0.01
-"""A larger share of wheel samples without a number is reported."""
+"""Largest share of wheel samples without a number that is not reported."""
 
 
 def wheel_samples(motion: WheelSource, stamps: Ints, config: Config, log_name: str) -> tuple[WheelSamples, list[Note]]:
@@ -408,13 +410,13 @@ WHEEL_UNITS: dict[str, tuple[float, WheelUnit]] = {
 """Configured units of wheels: the factor of the numbers, and the unit of the products, per second for speeds."""
 
 PAUSE_S, LONGEST_PAUSE_S = 600.0, 86_400.0
-"""A longer interval between samples is reported; a log whose samples are a day apart is of two recordings."""
+"""Longest interval between samples that is not reported [s]; interval from which a log counts as two recordings [s]."""
 
 
 def longest_part(log: RobotLog) -> RobotLog:
-    """Return a log without what another clock stamped, and with a finding where its clock may have been set forward.
+    """Return a log without samples of another clock, and with a finding where its clock may have been set forward.
 
-    Of parts that are `LONGEST_PAUSE_S` and more apart, that with the most wheel samples, and positions, is kept.
+    Of parts at least `LONGEST_PAUSE_S` apart, the part with the most wheel samples and positions is kept.
     """
     stamps, fixes, pause_ns = log.wheels.stamp_ns, log.gnss.stamp_ns, int(LONGEST_PAUSE_S * 1e9)
     ends = np.append(np.flatnonzero(np.diff(stamps) > pause_ns), len(stamps) - 1)

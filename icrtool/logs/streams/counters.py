@@ -14,29 +14,29 @@ TURN_MODULI = (360.0, 2 * np.pi)
 """Moduli of angles [deg, rad]."""
 
 FEWEST_STEPS = 20
-"""Of a shorter recording no modulus is found."""
+"""Least number of steps from which a modulus is found."""
 
 LARGE_STEP = 0.5
-"""A step that is a larger part of the range of the numbers passes the modulus; smaller ones do not."""
+"""Least size of a step that passes the modulus, as a share of the range of the numbers."""
 
 CONSISTENT_SHARE = 0.9
 """Share of the large steps that must agree with one modulus."""
 
 BETWEEN_WRAPS = 0.4
-"""Between two passages of the modulus in one direction, a counter covers at least this part of its range."""
+"""Least share of its range that a counter covers between two passages of the modulus in one direction."""
 
 ROUND_STEPS = (1000.0, 500.0, 100.0, 360.0)
-"""Moduli of counters are mostly multiples of one of these; the first that fits is taken."""
+"""Usual divisors of the moduli of counters; the first divisor that fits is taken."""
 
 
 TURN_TOLERANCE = 1e-3
-"""Angles are recorded as less than a turn, or as up to a rounded one."""
+"""Relative tolerance of a turn: angles are recorded as less than a turn, or up to a rounded turn."""
 
 POWERS = 7, 33
-"""Counters of 7 to 32 bits are known."""
+"""Range of the powers of two that are known moduli: counters of 7 to 32 bits."""
 
 FEWEST_PASSAGES = 2
-"""A single step back by an unknown modulus may be a restart of the robot."""
+"""Least number of passages of an unknown modulus: a single step back may be a restart of the robot."""
 
 
 class Modulus(NamedTuple):
@@ -45,7 +45,7 @@ class Modulus(NamedTuple):
     Attributes
     ----------
     value : the modulus, in the unit of the numbers
-    std : its standard deviation; 0 where it is a known one
+    std : its standard deviation; 0 for a known modulus
     """
 
     value: float
@@ -105,7 +105,7 @@ def find_modulus(columns: Iterable[NDArray[Any]], given: float | None = None) ->
 
 
 def _known_between(least: float, most: float, given: float | None, *, whole: bool) -> float | None:
-    """Return the first known modulus in a range: a turn, that of the configured encoder, a power of two."""
+    """Return the first known modulus in a range: a turn, the counts of the configured encoder, a power of two."""
     turn = next((one for one in TURN_MODULI if least <= (1 + TURN_TOLERANCE) * one and one <= most), None)
     if turn is not None or not whole:
         return turn
@@ -114,7 +114,7 @@ def _known_between(least: float, most: float, given: float | None, *, whole: boo
 
 
 def _wraps_of(values: Floats) -> _Wraps | None:
-    """Return the large steps of a column (n,), None where it has none that a modulus can explain."""
+    """Return the large steps of a column (n,); None where no modulus can explain them."""
     values = values[np.isfinite(values)]
     if len(values) < FEWEST_STEPS:
         return None

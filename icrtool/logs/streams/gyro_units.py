@@ -12,31 +12,30 @@ from icrtool.records.samples import HeadingSamples, PositionFixes
 DEGREE = math.radians(1.0)
 
 FASTEST_RADPS = math.radians(1000.0)
-"""No robot turns faster than this [rad/s]."""
+"""Largest turn rate of a robot [rad/s]."""
 
 MOST_BAD = 0.01
-"""A topic is not used where a larger share of its rates is not finite, or faster than a robot turns."""
+"""Largest share of rates of a used topic that are not finite, or faster than a robot turns."""
 
 SPAN_S, SHORTEST_CHORD_M = 1.0, 0.3
 """Turns are compared over this time [s], by positions between displacements of at least this length [m]."""
 
 MOST_SPANS = 20.0
-"""Of a slow robot the displacements take up to so many times as long."""
+"""Longest time of a displacement of a slow robot, in multiples of `SPAN_S`."""
 
 FEWEST_TURNS_OF_GYRO = 10
-"""With fewer turns to compare, the unit that the message type states is taken."""
+"""Least number of turns to compare; with fewer, the unit that the message type states is used."""
 
 AGREE, LEAST_SCATTER, CLEARER = 0.6, 0.05, 0.25
-"""Turns agree with deg/s where the mean direction of their differences has this length, and their scatter, 1 less that
-length, is smaller than this part of the scatter with rad/s, which is at least the second: a turn of a few degrees fits
-both."""
+"""Turns agree with deg/s if the mean of the unit vectors of their differences is at least `AGREE` long, and their
+scatter (1 minus that length) is below `CLEARER` times the scatter with rad/s, which counts as at least `LEAST_SCATTER`.
+Small turns fit both units."""
 
 
 def is_in_degrees(t_ns: Ints, rates: Floats, heading: HeadingSamples, fixes: PositionFixes) -> bool:
     """Return whether turn rates (n, 3) are in deg/s: by their size, else by the turns of headings or of fixes.
 
-    A turn by the integrated rate agrees with that of the reference in one of both units, in one
-    sense.
+    In one of the two units, and in one sense, the turn by the integrated rate agrees with the reference's turn.
     """
     fast = is_too_fast(rates)
     for begin, end, turn, half_turns in (_turns_of_heading(heading), _turns_of_course(fixes)):
@@ -53,7 +52,7 @@ def is_in_degrees(t_ns: Ints, rates: Floats, heading: HeadingSamples, fixes: Pos
 
 
 def is_too_fast(rates: Floats) -> bool:
-    """Return whether turn rates (n, 3) are too often those of no robot [rad/s]."""
+    """Return whether too large a share of turn rates (n, 3) [rad/s] is impossible for a robot."""
     return bool(np.count_nonzero(np.abs(rates).max(axis=1) > FASTEST_RADPS) > MOST_BAD * len(rates))
 
 

@@ -31,7 +31,7 @@ from icrtool.records.notes import Note, note
 from icrtool.records.samples import GyroSamples
 
 FUSED_WORTH = 30.0
-"""Of a heading that is fused with the wheels."""
+"""Worth of a heading that is fused with the wheels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +43,9 @@ class Bearing:
     what, worth : what it is called where it is chosen, and how suitable it is
     angle, std, variance : to rad and rad^2, as `number` reads them; std and variance: either or none. Degrees of 720
         and more stand for "unknown": Septentrio writes -2e10
-    valid : checks that all must pass for a heading
+    valid : checks, all of which a heading must pass
     convention, known_by : ``ned``: clockwise from north, ``enu``: counter-clockwise from east; how that is known
-    independent : where half of the messages or more do not pass, they are fused with the wheels
+    independent : checks of an independent heading; if half of the messages fail, it is fused with the wheels
     """
 
     what: str
@@ -70,7 +70,7 @@ class Bearing:
             variance = number(table, self.variance)
         elif self.std:
             std = number(table, self.std)
-            variance = std * np.abs(std)  # not positive, and so not stated, where the deviation is not
+            variance = std * np.abs(std)  # keeps the sign: a deviation that is not positive counts as not stated
         worth = min(self.worth, FUSED_WORTH) if is_fused(table, self.independent) else self.worth
         return replace(self, worth=worth).of(table, angle, variance, all_valid(table, self.valid))
 
@@ -96,7 +96,7 @@ def read_azimuths(table: TopicTable, _: Config) -> HeadingSource:
     yaw = table.column("azimuth") * factor
     orientation = table.column("orientation")
     ned = bool(np.median(orientation) == 1)
-    # Rows of the other orientation are converted: pi/2 - yaw, in both directions.
+    # Rows of the other orientation are converted: pi/2 - yaw, which holds in both directions.
     yaw = np.where((orientation == 1) == ned, yaw, np.pi / 2 - yaw)
     north = _NORTHS.get(float(np.median(table.floats("reference"))), "unknown")
     row = replace(_AZIMUTH, what=f"{_AZIMUTH.what}, {north} north", convention="ned" if ned else "enu")
@@ -107,15 +107,15 @@ BASELINE = Bearing(
     "u-blox moving base: bearing of the antenna baseline", 90.0, "relPosHeading|rel_pos_heading * 1e-5 * deg",
     "accHeading|acc_heading * 1e-5 * deg", valid=("flags & 260 == 260",), known_by="u-blox: clockwise from north",
 )  # fmt: skip
-"""Flags: 4 the baseline is valid, 256 its heading."""
+"""Heading of an antenna baseline. Flag 4: the baseline is valid; flag 256: its heading is valid."""
 
 _COMPONENTS = "relPosN|rel_pos_n + relPosHPN|rel_pos_hpn * 0.01", "relPosE|rel_pos_e + relPosHPE|rel_pos_hpe * 0.01"
 _ACCURACIES, _BASELINE_VALID = ("accN|acc_n * 0.01", "accE|acc_e * 0.01"), ("flags & 4 == 4",)
 BASELINE_FIELDS = fields_in((*_COMPONENTS, *_ACCURACIES), _BASELINE_VALID)
-"""Of the baseline by its components to the north and to the east, in cm."""
+"""Fields of a baseline with components to the north and to the east [cm]."""
 
 LEAST_BASELINE_CM = 0.005
-"""Half of what the fields of a baseline resolve: a shorter one has no direction."""
+"""Shortest baseline that has a direction [cm]: half of the resolution of its fields."""
 
 
 def read_baselines(table: TopicTable, _: Config) -> HeadingSource:
@@ -135,10 +135,11 @@ _ATTITUDE_WORDS = re.compile(r"quaternion|filter|imu|attitude|orientation|ahrs|x
 """Topics of QuaternionStamped that hold an inertial unit's orientation, not a receiver's compass angle."""
 
 RAW, NOT_INS = 10.0, 30.0
-"""Taken off of a topic that is raw, and of an odometry that is of no inertial navigation system."""
+"""Subtracted from the worth of a raw topic, and of an odometry of no inertial navigation system."""
 
 UNKNOWN_RAD2 = (2 * np.pi) ** 2
-"""A heading with a standard deviation of a turn is not known yet: drivers of moving bases write 1000."""
+"""Variance from which a heading counts as not known [rad^2], a standard deviation of one turn: drivers of moving bases
+write 1000."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +154,7 @@ class Orientation:
     absent : the field that is -1 where messages hold no orientation
     rate : the field of the turn rate of a gyro in the same message
     stuffed : some drivers of GNSS receivers write a compass angle into the quaternion as if it were a yaw
-    odometry : preferred where its name is that of an inertial navigation system
+    odometry : preferred where its name shows an inertial navigation system
     """
 
     what: str
@@ -177,7 +178,7 @@ class Orientation:
         variance = table.floats(self.variance)
         variance = np.where(variance > 0, variance, np.nan)
         unknown = variance >= UNKNOWN_RAD2
-        # where all are, the number means nothing
+        # where all messages have it, the number means nothing
         usable = usable if unknown[usable].all() else usable & ~unknown
         convention, why = frame_convention(table)
         if self.stuffed and not _ATTITUDE_WORDS.search(table.topic):
@@ -201,7 +202,8 @@ class Orientation:
 
 QUATERNION_NORM_TOLERANCE = 0.1
 UPRIGHT_COSINE = math.cos(math.radians(45.0))
-"""A sensor whose z axis is further than 45 deg from vertical is mounted on its side; its yaw is no heading."""
+"""Cosine of the largest tilt of an upright sensor, 45 deg. With more tilt it is mounted on its side, and its yaw is no
+heading."""
 
 LEVEL_COSINE = math.cos(math.radians(30.0))
 TILTED_SHARE = 0.01
@@ -229,13 +231,13 @@ def frame_convention(table: TopicTable) -> tuple[Convention, str]:
 def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple[Floats, Bools, Note | None]:
     """Return yaw [rad] (n,), which rows are rotations (n,), and a note where the sensor is not mounted upright.
 
-    Yaw is that of the sensor's x axis seen from above. In a sensor mounted on its side another axis is level all the
-    time: that axis is used, and has a constant angle to the robot's forward axis.
+    Yaw is the direction of the sensor's x axis seen from above. In a sensor mounted on its side another axis is level
+    all the time: this axis is used, and has a constant angle to the robot's forward axis.
 
     Parameters
     ----------
     q : the fields x, y, z, w, (n,) each
-    yaw_rate_radps : (n,) of a gyro in the same message; a quaternion in another order must turn with it
+    yaw_rate_radps : (n,) of a gyro in the same message, with which a quaternion in another order must turn
     """
     with np.errstate(over="ignore"):
         norm = _of_rows(lambda *fields: np.sqrt(sum(field * field for field in fields)), q)
@@ -259,7 +261,7 @@ def nose_yaw(q: Sequence[Floats], yaw_rate_radps: Floats | None = None) -> tuple
 
 
 def _of_rows(make: Callable[..., Floats], q: Sequence[Floats], norm: Floats | float = 1.0) -> Floats:
-    """Return what a function makes (n,) of four columns over their norm, some rows at a time, to bound memory."""
+    """Return the result (n,) of a function of four columns over their norm, computed in parts to bound memory."""
     found, norms = np.empty(len(q[0])), np.broadcast_to(norm, len(q[0]))
     for lo in range(0, len(found), ROWS_AT_ONCE):
         some = slice(lo, lo + ROWS_AT_ONCE)
@@ -287,7 +289,7 @@ def _written_order(
         return np.column_stack([field[chosen] for field in q]) / norm[chosen, None]
 
     as_named, some = (0, 1, 2, 3), unit(rows[:: max(1, len(rows) // MOST_ORIENTATIONS)])
-    # Of each axis of the sensor, the share of the time in which it is not upright.
+    # For each axis of the sensor, the share of the time in which it is not upright.
     upward = np.array([turned_axis(axis, *some.T)[2] for axis in range(3)])
     if len(some) < 2 or ((np.abs(upward) < UPRIGHT_COSINE).mean(axis=1) < TILTED_SHARE).any():
         return as_named, None
@@ -304,7 +306,7 @@ def _turns_with(unit: Floats, yaw_rate_radps: Floats | None) -> bool:
     if yaw_rate_radps is None or not np.isfinite(yaw_rate_radps).all() or np.ptp(yaw_rate_radps) == 0:
         return True
     yaw = unwrapped(_bearing(0, *unit.T))
-    # Over many samples: from one to the next there is more noise than turning.
+    # Over many samples: between two samples the noise is larger than the turn.
     edges = np.unique(np.linspace(0, len(yaw) - 1, STRETCHES + 1).astype(np.int64))
     turned, measured = np.diff(yaw[edges]), np.add.reduceat(yaw_rate_radps, edges[:-1])
     if len(turned) < 3 or float(np.ptp(turned)) == 0 or float(np.ptp(measured)) == 0:
@@ -331,7 +333,7 @@ def find_gyro(
     wheels_topic, heading_topic : the unit that is also the source of the heading is preferred, then one in the wheels'
         namespace, then the one with more samples
     clock : the clock of the other streams
-    known : stamps of topics that were read before
+    known : stamps of topics that were computed before
     """
     home = wheels_topic.strip("/").split("/")[0]
     found = []
@@ -349,7 +351,7 @@ def inertial_units(
         if table.message_type != GYRO_TYPE or len(table) < 2 or any(axis not in table.columns for axis in axes):
             continue
         rates = [table.floats(axis) for axis in axes]
-        # in rad/s or in deg/s: which, turns show later
+        # in rad/s or in deg/s: the turns show the unit later
         sound: Bools = np.logical_and.reduce([np.abs(one) <= FASTEST_RADPS for one in rates])
         if np.count_nonzero(~sound) > MOST_BAD * len(sound):
             sound = np.logical_and.reduce([np.abs(one) * DEGREE <= FASTEST_RADPS for one in rates])

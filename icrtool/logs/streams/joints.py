@@ -40,7 +40,7 @@ class Joints:
         return self.names, self.position, self.speed
 
     def read(self, table: TopicTable, config: Config) -> WheelSource:
-        """Return the motion of those joints that are wheels."""
+        """Return the motion of the joints that are wheels."""
         codes, texts = table.words(self.names)
         given = config.wheels.left_joints, config.wheels.right_joints
         left, right = (
@@ -72,13 +72,13 @@ class Joints:
 
 
 Columns = dict[Quantity, list[NDArray[Any]]]
-"""Positions and speeds (n,) of each wheel; no column of what is not recorded."""
+"""Positions and speeds (n,) of each wheel; no column for a quantity that is not recorded."""
 
 FEWEST_REPEATED = 5
-"""This often at least, messages of zeros come between others, where a second publisher sends them."""
+"""Least number of messages of zeros between others from which a second publisher is found."""
 
 LITTLE_CHANGE = 0.5
-"""Messages on both sides of such zeros differ by less than this share of what they state."""
+"""Largest difference of the messages before and after such zeros, as a share of their values."""
 
 
 def _by_message(
@@ -95,12 +95,12 @@ def _by_message(
     counted = (
         f"{np.count_nonzero(foreign)} of {len(foreign)} messages state 0 for every wheel, between others that do not"
     )
-    left_out = note("second_publisher", f"{counted}: those of a second publisher, left out")
+    left_out = note("second_publisher", f"{counted}: sent by a second publisher, left out")
     return kept, of_topic(table.rows(~foreign)), (left_out,)
 
 
 def _of_second_publisher(positions: Sequence[NDArray[Any]], speeds: Sequence[NDArray[Any]]) -> Bools | None:
-    """Return which messages (n,) state 0 for every wheel while those around them state what wheels do; None: none."""
+    """Return which messages (n,) state 0 for every wheel between messages that state motion; None: none."""
     columns = [*positions, *speeds]
     if not columns or len(columns[0]) < FEWEST_REPEATED:
         return None
@@ -170,8 +170,8 @@ def _by_own_messages(
 def _places_of(left: Sequence[int], right: Sequence[int], codes: Ints, joints: int) -> tuple[Ints, Bools]:
     """Return the place of each wheel in the list of each message (n, k), and which messages (n,) are used.
 
-    A wheel that a message does not list is at -1. Those messages are used that list the set of wheels most do, of those
-    sets with both sides: a mean over wheels that changes its members would jump.
+    A wheel that a message does not list is at -1. Messages are used if they list the most frequent set of wheels that
+    has both sides: a mean over changing wheels would jump.
     """
     wheels = [*left, *right]
     wheel = np.full(joints + 1, -1)

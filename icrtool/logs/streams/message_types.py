@@ -29,7 +29,7 @@ class OwnRow:
 
 
 MessageRow = Fix | Bearing | Orientation | Joints | FixedWheels | Twist | OwnRow
-"""What a message type carries for a role: the fields to take beside those of a header, and how they are read."""
+"""What a message type carries for a role: the fields to take in addition to the header, and how they are read."""
 
 # Wheels: Drive.msg of jackal_msgs and of clearpath_platform_msgs has 0 for left, 1 for right.
 _JOINTS = Joints("wheel joints by name", 100.0, "name[*]", "position[*]", "velocity[*]")
@@ -65,7 +65,7 @@ _TWIST = Twist("body twist", 50.0, fused=45.0)
 
 # Positions
 _GBAS = 2
-"""NavSatStatus: 2 is fixed or float, drivers differ. A log without any of these states nothing about the solution."""
+"""NavSatStatus: 2 is fixed or float, drivers differ. A log without such a status states nothing about the solution."""
 
 _GPSFIX_STATUS = {
     0: OTHER_FIX, 1: OTHER_FIX, _GBAS: RTK_FIX, 18: OTHER_FIX, 19: FIXED_FIX, 20: FLOAT_FIX, 33: OTHER_FIX,
@@ -76,7 +76,7 @@ _UBLOX_CARRIER = {0: OTHER_FIX, 1: FLOAT_FIX, 2: FIXED_FIX}
 """carrSoln of u-blox."""
 
 _UBLOX_FLAGS = {carrier << 6: fix_class for carrier, fix_class in _UBLOX_CARRIER.items()}
-"""Bits 6 and 7 of NavPVT.flags: the same."""
+"""carrSoln of u-blox in bits 6 and 7 of NavPVT.flags."""
 
 _NMEA_QUALITY = {1: OTHER_FIX, 2: OTHER_FIX, 3: OTHER_FIX, 4: FIXED_FIX, 5: FLOAT_FIX, 8: OTHER_FIX, 9: OTHER_FIX}
 """Quality of GGA: single, differential, PPS, RTK fixed and float, simulated, SBAS of NovAtel.
@@ -328,4 +328,4 @@ MESSAGE_TYPES: Mapping[Role, Mapping[str, MessageRow]] = {
 ``flags & 1 == 1`` (`sources.check_of`)."""
 
 KNOWN_TYPES = frozenset[str]().union(*MESSAGE_TYPES.values())
-"""Types with a row of their own: nothing is looked for by the names of their fields."""
+"""Types with a row of their own: their fields are not searched by name."""

@@ -1,4 +1,4 @@
-"""Messages that hold the robot's position: fixes, poses, and transforms: of the antenna, or of the robot itself."""
+"""Messages that hold the position of the antenna or of the robot: fixes, poses and transforms."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Solution(NamedTuple):
 
     Attributes
     ----------
-    codes, otherwise : the class by number, and that of all others
+    codes, otherwise : the class by number, and the class of all other numbers
     mask : the bits of the number that count
     informative : the topic states no class unless some fix is one with carrier phase: drivers write 0 for every fix
     """
@@ -63,33 +63,38 @@ REFERENCE_WORDS = re.compile(
     r"prism|leica|utm|global|navsat|\bins\b|vectornav|novatel|sbg|ublox",
     re.IGNORECASE,
 )
-"""In names of odometry and pose topics, or of their frames: a reference, not the robot's own dead reckoning."""
+"""Words in names of odometry and pose topics, or of their frames, that show a reference, not the robot's own dead
+reckoning."""
 
 REFERENCE_FRAMES = {"world", "earth", "ecef", "local_enu", "enu", "camera_init"}
-"""Names of frames that are no such words; FAST-LIO and LOAM call their map ``camera_init``."""
+"""Further names of frames of a reference; FAST-LIO and LOAM call their map ``camera_init``."""
 
 GOAL_WORDS = re.compile(r"goal|initial_?pose|cmd|command|desired|setpoint", re.IGNORECASE)
-GOAL = "its name is that of a goal, not of a measurement"
+GOAL = "its name is the name of a goal, not of a measurement"
 
 LEAST_AREA_M, FLAT_RATIO, LARGEST_PLACE_M, MOST_PLACES = 1.0, 0.1, 1e8, 2000
-"""A drive this wide (standard deviation) shows its plane where it is no thicker than a tenth of that."""
+"""Least width of a drive that shows its plane [m], a standard deviation; largest thickness over width of the plane;
+largest coordinate that is used [m]; number of positions that are used."""
 
 LEAST_RADIUS_M, LARGEST_RADIUS_M = 6.33e6, 6.40e6
-"""Of the earth; UTM coordinates far from the equator may be as large, but have a height near 0."""
+"""Least and largest distance of a place on earth from the centre [m]. UTM coordinates may reach these values, but have
+a height near 0."""
 
 NO_SOLUTION = Solution("", {})
 
 HIGHEST_M = 20_000.0
-"""A height beyond this means "unknown"; it is replaced by the median of the others."""
+"""Largest height [m]; a larger height means "unknown", and is replaced by the median of the others."""
 
 FARTHEST_M = 200_000.0
-"""No robot drives further from the middle of its fixes."""
+"""Largest distance of a robot from the middle of its fixes [m]."""
 
 STILL_M, METRES_PER_DEGREE = 0.5, 111_000.0
-"""A receiver whose fixes stay within this is that of a base station, or of a robot that stands."""
+"""Range of the fixes of a receiver that never moves [m], on a base station or a standing robot; metres in a degree of
+latitude."""
 
 GOOD_STD_M, NOT_GOOD = 0.3, 35.0
-"""A fix with a smaller standard deviation is RTK or nearly so, and preferred as reference; taken off of others."""
+"""Largest standard deviation of a preferred fix [m], which is RTK or nearly so; subtracted from the worth of other
+fixes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,14 +105,14 @@ class Fix:
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is as reference
     place : latitude and longitude [deg], height above the ellipsoid [m]; where `metric` x, y, z [m]
-    std : standard deviation [m] to the north and to the east; one for both. These are as `number` reads them
+    std : standard deviation [m] to the north and to the east; one text for both. All are read by `number`
     covariance : the variances to the north and to the east and their covariance, which have precedence
-    stated : checks that all must pass where a covariance is stated
-    valid : checks that all must pass for a fix
+    stated : checks, all of which a stated covariance must pass
+    valid : checks, all of which a fix must pass
     solution : how it was solved
     metric : x is taken as east and y as north, in the topic's own frame
     odometry : its name or frame must show that it is a reference
-    independent : where half of the messages or more do not pass, they are fused with the wheels
+    independent : checks of an independent position; if half of the messages fail, it is fused with the wheels
     """
 
     what: str
@@ -225,7 +230,7 @@ class Fix:
 
 
 def _far_away(latitude_deg: Floats, longitude_deg: Floats, known: Bools) -> Bools:
-    """Return the known fixes (n,) of another place: a receiver that was switched on may send where it was last."""
+    """Return the known fixes (n,) of another place: a receiver that was switched on may send its last place."""
     far, latitude_deg, longitude_deg = np.zeros(len(known), np.bool_), latitude_deg[known], longitude_deg[known]
     if len(latitude_deg):
         middle_deg = float(np.median(latitude_deg))
@@ -256,10 +261,10 @@ def _is_level(places_m: Floats) -> bool:
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 BASE_FRAMES = ("base_link", "base_footprint", "chassis_link", "base")
 LARGEST_LEVER_ARM_M = 5.0
-"""No antenna is further from the body origin than this [m]: such a transform is ignored."""
+"""Largest distance of an antenna from the body origin [m]; a longer transform is ignored."""
 
 LARGEST_TRANSLATION_M = 1e9
-"""Beyond it a transform is damaged; UTM coordinates reach 1e7."""
+"""Largest translation of a transform [m]; a larger one is damaged. UTM coordinates reach 1e7."""
 
 _PREFIX = "transforms[*]."
 TRANSFORM_FIELDS = (
@@ -268,7 +273,7 @@ TRANSFORM_FIELDS = (
     *(f"{_PREFIX}transform.translation.{axis}" for axis in "xyz"),
     *(f"{_PREFIX}transform.rotation.{axis}" for axis in "xyzw"),
 )
-"""Of a transform: parent, child, translation, rotation."""
+"""Fields of a transform: parent, child, translation, rotation."""
 
 TRANSFORM_STAMP = tuple(f"{_PREFIX}header.stamp.{part}" for part in ("sec", "nanosec"))
 _POSE = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw"))
@@ -347,8 +352,8 @@ class _Link(NamedTuple):
 def transform_pose(table: TopicTable) -> TopicTable:
     """Return the poses of the robot's base in the root of the transforms, as messages of PoseStamped.
 
-    Where the base is an odometry's and the root moves against it, as a map does by each scan that is matched, there is
-    a pose at the first odometry after each such step: later ones differ by what the odometry alone added.
+    Where the base is an odometry's and the root moves against it, as a map does after each matched scan, there is a
+    pose at the first odometry after each such step: later poses add only the odometry's motion.
 
     Raises
     ------
@@ -381,7 +386,8 @@ def every_transform_pose(table: TopicTable) -> TopicTable:
 class _BasePoses(NamedTuple):
     """Poses of the base in the root of the transforms: messages (n,) and places in them (n,), position, quaternion.
 
-    `step` (n,) marks those after the root moved against an odometry; all, where the base is the root's own child.
+    `step` (n,) marks the poses after the root moved with respect to an odometry; all poses where the base is the root's
+    own child.
     """
 
     root: LogText
@@ -392,7 +398,7 @@ class _BasePoses(NamedTuple):
     step: Bools
 
     def table_of(self, table: TopicTable, some: Bools) -> TopicTable:
-        """Return some of them (n,) as messages of PoseStamped."""
+        """Return some of the poses (n,) as messages of PoseStamped."""
         stamps = (table.column(path)[self.rows[some], self.places[some]] for path in TRANSFORM_STAMP)
         frame = np.zeros(np.count_nonzero(some), np.int64)
         values = [*stamps, frame, *self.place[some].T, *self.turn[some].T]

@@ -36,16 +36,17 @@ NEEDS: dict[Role, str] = {
 }
 
 SAME_NAMESPACE = 8.0
-"""Added to the score of a candidate in the namespace of the wheels: it belongs to the same robot."""
+"""Added to the score of a candidate in the namespace of the wheels, which belongs to the same robot."""
 
 COMPLETE = 5.0
 """Added for each other role that the wheels' namespace can fill: of two robots, the one with all sensors is chosen."""
 
 WORTHY = 40.0
-"""Wheel topics of this score or more are measured; below it they are commands or velocities of other sensors."""
+"""Least score of measured wheels; topics below are commands or velocities of other sensors."""
 
 SAME_MESSAGE = 100.0
-"""Position and heading of one metric pose share a frame; a heading from elsewhere does not fit a local map."""
+"""Added to the score of the heading of the metric pose that gives the position: both share a frame, and another heading
+does not fit a local map."""
 
 NO_SCHEMA = "no schema"
 """Stands for the message type of a channel that states none."""
@@ -54,7 +55,8 @@ MOST_LISTED_TOPICS = 40
 MOST_REFERENCES = 3
 
 FUSED_WORDS = re.compile(r"ekf|ukf|fused|filtered|localization|global", re.IGNORECASE)
-"""Names of poses that another filter made, usually of the wheels too: that they agree with the wheels shows nothing."""
+"""Words in names of poses that another filter made, usually with the wheels: agreement with the wheels shows
+nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,17 +111,17 @@ def fields_to_take(channels: Sequence[Channel], config: Config) -> dict[int, tup
             topics.gnss == channel.topic or not (has_position or topics.gnss)
         ):
             moving[channel.id] = (*TRANSFORM_FIELDS, *TRANSFORM_STAMP)
-    # of one frame in both, the moving transform counts
+    # if a frame is in both, the moving transform counts
     return wanted | static | moving
 
 
 def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[str, str]) -> Candidates:
     """Return every decoded topic as a source of each role it may have, ranked by type, content and namespace.
 
-    Columns that only these are made of are removed: those of topics that can be wheels alone before others are read.
+    Columns from which only candidates are made are removed: for topics that can only be wheels, before others are read.
     """
     topics = config.topics
-    # the wheels first: they take most memory for a while, which is then free for the others
+    # the wheels first: their memory, the largest, is then free for the others
     wheels = pair_candidates(tables, config)
     if topics.wheel_left is None:
         wheels = _read_all(tables, "wheels", config, WheelSource) + wheels
@@ -155,7 +157,7 @@ def find_candidates(tables: Sequence[TopicTable], config: Config, unread: dict[s
 
 
 def drop_used_columns(tables: Sequence[TopicTable]) -> None:
-    """Remove the columns that only candidates were made of: half of what a log takes."""
+    """Remove the columns from which only candidates were made: half of the memory of a log."""
     for table in tables:
         for name in table.columns.keys() - {*HEADER, *GYRO_AXES, *TRANSFORM_FIELDS}:
             del table.columns[name]
@@ -181,11 +183,11 @@ def _ranked(
     others: frozenset[str] = frozenset(),
     same: str = "",
 ) -> list[Kind]:
-    """Return the sources sorted: usable ones first, this robot's before those of others, then by score and bonus.
+    """Return the sources sorted: usable ones first, this robot's before other robots', then by score and bonus.
 
     Parameters
     ----------
-    bonus, others : by namespace, what is added to a score; those of other robots
+    bonus, others : what is added to a score, by namespace; namespaces of other robots
     same : the topic of a metric pose, whose heading is preferred
     """
 
@@ -248,7 +250,7 @@ def choose_streams(found: Candidates, config: Config, log: str, channels: Sequen
 def other_references(found: Candidates, choice: Choice, config: Config) -> tuple[Choice, ...]:
     """Return the choice with each other position reference that may be better than the chosen one.
 
-    A pose brings its own heading; GNSS receivers beside the chosen one are no other reference. A configured topic of
+    A pose brings its own heading; GNSS receivers next to the chosen one are no other reference. A configured topic of
     position or heading has precedence: then there is none.
     """
     if config.topics.gnss is not None or config.topics.heading is not None:
@@ -349,7 +351,7 @@ def check_joints(chosen: WheelSource | None, candidates: Sequence[WheelSource], 
     Raises
     ------
     ConfigError
-        The first such joint, with those that are listed.
+        The first such joint, with the listed joints.
     """
     # If the chosen topic lists no joints, none of the others has the configured ones: name the closest one.
     listing = [chosen] if chosen is not None and chosen.joints else [motion for motion in candidates if motion.joints]

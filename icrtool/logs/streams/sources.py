@@ -1,6 +1,6 @@
-"""Topics that may feed a role: what was read of each, by which clock, and the fields of messages that it is read from.
+"""Topics that may feed a role: the values of each, their clock, and the fields of messages that they are read from.
 
-The clock of a topic is that of its header stamps where they can be used, else log time.
+The clock of a topic is the clock of its header stamps where they can be used, else log time.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ LARGEST_SHARE_ZERO = 0.01
 Clock = Literal["header", "log"]
 
 FEWEST_STAMPS = 2
-"""A stream with fewer shows no clock."""
+"""Least number of stamps that show a clock."""
 
 AROUND = 25
-"""Messages before and after a step of a clock whose median delay to log time shows its size."""
+"""Number of messages before, and after, a step of a clock: their median delay to log time shows its size."""
 
 
 class ClockSet(NamedTuple):
@@ -50,11 +50,11 @@ class StampedRows:
     ----------
     header_ns : (n,) header stamps, None where they are absent or cannot be used
     log_ns : (n,) log times
-    note : why the header's are not used, empty when they are
+    note : why header stamps are not used, empty where they are
     delay_ns : median of log time minus header stamp, 0 without header stamps
-    replaced : header stamps of another clock that log times stand for
+    replaced : number of header stamps of another clock that log times replace
     set_back : as `TopicTable.set_back`
-    clock_set : of the headers; their stamps are those of a clock that was not set
+    clock_set : step of the headers' clock; `header_ns` are corrected for it
     far_ns : (n,) header stamps of a clock far from log time, as simulated time is; None where there are none
     """
 
@@ -68,7 +68,7 @@ class StampedRows:
     far_ns: Ints | None = None
 
     def on(self, clock: Clock) -> Ints:
-        """Return the stamps on a clock; the log's where the header's cannot be used."""
+        """Return the stamps on a clock; log times where header stamps cannot be used."""
         return self.header_ns if clock == "header" and self.header_ns is not None else self.log_ns
 
 
@@ -127,21 +127,21 @@ def share_clock(streams: Sequence[StampedRows]) -> bool:
 
 
 def by_header(rows: StampedRows) -> StampedRows:
-    """Return stamps that go by the header, however far from log time; the same where there are none."""
+    """Return stamps by the header, however far from log time; unchanged where there are no header stamps."""
     return rows if rows.far_ns is None else replace(rows, header_ns=rows.far_ns, note="", far_ns=None)
 
 
 def by_log(rows: StampedRows) -> StampedRows:
-    """Return stamps that go by log time."""
+    """Return stamps by log time."""
     return replace(rows, header_ns=None, note=BY_LOG, delay_ns=0, replaced=0, far_ns=None)
 
 
 def _without_clock_steps(header: Ints, log_ns: Ints) -> tuple[Ints, ClockSet]:
     """Return header stamps (n,) of a clock that was set as if it had not been, and the largest step.
 
-    Log time goes on, so the delay to it changes by the step and stays so; after a message out of place it does not.
-    A step ahead counts where the whole stretch before it was later, too: a connection that was slow for a while and
-    then lost messages is no clock.
+    Log time goes on, so the delay to it changes by the step and stays changed; after a message out of place it returns.
+    A step forward counts only if the delay was larger in the whole stretch before it: a connection that was slow for a
+    while and then lost messages is no step of a clock.
     """
     found = []
     for lo in range(0, len(header), ROWS_AT_ONCE):
@@ -190,14 +190,14 @@ def increasing(stamps: Ints, usable: Bools | None = None) -> tuple[Ints | slice,
 
 
 NEVER_MOVES = 60.0
-"""Subtracted from the score of what never moves: another topic that moves is preferred."""
+"""Subtracted from the score of a topic that never moves: a topic that moves is preferred."""
 
 NO_ROWS: Bools = np.zeros(0, np.bool_)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """A topic, or a pair of topics, that may feed a role; of one that cannot be read the subclass holds no values.
+    """A topic, or a pair of topics, that may feed a role; an unreadable topic has no values in the subclass.
 
     Attributes
     ----------
@@ -281,7 +281,8 @@ class WheelSource(Source):
     ----------
     position : travelled since some start, in `unit`; None where not recorded
     speed : in `unit` per second; None where not recorded
-    twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only that of the body is recorded
+    twist : (n, 2) forward speed [m/s] and turn rate [rad/s, counter-clockwise], where only the body's motion is
+        recorded
     joints : the joints that its messages list by name, where they do
     """
 
@@ -307,7 +308,7 @@ def motion_of(
     problem: str = "",
     **others: Any,
 ) -> WheelSource:
-    """Return the motion of what left and right recorded; without what one side lacks, or has no finite value of."""
+    """Return the motion by records of left and right; a quantity without finite values on a side is left out."""
     both: list[Pair | None] = [None, None]
     for place, (left, right) in enumerate((position, speed)):
         if left is not None and right is not None and np.isfinite(left).any() and np.isfinite(right).any():
@@ -327,14 +328,14 @@ def moves(speeds: Floats) -> bool:
 
 
 def of_topic(table: TopicTable) -> dict[str, Any]:
-    """Return what a source has of its topic."""
+    """Return the fields of a source that come from its topic."""
     return {"topic": table.topic, "message_type": table.message_type, "stamps": stamp_rows(table)}
 
 
 _TERM = re.compile(r"(\S+?)(?: < (\S+))?((?: \* \S+)*)")
 _CHECK = re.compile(r"(\S+?)(?: & (\d+))? (==|!=|>=) (\S+)(?: unless (\S+))?")
 UNITS = {"deg": math.radians(1.0), "rad": math.degrees(1.0)}
-"""Of a bearing that is recorded in degrees, and of a latitude that is recorded in radians."""
+"""Factors of units: ``deg`` for a bearing in degrees, ``rad`` for a latitude in radians."""
 
 
 @cache
@@ -343,8 +344,8 @@ def terms_of(text: str) -> list[tuple[list[str], float, float]]:
 
     Returns
     -------
-    Of each field its names, in each spelling that drivers use; the number from which on recorded ones, of either sign,
-    stand for "not known"; and its unit, what 1 means: in m, radians, degrees of latitude or longitude.
+    For each field: its names, in each spelling that drivers use; the size from which recorded numbers, of either sign,
+    mean "not known"; and the value of 1 in m, radians, or degrees of latitude or longitude.
     """
     terms = []
     for one in text.split(" + "):
@@ -359,7 +360,7 @@ def terms_of(text: str) -> list[tuple[list[str], float, float]]:
 def number(table: TopicTable, text: str, *, needed: bool = False) -> Floats:
     """Return the values (n,) of a number as a text describes it; NaN where unknown, or where the type lacks it.
 
-    What stands behind a plus is added where it is known: further digits, or the height of the geoid.
+    The term after a plus is added where it is known: further digits, or the height of the geoid.
 
     Raises
     ------
@@ -382,8 +383,8 @@ def check_of(text: str) -> tuple[list[str], int | None, str, list[int | str], fl
     Returns
     -------
     The names of the field, in each spelling that drivers use; the bits of a whole number that count; ``==`` one of the
-    numbers or words that follow, ``!=`` none of them, ``>=`` the number; and the number that drivers leave in it which
-    never set it: where all messages have it, all are valid.
+    numbers or words that follow, ``!=`` none of them, ``>=`` the number; and the number in messages of drivers that
+    never set the field: where all messages have this number, all are valid.
     """
     if (found := _CHECK.fullmatch(text)) is None:
         raise ValueError(f"{text!r} describes no check")
@@ -393,7 +394,7 @@ def check_of(text: str) -> tuple[list[str], int | None, str, list[int | str], fl
 
 
 def all_valid(table: TopicTable, checks: Sequence[str]) -> Bools:
-    """Return which messages (n,) pass all checks; those of a field that the type lacks do."""
+    """Return which messages (n,) pass all checks; a check of a field that the type lacks is passed."""
     valid = np.ones(len(table), np.bool_)
     for names, mask, relation, wanted, unset in map(check_of, checks):
         if (path := names[0]) in table.texts:

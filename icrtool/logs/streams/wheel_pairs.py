@@ -30,7 +30,7 @@ from icrtool.records.text import LogText
 
 _NUMBERS = ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32", "UInt64")
 BYTE_TYPES = {"std_msgs/Int8", "std_msgs/UInt8"}
-"""Message types that hold a counter of 8 bits, or the state of a lamp: the topic's name decides."""
+"""Message types that may hold a counter of 8 bits or, for example, the state of a lamp: the topic's name decides."""
 
 PAIR_TYPES = {f"std_msgs/{name}" for name in _NUMBERS} | BYTE_TYPES
 """Message types that hold one number of one side."""
@@ -44,13 +44,13 @@ _OTHER_WORDS = re.compile(
     r"current|volt|temp|power|torque|effort|force|pwm|duty|status|error|fault|limit|gain|stamp|time|range",
     re.IGNORECASE,
 )
-"""Fields of a motor driver's messages that are no motion."""
+"""Words in fields of a motor driver's messages that are no motion."""
 
 _SIDE_WORDS = re.compile("left|right", re.IGNORECASE)
 _ONLY_SIDE = re.compile(
     r"(?:(?:left|right|front|rear|wheels?|tracks?|motor|drive|side|value|data)_?|\d)+", re.IGNORECASE
 )
-"""A field that names a side alone: its topic or message states of what."""
+"""A field whose name states only the side: the name of the topic or message states what it is."""
 
 _OF_WHEELS = re.compile(
     rf"{WHEEL_WORDS.pattern}|tick|encoder|(?<![a-z])enc(?![a-z])|rpm|vesc|roboteq|roboclaw", re.IGNORECASE
@@ -58,14 +58,14 @@ _OF_WHEELS = re.compile(
 """Words of a message about wheels; the last ones are makes of motor controllers."""
 
 MOST_LOOKED_AT, MOST_SEARCHED, MOST_PATHS = 1 << 21, 1 << 17, 1 << 20
-"""Characters of the definitions in a log that are looked through for words of wheels; of those with such words, whose
-fields are searched for sides, some ten types; and of the paths of these fields."""
+"""Largest number of characters: of definitions in a log that are searched for words of wheels; of definitions with such
+words, whose fields are searched for sides (some ten types); of the paths of these fields."""
 
 MOST_PAIRS = 256
-"""Of sides of a log that are looked at."""
+"""Largest number of pairs of sides of a log that are tried."""
 
 _HOLD_NS = 500_000_000
-"""A side that ends before the other is held for this long at most [s]."""
+"""Longest time for which the last value of a side that ends before the other is held [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class Side:
 
     Attributes
     ----------
-    path : its field, ``data``, ``left_ticks``, ``drivers[0].speed``; of elements ``data[0,2]`` the mean is taken
+    path : its field, ``data``, ``left_ticks``, ``drivers[0].speed``; for several elements, ``data[0,2]``, their mean
     """
 
     table: TopicTable
@@ -111,7 +111,7 @@ class PairNumbers(NamedTuple):
 
 
 def numbers_of(left: Side, right: Side, config: Config) -> PairNumbers:
-    """Return the numbers of two sides; of several elements their mean.
+    """Return the numbers of two sides; the mean where a side has several elements.
 
     Raises
     ------
@@ -177,12 +177,12 @@ def side_fields(channels: Sequence[Channel], topics: TopicsConfig) -> dict[int, 
 
 @dataclass(slots=True)
 class _Search:
-    """What was found in the definitions of a log, each looked through once, and how much may still be.
+    """Results of the search in the definitions of a log, each searched once, and the limits that are left.
 
     Attributes
     ----------
     looked_at, paths : characters that are left
-    searched : what may still be parsed
+    searched : limit of what is parsed
     of_wheels : by type and definition, whether words of wheels and of sides are in it
     fields : by type and definition, the paths of its numbers
     """
@@ -203,7 +203,7 @@ class _Search:
         return self.of_wheels[one]
 
     def fields_of(self, channel: Channel) -> list[str]:
-        """Return the paths of the numbers in the messages of a channel; none beyond what may be searched."""
+        """Return the paths of the numbers in the messages of a channel; none beyond the limits of the search."""
         one = (channel.message_type, channel.definition)
         if one not in self.fields:
             self.fields[one] = []
@@ -220,7 +220,7 @@ class _Search:
 
 
 def _fields_of(channel: Channel, search: _Search) -> list[str]:
-    """Return the fields of a channel's messages that may be of wheels; of unknown types by their names."""
+    """Return the fields of a channel's messages that may belong to wheels; for unknown types, by their names."""
     topic, message_type = channel.topic, channel.message_type
     if message_type in PAIR_TYPES:
         return ["data"] if _may_be_side(topic, message_type, "data") else []
@@ -277,7 +277,7 @@ def pair_candidates(tables: Sequence[TopicTable], config: Config) -> list[WheelS
 def _array_motion(table: TopicTable, config: Config) -> WheelSource:
     """Return the motion of wheels in an array; the side of the first one is taken as left.
 
-    What of a wheel's motion the mean of all does not have is the turning, which has opposite signs on the two sides.
+    A wheel's motion minus the mean of all wheels is its part of the turn, which has opposite signs on the two sides.
     """
     values = table.column("data[*]")
     modulus = find_modulus(list(values.T), config.robot.encoder_counts_per_rev)
@@ -287,7 +287,7 @@ def _array_motion(table: TopicTable, config: Config) -> WheelSource:
     alike = turning @ turning[0] > 0.0
     if len(wheels) > 2 * MOST_WHEELS or not 0 < 2 * np.count_nonzero(alike) == len(wheels):
         advice = f"name them in topics.wheel_left and wheel_right, as {_name(table.topic, 'data[0]')}"
-        return WheelSource(**of_topic(table), problem=f"its numbers do not show two sides of as many wheels; {advice}")
+        return WheelSource(**of_topic(table), problem=f"it does not show as many left as right wheels; {advice}")
     left, right = (f"data[{','.join(map(str, np.flatnonzero(side)))}]" for side in (alike, ~alike))
     return pair_motion(Side(table, left), Side(table, right), config)
 
@@ -309,7 +309,7 @@ def pair_motion(left: Side, right: Side, config: Config) -> WheelSource:
         if not (len(times) and len(held)):
             raise DefinitionError(topic, f"{(right if len(times) else left).table.topic} holds no message")
         lefts, rights, modulus = numbers_of(left, right, config)
-        # While both were recorded: a side that is held for long would look like a turn.
+        # Only while both were recorded: a side that is held for a long time would look like a turn.
         slack = max(_half_interval(times), _half_interval(held))
         both = (times >= held[0] - slack) & (times <= held[-1] + max(slack, _HOLD_NS))
         if not both.any():
@@ -365,7 +365,7 @@ def _half_interval(times: Ints) -> int:
 
 
 def _unwrapped(values: NDArray[Any], modulus: Modulus | None) -> NDArray[Any]:
-    """Return a counter (n,) counted on past its modulus; None: of the least of 16 and 32 bits that holds it."""
+    """Return a counter (n,) continued past its modulus; None: the smaller of 16 and 32 bits that holds it."""
     if not len(values) or (modulus is None and values.dtype.kind == "f"):
         return values
     size = modulus.value if modulus is not None else register_size(values)
@@ -384,7 +384,7 @@ def _is_position(side: Side, values: NDArray[Any], config: Config, *, integer: b
     finite = values[np.isfinite(values)]
     if len(finite) < 3 or np.ptp(finite) == 0:
         return integer
-    # A position's steps add up to about its range; a speed goes up and down around few values.
+    # A position's steps add up to about its range; a speed varies around few values.
     return bool(np.abs(np.diff(finite)).sum() < 3.0 * np.ptp(finite) and np.ptp(finite) > 5.0)
 
 

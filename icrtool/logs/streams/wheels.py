@@ -23,18 +23,19 @@ from icrtool.records.samples import WheelUnit
 from icrtool.records.text import listed
 
 ONE_TURN_RAD, LEAST_WRAP_RAD, FEWEST_WRAPS = 2 * np.pi + 1e-3, 1.5 * np.pi, 2
-"""Positions that stay within one turn, and jump by nearly one turn this often, are recorded modulo a turn."""
+"""Positions are recorded modulo a turn if they stay within `ONE_TURN_RAD`, and jump by more than `LEAST_WRAP_RAD` at
+least `FEWEST_WRAPS` times."""
 
 Quantity = Literal["position", "speed"]
 
 MOST_WHEELS = 32
-"""Of a side. A message that lists more is not of wheels, or was made to take time."""
+"""Largest number of wheels of a side. A message that lists more is not of wheels, or is an attack on the reader."""
 
 
 def of_wheels(
     wheels: Callable[[Quantity], list[NDArray[Any]]], lefts: int, names: Sequence[str], unit: WheelUnit, **others: Any
 ) -> WheelSource:
-    """Return the mean over the wheels of each side, those left out that have no encoder, or a dead one.
+    """Return the mean over the wheels of each side; wheels without an encoder, or with a dead encoder, are left out.
 
     Parameters
     ----------
@@ -45,11 +46,11 @@ def of_wheels(
     """
     means: dict[Quantity, Sides] = {"position": (None, None), "speed": (None, None)}
     dead: set[int] = set()
-    # One after the other: the columns of all wheels of a long log are large.
+    # One wheel after the other: the columns of all wheels of a long log are large.
     for quantity in means:
         columns = wheels(quantity)
         if columns:
-            # before a side is averaged: a front and a rear wheel do not begin a turn at the same time
+            # before the mean of a side: a front and a rear wheel do not begin a turn at the same time
             turns_modulo = quantity == "position" and unit == "rad"
             means[quantity], stuck = _side_means([*map(unwound_turns, columns)] if turns_modulo else columns, lefts)
             dead |= stuck
@@ -110,8 +111,8 @@ class FixedWheels:
     Attributes
     ----------
     what, worth : what it is called where it is chosen, and how suitable it is
-    position, speed : fields of the left and of the right side; of several places in a list the mean is taken
-    unit : of the positions, and of the speeds per second; factor : of the recorded numbers to it
+    position, speed : fields of the left and of the right side; for several places in a list, their mean
+    unit : unit of the positions, and per second of the speeds; factor : from recorded numbers to the unit
     """
 
     what: str
@@ -161,9 +162,9 @@ TICK_FIELDS = (
 
 
 def read_ticks(table: TopicTable, _: Config) -> WheelSource:
-    """Return the motion in xbot_msgs/WheelTick: counters that count up, with the direction of each wheel beside them.
+    """Return the motion in xbot_msgs/WheelTick: counters that only count up, and the direction of each wheel.
 
-    A step counts with the direction stated behind it, as in OpenMower's own xbot_positioning. Its driver leaves
+    A step has the direction that is stated after it, as in OpenMower's own xbot_positioning. Its driver leaves
     `valid_wheels` at 0, and the rear wheels are meant.
     """
     valid = table.integers("valid_wheels")
@@ -190,20 +191,22 @@ COMMANDED = re.compile(r"cmd|command|desired|target|setpoint|reference|joy", re.
 COMMAND_NOTES = (
     note(
         "wheels_commanded",
-        "commanded speeds, not measured ones: what the wheels did not do of them is in the ICRs and delays",
+        "commanded speeds, not measured ones: the difference to the wheels' motion is in the ICRs and delays",
     ),
 )
 COMMANDED_PENALTY = 40.0
-"""Taken off of a topic with commanded speeds."""
+"""Subtracted from the score of a topic with commanded speeds."""
 
 _FUSED = re.compile(
     r"filter|fused|combined|ekf|ukf|visual|(?<![a-z])vi?o(?![a-z])|camera|stereo|zed|realsense|t265|vins|rtab|mavros|amcl",
     re.IGNORECASE,
 )
-"""Names of odometry and twists that are fused with other sensors: used only where there is nothing better."""
+"""Words in names of odometry and twists that are fused with other sensors; these are used only where nothing better
+exists."""
 
 SIDEWAYS_SHARE = 0.2
-"""A twist with more than this sideways, and no turn, is a velocity in east and north, not in the body frame."""
+"""Largest sideways share of a twist in the body frame; a twist with more, and without turns, is a velocity in east and
+north."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +218,7 @@ class Twist:
     what, worth : what it is called where it is chosen, and how suitable it is
     path : the field of the twist, with its dot
     forward, sideways, turn : fields of it: the speeds [m/s] and the turn rate [rad/s, counter-clockwise]
-    fused : taken off where the name is that of a topic fused with others; 0: a base's own, whatever its name
+    fused : subtracted from the worth where the name shows a fused topic; 0: the base's own twist, whatever its name
     """
 
     what: str
@@ -232,7 +235,7 @@ class Twist:
         return tuple(f"{self.path}{field}" for field in (self.forward, self.sideways, self.turn))
 
     def read(self, table: TopicTable, _: Config) -> WheelSource:
-        """Return the twist; that of a position reference, or in east and north, is refused."""
+        """Return the twist; a twist of a position reference, or in east and north, is refused."""
         forward, sideways, turn = self.fields
         twist = np.column_stack([table.column(forward), table.column(turn)]).astype(np.float64)
         forward_sum, across_sum = (float(np.nansum(np.abs(side))) for side in (twist[:, 0], table.floats(sideways)))
@@ -248,7 +251,7 @@ class Twist:
         if not moves(twist[:, 1]) and across_sum > SIDEWAYS_SHARE * forward_sum:
             problem = "moves sideways and never turns: a velocity in east and north, not in the body frame"
         elif self.fused and REFERENCE_WORDS.search(table.topic):
-            problem = "its name is that of a position reference, not of wheels"
+            problem = "its name is the name of a position reference, not of wheels"
         return motion_of(**of_topic(table), twist=twist, unit="m", score=score, why=why, notes=known, problem=problem)
 
 
@@ -256,7 +259,7 @@ WHEEL_WORDS = re.compile(r"wheel|track(?!er|ing)|sprocket|drive|motor|tire|tyre"
 _OTHER_JOINTS = re.compile(
     r"(arm|pan|tilt|lift)\d*|(gripper|flipper|finger|steer|elbow|shoulder|wrist|caster|camera|rocker|bogie|suspension).*"
 )
-"""Words in the name of a joint that is not a wheel. Only complete words count: "panther" is not "pan"."""
+"""Words in the name of a joint that is no wheel. Only complete words count: "panther" is not "pan"."""
 
 _TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _LEFT_TOKENS = {"l", "left", "fl", "rl", "bl", "ml", "lf", "lb", "lr", "lm", "lh", "lwheel", "wl"}
@@ -273,7 +276,7 @@ def wheel_joints(names: Sequence[str]) -> tuple[list[int], list[int]]:
 
 @lru_cache(4096)
 def side_of(name: str) -> tuple[Literal["left", "right", ""], bool]:
-    """Return the side of a joint that may be a wheel, empty for others, and whether its name is that of a wheel.
+    """Return the side of a joint that may be a wheel, empty for others, and whether its name is a wheel's name.
 
     The words of a name are found in ``wheel_FL_joint``, ``frontLeftWheel`` and ``panther/rl_wheel_joint``.
     """
