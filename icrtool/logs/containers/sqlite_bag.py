@@ -106,7 +106,7 @@ class SqliteBag(Container):
             is_ahead = file.read(_WAL_AT + 1)[_WAL_AT:] == _IN_WAL_MODE
         if not is_ahead or log.exists():
             return ""
-        return f"its write-ahead log {log.name} is missing, in which a recorder keeps messages: copy it too"
+        return f"its write-ahead log {log.name} is missing, in which a recorder keeps messages: copy it to its folder"
 
     def share_read(self) -> float:
         """Return the last row read as a share of all rows."""

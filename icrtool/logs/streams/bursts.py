@@ -46,7 +46,7 @@ class Bursts(NamedTuple):
 
 
 def spread_bursts(stamp_ns: Ints) -> Bursts:
-    """Return stamps (n,) of samples in any order, those of each packet spread over the time since the packet before.
+    """Return stamps (n,) of samples in any order; samples of a packet are spread over the time since the last packet.
 
     Notes
     -----
